@@ -172,7 +172,7 @@ def dimensions(options: Any) -> tuple[Table, list[str]]:
         flow = flow_of(Coordinates(space), settings)
         target = build_target(scenes, space, DensitySettings(), "raycast")
         generator = torch.Generator().manual_seed(1)
-        base = flow.draw_base(options.batch, generator)
+        base, _ = flow.draw(options.batch, generator)
         points = space.sample(options.batch, np.random.default_rng(0))
 
         def step(flow=flow, base=base) -> None:

@@ -17,7 +17,7 @@ from lidardesign.density.target.prepare import prepare_target
 from lidardesign.density.target.proposals import independent_points
 from lidardesign.density.target.target import Target
 from lidardesign.density.target.visibility import common_receiver
-from lidardesign.density.training.checkpoint import clear_snapshots, save_arrays
+from lidardesign.density.training.checkpoint import clear_snapshots, save_flow
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import draw_probes, measure
 from lidardesign.density.training.training import PROGRESS, LearnProgress, Trainer
@@ -27,9 +27,9 @@ from lidardesign.geometry.frames import in_view
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase, running
 from lidardesign.run.manifest import note, record
-from lidardesign.samples import Samples, save_samples
+from lidardesign.samples import save_samples
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
+from lidardesign.space import AZIMUTH, observed_point
 from lidardesign.task import Task, notes_of, random_generator, scenes_of
 
 FLOW = "flow.safetensors"
@@ -120,9 +120,8 @@ def training_scenes(task: Task, config: RunConfig) -> list[Scene]:
 @phase("proposals")
 def _pool(target: Target, config: RunConfig) -> Pool:
     """Proposals for balancing, independent of those that coverage is measured on."""
-    count = config.learning.balance_proposals
     generator = random_generator(config.seed, "balancing")
-    points, log_density = independent_points(target, count, generator)
+    points, log_density = independent_points(target, config.learning.balance_proposals, generator)
     if not len(points):
         raise DataError(
             "no ray of the design space reaches a target surface in any training scene",
@@ -130,9 +129,8 @@ def _pool(target: Target, config: RunConfig) -> Pool:
             hint="widen the angles or the range, move the origin, or raise density.sigma_m",
         )
     refuse_blind_receiver(target.scenes, points)
-    log_target = target.log_density(points)
     # points on the space's faces may leave it by rounding
-    return Pool.of(config.space.to_unit(points).clip(-1.0, 1.0), log_target, log_density)
+    return Pool.of(config.space.to_unit(points).clip(-1.0, 1.0), target.log_density(points), log_density)
 
 
 def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
@@ -142,8 +140,7 @@ def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
         DataError: So it is.
     """
     receiver = common_receiver(scenes)
-    reached = points[:, :3] + points[:, RANGE, None] * direction(points[:, AZIMUTH], points[:, ELEVATION])
-    if receiver is not None and not in_view(receiver, reached).any():
+    if receiver is not None and not in_view(receiver, observed_point(points)).any():
         raise DataError(
             "its field of view and range hold no surface that a ray of the design space reaches",
             where="receiver",
@@ -196,7 +193,11 @@ def learn(
         with phase("measuring"):
             probes = draw_probes(trainer.target, config.learning.coverage_proposals, generator)
         measured = measure(trainer, probes, config.learning.samples)
-        _store(trainer, measured.samples, run)
+        with phase("writing"):
+            save_flow(trainer.flow, run, FLOW)
+            save_samples(measured.samples, run)
+            if (run / PROGRESS).exists():
+                record(run, [PROGRESS])
     result = LearnResult(
         run=str(run),
         task=config.task_name,
@@ -207,8 +208,8 @@ def learn(
         error_estimates=measured.estimates,
         **{name: estimate.value for name, estimate in measured.estimates.items()},
     )
-    found = {"visibility": data.target.visibility.name, "round_trip_nats": measured.round_trip_nats}
-    note(run, learn=result.as_dict(), **found)
+    visibility = data.target.visibility.name
+    note(run, learn=result.as_dict(), visibility=visibility, round_trip_nats=measured.round_trip_nats)
     return result
 
 
@@ -242,30 +243,20 @@ def make_trainer(data: TrainingData, config: RunConfig, run: Path, device: torch
     """A trainer at its first step."""
     generator = torch.Generator().manual_seed(config.seed)
     flow = make_flow(config, generator).to(device=device, dtype=getattr(torch, config.learning.dtype))
-    coordinates = Coordinates(config.space)
     target = data.target if device.type == "cpu" else on_device(data.target, device)
-    return Trainer(flow, target, coordinates, config.learning, run, generator, data.pool.to(device))
+    coordinates, pool = Coordinates(config.space), data.pool.to(device)
+    return Trainer(flow, target, coordinates, generator, config.learning, run, pool)
 
 
 def make_flow(config: RunConfig, generator: torch.Generator) -> DesignFlow:
     """The flow of a configuration with its initial weights."""
     coordinates, settings = Coordinates(config.space), config.learning
-    circular = [config.space.free[n] == AZIMUTH and config.space.full_azimuth for n in coordinates.learned]
     return DesignFlow(
         coordinates.blocks,
         len(coordinates.conditions),
         layers=settings.layers,
         hidden=settings.hidden,
         bins=settings.bins,
-        periodic=circular,
+        periodic=[config.space.free[n] == AZIMUTH and config.space.full_azimuth for n in coordinates.learned],
         generator=generator,
     )
-
-
-@phase("writing")
-def _store(trainer: Trainer, samples: Samples, run: Path) -> None:
-    weights = {name: value.detach().cpu().numpy() for name, value in trainer.flow.state_dict().items()}
-    save_arrays(run, FLOW, weights, {"features": trainer.flow.features, "context": trainer.flow.context})
-    save_samples(samples, run)
-    if (run / PROGRESS).exists():
-        record(run, [PROGRESS])

@@ -27,8 +27,8 @@ from lidardesign.density.learn import FLOW, make_flow
 from lidardesign.density.target.target import Target
 from lidardesign.density.target.visibility import Optics
 from lidardesign.density.training.checkpoint import load_arrays, measured_steps, stored_snapshots, twin_step
-from lidardesign.density.training.losses import Pool, balancing_loss, draw_conditions, pathwise_loss
-from lidardesign.density.training.quality import IndependentProbes, draw_samples, log_density_of, measure
+from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
+from lidardesign.density.training.quality import IndependentProbes, LearnedFlow, draw_samples, log_density_of, measure
 from lidardesign.density.training.training import PROGRESS, SIGMA_START_RATIO
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
@@ -36,16 +36,6 @@ from lidardesign.numerics import TINY
 from lidardesign.run.manifest import verify
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
-
-
-@dataclass(frozen=True, eq=False)
-class LoadedFlow:
-    """A flow of a run with what it is measured by; see `measure.Learned`."""
-
-    flow: DesignFlow
-    target: Target
-    coordinates: Coordinates
-    generator: torch.Generator
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,17 +96,17 @@ def remeasured(
     """
     files = {**stored_snapshots(run), config.learning.steps: FLOW}
     rungs = [step for step in measured_steps(config.learning) if step in files]
-    seconds, found = seconds_at(run, rungs), []
+    seconds, qualities = seconds_at(run, rungs), []
     for step in rungs:
         reached = measure(load_flow(run, files[step], config, target, seed), probes, count)
         twin = files.get(twin_step(config.learning, step))
-        other = measure(load_flow(run, twin, config, target, seed), probes, count) if twin else None
-        apart = None if other is None else other.estimates["misplaced"]
-        found.append(SnapshotQuality(step, seconds[step], reached.estimates, reached.samples, apart))
-    return found
+        other = measure(load_flow(run, twin, config, target, seed), probes, count).estimates if twin else {}
+        misplaced = other.get("misplaced")
+        qualities.append(SnapshotQuality(step, seconds[step], reached.estimates, reached.samples, misplaced))
+    return qualities
 
 
-def load_flow(run: Path, name: str, config: RunConfig, target: Target, seed: int) -> LoadedFlow:
+def load_flow(run: Path, name: str, config: RunConfig, target: Target | FlatTarget, seed: int) -> LearnedFlow:
     """A flow of a run from its file, in double precision.
 
     Raises:
@@ -130,7 +120,7 @@ def load_flow(run: Path, name: str, config: RunConfig, target: Target, seed: int
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise DataError(f"is of another flow: {reason}", where=str(run / name), hint="learn the run again") from None
-    return LoadedFlow(flow, target, Coordinates(config.space), generator.manual_seed(seed))
+    return LearnedFlow(flow, target, Coordinates(config.space), generator.manual_seed(seed))
 
 
 def seconds_at(run: Path, steps: list[int]) -> dict[int, float]:
@@ -225,8 +215,8 @@ def gradient(flow: DesignFlow, loss: Loss, seed: int, clip_norm: float) -> np.nd
         clip_norm: The length that steps are clipped to.
     """
     parameters = list(flow.parameters())
-    found = torch.autograd.grad(loss(flow, torch.Generator().manual_seed(seed)), parameters, allow_unused=True)
-    parts = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, found, strict=True)]
+    batch = torch.Generator().manual_seed(seed)
+    parts = torch.autograd.grad(loss(flow, batch), parameters, allow_unused=True, materialize_grads=True)
     flat = torch.cat([part.detach().double().reshape(-1) for part in parts]).cpu().numpy()
     if not np.isfinite(flat).all():
         return np.zeros_like(flat)
@@ -301,7 +291,7 @@ class FlowSamples:
     def of(cls, flow: DesignFlow, count: int, seed: int) -> FlowSamples:
         """Samples of a float64 flow."""
         generator = torch.Generator().manual_seed(seed)
-        conditions, base = draw_conditions(flow, count, generator), flow.draw_base(count, generator)
+        base, conditions = flow.draw(count, generator)
         with torch.no_grad():
             values, log_prob = flow(base, conditions)
         return cls(base, values, conditions, log_prob.numpy())
@@ -323,14 +313,6 @@ class FlowSamples:
         return values.to(like), None if self.conditions is None else self.conditions.to(like)
 
 
-class _NoTarget:
-    """Stands for the target where samples of the flow alone are wanted."""
-
-    def log_density(self, points: np.ndarray) -> np.ndarray:
-        """Nothing is known of it."""
-        return np.zeros(len(points))
-
-
 class LearnedDensity:
     """A normalised density over rays: design points (x, y, z, azimuth, elevation, range) in metres and radians.
 
@@ -343,8 +325,10 @@ class LearnedDensity:
         self._run, self._config = run, config
 
     @cached_property
-    def _flow(self) -> LoadedFlow:
-        return load_flow(self._run, FLOW, self._config, _NoTarget(), self._config.seed)
+    def _flow(self) -> LearnedFlow:
+        # samples of the flow alone need no target
+        nothing = FlatTarget(Optics.of(self._config.density), self.space)
+        return load_flow(self._run, FLOW, self._config, nothing, self._config.seed)
 
     @property
     def space(self) -> DesignSpace:

@@ -6,8 +6,6 @@ rectangular stop of a camera.
 
 Light that leaves o along v, meets a surface at range r and goes on to a receiver at x has the path
 L = r + |o + r v - x|. With b = x - o: r = (L / 2) (1 - (|b| / L)^2) / (1 - b.v / L). For b = 0 it is L / 2 exactly.
-
-Rotation matrices of the angles and quaternions that files hold.
 """
 
 from __future__ import annotations
@@ -54,8 +52,7 @@ def path_of_range(rays: Rays, receiver: Receiver | None, range_m: np.ndarray) ->
         return range_m
     points = rays.origin_m + range_m[:, None] * rays.direction
     back_m = np.linalg.norm(points - np.asarray(receiver.origin_m), axis=1)
-    together = _at_the_receiver(rays, receiver)
-    return np.where(together, range_m, (range_m + back_m) / 2)
+    return np.where(_at_the_receiver(rays, receiver), range_m, (range_m + back_m) / 2)
 
 
 def range_of_path(rays: Rays, receiver: Receiver | None, path_m: np.ndarray) -> np.ndarray:
@@ -76,8 +73,7 @@ def range_of_path(rays: Rays, receiver: Receiver | None, path_m: np.ndarray) -> 
 
 def path_windows(rays: Rays, receiver: Receiver | None) -> np.ndarray:
     """The gates of rays as intervals of half paths, shape (N, 2) [m]: a path grows with its range."""
-    ends = [path_of_range(rays, receiver, np.ascontiguousarray(rays.gate_m[:, end])) for end in (0, 1)]
-    return np.stack(ends, axis=1)
+    return np.stack([path_of_range(rays, receiver, np.ascontiguousarray(end)) for end in rays.gate_m.T], axis=1)
 
 
 def _at_the_receiver(rays: Rays, receiver: Receiver) -> np.ndarray:
@@ -90,8 +86,7 @@ def rotation_of_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.nda
     (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a), math.cos(a)) for a in (roll_rad, pitch_rad, yaw_rad))
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
     about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    return about_z @ about_y @ about_x
+    return np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]]) @ about_y @ about_x
 
 
 def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidardesign.geometry.rays import Crossings, Hits
 from lidardesign.numerics import ROUNDING, unit_vectors
-from lidardesign.scene import Body, Box, Capsule, Plane, Sphere, inverse_rigid
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Sphere, inverse_rigid
 
 GROUP_CHUNK = 200_000  # ray-primitive pairs at a time: the temporaries stay below some 50 MB
 # Relative rounding of squared distances, doubled many times over: bounding balls are never missed.
@@ -43,7 +43,7 @@ class PrimitiveGroup:
         kind = type(members[0][1].shape)
         self._crossed, self._normal = _CROSSED[kind], _NORMALS[kind]
         self._body = np.array([index for index, _ in members], dtype=np.int64)
-        self._sizes = np.array([_SIZES[kind](body.shape) for _, body in members])
+        self._sizes = np.array([SIZES[kind](body.shape) for _, body in members])
         self._radii_m = np.array([_RADII[kind](body.shape) for _, body in members])
         poses = np.stack([body.pose(frame) for _, body in members])
         self._rotation = poses[:, :3, :3]
@@ -84,10 +84,10 @@ class PrimitiveGroup:
         for pairs in self._pairs(origins, directions, limit_m):
             start, limit = start_m[pairs.rows][pairs.ray], limit_m[pairs.rows][pairs.ray]
             for range_m in (pairs.near, pairs.far):
-                kept = np.flatnonzero((range_m >= start) & (range_m < limit))
-                row = pairs.ray[kept] + pairs.rows.start
-                cosine = np.abs(_dot(self._normals(pairs, kept, range_m[kept]), directions[row]))
-                parts.append(Crossings(row, range_m[kept], cosine))
+                within = np.flatnonzero((range_m >= start) & (range_m < limit))
+                row = pairs.ray[within] + pairs.rows.start
+                cosine = np.abs(_dot(self._normals(pairs, within, range_m[within]), directions[row]))
+                parts.append(Crossings(row, range_m[within], cosine))
         return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _pairs(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Iterator[_Pairs]:
@@ -181,8 +181,7 @@ def _capsule(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> 
         height = np.where(across == 0, end * directions[:, 2] * np.inf, height)
         centred = origins.copy()
         centred[:, 2] -= np.sign(height) * half_length_m
-        cap = _ball(centred, directions, radius_m)[number]
-        roots.append(np.where(np.abs(height) <= half_length_m, side, cap))
+        roots.append(np.where(np.abs(height) <= half_length_m, side, _ball(centred, directions, radius_m)[number]))
     return roots[0], roots[1]
 
 
@@ -215,11 +214,13 @@ _NORMALS: dict[type, Callable[..., np.ndarray]] = {
     Capsule: _capsule_normal,
     Plane: _plane_normal,
 }
-_SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
+# Their lengths, as closed forms and compiled loops take them; planes and meshes have none.
+SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
     Sphere: lambda shape: (shape.radius_m, 0.0, 0.0),
     Box: lambda shape: shape.half_extents_m,
     Capsule: lambda shape: (shape.radius_m, shape.half_length_m, 0.0),
     Plane: lambda shape: (0.0, 0.0, 0.0),
+    Mesh: lambda shape: (0.0, 0.0, 0.0),
 }
 _RADII: dict[type, Callable[..., float]] = {
     Sphere: lambda shape: shape.radius_m,

@@ -103,29 +103,29 @@ def trace_each(
     learning, only share Embree's own calls out.
     """
     resting = [caster.resting for caster in casters]
-    if any(one is None for one in resting):
+    if any(meshes is None for meshes in resting):
         parts = [
             caster.trace(origins[begin:end], directions[begin:end], limit_m[begin:end])
             for caster, begin, end in zip(casters, starts[:-1], starts[1:], strict=True)
         ]
         return Hits.joined(parts)
-    # `trace_each` for meshes at rest: everything but Embree's calls is done for all rays together
+    # for meshes at rest everything but Embree's calls is done for all rays together
     counts = np.diff(starts)
-    local = origins - np.repeat([one.triangles.centre for one in resting], counts, axis=0)
-    advance_m = advances_m(local, directions, np.repeat([one.radius_m for one in resting], counts))
+    local = origins - np.repeat([meshes.triangles.centre_m for meshes in resting], counts, axis=0)
+    advance_m = advances_m(local, directions, np.repeat([meshes.radius_m for meshes in resting], counts))
     local = (local + advance_m[:, None] * directions).astype(np.float32)
     toward, limit = directions.astype(np.float32), np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32)
     hits = Hits.none(len(origins))
     rows, ranges, normals = [], [], []
-    for one, begin, end in zip(resting, starts[:-1], starts[1:], strict=True):
+    for meshes, begin, end in zip(resting, starts[:-1], starts[1:], strict=True):
         if begin == end:
             continue
-        found = one.triangles.run(local[begin:end], toward[begin:end], limit[begin:end])
+        found = meshes.triangles.run(local[begin:end], toward[begin:end], limit[begin:end])
         hit = np.flatnonzero(found["primID"] >= 0)
         rows.append(begin + hit)
         ranges.append(found["tfar"][hit])
         normals.append(found["Ng"][hit])
-        hits.body[begin + hit] = one.body_of_geometry[found["geomID"][hit]]
+        hits.body[begin + hit] = meshes.body_of_geometry[found["geomID"][hit]]
     if rows:
         hit = np.concatenate(rows)
         hits.range_m[hit] = np.concatenate(ranges) + advance_m[hit]
@@ -179,8 +179,7 @@ class _AtRest:
     ) -> Hits:
         hits = Hits.none(len(origins))
         if len(origins):
-            local = origins - self.triangles.centre
-            rows, range_m, geometry, normal = self.triangles.trace(local, directions, limit_m, twice)
+            rows, range_m, geometry, normal = self.triangles.trace(origins, directions, limit_m, twice)
             hits.range_m[rows], hits.body[rows], hits.normal[rows] = range_m, self.body_of_geometry[geometry], normal
         return hits
 
@@ -237,7 +236,7 @@ class _Moving:
                 continue
             rotation = self._rotation[number]
             local = _turned(origins[rows] - self._translation[number], rotation.T)
-            range_m, normal = caster.trace(local, _turned(directions[rows], rotation.T), bound[rows], twice)
+            range_m, normal = caster.first_hits(local, _turned(directions[rows], rotation.T), bound[rows], twice)
             hit = np.isfinite(range_m)
             won = rows[hit]
             hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
@@ -266,7 +265,9 @@ class _Meshes:
     ) -> Crossings:
         parts = [Crossings(np.empty(0, int), np.empty(0), np.empty(0))]
         if self.resting or self.moving:
-            alive, start, step_m = np.arange(len(origins)), start_m.copy(), self._step_m(limit_m)
+            reach_m = float(limit_m[np.isfinite(limit_m)].max(initial=0.0))
+            step_m = STEP_SHARE * max(reach_m, *(part.radius_m for part in (self.resting, self.moving) if part))
+            alive, start = np.arange(len(origins)), start_m.copy()
             for _ in range(MAXIMUM_LAYERS):
                 ahead, toward = start[alive], directions[alive]
                 hits = self.trace(origins[alive] + ahead[:, None] * toward, toward, limit_m[alive] - ahead, None)
@@ -279,10 +280,6 @@ class _Meshes:
                 parts.append(Crossings(alive, reached, cosine))
                 start[alive] = reached + step_m
         return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-    def _step_m(self, limit_m: np.ndarray) -> float:
-        reach = limit_m[np.isfinite(limit_m)].max(initial=0.0)
-        return STEP_SHARE * max(float(reach), *(part.radius_m for part in (self.resting, self.moving) if part))
 
 
 def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:

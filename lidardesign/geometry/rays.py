@@ -83,8 +83,7 @@ class Rays:
             if not np.isfinite(values).all():
                 raise ConfigError("values are NaN or infinite", where=f"rays.{name}")
             object.__setattr__(self, name, values)
-        lengths = np.linalg.norm(self.direction, axis=1)
-        if count and np.abs(lengths - 1).max() > COARSE_SLACK:
+        if count and np.abs(np.linalg.norm(self.direction, axis=1) - 1).max() > COARSE_SLACK:
             raise ConfigError("directions are not unit vectors", where="rays.direction")
         if count and (self.gate_m[:, 0].min() < 0 or (self.gate_m[:, 1] < self.gate_m[:, 0]).any()):
             raise ConfigError("a gate is negative or ends before it starts", where="rays.gate_m")
@@ -100,8 +99,8 @@ class Rays:
     ) -> Rays:
         """Rays whose angles (N,) keep every digit, evenly over a frame at the default rate."""
         looking = direction(azimuth_rad, elevation_rad)
-        both = np.stack([azimuth_rad, elevation_rad], axis=1)
-        return cls(origin_m, looking, gate_m, sensor, fire_times(len(looking), DEFAULT_RATE_HZ), both)
+        times = fire_times(len(looking), DEFAULT_RATE_HZ)
+        return cls(origin_m, looking, gate_m, sensor, times, np.stack([azimuth_rad, elevation_rad], axis=1))
 
     @property
     def azimuth_rad(self) -> np.ndarray:
@@ -122,8 +121,7 @@ class Rays:
 
     def subset(self, keep: np.ndarray) -> Rays:
         """The rays at an index or mask."""
-        columns = (self.origin_m, self.direction, self.gate_m, self.sensor, self.time_s, self.angles_rad)
-        return Rays(*(None if column is None else column[keep] for column in columns))  # type: ignore[arg-type]
+        return Rays(*(None if column is None else column[keep] for column in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,13 +33,16 @@ def sample_triangles(
     if not len(faces):
         raise ValueError("a surface without faces has no points")
     corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    cumulated = np.cumsum(area)
+    cumulated = np.cumsum(_doubled_areas(corners))
     places = (np.arange(count) + generator.random(count)) / count * cumulated[-1]
     chosen = np.minimum(np.searchsorted(cumulated, places, side="right"), len(faces) - 1)
     root, share = np.sqrt(generator.random((count, 1))), generator.random((count, 1))
     a, b, c = np.moveaxis(corners[chosen], 1, 0)
     return (1 - root) * a + root * (1 - share) * b + root * share * c, chosen
+
+
+def _doubled_areas(corners: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
 def sample_body(
@@ -56,18 +59,17 @@ def sample_body(
 
 def surface_area_m2(body: Body, space: DesignSpace) -> float:
     """The area of a body's surface [m^2]; of a plane, the square that the space can reach."""
-    shape = body.shape
-    if isinstance(shape, Sphere):
-        return 4 * math.pi * shape.radius_m**2
-    if isinstance(shape, Box):
-        x, y, z = shape.half_extents_m
-        return 8 * (x * y + y * z + z * x)
-    if isinstance(shape, Capsule):
-        return 4 * math.pi * shape.radius_m * (shape.radius_m + shape.half_length_m)
-    if isinstance(shape, Plane):
-        return (2 * _reach_m(space)) ** 2
-    a, b, c = np.moveaxis(shape.vertices[shape.faces], 1, 0)
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    match body.shape:
+        case Sphere(radius_m=radius_m):
+            return 4 * math.pi * radius_m**2
+        case Box(half_extents_m=(x, y, z)):
+            return 8 * (x * y + y * z + z * x)
+        case Capsule(radius_m=radius_m, half_length_m=half_length_m):
+            return 4 * math.pi * radius_m * (radius_m + half_length_m)
+        case Plane():
+            return (2 * _reach_m(space)) ** 2
+        case Mesh(vertices=vertices, faces=faces):
+            return float(_doubled_areas(vertices[faces]).sum() / 2)
 
 
 def target_area_m2(scene: Scene, space: DesignSpace) -> float:
@@ -76,8 +78,7 @@ def target_area_m2(scene: Scene, space: DesignSpace) -> float:
 
 
 def _reach_m(space: DesignSpace) -> float:
-    extent = np.array(space.high[:3]) - np.array(space.low[:3])
-    return space.high[RANGE] + float(np.linalg.norm(extent)) / 2
+    return space.high[RANGE] + float(np.linalg.norm(np.array(space.high[:3]) - np.array(space.low[:3]))) / 2
 
 
 def _on_body(
@@ -91,8 +92,7 @@ def _on_body(
         return Sampled(points @ pose[:3, :3].T + pose[:3, 3], corners @ pose[:3, :3].T + pose[:3, 3])
     if isinstance(body.shape, Plane):
         centre = (np.array(space.low[:3]) + np.array(space.high[:3])) / 2
-        foot = (centre - pose[:3, 3]) @ pose[:3, :3]
-        local = foot + generator.uniform(-_reach_m(space), _reach_m(space), (count, 3))
+        local = (centre - pose[:3, 3]) @ pose[:3, :3] + generator.uniform(-_reach_m(space), _reach_m(space), (count, 3))
         local[:, 2] = 0.0
     else:
         local = _on_primitive(body.shape, count, generator)
@@ -102,7 +102,11 @@ def _on_body(
 
 def _on_primitive(shape: Sphere | Box | Capsule, count: int, generator: np.random.Generator) -> np.ndarray:
     if isinstance(shape, Box):
-        return _on_box(np.array(shape.half_extents_m), count, generator)
+        half = np.array(shape.half_extents_m)
+        points, area = generator.uniform(-half, half, (count, 3)), half.prod() / half
+        axis = generator.choice(3, count, p=area / area.sum())
+        points[np.arange(count), axis] = half[axis] * generator.choice([-1.0, 1.0], count)
+        return points
     direction = generator.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     if isinstance(shape, Sphere):
@@ -114,11 +118,3 @@ def _on_primitive(shape: Sphere | Box | Capsule, count: int, generator: np.rando
     side = np.stack([shape.radius_m * np.cos(turn), shape.radius_m * np.sin(turn), height], axis=1)
     on_side = generator.random(count) * (shape.radius_m + shape.half_length_m) < shape.half_length_m
     return np.where(on_side[:, None], side, ends)
-
-
-def _on_box(half: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
-    points = generator.uniform(-half, half, (count, 3))
-    area = half.prod() / half
-    axis = generator.choice(3, count, p=area / area.sum())
-    points[np.arange(count), axis] = half[axis] * generator.choice([-1.0, 1.0], count)
-    return points

@@ -50,27 +50,29 @@ class SecondCasts:
 
 
 class Triangles:
-    """Meshes in one Embree scene, recentred."""
+    """Meshes in one Embree scene, recentred; `centre_m` (3,) and `radius_m` are those of a ball around them."""
 
     def __init__(self, meshes: Sequence[Mesh]) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
         corners = np.concatenate([mesh.bounds_m for mesh in meshes])
-        self.centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        self.centre_m = (corners.min(axis=0) + corners.max(axis=0)) / 2
         self.radius_m = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
         self._scene = EmbreeScene()
         self._geometries = [
-            TriangleMesh(self._scene, (mesh.vertices - self.centre).astype(np.float32), mesh.faces) for mesh in meshes
+            TriangleMesh(self._scene, (mesh.vertices - self.centre_m).astype(np.float32), mesh.faces) for mesh in meshes
         ]
 
     def trace(
-        self, local: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None = None
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """First hits of rays relative to the centre: rows (K,), their ranges (K,), meshes (K,) and normals (K, 3).
+        """First hits of finite float64 rays of unit length: rows (K,), ranges (K,), meshes (K,) and normals (K, 3).
 
-        Where hits are asked for twice, what is cast again is counted there.
+        From its limit (N,) on, a hit counts as a miss. Normals are wound as the faces are. Where hits are asked for
+        twice, what is cast again is counted there.
         """
+        local = origins - self.centre_m
         advance_m = advances_m(local, directions, self.radius_m)
         near = local + advance_m[:, None] * directions
         limit = np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32)
@@ -114,6 +116,16 @@ class Triangles:
         for name in ("primID", "geomID", "tfar", "Ng"):
             found[name][doubtful[nearer]] = again[name][nearer]
 
+    def first_hits(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Ranges (N,) [m], infinite on a miss, and normals (N, 3), zero there, of rays as in `trace`."""
+        range_m, normal = np.full(len(origins), np.inf), np.zeros((len(origins), 3))
+        if len(origins):
+            rows, reached_m, _, found = self.trace(origins, directions, limit_m, twice)
+            range_m[rows], normal[rows] = reached_m, found
+        return range_m, normal
+
     def run(self, local: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> dict[str, np.ndarray]:
         """Embree's own answer for float32 rays."""
         return self._scene.run(local, directions, dists=limit_m, output=True)
@@ -128,47 +140,15 @@ def advances_m(local: np.ndarray, directions: np.ndarray, radius_m: np.ndarray |
     return np.where(far, np.maximum(closest - 2 * radius_m, 0.0), 0.0)
 
 
-class MeshCaster:
-    """Casts rays at one mesh in its own frame; `mesh_caster` keeps one for every mesh."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self._triangles = Triangles([mesh])
-
-    @property
-    def centre_m(self) -> np.ndarray:
-        """The centre of a ball around the mesh, shape (3,)."""
-        return self._triangles.centre
-
-    @property
-    def radius_m(self) -> float:
-        """The radius of that ball."""
-        return self._triangles.radius_m
-
-    def trace(
-        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """First hits of finite float64 rays of unit length in the mesh's frame, shapes (N, 3) and (N, 3).
-
-        From its limit (N,) on, a hit counts as a miss. Ranges (N,) [m] are infinite and unit normals (N, 3), wound as
-        the faces are, zero on a miss. Where hits are asked for twice, what is cast again is counted there.
-        """
-        range_m, normal = np.full(len(origins), np.inf), np.zeros((len(origins), 3))
-        if len(origins):
-            local = origins - self.centre_m
-            rows, found_m, _, found_normal = self._triangles.trace(local, directions, limit_m, twice)
-            range_m[rows], normal[rows] = found_m, found_normal
-        return range_m, normal
+_mesh_casters: WeakKeyDictionary[Mesh, Triangles] = WeakKeyDictionary()
+_casters_by_content: WeakValueDictionary[str, Triangles] = WeakValueDictionary()
 
 
-_mesh_casters: WeakKeyDictionary[Mesh, MeshCaster] = WeakKeyDictionary()
-_casters_by_content: WeakValueDictionary[str, MeshCaster] = WeakValueDictionary()
-
-
-def mesh_caster(mesh: Mesh) -> MeshCaster:
+def mesh_caster(mesh: Mesh) -> Triangles:
     """The one caster of a mesh in its own frame, kept as long as the mesh; meshes of equal content share it."""
     if mesh not in _mesh_casters:
         known = _casters_by_content.get(mesh.content_hash)
         if known is None:
-            known = _casters_by_content[mesh.content_hash] = MeshCaster(mesh)
+            known = _casters_by_content[mesh.content_hash] = Triangles([mesh])
         _mesh_casters[mesh] = known
     return _mesh_casters[mesh]

@@ -20,7 +20,7 @@ from support.tables import each_row
 from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learned import FlatTarget
 from lidardesign.density.target.visibility import Optics
-from lidardesign.density.training.losses import Pool, draw_conditions
+from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import draw_samples, log_density_of
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
@@ -106,7 +106,7 @@ def test_samples_of_a_flow_have_its_integrated_density(name, dtype):
     edges = edges_of(*sizes)
     mass = mass_of_cells(of_flow(flow, context), edges, inside)
     assert mass.sum() == pytest.approx(1.0, abs=5e-3)
-    base = flow.draw_base(DRAWS, torch.Generator().manual_seed(2)).to(dtype)
+    base = flow.draw(DRAWS, torch.Generator().manual_seed(2))[0].to(dtype)
     with torch.no_grad():
         values, _ = flow.to(dtype)(base, None if context is None else context.to(dtype).expand(DRAWS, -1))
     assert p_value(counts_of_cells(values.double().numpy(), edges), DRAWS * mass / mass.sum()) > UNLIKELY
@@ -117,7 +117,7 @@ def test_a_sampler_that_is_a_little_wrong_is_found_out():
     edges = edges_of(16, 16)
     mass = mass_of_cells(of_flow(flow, None), edges, 12)
     with torch.no_grad():
-        values, _ = flow(flow.draw_base(DRAWS, torch.Generator().manual_seed(2)))
+        values, _ = flow(*flow.draw(DRAWS, torch.Generator().manual_seed(2)))
     shifted = np.clip(values.numpy() + 0.02, -1, 1)
     assert p_value(counts_of_cells(shifted, edges), DRAWS * mass / mass.sum()) < UNLIKELY
 
@@ -167,7 +167,7 @@ def test_samples_of_a_run_have_the_density_per_chart_volume_that_is_stored_with_
 
 def test_conditions_and_proposals_are_drawn_as_they_say():
     generator = torch.Generator().manual_seed(5)
-    conditions = draw_conditions(flow_of("chain, given two"), DRAWS, generator).numpy()
+    conditions = flow_of("chain, given two").draw(DRAWS, generator)[1].numpy()
     edges = edges_of(10, 10)
     assert p_value(counts_of_cells(conditions, edges), np.full(100, DRAWS / 100)) > UNLIKELY
     log_weights = np.random.default_rng(6).normal(0, 2, 400)

@@ -103,7 +103,7 @@ def _trainer(run: Path) -> object:
     config = small_config()
     generator = torch.Generator().manual_seed(0)
     flow, coordinates = make_flow(config, generator), Coordinates(config.space)
-    trainer = Trainer(flow, None, coordinates, config.learning, run, generator, None)
+    trainer = Trainer(flow, None, coordinates, generator, config.learning, run, None)
     for parameter in trainer.flow.parameters():
         parameter.grad = torch.zeros_like(parameter)
     trainer.optimiser.step()
@@ -114,7 +114,7 @@ def checkpoints(folder: Path) -> list[bytes]:
     """The checkpoint of a small flow."""
     run = make_run(folder / "checkpointed", count=50)
     trainer = _trainer(run)
-    trainer._save(trainer._taken())
+    trainer._save(*trainer._state())
     return [(run / "checkpoint.safetensors").read_bytes()]
 
 

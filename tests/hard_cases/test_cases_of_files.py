@@ -235,7 +235,7 @@ class TestCheckpoints:
 
     def test_one_of_another_flow_is_refused_and_the_trainer_keeps_its_weights(self, run):
         trainer = fresh_trainer(run, hidden=8)
-        trainer._save(trainer._taken())
+        trainer._save(*trainer._state())
         other = fresh_trainer(run, hidden=12)
         before = [parameter.detach().clone() for parameter in other.flow.parameters()]
         with pytest.raises(DataError, match="another flow"):
@@ -247,8 +247,8 @@ class TestCheckpoints:
     @pytest.mark.parametrize("value", [None, -1, "7", True, [1], 1e400, 10**400], ids=lambda value: str(value)[:5])
     def test_a_counter_that_is_none_is_refused(self, run, name, value):
         trainer = fresh_trainer(run, hidden=8)
-        taken = trainer._taken()
-        save_arrays(run, CHECKPOINT, taken.arrays, {**taken.state, name: value})
+        arrays, state = trainer._state()
+        save_arrays(run, CHECKPOINT, arrays, {**state, name: value})
         with pytest.raises(DataError, match=f"has {name} = "):
             trainer.resume()
 
@@ -264,8 +264,8 @@ class TestCheckpoints:
     )
     def test_parts_that_do_not_fit_are_refused(self, run, name, array, words):
         trainer = fresh_trainer(run, hidden=8)
-        taken = trainer._taken()
-        save_arrays(run, CHECKPOINT, {**taken.arrays, name: array}, taken.state)
+        arrays, state = trainer._state()
+        save_arrays(run, CHECKPOINT, {**arrays, name: array}, state)
         with pytest.raises(DataError, match=words):
             trainer.resume()
 
@@ -277,21 +277,21 @@ class TestCheckpoints:
         for parameter in trainer.flow.parameters():
             parameter.grad = torch.ones_like(parameter)
         trainer.optimiser.step()
-        taken = trainer._taken()
-        save_arrays(run, CHECKPOINT, taken.arrays, taken.state)
+        arrays, state = trainer._state()
+        save_arrays(run, CHECKPOINT, arrays, state)
         trainer.resume()
         name = f"adam.0.{moment}"
-        array = np.full_like(taken.arrays[name], value)
-        save_arrays(run, CHECKPOINT, {**taken.arrays, name: array}, taken.state)
+        array = np.full_like(arrays[name], value)
+        save_arrays(run, CHECKPOINT, {**arrays, name: array}, state)
         with pytest.raises(DataError, match="impossible numbers"):
             trainer.resume()
 
     def test_one_from_before_float64_was_entered_is_resumed(self, run):
         """Checkpoints of the first version have no entry for the step at which float64 took over."""
         trainer = fresh_trainer(run, hidden=8)
-        taken = trainer._taken()
-        state = {key: value for key, value in taken.state.items() if key != "doubled_at"}
-        save_arrays(run, CHECKPOINT, taken.arrays, {**state, "step": 5})
+        arrays, state = trainer._state()
+        state = {key: value for key, value in state.items() if key != "doubled_at"}
+        save_arrays(run, CHECKPOINT, arrays, {**state, "step": 5})
         trainer.resume()
         assert trainer.step == 5
 
@@ -308,4 +308,4 @@ def fresh_trainer(run, hidden):
     config = resolve(load_task("flatland"), preset="draft", overrides=small)
     generator = torch.Generator().manual_seed(0)
     flow, coordinates = make_flow(config, generator), Coordinates(config.space)
-    return Trainer(flow, None, coordinates, config.learning, run, generator, None)
+    return Trainer(flow, None, coordinates, generator, config.learning, run, None)

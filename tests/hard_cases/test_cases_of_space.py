@@ -364,7 +364,7 @@ class TestFixedDimensions:
         circular = [False, False, True, False, False]
         flow = DesignFlow(coordinates.blocks, 0, layers=1, hidden=8, bins=4, periodic=circular, generator=generator)
         assert flow.features == 5
-        learned, _ = flow(flow.draw_base(200, generator), None)
+        learned, _ = flow(*flow.draw(200, generator))
         points = space.from_unit(coordinates.join(learned, None).detach().double().numpy())
         assert (points[:, 2] == 1.0).all()
 

@@ -32,9 +32,4 @@ def flow_of(name, layers=3, scale=3.0, seed=0):
 
 
 def draw(flow, count, seed=1):
-    generator = torch.Generator().manual_seed(seed)
-    base = flow.draw_base(count, generator)
-    context = None
-    if flow.context:
-        context = 2 * torch.rand(count, flow.context, generator=generator, dtype=torch.float64) - 1
-    return base, context
+    return flow.draw(count, torch.Generator().manual_seed(seed))

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidardesign.density.fields.grids import Grid, cached_distance_grids, grid_around
+from lidardesign.geometry.primitives import SIZES
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid
 
 # Kinds of bodies, as the compiled loops know them.
@@ -95,10 +96,10 @@ class Pairs:
         """The point of each pair, shape (P,)."""
         return np.repeat(np.arange(len(self.row_starts) - 1), np.diff(self.row_starts))
 
-    def where(self, kept: np.ndarray) -> Pairs:
+    def where(self, mask: np.ndarray) -> Pairs:
         """Those that a mask (P,) keeps."""
-        row_starts = np.concatenate([[0], np.cumsum(kept)])[self.row_starts]
-        return Pairs(row_starts, self.columns[kept], self.distances[kept], self.bodies[kept])
+        before = np.concatenate([[0], np.cumsum(mask)])
+        return Pairs(before[self.row_starts], self.columns[mask], self.distances[mask], self.bodies[mask])
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,10 +142,10 @@ class Bodies:
     def arrays(self) -> BodyArrays:
         """All of it, for the compiled loops."""
         grids, edges = self.grids, np.concatenate([self.low.T, self.high.T])
-        placed = np.column_stack([grids.lows, grids.counts, grids.inverse_steps, grids.starts])
         return BodyArrays(
-            self.kinds, self.sizes, self.to_body, self.grid, grids.values, placed, self.low, self.high, edges,
-            self.starts,
+            self.kinds, self.sizes, self.to_body, self.grid, grids.values,
+            np.column_stack([grids.lows, grids.counts, grids.inverse_steps, grids.starts]),
+            self.low, self.high, edges, self.starts,
         )  # fmt: skip
 
     @property
@@ -165,10 +166,10 @@ class Bodies:
         rows = self.starts[first]
         low = np.full((len(first), 3), np.inf)
         high = np.full((len(first), 3), -np.inf)
-        held = self.starts[np.minimum(first + GROUP_COLUMNS, self.columns)] > rows
-        if held.any():
-            low[held] = np.minimum.reduceat(self.low, rows[held])
-            high[held] = np.maximum.reduceat(self.high, rows[held])
+        filled = self.starts[np.minimum(first + GROUP_COLUMNS, self.columns)] > rows
+        if filled.any():
+            low[filled] = np.minimum.reduceat(self.low, rows[filled])
+            high[filled] = np.maximum.reduceat(self.high, rows[filled])
         return np.concatenate([low.T, high.T])
 
     def take(self, columns: np.ndarray) -> Bodies:
@@ -196,8 +197,7 @@ def collect_bodies(
         resolution: Grid points along the longest side of a mesh field.
         padding_m: How far grids reach beyond their meshes [m].
     """
-    build = partial(own_grid, resolution=resolution, padding_m=padding_m)
-    return place_bodies(*_entries(scenes, chosen), build)
+    return place_bodies(*_entries(scenes, chosen), partial(own_grid, resolution=resolution, padding_m=padding_m))
 
 
 def occluding_bodies(scenes: Sequence[Scene]) -> Bodies:
@@ -217,14 +217,9 @@ def _no_distances(mesh: Mesh) -> tuple[Grid, np.ndarray]:
 
 def _entries(scenes: Sequence[Scene], chosen: Callable[[Body], bool]) -> tuple[list[Entry], int]:
     """The chosen bodies of every scene and frame, and the number of columns."""
-    entries: list[Entry] = []
-    column = 0
-    for scene in scenes:
-        kept = [body for body in scene.bodies if chosen(body)]
-        for frame in range(scene.frames):
-            entries += [(column, body, frame) for body in kept]
-            column += 1
-    return entries, column
+    columns = [(scene, frame) for scene in scenes for frame in range(scene.frames)]
+    entries = [(c, body, frame) for c, (scene, frame) in enumerate(columns) for body in scene.bodies if chosen(body)]
+    return entries, len(columns)
 
 
 def place_bodies(entries: Sequence[Entry], columns: int, build_grid: BuildGrid) -> Bodies:
@@ -233,7 +228,7 @@ def place_bodies(entries: Sequence[Entry], columns: int, build_grid: BuildGrid) 
     column = np.array([column for column, _, _ in entries], dtype=np.int64)
     grids, grid = _grids(entries, build_grid)
     kinds = np.array([KINDS[type(body.shape)] for _, body, _ in entries], dtype=np.int64)
-    sizes = np.array([size_of(body) for _, body, _ in entries], dtype=np.float64).reshape(-1, 3)
+    sizes = np.array([SIZES[type(body.shape)](body.shape) for _, body, _ in entries], dtype=np.float64).reshape(-1, 3)
     # World boxes around every body, shape (B, 3) each; of a mesh, around its whole grid
     centre, half = np.zeros((len(kinds), 3)), sizes.copy()
     sphere, capsule = kinds == SPHERE, kinds == CAPSULE
@@ -250,58 +245,40 @@ def place_bodies(entries: Sequence[Entry], columns: int, build_grid: BuildGrid) 
     # a sphere is as wide in every turned frame
     reach[sphere] = half[sphere]
     reach[kinds == PLANE] = np.inf
-    low, high = np.ascontiguousarray(middle - reach), np.ascontiguousarray(middle + reach)
     return Bodies(
         kinds=kinds,
         sizes=sizes,
         to_body=np.ascontiguousarray(inverse_rigid(poses)[:, :3]),
         grid=grid,
-        low=low,
-        high=high,
+        low=np.ascontiguousarray(middle - reach),
+        high=np.ascontiguousarray(middle + reach),
         column=column,
         starts=np.searchsorted(column, np.arange(columns + 1)),
         grids=grids,
     )
 
 
-def size_of(body: Body) -> tuple[float, float, float]:
-    """The lengths of a primitive as the kernels take them; zeros for planes and meshes."""
-    match body.shape:
-        case Sphere(radius_m=radius):
-            return radius, 0.0, 0.0
-        case Capsule(radius_m=radius, half_length_m=half_length):
-            return radius, half_length, 0.0
-        case Box(half_extents_m=half):
-            return half[0], half[1], half[2]
-        case _:
-            return 0.0, 0.0, 0.0
-
-
 def _grids(entries: Sequence[Entry], build_grid: BuildGrid) -> tuple[Grids, np.ndarray]:
     """One grid per distinct mesh, and the grid row of every entry."""
-    known: dict[tuple[str, str], int] = {}
+    row_of: dict[tuple[str, str], int] = {}
     meshes: list[Mesh] = []
-    built: list[tuple[Grid, np.ndarray]] = []
     row = np.zeros(len(entries), dtype=np.int64)
     for index, (_, body, _) in enumerate(entries):
-        mesh = body.shape
-        if isinstance(mesh, Mesh):
-            name = mesh.content_hash, mesh.importance_hash
-            if name not in known:
-                known[name] = len(meshes) + 1
-                meshes.append(mesh)
-                built.append(build_grid(mesh))
-            row[index] = known[name]
+        if isinstance(body.shape, Mesh):
+            name = body.shape.content_hash, body.shape.importance_hash
+            if name not in row_of:
+                meshes.append(body.shape)
+                row_of[name] = len(meshes)
+            row[index] = row_of[name]
+    built = [build_grid(mesh) for mesh in meshes]
     # row 0 is a grid of one empty cell, so that the kernels always have something to index
     values = [np.zeros(8, np.float32), *(distances for _, distances in built)]
-    lengths = [len(part) for part in values]
-    counts = [np.full(3, 2), *(grid.counts for grid, _ in built)]
-    lows = [np.zeros(3), *(grid.low for grid, _ in built)]
+    counts = np.array([np.full(3, 2), *(grid.counts for grid, _ in built)], dtype=np.int64)
+    lows = np.array([np.zeros(3), *(grid.low for grid, _ in built)])
     steps = np.array([1.0, *(grid.step for grid, _ in built)])
-    counts, lows = np.array(counts, dtype=np.int64), np.array(lows)
     grids = Grids(
         values=np.concatenate(values),
-        starts=np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64),
+        starts=np.concatenate([[0], np.cumsum([len(part) for part in values])[:-1]]).astype(np.int64),
         counts=counts,
         lows=lows,
         inverse_steps=1.0 / steps,

@@ -41,11 +41,6 @@ def _primitive_distance(kind, size, q, gradient):  # noqa: ANN001, ANN202
     if kind == PLANE:
         gradient[0], gradient[1], gradient[2] = 0.0, 0.0, 1.0
         return q[2]
-    return _box_distance(size, q, gradient)
-
-
-@njit(cache=True, nogil=True)
-def _box_distance(size, q, gradient):  # noqa: ANN001, ANN202
     squared, deepest, axis = 0.0, -np.inf, 0
     for k in range(3):
         beyond = abs(q[k]) - size[k]
@@ -395,19 +390,16 @@ def _box_roots(low, high, origin, direction):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _capsule_roots(size, origin, direction, centred):  # noqa: ANN001, ANN202
-    """A line meets the side, or the cap on whose side it meets the endless cylinder (as in `simulate.raycast`)."""
+    """A line meets the side, or the cap on whose side it meets the endless cylinder (as in `primitives`)."""
     radius, half_length = size[0], size[1]
     across = direction[0] * direction[0] + direction[1] * direction[1]
-    roots = (np.nan, np.nan)
-    near, far = np.nan, np.nan
-    half = 0.0
-    along = 0.0
+    near, far, half, along = np.nan, np.nan, 0.0, 0.0
     if across > 0.0:
         along = (origin[0] * direction[0] + origin[1] * direction[1]) / across
         x, y = origin[0] - along * direction[0], origin[1] - along * direction[1]
         room = radius * radius - x * x - y * y
         if room < 0.0:
-            return roots
+            return near, far
         half = math.sqrt(room / across)
     for end in (-1.0, 1.0):
         side = -along + end * half

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from lidardesign.density.fields import grids
-from lidardesign.density.fields.bodies import Bodies, own_grid, place_bodies
+from lidardesign.density.fields.bodies import Bodies, Pairs, own_grid, place_bodies
 from lidardesign.density.fields.grids import Grid, GridTable, cached_distance_grids, grid_around
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Mesh, Scene
@@ -85,12 +85,23 @@ class TableField:
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `Field`."""
-        points = np.ascontiguousarray(points, dtype=np.float64)
         from lidardesign.density.fields import table_kernels
 
+        points = np.ascontiguousarray(points, dtype=np.float64)
         out = np.empty_like(points)
         table_kernels.table_gradient(self.arrays, points, np.ascontiguousarray(weights, np.float64), out)
         return out
+
+
+def all_pairs(bodies: Bodies, points: np.ndarray) -> Pairs:
+    """Points (N, 3) with all columns."""
+    from lidardesign.density.fields import body_kernels
+
+    shape = len(points), bodies.columns
+    distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
+    body_kernels.all_distances(bodies.arrays, np.ascontiguousarray(points, dtype=np.float64), distances, nearest)
+    columns = np.tile(np.arange(shape[1]), shape[0])
+    return Pairs(np.arange(shape[0] + 1) * shape[1], columns, distances.ravel(), nearest.ravel())
 
 
 class BodyField:
@@ -108,30 +119,19 @@ class BodyField:
         unsigned = np.array([False, *(mesh.sign == "unsigned" for mesh in bodies.grids.meshes)])
         np.maximum.at(self.shell_m, bodies.column, np.where(unsigned, steps, 0.0)[bodies.grid])
 
-    def _evaluate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        points = np.ascontiguousarray(points, dtype=np.float64)
-        from lidardesign.density.fields import body_kernels
-
-        shape = (len(points), self.columns)
-        distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
-        body_kernels.all_distances(self.bodies.arrays, points, distances, nearest)
-        return distances, nearest
-
     def distances(self, points: np.ndarray) -> np.ndarray:
         """See `Field`."""
-        return self._evaluate(points)[0]
+        return all_pairs(self.bodies, points).distances.reshape(len(points), self.columns)
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `Field`."""
-        points = np.ascontiguousarray(points, dtype=np.float64)
-        nearest = self._evaluate(points)[1]
         from lidardesign.density.fields import body_kernels
 
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        pairs, out = all_pairs(self.bodies, points), np.empty_like(points)
         # a column without bodies has no nearest one, and no gradient
-        known = np.where(nearest >= 0, weights, 0.0).ravel()
-        rows = np.arange(len(points) + 1) * self.columns
-        out = np.empty_like(points)
-        body_kernels.add_gradients(self.bodies.arrays, points, rows, nearest.ravel(), known, out)
+        pulls = np.where(pairs.bodies >= 0, np.ravel(weights), 0.0)
+        body_kernels.add_gradients(self.bodies.arrays, points, pairs.row_starts, pairs.bodies, pulls, out)
         return out
 
 
@@ -164,13 +164,27 @@ class UnionField:
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `Field`."""
         nearer = self.first.distances(points) <= self.second.distances(points)
-        first = self.first.gradient(points, np.where(nearer, weights, 0.0))
-        return first + self.second.gradient(points, np.where(nearer, 0.0, weights))
+        own, other = np.where(nearer, weights, 0.0), np.where(nearer, 0.0, weights)
+        return self.first.gradient(points, own) + self.second.gradient(points, other)
 
 
 def scene_columns(scenes: Sequence[Scene]) -> list[tuple[int, int]]:
     """Scene and frame of every column, in order."""
     return [(index, frame) for index, scene in enumerate(scenes) for frame in range(scene.frames)]
+
+
+def bodies_by_rest(
+    scenes: Sequence[Scene], chosen: Callable[[Body], bool]
+) -> tuple[list[tuple[int, Body]], list[tuple[int, Body, int]]]:
+    """Columns and bodies of chosen meshes at rest, which share a table; columns, bodies and frames of all others."""
+    at_rest, others = [], []
+    for column, (index, frame) in enumerate(scene_columns(scenes)):
+        for body in filter(chosen, scenes[index].bodies):
+            if isinstance(body.shape, Mesh) and scenes[index].frames == 1:
+                at_rest.append((column, body))
+            else:
+                others.append((column, body, frame))
+    return at_rest, others
 
 
 def build_field(
@@ -184,21 +198,14 @@ def build_field(
         resolution: Grid points along the longest side of a mesh field.
         padding_m: How far grids reach beyond their meshes [m].
     """
-    columns = scene_columns(scenes)
-    at_rest: list[tuple[int, Body]] = []
-    others: list[tuple[int, Body, int]] = []
-    for column, (index, frame) in enumerate(columns):
-        for body in filter(chosen, scenes[index].bodies):
-            if isinstance(body.shape, Mesh) and scenes[index].frames == 1:
-                at_rest.append((column, body))
-            else:
-                others.append((column, body, frame))
+    columns = len(scene_columns(scenes))
+    at_rest, others = bodies_by_rest(scenes, chosen)
     fields: list[Field] = []
     if at_rest:
-        fields.append(_table_field(at_rest, len(columns), resolution, padding_m))
+        fields.append(_table_field(at_rest, columns, resolution, padding_m))
     if others or not at_rest:
         build = partial(own_grid, resolution=resolution, padding_m=padding_m)
-        fields.append(BodyField(place_bodies(others, len(columns), build)))
+        fields.append(BodyField(place_bodies(others, columns, build)))
     return fields[0] if len(fields) == 1 else UnionField(*fields)
 
 

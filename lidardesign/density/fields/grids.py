@@ -11,6 +11,7 @@ nothing. `table_kernels` computes the same at a fifth of the time, after 0.8 s o
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import os
@@ -117,9 +118,8 @@ def narrow_band(
     import igl
 
     unsigned = igl.SIGNED_DISTANCE_TYPE_UNSIGNED
-    reach = BAND_CELLS * grid.step
     distance, face, closest, _ = igl.signed_distance(
-        points, vertices, faces, sign_type=unsigned, lower_bound=0.0, upper_bound=reach
+        points, vertices, faces, sign_type=unsigned, lower_bound=0.0, upper_bound=BAND_CELLS * grid.step
     )
     if np.isnan(distance).all():  # a surface that no grid point comes near: exact everywhere
         distance, face, closest, _ = igl.signed_distance(points, vertices, faces, sign_type=unsigned)
@@ -139,9 +139,7 @@ def nearest_known(beyond: np.ndarray, grid: Grid) -> np.ndarray:
 def cache_folder() -> Path:
     """Where grids are cached: $LIDARDESIGN_CACHE, else the user's cache folder."""
     chosen = os.environ.get("LIDARDESIGN_CACHE")
-    if chosen:
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lidardesign"
+    return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lidardesign"
 
 
 def cached_distance_grids(meshes: list[Mesh], grid: Grid, workers: int = 2) -> list[np.ndarray]:
@@ -168,11 +166,11 @@ def cached_grids(
 
     def load_or_build(mesh: Mesh) -> np.ndarray:
         path = _cache_path(mesh, grid, named(mesh))
-        loaded = _load(path, grid.size)
-        if loaded is None:
-            loaded = build(mesh, grid)
-            _store(path, loaded)
-        return loaded
+        values = _load(path, grid.size)
+        if values is None:
+            values = build(mesh, grid)
+            _store(path, values)
+        return values
 
     # libigl and SciPy release the interpreter lock
     with ThreadPoolExecutor(max_workers=workers) as pool:
@@ -180,10 +178,9 @@ def cached_grids(
 
 
 def _cache_path(mesh: Mesh, grid: Grid, name: str) -> Path:
-    digest = hashlib.sha256(mesh.content_hash.encode())
-    digest.update(name.encode())
-    digest.update(np.array([*grid.low, grid.step, *grid.counts]).tobytes())
-    return cache_folder() / "fields" / f"{digest.hexdigest()}.npy"
+    placed = np.array([*grid.low, grid.step, *grid.counts]).tobytes()
+    digest = _digest(mesh.content_hash.encode() + name.encode() + placed)
+    return cache_folder() / "fields" / f"{digest.hex()}.npy"
 
 
 def _load(path: Path, size: int) -> np.ndarray | None:
@@ -196,8 +193,7 @@ def _load(path: Path, size: int) -> np.ndarray | None:
     # numpy raises anything on garbage, as TokenError; what cannot be read is made again
     except Exception:
         return None
-    usable = values.shape == (size,) and values.dtype == np.float32 and np.isfinite(values).all()
-    return values if usable else None
+    return values if values.shape == (size,) and values.dtype == np.float32 and np.isfinite(values).all() else None
 
 
 def _digest(content: bytes) -> bytes:
@@ -209,12 +205,10 @@ def _store(path: Path, values: np.ndarray) -> None:
 
     buffer = io.BytesIO()
     np.save(buffer, values, allow_pickle=False)
-    try:
+    # a cache that cannot be written costs time, never the result
+    with contextlib.suppress(OSError, DataError):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, buffer.getvalue() + _digest(buffer.getvalue()))
-    except (OSError, DataError):
-        # a cache that cannot be written costs time, never the result
-        return
 
 
 CHUNK = 2048
@@ -251,6 +245,5 @@ def _blended(field: GridTable, clamped: np.ndarray) -> np.ndarray:
     inner = np.zeros((len(clamped), field.table.shape[1]))
     for corner in np.ndindex(2, 2, 2):
         weight = np.where(corner, fraction, 1.0 - fraction).prod(axis=1)
-        index = np.ravel_multi_index(tuple((cell + corner).T), tuple(field.counts))
-        inner += weight[:, None] * field.table[index]
+        inner += weight[:, None] * field.table[np.ravel_multi_index(tuple((cell + corner).T), tuple(field.counts))]
     return inner

@@ -17,7 +17,15 @@ import numpy as np
 
 from lidardesign.density.fields import grids
 from lidardesign.density.fields.bodies import Bodies, Pairs
-from lidardesign.density.fields.distance import BodyField, Field, TableField, UnionField, check_table, scene_columns
+from lidardesign.density.fields.distance import (
+    BodyField,
+    Field,
+    TableField,
+    UnionField,
+    all_pairs,
+    bodies_by_rest,
+    check_table,
+)
 from lidardesign.density.fields.grids import (
     Grid,
     GridTable,
@@ -41,8 +49,8 @@ def log_weight_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
     known = ~np.isnan(distance)
     log_weights = np.zeros(grid.size)
     corners = mesh.faces[face[known]]
-    shares = barycentric(closest[known], vertices[corners])
-    log_weights[known] = np.einsum("nk,nk->n", shares, np.log(mesh.importance)[corners])
+    at_corners = np.log(mesh.importance)[corners]
+    log_weights[known] = np.einsum("nk,nk->n", barycentric(closest[known], vertices[corners]), at_corners)
     if not known.all():
         log_weights[~known] = log_weights[nearest_known(~known, grid)]
     return log_weights.astype(np.float32)
@@ -60,9 +68,8 @@ def barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
-    opposite = [(b, c), (c, a), (a, b)]
-    areas = np.stack([np.einsum("nk,nk->n", np.cross(p - points, q - points), normal) for p, q in opposite], axis=1)
-    areas = np.maximum(areas, 0.0)
+    crosses = [np.cross(p - points, q - points) for p, q in ((b, c), (c, a), (a, b))]
+    areas = np.maximum(np.stack([np.einsum("nk,nk->n", cross, normal) for cross in crosses], axis=1), 0.0)
     total = areas.sum(axis=1, keepdims=True)
     return np.where(total > 0, areas / np.where(total > 0, total, 1.0), 1 / 3)
 
@@ -151,18 +158,17 @@ class BodyWeights:
     @cached_property
     def spread(self) -> float:
         """By how much a log weight may be below the largest of its column [nats]."""
-        below = self.column_peaks[self.bodies.column] - self.bodies.log_weight[:, 1]
-        return float(below.max(initial=0.0))
+        return float((self.column_peaks[self.bodies.column] - self.bodies.log_weight[:, 1]).max(initial=0.0))
 
     def values(self, points: np.ndarray) -> np.ndarray:
         """See `LogWeights`."""
-        return self.of_pairs(points, self._pairs(points)).reshape(len(points), -1)
+        return self.of_pairs(points, all_pairs(self.bodies, points)).reshape(len(points), -1)
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `LogWeights`."""
         out = np.zeros(points.shape)
         weights = np.ascontiguousarray(weights, dtype=np.float64).ravel()
-        self.add_pair_gradients(points, self._pairs(points), weights, out)
+        self.add_pair_gradients(points, all_pairs(self.bodies, points), weights, out)
         return out
 
     def of_pairs(self, points: np.ndarray, pairs: Pairs) -> np.ndarray:
@@ -184,17 +190,6 @@ class BodyWeights:
         body_kernels.add_log_weight_gradients(
             self.bodies.arrays, values, points, pairs.row_starts, pairs.bodies, weights, out
         )
-
-    def _pairs(self, points: np.ndarray) -> Pairs:
-        """All points with all columns."""
-        from lidardesign.density.fields import body_kernels
-
-        shape = len(points), self.bodies.columns
-        distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
-        points = np.ascontiguousarray(points, dtype=np.float64)
-        body_kernels.all_distances(self.bodies.arrays, points, distances, nearest)
-        columns = np.tile(np.arange(shape[1]), shape[0])
-        return Pairs(np.arange(shape[0] + 1) * shape[1], columns, distances.ravel(), nearest.ravel())
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,8 +220,8 @@ class UnionWeights:
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `LogWeights`."""
         nearer = self._nearer(points)
-        first = self.first.gradient(points, np.where(nearer, weights, 0.0))
-        return first + self.second.gradient(points, np.where(nearer, 0.0, weights))
+        own, other = np.where(nearer, weights, 0.0), np.where(nearer, 0.0, weights)
+        return self.first.gradient(points, own) + self.second.gradient(points, other)
 
 
 def is_weighted(scenes: Sequence[Scene]) -> bool:
@@ -259,17 +254,14 @@ def weigh(bodies: Bodies, entries: Sequence[Body]) -> Bodies:
         bodies: Of all columns; their meshes have grids.
         entries: The body of each row.
     """
-    grids, known = bodies.grids, {}
-    values = [np.zeros(8, np.float32)]
+    grids, values = bodies.grids, [np.zeros(8, np.float32)]
     for row, mesh in enumerate(grids.meshes, start=1):
         grid = Grid(grids.lows[row], 1.0 / grids.inverse_steps[row], grids.counts[row])
         values += cached_log_weight_grids([mesh], grid)
-    log_weight = np.empty((len(entries), 3))
-    for row, body in enumerate(entries):
-        # thousands of frames share few bodies
-        if id(body) not in known:
-            known[id(body)] = (float(np.log(body.importance)), *log_weight_range(body))
-        log_weight[row] = known[id(body)]
+    # thousands of frames share few bodies
+    distinct = {id(body): body for body in entries}
+    weights = {key: (float(np.log(body.importance)), *log_weight_range(body)) for key, body in distinct.items()}
+    log_weight = np.array([weights[id(body)] for body in entries]).reshape(-1, 3)
     return replace(bodies, log_weight=log_weight, grids=replace(grids, log_weights=np.concatenate(values)))
 
 
@@ -282,22 +274,17 @@ def build_log_weights(scenes: Sequence[Scene], field: Field) -> LogWeights | Non
     """
     if not is_weighted(scenes):
         return None
-    columns = scene_columns(scenes)
-    at_rest, others = [], []
-    for column, (index, _) in enumerate(columns):
-        for body in scenes[index].bodies:
-            if body.is_target:
-                in_table = isinstance(body.shape, Mesh) and scenes[index].frames == 1
-                (at_rest if in_table else others).append((column, body))
+    at_rest, others = bodies_by_rest(scenes, lambda body: body.is_target)
     if isinstance(field, TableField):
-        return _table_weights(field, at_rest, len(columns))
+        return _table_weights(field, at_rest)
+    entries = [body for _, body, _ in others]
     if isinstance(field, BodyField):
-        return BodyWeights(weigh(field.bodies, [body for _, body in others]))
-    first = _table_weights(field.first, at_rest, len(columns))
-    return UnionWeights(field, first, BodyWeights(weigh(field.second.bodies, [body for _, body in others])))
+        return BodyWeights(weigh(field.bodies, entries))
+    return UnionWeights(field, _table_weights(field.first, at_rest), BodyWeights(weigh(field.second.bodies, entries)))
 
 
-def _table_weights(field: TableField, bodies: list[tuple[int, Body]], columns: int) -> TableWeights:
+def _table_weights(field: TableField, bodies: list[tuple[int, Body]]) -> TableWeights:
+    columns = field.columns
     check_table(field.grid, columns, tables=2)
     meshes = [body.shape.transformed(body.pose()) for _, body in bodies]
     table = np.zeros((field.grid.size, columns), dtype=np.float32)

@@ -94,25 +94,21 @@ class _Block(nn.Module):
             parameters = self._of_splines(layer, outputs, context)
             inputs, log_slope = spline(outputs, parameters, self.periodic, inverted=True)
             return inputs, log_slope[:, 0]
+        *modules, last = layer.hyper
         columns = list(torch.zeros_like(outputs).split(1, dim=-1))
         total = torch.zeros_like(outputs[:, 0])
         for turn, dimension in enumerate(order.argsort().tolist()):
-            known = _joined(torch.cat(columns, dim=-1), context)
+            hidden = _joined(torch.cat(columns, dim=-1), context)
             # the first one depends on the context alone: without one, all points share its parameters
-            seen = known[:1] if turn == 0 and context is None else known
-            parameters = self._of_dimension(dimension, layer, seen).expand(len(outputs), -1, -1)
-            column = slice(dimension, dimension + 1)
+            hidden = hidden[:1] if turn == 0 and context is None else hidden
+            for module in modules:
+                hidden = module(hidden)
+            rows = slice(dimension * self.parameters_each, (dimension + 1) * self.parameters_each)
+            parameters = linear(hidden, last.mask[rows] * last.weight[rows], last.bias[rows])[:, None]
+            parameters, column = parameters.expand(len(outputs), -1, -1), slice(dimension, dimension + 1)
             columns[dimension], log_slope = spline(outputs[:, column], parameters, self.periodic[column], inverted=True)
             total = total + log_slope[:, 0]
         return torch.cat(columns, dim=-1), total
-
-    def _of_dimension(self, dimension: int, layer: nn.Module, inputs: Tensor) -> Tensor:
-        """The parameters of one dimension's splines alone, shape (N, 1, parameters of one)."""
-        *modules, last = layer.hyper
-        for module in modules:
-            inputs = module(inputs)
-        rows = slice(dimension * self.parameters_each, (dimension + 1) * self.parameters_each)
-        return linear(inputs, last.mask[rows] * last.weight[rows], last.bias[rows])[:, None]
 
 
 def _joined(values: Tensor, context: Tensor | None) -> Tensor:
@@ -155,15 +151,13 @@ class DesignFlow(nn.Module):
                 circular = [self._periodic[i] for i in dimensions]
                 self.blocks.append(_Block(dimensions, width, layers, hidden, bins, circular))
                 seen += dimensions
-        for parameter in self.parameters():
-            bound = 1 / math.sqrt(parameter.shape[-1])
-            with torch.no_grad():
+        with torch.no_grad():
+            for parameter in self.parameters():
+                bound = 1 / math.sqrt(parameter.shape[-1])
                 parameter.uniform_(-bound, bound, generator=generator)
-        for block in self.blocks:
-            for layer in block.layers:
-                with torch.no_grad():
-                    for parameter in list(layer.parameters())[-2:]:
-                        parameter.mul_(INITIAL_SCALE)
+            for layer in (layer for block in self.blocks for layer in block.layers):
+                for parameter in list(layer.parameters())[-2:]:
+                    parameter.mul_(INITIAL_SCALE)
 
     @property
     def log_base(self) -> float:
@@ -188,8 +182,7 @@ class DesignFlow(nn.Module):
             values, log_slope = block(base[:, block.dimensions], self._features(finished, context))
             log_prob = log_prob - log_slope
             finished += [(dimension, values[:, [n]]) for n, dimension in enumerate(block.dimensions)]
-        ordered = [values for _, values in sorted(finished, key=lambda pair: pair[0])]
-        return torch.cat(ordered, dim=-1), log_prob
+        return torch.cat([values for _, values in sorted(finished, key=lambda pair: pair[0])], dim=-1), log_prob
 
     def log_prob(self, values: Tensor, context: Tensor | None = None) -> Tensor:
         """The log density of any points in [-1, 1]^D, (N, D) to (N,); -inf outside, also for NaN."""
@@ -202,8 +195,14 @@ class DesignFlow(nn.Module):
             finished += [(dimension, values[:, [dimension]]) for dimension in block.dimensions]
         return torch.where(outside, -torch.inf, log_prob)
 
-    def draw_base(self, count: int, generator: torch.Generator) -> Tensor:
-        """Uniform base points, shape (count, D), in the parameters' type and place."""
-        like = next(self.parameters())
-        points = torch.rand(count, self.features, generator=generator, dtype=torch.float64)
-        return (2 * points - 1).to(dtype=like.dtype, device=like.device)
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
+        """Uniform base points, shape (count, D), and uniform conditions, shape (count, context), or None without any.
+
+        Both are in the parameters' type and place.
+        """
+        conditions = self._uniform(count, self.context, generator) if self.context else None
+        return self._uniform(count, self.features, generator), conditions
+
+    def _uniform(self, count: int, columns: int, generator: torch.Generator) -> Tensor:
+        points = torch.rand(count, columns, generator=generator, dtype=torch.float64)
+        return (2 * points - 1).to(next(self.parameters()))

@@ -61,8 +61,7 @@ class Coordinates:
         """
         names = [self.space.free[n] for n in self.learned]
         angles = ((AZIMUTH,), (ELEVATION,)) if self.space.full_azimuth else ((AZIMUTH, ELEVATION),)
-        groups = ((X, Y, Z), *angles, (RANGE,))
-        parts = [[k for k, i in enumerate(names) if i in group] for group in groups]
+        parts = ([k for k, i in enumerate(names) if i in group] for group in ((X, Y, Z), *angles, (RANGE,)))
         return [part for part in parts if part]
 
     @cached_property
@@ -124,17 +123,21 @@ class DeviceTarget(Target):
         return few
 
     def log_density_of_unit(self, unit: Tensor, sigma_m: float | None = None) -> Tensor:
-        """log p* of unit points on the device, differentiable: (N, len(free)) to (N,)."""
+        """log p* of unit points on the device, differentiable: (N, len(free)) to (N,).
+
+        Raises:
+            NumericalError: A point is not finite.
+        """
+        if not torch.isfinite(unit).all():
+            raise NumericalError("design points are not finite", where="target density")
         optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
-        size = self.rows_at_once
-        return torch.cat([self._log_density(rows, optics) for rows in unit.split(size)])
+        return torch.cat([self._log_density(rows, optics) for rows in unit.split(self.rows_at_once)])
 
     def _log_density(self, unit: Tensor, optics: Optics) -> Tensor:
         origins, toward, range_m = self._rays(unit)
         observed = origins + range_m[:, None] * toward
-        distances = self._table.distances(observed)
         weights = torch.as_tensor(self.surfaces.log_column_weights).to(unit)
-        terms = weights - distances.square() / (2 * optics.sigma_m**2)
+        terms = weights - self._table.distances(observed).square() / (2 * optics.sigma_m**2)
         if self._weights is not None:
             terms = terms + self._weights.values(observed)
         if self._occluders is not None:
@@ -180,8 +183,7 @@ class _Table:
         cells, inside = self._cells(places)
         values = self._blended(inside)
         beyond = ((cells - inside) * self._step).square().sum(dim=-1, keepdim=True)
-        outside = beyond > 0
-        return torch.where(outside, safe_sqrt(beyond + values.clamp(min=0).square()), values)
+        return torch.where(beyond > 0, safe_sqrt(beyond + values.clamp(min=0).square()), values)
 
     def values(self, places: Tensor) -> Tensor:
         """Values of all columns at places, (N, 3) to (N, columns): trilinear; those at its faces outside the grid."""
@@ -239,7 +241,7 @@ class _LogTarget(torch.autograd.Function):
 def log_target(unit: Tensor, target: Target, coordinates: Coordinates, sigma_m: float) -> Tensor:
     """log p* of unit points at a sigma, differentiable: (N, len(free)) to (N,)."""
     if isinstance(target, DeviceTarget):
-        return target.log_density_of_unit(_finite(unit), sigma_m)
+        return target.log_density_of_unit(unit, sigma_m)
     return _LogTarget.apply(unit, target, coordinates, sigma_m)
 
 
@@ -247,17 +249,6 @@ def log_target(unit: Tensor, target: Target, coordinates: Coordinates, sigma_m: 
 def log_target_values(unit: Tensor, target: Target, coordinates: Coordinates) -> Tensor:
     """log p* of unit points at the final sigma, without a gradient: (N, len(free)) to (N,)."""
     if isinstance(target, DeviceTarget):
-        return target.log_density_of_unit(_finite(unit))
+        return target.log_density_of_unit(unit)
     points = coordinates.space.from_unit(unit.cpu().double().numpy())
     return torch.as_tensor(target.log_density(points)).to(unit)
-
-
-def _finite(unit: Tensor) -> Tensor:
-    """Points as they are.
-
-    Raises:
-        NumericalError: One is not finite.
-    """
-    if not torch.isfinite(unit).all():
-        raise NumericalError("design points are not finite", where="target density")
-    return unit

@@ -40,8 +40,7 @@ class BoundedSpline(MonotonicRQSTransform):
         slopes = torch.exp(softened)
         if periodic is not None:
             outer = torch.exp((softened[..., :1] + softened[..., -1:]) / 2)
-            tied = torch.cat([outer, slopes[..., 1:-1], outer], dim=-1)
-            slopes = torch.where(periodic[:, None], tied, slopes)
+            slopes = torch.where(periodic[:, None], torch.cat([outer, slopes[..., 1:-1], outer], dim=-1), slopes)
         self.derivatives = slopes
         self.periodic = periodic
         # accumulated widths can pass the bound by rounding; the last knots are exact
@@ -68,8 +67,7 @@ class BoundedSpline(MonotonicRQSTransform):
         _, x0, x1, y0, y1, d0, d1, s = self.bin(self.searchsorted(self.vertical, y) - 1)
         bend = (y - y0) * (d0 + d1 - 2 * s)
         a, b, c = (y1 - y0) * (s - d0) + bend, (y1 - y0) * d0 - bend, -s * (y - y0)
-        discriminant = b**2 - 4 * a * c
-        share = (2 * c / (-b - safe_sqrt(discriminant))).clamp(0.0, 1.0)
+        share = (2 * c / (-b - safe_sqrt(b**2 - 4 * a * c))).clamp(0.0, 1.0)
         return self._turned(x0 + share * (x1 - x0))
 
 

@@ -74,14 +74,16 @@ def prepare_target(
         generator = random_generator(config.seed, "quadrature")
         probes = propose(scenes, config.space, PROBES, settings.sigma_m, generator).points
         target, refined = refine_quadrature(target, probes)
-        notes.extend(refined)
-    notes.extend(resolution_notes(target, settings))
-    notes.extend(flatness_notes(target, settings.sigma_m, random_generator(config.seed, "flatness")))
-    notes.extend(importance_notes(scenes))
-    notes.extend(dict.fromkeys(line for scene in scenes for line in scene.notes))
+        notes += refined
     shapes = [body.shape for scene in scenes for body in scene.bodies]
-    notes.extend(sorted({line for shape in shapes for line in getattr(shape, "notes", ())}))
-    return target, notes
+    return target, [
+        *notes,
+        *resolution_notes(target, settings),
+        *flatness_notes(target, settings.sigma_m, random_generator(config.seed, "flatness")),
+        *importance_notes(scenes),
+        *dict.fromkeys(line for scene in scenes for line in scene.notes),
+        *sorted({line for shape in shapes for line in getattr(shape, "notes", ())}),
+    ]
 
 
 @phase("visibility")
@@ -108,9 +110,9 @@ def refine_quadrature(target: Target, probes: np.ndarray) -> tuple[Target, list[
         probes: Design points, shape (N, 6).
     """
     rays = RayBatch.of(probes)
-    active = np.ones((len(probes), target.columns), dtype=bool)
-    exact = Raycast(target.scenes).transmittance(rays, active, target.optics, differentiable=False).log_values
-    hidden = exact < np.log(OPAQUE)
+    everywhere = np.ones((len(probes), target.columns), dtype=bool)
+    exact = Raycast(target.scenes).transmittance(rays, everywhere, target.optics, differentiable=False)
+    hidden = exact.log_values < np.log(OPAQUE)
     if not hidden.any():
         return target, []
 
@@ -163,27 +165,22 @@ def resolution_notes(target: Target, settings: DensitySettings) -> list[str]:
     if not len(steps) or sigma_m >= BLURRED_SHARE * steps.max():
         return []
     if sigma_m < UNRESOLVED_SHARE * steps.min():
+        hint, across_m = "raise density.field_resolution, or sigma", float(steps.min()) * settings.field_resolution
+        if across_m >= DOUBTFUL_ACROSS_M:
+            hint = (
+                f"are the lengths in metres? the scenes are about {across_m:.2g} m across; files in millimetres need "
+                f"the factor 0.001 (task meshes: --set scale=0.001); else {hint}"
+            )
         raise ConfigError(
             f"sigma {sigma_m:g} m is far below the grid step {steps.min():.3g} m of the fields",
             where="density.sigma_m",
             allowed=f"at least {UNRESOLVED_SHARE * steps.min():.3g} m on this grid",
-            hint=_finer_hint(float(steps.min()) * settings.field_resolution),
+            hint=hint,
         )
     return [
         f"sigma {sigma_m:g} m is below half the field's grid step {steps.max():.3g} m: "
         "surfaces are blurred more than sigma says; raise density.field_resolution"
     ]
-
-
-def _finer_hint(across_m: float) -> str:
-    """What to do about fields across so many metres that sigma is lost in them."""
-    finer = "raise density.field_resolution, or sigma"
-    if across_m < DOUBTFUL_ACROSS_M:
-        return finer
-    return (
-        f"are the lengths in metres? the scenes are about {across_m:.2g} m across; files in millimetres need the "
-        f"factor 0.001 (task meshes: --set scale=0.001); else {finer}"
-    )
 
 
 def flatness_notes(target: Target, sigma_m: float, generator: np.random.Generator) -> list[str]:

@@ -127,21 +127,22 @@ def propose(
     scenes: Sequence[Scene], space: DesignSpace, count: int, spread_m: float, generator: np.random.Generator
 ) -> ProposedPoints:
     """Proposals from at most `count` draws; those that leave the space are dropped."""
-    columns = _chosen_columns(scenes, generator)
+    columns = scene_columns(scenes)
+    if len(columns) > MAXIMUM_COLUMNS:
+        columns = [columns[i] for i in sorted(generator.choice(len(columns), MAXIMUM_COLUMNS, replace=False))]
     angles_free = AZIMUTH in space.free and ELEVATION in space.free
     draw = _from_aimed_rays if angles_free else _from_random_rays
     points, surface_range, column, density = draw(scenes, columns, space, count, spread_m, generator)
     if angles_free and space.measure == "angles":
         density *= np.cos(points[:, ELEVATION])
-    kept = np.flatnonzero(space.contains(points) & (density > 0))
-    return ProposedPoints(points[kept], np.log(density[kept]), surface_range[kept], column[kept], columns)
+    usable = np.flatnonzero(space.contains(points) & (density > 0))
+    return ProposedPoints(points[usable], np.log(density[usable]), surface_range[usable], column[usable], columns)
 
 
 def occluded_share(scenes: Sequence[Scene], proposals: ProposedPoints, margin_m: float) -> float:
     """The share of proposals whose surface has an occluder more than the margin in front of it, on any of its ways."""
-    origins = proposals.points[:, :3]
-    surface = proposals.surface_range_m[:, None]
-    points = origins + surface * direction(proposals.points[:, AZIMUTH], proposals.points[:, ELEVATION])
+    origins, azimuth, elevation = proposals.points[:, :3], *proposals.points[:, [AZIMUTH, ELEVATION]].T
+    points = origins + proposals.surface_range_m[:, None] * direction(azimuth, elevation)
     blocked = np.zeros(len(points), dtype=bool)
     for number, (index, frame) in enumerate(proposals.columns):
         rows = np.flatnonzero(proposals.column == number)
@@ -160,16 +161,9 @@ def _is_hidden(caster: SceneCaster, places: np.ndarray, points: np.ndarray, marg
     reach_m = np.linalg.norm(offset, axis=1)
     seen = np.flatnonzero(reach_m > 0)
     hidden = np.zeros(len(points), dtype=bool)
-    starts = np.broadcast_to(places, points.shape)[seen]
-    hidden[seen] = caster.first_hit(starts, offset[seen]).range_m < reach_m[seen] - margin_m
+    hits = caster.first_hit(np.broadcast_to(places, points.shape)[seen], offset[seen])
+    hidden[seen] = hits.range_m < reach_m[seen] - margin_m
     return hidden
-
-
-def _chosen_columns(scenes: Sequence[Scene], generator: np.random.Generator) -> list[tuple[int, int]]:
-    columns = scene_columns(scenes)
-    if len(columns) <= MAXIMUM_COLUMNS:
-        return columns
-    return [columns[i] for i in sorted(generator.choice(len(columns), MAXIMUM_COLUMNS, replace=False))]
 
 
 _Drawn = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -194,11 +188,9 @@ def _from_aimed_rays(
     end = points[:, RANGE] + WINDOW_SPREADS * spread_m
     density, found = np.zeros(len(points)), np.zeros(len(points), dtype=bool)
     for number, (index, frame) in enumerate(columns):
-        caster = shared_caster(scenes[index], frame, only="targets")
-        crossed = caster.crossings(points[:, :3], directions, start, end)
-        share = crossed.range_m**2 / (
-            target_area_m2(scenes[index], space) * np.maximum(crossed.cosine, MINIMUM_COSINE)
-        )
+        crossed = shared_caster(scenes[index], frame, only="targets").crossings(points[:, :3], directions, start, end)
+        area_m2 = target_area_m2(scenes[index], space)
+        share = crossed.range_m**2 / (area_m2 * np.maximum(crossed.cosine, MINIMUM_COSINE))
         _add_shares(density, crossed, share, points, spread_m)
         own = np.abs(crossed.range_m - surface_range[crossed.row]) < FOUND_SPREADS * spread_m
         found[crossed.row[own & (column[crossed.row] == number)]] = True
@@ -230,8 +222,7 @@ def _from_random_rays(
     points, surface_range, accepted = _with_range_error(rays, space, spread_m, generator)
     density = np.zeros(count)
     for found in crossed:
-        share = 1.0 / np.bincount(found.row, minlength=count)[found.row]
-        _add_shares(density, found, share, points, spread_m)
+        _add_shares(density, found, 1.0 / np.bincount(found.row, minlength=count)[found.row], points, spread_m)
     kept = np.isfinite(chosen) & accepted
     return points[kept], surface_range[kept], column[kept], density[kept]
 
@@ -274,8 +265,7 @@ def _aimed_rays(
         rows = np.flatnonzero(column == number)
         if len(rows):
             targets = [body for body in scenes[index].bodies if body.is_target]
-            drawn = sample_body(targets, space, len(rows), generator, frame).points
-            surface[rows] = generator.permutation(drawn)
+            surface[rows] = generator.permutation(sample_body(targets, space, len(rows), generator, frame).points)
     rays = space.wrap(aim(space.sample(count, generator)[:, :3], surface))
     angles_only = rays.copy()
     angles_only[:, RANGE] = space.low[RANGE]

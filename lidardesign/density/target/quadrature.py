@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -30,12 +31,12 @@ class _Depth:
     log_values: np.ndarray
     lengths: np.ndarray
     slopes: list[tuple[slice, np.ndarray]]
-    contract: Callable[[slice, np.ndarray, np.ndarray, RayGradient], None]
+    add_gradient: Callable[[slice, np.ndarray, np.ndarray, RayGradient], None]
 
     def gradient(self, weights: np.ndarray) -> RayGradient:
         out = RayGradient.zeros(len(self.lengths))
         for rows, slope in self.slopes:
-            self.contract(rows, slope, -weights[rows], out)
+            self.add_gradient(rows, slope, -weights[rows], out)
         # the step grows with the length: d depth / d length at fixed integrand is depth / length
         ahead = self.lengths > 0
         by_step = np.einsum("nc,nc->n", weights, self.log_values)
@@ -83,7 +84,8 @@ class Quadrature(OneWay):
             slope = self._integrate(rays, lengths, rows, optics, depth, differentiable)
             if differentiable:
                 slopes.append((rows, slope))
-        return _Depth(np.where(columns, -depth, 0.0), lengths, slopes, self._contract(rays, lengths, optics))
+        add_gradient = partial(self._add_gradient, rays, lengths, CUTOFF_LENGTHS / optics.sharpness_per_m)
+        return _Depth(np.where(columns, -depth, 0.0), lengths, slopes, add_gradient)
 
     def _integrate(
         self, rays: RayBatch, lengths: np.ndarray, rows: slice, optics: Optics, depth: np.ndarray, differentiable: bool
@@ -100,40 +102,35 @@ class Quadrature(OneWay):
                 depth[rows], slope,
             )  # fmt: skip
             return slope
-        places, steps = self._places(rays, lengths, rows)
-        distances = self.field.distances(places.reshape(-1, 3)).reshape(shape) - self.field.shell_m
-        exponent = np.clip(optics.sharpness_per_m * distances, -60.0, 60.0)
-        inside = 1.0 / (1.0 + np.exp(exponent))
-        rate = optics.attenuation_per_m * steps[:, None, None]
+        places = self._places(rays, lengths, rows).reshape(-1, 3)
+        distances = self.field.distances(places).reshape(shape) - self.field.shell_m
+        inside = 1.0 / (1.0 + np.exp(np.clip(optics.sharpness_per_m * distances, -60.0, 60.0)))
+        rate = optics.attenuation_per_m * (lengths[rows] / self.points)[:, None, None]
         depth[rows] = (rate * inside).sum(axis=1)
         if differentiable:
             slope[:] = -rate * optics.sharpness_per_m * inside * (1.0 - inside)
         return slope
 
-    def _places(self, rays: RayBatch, lengths: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+    def _places(self, rays: RayBatch, lengths: np.ndarray, rows: slice) -> np.ndarray:
         along = (np.arange(self.points) + 0.5) / self.points * lengths[rows, None]
-        places = rays.origins[rows, None] + along[..., None] * rays.directions[rows, None]
-        return places, lengths[rows] / self.points
+        return rays.origins[rows, None] + along[..., None] * rays.directions[rows, None]
 
-    def _contract(
-        self, rays: RayBatch, lengths: np.ndarray, optics: Optics
-    ) -> Callable[[slice, np.ndarray, np.ndarray, RayGradient], None]:
-        def table(rows: slice, slope: np.ndarray, weights: np.ndarray, out: RayGradient) -> None:
+    def _add_gradient(
+        self, rays: RayBatch, lengths: np.ndarray, cutoff_m: float,
+        rows: slice, slope: np.ndarray, weights: np.ndarray, out: RayGradient,
+    ) -> None:  # fmt: skip
+        if isinstance(self.field, TableField):
             from lidardesign.density.fields import table_kernels
 
             table_kernels.table_quadrature_gradient(
-                self.field.arrays, self._clear, (rays.origins[rows], rays.directions[rows], lengths[rows]),
-                CUTOFF_LENGTHS / optics.sharpness_per_m, slope, np.ascontiguousarray(weights),
-                out.origins[rows], out.directions[rows], out.ranges[rows],
+                self.field.arrays, self._clear, (rays.origins[rows], rays.directions[rows], lengths[rows]), cutoff_m,
+                slope, np.ascontiguousarray(weights), out.origins[rows], out.directions[rows], out.ranges[rows],
             )  # fmt: skip
-
-        def general(rows: slice, slope: np.ndarray, weights: np.ndarray, out: RayGradient) -> None:
-            places, _ = self._places(rays, lengths, rows)
-            column_weights = (weights[:, None, :] * slope).reshape(-1, self.field.columns)
-            by_place = self.field.gradient(places.reshape(-1, 3), column_weights).reshape(places.shape)
-            share = (np.arange(self.points) + 0.5) / self.points
-            out.origins[rows] += by_place.sum(axis=1)
-            out.directions[rows] += np.einsum("m,nmk->nk", share, by_place) * lengths[rows, None]
-            out.ranges[rows] += np.einsum("m,nmk,nk->n", share, by_place, rays.directions[rows])
-
-        return table if isinstance(self.field, TableField) else general
+            return
+        places = self._places(rays, lengths, rows)
+        column_weights = (weights[:, None, :] * slope).reshape(-1, self.field.columns)
+        by_place = self.field.gradient(places.reshape(-1, 3), column_weights).reshape(places.shape)
+        share = (np.arange(self.points) + 0.5) / self.points
+        out.origins[rows] += by_place.sum(axis=1)
+        out.directions[rows] += np.einsum("m,nmk->nk", share, by_place) * lengths[rows, None]
+        out.ranges[rows] += np.einsum("m,nmk,nk->n", share, by_place, rays.directions[rows])

@@ -24,7 +24,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lidardesign.density.fields.bodies import GROUP_COLUMNS, Bodies, Pairs
+from lidardesign.density.fields.bodies import GROUP_COLUMNS, Bodies, Pairs, occluding_bodies
 from lidardesign.density.fields.distance import Field, scene_columns
 from lidardesign.density.fields.importance import BodyWeights, LogWeights
 from lidardesign.density.target.visibility import BodyRaycast, Columns, Raycast, Visibility
@@ -95,6 +95,16 @@ class Surfaces(Protocol):
         """Points (N, 6) inside the space, at most `count`, and their log density per chart volume up to a constant."""
 
 
+class _Weighted:
+    log_column_weights: np.ndarray
+    importance: LogWeights | None
+
+    @property
+    def log_peak(self) -> float:
+        """See `Surfaces`."""
+        return float(self.log_column_weights.max()) + (0.0 if self.importance is None else self.importance.peak)
+
+
 @dataclass(frozen=True, eq=False)
 class _NearTable:
     table: SceneTable
@@ -120,7 +130,7 @@ class _NearTable:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneTable:
+class SceneTable(_Weighted):
     """Every column at every point; see `Surfaces`.
 
     Arguments:
@@ -133,11 +143,6 @@ class SceneTable:
     log_column_weights: np.ndarray
     importance: LogWeights | None = None
     can_propose = True
-
-    @property
-    def log_peak(self) -> float:
-        """See `Surfaces`."""
-        return float(self.log_column_weights.max()) + (0.0 if self.importance is None else self.importance.peak)
 
     @property
     def rows_at_once(self) -> int:
@@ -158,8 +163,8 @@ class SceneTable:
         """See `Surfaces`; columns are a mask (N, columns)."""
         distances = self.field.distances(observed).astype(np.float64)
         surface = self.terms(observed, distances, sigma_m)
-        active = surface >= surface.max(axis=1, keepdims=True, initial=-np.inf) - tolerance_nats
-        return _NearTable(self, observed, sigma_m, distances, surface, active)
+        best = surface.max(axis=1, keepdims=True, initial=-np.inf)
+        return _NearTable(self, observed, sigma_m, distances, surface, surface >= best - tolerance_nats)
 
     def log_proximity(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> np.ndarray:
         """See `Surfaces`; of all columns."""
@@ -183,8 +188,7 @@ class SceneTable:
         """See `Surfaces`."""
         columns = scene_columns(scenes)
         column = np.sort(generator.integers(len(columns), size=count))
-        surface = np.empty((count, 3))
-        normal = np.empty((count, 3))
+        surface, normal = np.empty((count, 3)), np.empty((count, 3))
         for number in np.unique(column):
             rows = np.flatnonzero(column == number)
             index, frame = columns[number]
@@ -237,7 +241,7 @@ class _NearFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class MovingFrames:
+class MovingFrames(_Weighted):
     """Primitives and moving bodies, of which only those columns are evaluated that matter; see `Surfaces`.
 
     Arguments:
@@ -249,11 +253,6 @@ class MovingFrames:
     bodies: Bodies
     log_column_weights: np.ndarray
     importance: BodyWeights | None = None
-
-    @property
-    def log_peak(self) -> float:
-        """See `Surfaces`."""
-        return float(self.log_column_weights.max()) + (0.0 if self.importance is None else self.importance.peak)
 
     @property
     def rows_at_once(self) -> int:
@@ -272,18 +271,17 @@ class MovingFrames:
 
     def near(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> _NearFrames:
         """See `Surfaces`; columns are pairs."""
-        if self.importance is None:
-            pairs = near_pairs(self.bodies, observed, self.log_column_weights, sigma_m, tolerance_nats)
-            surface = self.log_column_weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2
-            return _NearFrames(self, observed, sigma_m, pairs, surface)
-        # bounds know the most that a column may count, and by how much it may count less
-        weights = self.log_column_weights + self.importance.column_peaks
-        pairs = near_pairs(self.bodies, observed, weights, sigma_m, tolerance_nats + self.importance.spread)
+        weights, bound_nats = self.log_column_weights, tolerance_nats
+        if self.importance is not None:
+            # bounds know the most that a column may count, and by how much it may count less
+            weights, bound_nats = weights + self.importance.column_peaks, bound_nats + self.importance.spread
+        pairs = near_pairs(self.bodies, observed, weights, sigma_m, bound_nats)
         surface = self.log_column_weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2
-        surface += self.importance.of_pairs(observed, pairs)
-        best = np.maximum.reduceat(surface, pairs.row_starts[:-1])
-        near = surface >= best[pairs.rows] - tolerance_nats
-        return _NearFrames(self, observed, sigma_m, pairs.where(near), surface[near])
+        if self.importance is not None:
+            surface += self.importance.of_pairs(observed, pairs)
+            near = surface >= np.maximum.reduceat(surface, pairs.row_starts[:-1])[pairs.rows] - tolerance_nats
+            pairs, surface = pairs.where(near), surface[near]
+        return _NearFrames(self, observed, sigma_m, pairs, surface)
 
     def log_proximity(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> np.ndarray:
         """See `Surfaces`; of the columns that matter."""
@@ -298,7 +296,7 @@ class MovingFrames:
 
     def raycast(self, scenes: Sequence[Scene]) -> BodyRaycast:
         """See `Surfaces`."""
-        return BodyRaycast.of(scenes)
+        return BodyRaycast(occluding_bodies(scenes))
 
     def propose(
         self, scenes: Sequence[Scene], space: DesignSpace, count: int, sigma_m: float, generator: np.random.Generator
@@ -370,8 +368,7 @@ def near_pairs(
 
 def row_log_sums(terms: np.ndarray, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
     """log of the sum of exp(terms) of each row (N,), and the share of each pair in it (P,)."""
-    starts = pairs.row_starts[:-1]
-    counts = np.diff(pairs.row_starts)
+    starts, counts = pairs.row_starts[:-1], np.diff(pairs.row_starts)
     peak = np.maximum.reduceat(terms, starts)
     shares = np.exp(terms - np.repeat(peak, counts))
     total = np.add.reduceat(shares, starts)

@@ -147,9 +147,9 @@ def nearby_order(points: np.ndarray) -> np.ndarray:
     """
     if len(points) < 2:
         return np.arange(len(points))
-    low, size = points.min(axis=0), np.ptp(points, axis=0)
+    size = np.ptp(points, axis=0)
     # points that share a coordinate have no extent there
-    shares = (points - low) / np.where(size > 0, size, 1.0)
+    shares = (points - points.min(axis=0)) / np.where(size > 0, size, 1.0)
     cells = np.minimum((shares * 2**LEVELS).astype(np.int64), 2**LEVELS - 1)
     keys = np.zeros(len(points), dtype=np.int64)
     for level in range(LEVELS):
@@ -185,11 +185,18 @@ def build_target(
     """
     scenes = tuple(scenes)
     fields = {"resolution": settings.field_resolution, "padding_m": PADDING_SIGMAS * settings.sigma_m}
-    frames = [scenes[index].frames for index, _ in scene_columns(scenes)]
-    log_column_weights = -np.log(np.array(frames, dtype=np.float64))
-    one_by_one = common_receiver(scenes) is None and visibility != "quadrature" and not _have_meshes_at_rest(scenes)
-    if one_by_one:
-        surfaces: Surfaces = _moving_frames(scenes, log_column_weights, **fields)
+    log_column_weights = -np.log(np.array([scenes[index].frames for index, _ in scene_columns(scenes)], np.float64))
+    # meshes at rest are best kept in the table that all scenes at rest share
+    at_rest = [body for scene in scenes if scene.frames == 1 for body in scene.bodies if body.is_target]
+    tabled = visibility == "quadrature" or any(isinstance(body.shape, Mesh) for body in at_rest)
+    if common_receiver(scenes) is None and not tabled:
+        bodies = collect_bodies(scenes, lambda body: body.is_target, **fields)
+        importance = None
+        if is_weighted(scenes):
+            entries = [body for scene in scenes for _ in range(scene.frames) for body in scene.bodies if body.is_target]
+            bodies = weigh(bodies, entries)
+            importance = BodyWeights(bodies)
+        surfaces: Surfaces = MovingFrames(bodies, log_column_weights, importance)
     else:
         check_quadrature(scenes, visibility)
         field = build_field(scenes, lambda body: body.is_target, **fields)
@@ -206,23 +213,6 @@ def build_target(
         way = Quadrature(occluders, settings.quadrature_points)
     target = Target(scenes, surfaces, way, Optics.of(settings), space, settings.surface_tolerance_nats)
     return target.with_visibility(way)
-
-
-def _moving_frames(
-    scenes: Sequence[Scene], log_column_weights: np.ndarray, *, resolution: int, padding_m: float
-) -> MovingFrames:
-    bodies = collect_bodies(scenes, lambda body: body.is_target, resolution=resolution, padding_m=padding_m)
-    if not is_weighted(scenes):
-        return MovingFrames(bodies, log_column_weights)
-    entries = [body for scene in scenes for _ in range(scene.frames) for body in scene.bodies if body.is_target]
-    bodies = weigh(bodies, entries)
-    return MovingFrames(bodies, log_column_weights, BodyWeights(bodies))
-
-
-def _have_meshes_at_rest(scenes: Sequence[Scene]) -> bool:
-    """Whether targets are best kept in the table that all scenes at rest share."""
-    at_rest = [body for scene in scenes if scene.frames == 1 for body in scene.bodies if body.is_target]
-    return any(isinstance(body.shape, Mesh) for body in at_rest)
 
 
 def check_quadrature(scenes: Sequence[Scene], visibility: str) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.special import expit, log_expit
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.fields.bodies import Bodies, Pairs, occluding_bodies
+from lidardesign.density.fields.bodies import Bodies, Pairs
 from lidardesign.density.fields.distance import scene_columns
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.frames import receiver_axes
@@ -99,8 +99,8 @@ class RayBatch:
     @classmethod
     def of(cls, points: np.ndarray) -> RayBatch:
         """The rays of design points, (N, 6)."""
-        directions = direction(points[:, AZIMUTH], points[:, ELEVATION])
-        return cls(np.ascontiguousarray(points[:, :3]), directions, np.ascontiguousarray(points[:, RANGE]))
+        origins, ranges = np.ascontiguousarray(points[:, :3]), np.ascontiguousarray(points[:, RANGE])
+        return cls(origins, direction(points[:, AZIMUTH], points[:, ELEVATION]), ranges)
 
     @property
     def observed(self) -> np.ndarray:
@@ -120,20 +120,6 @@ class RayGradient:
     def zeros(cls, count: int) -> RayGradient:
         """All zero, for `count` rays."""
         return cls(np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count))
-
-    def pull_behind(self, rows: np.ndarray, pull: np.ndarray, hit_m: np.ndarray, plane: np.ndarray) -> None:
-        """Subtract the derivatives of sum pull * (range - hit) over hits: of ray `rows`, at `hit_m`, shapes (P,).
-
-        Arguments:
-            rows, pull, hit_m: Shape (P,); a ray may have many hits.
-            plane: Normals over their product with the direction, minus the hit's derivative by the origin, (P, 3).
-        """
-        count = len(self.ranges)
-        self.ranges -= np.bincount(rows, pull, minlength=count)
-        for axis in range(3):
-            force = pull * plane[:, axis]
-            self.origins[:, axis] -= np.bincount(rows, force, minlength=count)
-            self.directions[:, axis] -= np.bincount(rows, force * hit_m, minlength=count)
 
     def add_by_point(self, by_point: np.ndarray, rays: RayBatch) -> None:
         """Add the derivatives by the observed scene points, shape (N, 3)."""
@@ -228,9 +214,13 @@ class Blocked:
         return cls(log_values, len(rays.ranges), rows, index, hit_m, plane, optics.attenuation_per_m)
 
     def gradient(self, weights: np.ndarray) -> RayGradient:
-        """See `Transmittance`."""
-        out = RayGradient.zeros(self.rays)
-        out.pull_behind(self.rows, self.attenuation_per_m * weights[self.index], self.hit_m, self.plane)
+        """See `Transmittance`; a ray may have many hits."""
+        out, pull = RayGradient.zeros(self.rays), self.attenuation_per_m * weights[self.index]
+        out.ranges -= np.bincount(self.rows, pull, minlength=self.rays)
+        for axis in range(3):
+            force = pull * self.plane[:, axis]
+            out.origins[:, axis] -= np.bincount(self.rows, force, minlength=self.rays)
+            out.directions[:, axis] -= np.bincount(self.rows, force * self.hit_m, minlength=self.rays)
         return out
 
 
@@ -291,11 +281,6 @@ class BodyRaycast(OneWay):
         self.bodies = bodies
         self._casters = [mesh_caster(mesh) for mesh in bodies.grids.meshes]
 
-    @classmethod
-    def of(cls, scenes: Sequence[Scene]) -> BodyRaycast:
-        """The occluders of all scenes and frames."""
-        return cls(occluding_bodies(scenes))
-
     def take(self, columns: np.ndarray) -> BodyRaycast:
         """See `Visibility`."""
         return BodyRaycast(self.bodies.take(columns))
@@ -304,10 +289,10 @@ class BodyRaycast(OneWay):
         self, rays: RayBatch, columns: Columns, optics: Optics, *, differentiable: bool = True
     ) -> Transmittance:
         """See `Visibility`; columns are pairs."""
-        hits, normals = self.first_hits(rays, columns, rays.ranges - optics.margin_m)
-        chosen = np.flatnonzero(np.isfinite(hits))
-        found = (hits[chosen], normals[chosen])
-        return Blocked.at(np.zeros(len(hits)), rays, columns.rows[chosen], chosen, found, optics)
+        hit_m, normals = self.first_hits(rays, columns, rays.ranges - optics.margin_m)
+        blocked = np.flatnonzero(np.isfinite(hit_m))
+        hits = hit_m[blocked], normals[blocked]
+        return Blocked.at(np.zeros(len(hit_m)), rays, columns.rows[blocked], blocked, hits, optics)
 
     def first_hits(self, rays: RayBatch, pairs: Pairs, limit_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Ranges of first hits before a limit, infinite without one (P,), and normals facing the origin (P, 3)."""
@@ -318,15 +303,14 @@ class BodyRaycast(OneWay):
         body_kernels.first_hits(self.bodies.arrays, pairs.row_starts, pairs.columns, lines, hits, normals)
         if self.bodies.grids.meshes:
             rows, chosen, body = self._candidates(rays, pairs, limit_m)
-            row_of_grid = self.bodies.grid[body]
             for number, caster in enumerate(self._casters, start=1):
-                mine = np.flatnonzero(row_of_grid == number)
+                mine = np.flatnonzero(self.bodies.grid[body] == number)
                 if not len(mine):
                     continue
                 pose, ray, pair = self.bodies.to_body[body[mine]], rows[mine], chosen[mine]
                 origins = np.einsum("pij,pj->pi", pose[:, :, :3], rays.origins[ray]) + pose[:, :, 3]
                 directions = np.einsum("pij,pj->pi", pose[:, :, :3], rays.directions[ray])
-                range_m, normal = caster.trace(origins, directions, np.minimum(limit_m[ray], hits[pair]))
+                range_m, normal = caster.first_hits(origins, directions, np.minimum(limit_m[ray], hits[pair]))
                 nearer = np.flatnonzero(range_m < hits[pair])
                 # a pair may meet the same mesh in two poses: the nearest is written last
                 nearer = nearer[np.argsort(-range_m[nearer], kind="stable")]
@@ -349,8 +333,7 @@ class BodyRaycast(OneWay):
                 self.bodies.arrays, self.bodies.mesh_bounds, pairs.row_starts, pairs.columns, lines, out
             )
             if count <= room:
-                rows, chosen, body = out
-                return rows[:count], chosen[:count], body[:count]
+                return tuple(values[:count] for values in out)
             room = count
 
 
@@ -382,8 +365,7 @@ class _BothWays:
     view_gradient: np.ndarray
 
     def gradient(self, weights: np.ndarray) -> RayGradient:
-        total = self.out.gradient(weights)
-        back = self.back.gradient(weights)
+        total, back = self.out.gradient(weights), self.back.gradient(weights)
         looking = self.back_rays.directions
         # the receiver stays where it is: turning its line of sight moves s across, lengthening it moves s along
         across = back.directions - np.einsum("nk,nk->n", back.directions, looking)[:, None] * looking

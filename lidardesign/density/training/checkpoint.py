@@ -35,9 +35,9 @@ def save_arrays(run: Path, name: str, arrays: Mapping[str, np.ndarray], state: M
     """Write arrays and plain state atomically, with their hash in the manifest at every moment."""
     from safetensors.numpy import save
 
+    contiguous = {key: np.ascontiguousarray(value) for key, value in arrays.items()}
     # one entry only: safetensors writes several in an order that changes from process to process
-    metadata = {FORMAT: json.dumps(dict(state))}
-    write_recorded(run, name, save({key: np.ascontiguousarray(value) for key, value in arrays.items()}, metadata))
+    write_recorded(run, name, save(contiguous, {FORMAT: json.dumps(dict(state))}))
 
 
 def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -58,8 +58,8 @@ def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, 
         raise DataError(f"cannot be read: {error}", where=str(path), hint="learn the run again") from None
     if FORMAT not in metadata:
         found = ", ".join(sorted(metadata)) or "none"
-        newer = found.startswith(FORMAT.rstrip("0123456789"))
-        hint = "use the version of lidardesign that wrote it, or a newer one" if newer else "learn the run again"
+        ours = found.startswith(FORMAT.rstrip("0123456789"))
+        hint = "use the version of lidardesign that wrote it, or a newer one" if ours else "learn the run again"
         raise DataError(f"has the format {found!r}", where=str(path), allowed=FORMAT, hint=hint)
     for key, value in arrays.items():
         if value.dtype.kind == "f" and not np.isfinite(value).all():
@@ -164,8 +164,7 @@ def twin_step(settings: LearningSettings, step: int) -> int | None:
 def snapshot_steps(settings: LearningSettings) -> tuple[int, ...]:
     """The steps after which a snapshot is kept, ascending."""
     rungs = [step for step in measured_steps(settings) if step < settings.steps]
-    twins = (twin_step(settings, step) for step in rungs)
-    return tuple(sorted({*rungs, *(twin for twin in twins if twin is not None)}))
+    return tuple(sorted({*rungs, *(twin_step(settings, step) for step in rungs)} - {None}))
 
 
 def snapshot_name(step: int) -> str:
@@ -173,10 +172,10 @@ def snapshot_name(step: int) -> str:
     return f"{FOLDER}/step-{step:06d}.safetensors"
 
 
-def save_snapshot(flow: DesignFlow, run: Path, step: int) -> None:
-    """Keep the flow's weights after a step; no clock enters, so that a resumed run writes the same bytes."""
-    weights: dict[str, np.ndarray] = {key: value.detach().cpu().numpy() for key, value in flow.state_dict().items()}
-    save_arrays(run, snapshot_name(step), weights, {"step": step, "features": flow.features, "context": flow.context})
+def save_flow(flow: DesignFlow, run: Path, name: str, **state: int) -> None:
+    """Write the flow's weights; no clock enters, so that a resumed run writes the same bytes."""
+    weights = {key: value.detach().cpu().numpy() for key, value in flow.state_dict().items()}
+    save_arrays(run, name, weights, {**state, "features": flow.features, "context": flow.context})
 
 
 def stored_snapshots(run: Path) -> dict[int, str]:

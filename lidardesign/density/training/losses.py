@@ -40,14 +40,6 @@ LEAK_WEIGHT = 3.0
 FORWARD_SHARE = 0.5
 
 
-def draw_conditions(flow: DesignFlow, count: int, generator: torch.Generator) -> Tensor | None:
-    """Uniform conditions in [-1, 1], shape (count, context), or None for a flow without any."""
-    if not flow.context:
-        return None
-    like = next(flow.parameters())
-    return (2 * torch.rand(count, flow.context, generator=generator, dtype=torch.float64) - 1).to(like)
-
-
 def effective_share(log_weights: Tensor) -> float:
     """(sum w)^2 / (N sum w^2) of log weights, shape (N,)."""
     return effective_sample_size(log_weights.detach().double().cpu().numpy())
@@ -63,8 +55,8 @@ def pathwise_loss(
     generator: torch.Generator,
 ) -> tuple[Tensor, float, float]:
     """mean of (1 + eta) log p(d) - log p*(d) over flow samples; also its value for reports and the batch's ESS."""
-    conditions = draw_conditions(flow, count, generator)
-    learned, log_prob = flow(flow.draw_base(count, generator), conditions)
+    base, conditions = flow.draw(count, generator)
+    learned, log_prob = flow(base, conditions)
     log_p_star = log_target(coordinates.join(learned, conditions), target, coordinates, sigma_m)
     loss = ((1 + eta) * log_prob - log_p_star).sum() / count
     log_prob, log_p_star = log_prob.detach(), log_p_star.detach()
@@ -90,8 +82,7 @@ class Pool:
         """The pool of proposals with log p* and log q."""
         log_weights = log_target - log_proposal
         weights = np.exp(log_weights - log_weights.max())
-        cumulated = np.cumsum(weights / weights.sum())
-        return cls(torch.as_tensor(unit), torch.as_tensor(log_target), torch.as_tensor(cumulated))
+        return cls(*map(torch.as_tensor, (unit, log_target, np.cumsum(weights / weights.sum()))))
 
     def draw(self, count: int, generator: torch.Generator, like: Tensor) -> tuple[Tensor, Tensor]:
         """Unit points distributed as p*, shape (count, free), and log p* at them, shape (count,)."""
@@ -108,13 +99,10 @@ def balancing_loss(
     flow: DesignFlow, target: Target, coordinates: Coordinates, count: int, pool: Pool, generator: torch.Generator
 ) -> tuple[Tensor, float, float]:
     """A loss whose gradient balances mass by values of p*; also the reverse KL loss and the batch's ESS."""
-    conditions = draw_conditions(flow, count, generator)
-    base = flow.draw_base(count, generator)
+    base, conditions = flow.draw(count, generator)
     with torch.no_grad():
         learned, log_prob = flow(base, conditions)
-    unit = coordinates.join(learned, conditions)
-    log_p_star = log_target_values(unit, target, coordinates)
-    log_weights = log_p_star - log_prob
+    log_weights = log_target_values(coordinates.join(learned, conditions), target, coordinates) - log_prob
     log_z = logsumexp(log_weights) - np.log(count)
     centred = log_weights - log_z
     pull = centred.clamp(-LARGEST_PULL_NATS, LARGEST_PULL_NATS)
@@ -128,18 +116,13 @@ def balancing_loss(
     loss = -(pull * own).sum() / count - FORWARD_SHARE * (starved * others).sum() / count
     leaked = centred < -LARGEST_PULL_NATS
     if leaked.any():
-        cost = _leak_cost(flow, target, coordinates, base[leaked], None if conditions is None else conditions[leaked])
+        few = None if conditions is None else conditions[leaked]
+        again, _ = flow(base[leaked], few)
+        log_p_star = log_target(coordinates.join(again, few), target, coordinates, target.optics.sigma_m)
+        # the summed distances of leaked samples from the target, in sigmas
+        cost = torch.sqrt((-2 * log_p_star).clamp(min=1.0)).sum()
         loss = loss + LEAK_WEIGHT * cost / count
     return loss, float(-log_weights.mean()), effective_share(log_weights)
-
-
-def _leak_cost(
-    flow: DesignFlow, target: Target, coordinates: Coordinates, base: Tensor, conditions: Tensor | None
-) -> Tensor:
-    """The summed distances of leaked samples from the target, in sigmas: sqrt(-2 log p*), differentiable."""
-    learned, _ = flow(base, conditions)
-    log_p_star = log_target(coordinates.join(learned, conditions), target, coordinates, target.optics.sigma_m)
-    return torch.sqrt((-2 * log_p_star).clamp(min=1.0)).sum()
 
 
 # Weights are then off by one in a hundred.
@@ -149,7 +132,7 @@ TOLERANCE_NATS = 1e-2
 @torch.no_grad()
 def round_trip_nats(flow: DesignFlow, count: int, generator: torch.Generator) -> float:
     """The largest difference of the two log densities over `count` samples [nats]; inf where one is not finite."""
-    conditions = draw_conditions(flow, count, generator)
-    values, drawn = flow(flow.draw_base(count, generator), conditions)
+    base, conditions = flow.draw(count, generator)
+    values, drawn = flow(base, conditions)
     off = (drawn - flow.log_prob(values, conditions)).abs()
     return float(torch.nan_to_num(off, nan=torch.inf).max())

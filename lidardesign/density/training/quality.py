@@ -21,7 +21,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -31,7 +30,7 @@ from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.target.proposals import independent_points
 from lidardesign.density.target.target import Target
-from lidardesign.density.training.losses import TOLERANCE_NATS, draw_conditions, round_trip_nats
+from lidardesign.density.training.losses import TOLERANCE_NATS, round_trip_nats
 from lidardesign.errors import NumericalError
 from lidardesign.estimates import Estimate, effective_share_error, log_mean_error, standard_error, weighted_mean_error
 from lidardesign.numerics import SLACK, TINY, logsumexp, normalised_weights
@@ -179,10 +178,8 @@ def overlap(sides: OverlapPoints) -> Overlap:
     Raises:
         NumericalError: A value is NaN, or one side has no points of finite weight.
     """
-    if sides.sample_groups is None or sides.proposal_groups is None:
-        return _overlap(sides.at_samples, sides.at_proposals, sides.log_weights)
     parts = []
-    for group in np.unique(sides.sample_groups):
+    for group in [] if sides.sample_groups is None else np.unique(sides.sample_groups):
         mine, theirs = sides.sample_groups == group, sides.proposal_groups == group
         if min(mine.sum(), theirs.sum()) >= LEAST_POINTS:
             parts.append(_overlap(sides.at_samples[mine], sides.at_proposals[theirs], sides.log_weights[theirs]))
@@ -201,23 +198,25 @@ def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.n
     if not np.isfinite(at_samples).any() or not np.isfinite(log_weights).any():
         raise NumericalError("the target is 0 at all points that the density is compared at")
     weights = normalised_weights(log_weights)
-    finite = at_samples[np.isfinite(at_samples)]
-    start = float(logsumexp(finite)) - math.log(len(at_samples))
+
+    def shares(log_z: float) -> tuple[np.ndarray, np.ndarray]:
+        """min(1, pi / p) at the samples and min(1, p / pi) at the proposals."""
+        return np.exp(np.minimum(at_samples - log_z, 0.0)), np.exp(np.minimum(log_z - at_proposals, 0.0))
 
     def gap(log_z: float) -> float:
-        kept = float(np.exp(np.minimum(at_samples - log_z, 0.0)).mean())
-        return kept - float(weights @ np.exp(np.minimum(log_z - at_proposals, 0.0)))
+        at_own, at_others = shares(log_z)
+        return float(at_own.mean()) - float(weights @ at_others)
 
-    low, high = _bracket(gap, start)
-    log_z = float(brentq(gap, low, high, xtol=LOG_Z_TOLERANCE_NATS))
-    kept = np.exp(np.minimum(at_samples - log_z, 0.0))
-    reached = np.exp(np.minimum(log_z - at_proposals, 0.0))
-    shared = float(kept.mean())
+    start = float(logsumexp(at_samples[np.isfinite(at_samples)])) - math.log(len(at_samples))
+    log_z = float(brentq(gap, *_bracket(gap, start), xtol=LOG_Z_TOLERANCE_NATS))
+    at_own, at_others = shares(log_z)
+    shared = float(at_own.mean())
     # of the overlap, p is the lesser density on `rare` and pi on the rest; a shift of log Z trades one for the other
     rare = float((at_samples >= log_z).mean())
     rest = shared - rare
-    variances = np.square(kept - shared).mean() / len(kept), float(np.square(weights * (reached - shared)).sum())
-    error = math.hypot(rare * math.sqrt(variances[0]), rest * math.sqrt(variances[1])) / max(shared, LEAST_SHARED)
+    own = np.square(at_own - shared).mean() / len(at_own)
+    others = float(np.square(weights * (at_others - shared)).sum())
+    error = math.hypot(rare * math.sqrt(own), rest * math.sqrt(others)) / max(shared, LEAST_SHARED)
     return Overlap(misplaced=1.0 - shared, error=error, log_z=log_z)
 
 
@@ -243,7 +242,8 @@ NOT_COVERED = (
 )
 
 
-class LearnedFlow(Protocol):
+@dataclass(eq=False)
+class LearnedFlow:
     """A flow, the target that it was learned for, and the stream that its samples are drawn from."""
 
     flow: DesignFlow
@@ -301,20 +301,19 @@ def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> Meas
     samples = draw_samples(learned, count)
     space = samples.space
     groups = condition_groups(space, samples.points)
-    found = quality(samples.log_prob, samples.log_target, groups)
+    figures = quality(samples.log_prob, samples.log_target, groups)
     covered, notes = Estimate(0.0, None), []
     sides = OverlapPoints(samples.log_weights, samples.log_weights, samples.log_weights, groups, groups)
     if len(probes.points):
-        log_prob = log_density_of(learned, probes.points)
-        log_z = _log_z_at(probes.points, samples, groups, found.log_z)
+        log_prob, theirs = log_density_of(learned, probes.points), condition_groups(space, probes.points)
+        log_z = _log_z_at(probes.points, samples, groups, figures.log_z)
         covered = coverage(log_prob, probes.log_target, probes.log_proposal, log_z)
         log_weights = probes.log_target - probes.log_proposal
-        theirs = condition_groups(space, probes.points)
         sides = OverlapPoints(samples.log_weights, probes.log_target - log_prob, log_weights, groups, theirs)
     else:
         notes.append(NOT_COVERED)
     apart = overlap(sides)
-    estimates = {**found.estimates(), "coverage": covered, "misplaced": Estimate(apart.misplaced, apart.error)}
+    estimates = {**figures.estimates(), "coverage": covered, "misplaced": Estimate(apart.misplaced, apart.error)}
     off = round_trip_nats(learned.flow, ROUND_TRIPS, torch.Generator().manual_seed(0))
     if off > TOLERANCE_NATS:
         notes.append(
@@ -331,23 +330,21 @@ def draw_samples(learned: LearnedFlow, count: int) -> Samples:
     with torch.no_grad():
         for start in range(0, count, SAMPLE_CHUNK):
             size = min(SAMPLE_CHUNK, count - start)
-            conditions = draw_conditions(flow, size, learned.generator)
-            values, log_density = flow(flow.draw_base(size, learned.generator), conditions)
+            base, conditions = flow.draw(size, learned.generator)
+            values, log_density = flow(base, conditions)
             unit = coordinates.join(values, conditions)
             points.append(coordinates.space.from_unit(unit.cpu().double().numpy()))
             log_prob.append(log_density.cpu().double().numpy())
     points = np.concatenate(points)
     offset = coordinates.log_condition_density - coordinates.log_unit_volume
-    log_target = learned.target.log_density(points)
-    return Samples(points, np.concatenate(log_prob) + offset, log_target, coordinates.space)
+    return Samples(points, np.concatenate(log_prob) + offset, learned.target.log_density(points), coordinates.space)
 
 
 def log_density_of(learned: LearnedFlow, points: np.ndarray) -> np.ndarray:
     """The flow's log density per chart volume at any design points, (N, 6) to (N,); -inf outside the space."""
     flow, coordinates = learned.flow, learned.coordinates
-    like = next(flow.parameters())
     # points on the space's faces may leave it by rounding
-    unit = torch.as_tensor(coordinates.space.to_unit(points).clip(-1.0, 1.0)).to(like)
+    unit = torch.as_tensor(coordinates.space.to_unit(points).clip(-1.0, 1.0)).to(next(flow.parameters()))
     conditions = unit[:, coordinates.conditions] if coordinates.conditions else None
     with torch.no_grad():
         parts = [

@@ -104,8 +104,7 @@ class ToleranceGoal:
 
     def with_stage(self, stage: Stage) -> ToleranceGoal:
         """The goal after a stage, in place of an earlier one of the same steps."""
-        others = tuple(other for other in self.stages if other.steps != stage.steps)
-        return replace(self, stages=(*others, stage))
+        return replace(self, stages=(*(other for other in self.stages if other.steps != stage.steps), stage))
 
     def as_dict(self) -> dict[str, Any]:
         """The form that the manifest has."""
@@ -127,14 +126,13 @@ def goal_of(run: Path) -> ToleranceGoal | None:
     if "planned_steps" not in found:
         return None
     try:
-        goal = TypeAdapter(ToleranceGoal).validate_python({key: found[key] for key in found if key != "met"})
+        return TypeAdapter(ToleranceGoal).validate_python({key: found[key] for key in found if key != "met"})
     except ValidationError as error:
         raise DataError(
             f"the manifest's {GOAL!r} is damaged: {error.errors()[0]['msg']}",
             where=str(Path(run) / FILE_NAME),
             hint=DAMAGED_HINT,
         ) from None
-    return goal
 
 
 def with_steps(config: RunConfig, steps: int) -> RunConfig:
@@ -161,12 +159,10 @@ def learn_to_tolerance(
     """
     first = config.learning.steps if resume or goal.stages else 0
     # the stages from this one on; a configuration that is none of them is one of its own
-    later = {steps for steps in stage_steps(goal.planned_steps) if steps > first}
-    for steps in sorted(later | ({first} if first else set())):
+    for steps in sorted({steps for steps in (first, *stage_steps(goal.planned_steps)) if steps >= max(first, 1)}):
         staged = with_steps(config, steps)
         if not resume:
-            # Take away what the stage before left and enter the next one; killed in between, that stage is learned
-            # again
+            # what the stage before left goes; killed in between, the next one is learned again
             forget(run, [CHECKPOINT, PROGRESS, FLOW, SAMPLES])
             clear_snapshots(run)
             manifest = read_manifest(run)
@@ -226,8 +222,7 @@ class TimePlan:
 
     def applied(self, settings: LearningSettings) -> LearningSettings:
         """Settings with the planned numbers of steps."""
-        update = {"steps": self.steps, "balance": self.balancing_steps / self.steps}
-        return settings.model_copy(update=update)
+        return settings.model_copy(update={"steps": self.steps, "balance": self.balancing_steps / self.steps})
 
     def as_dict(self) -> dict[str, Any]:
         """The form that the manifest has."""
@@ -279,8 +274,8 @@ class Timekeeper:
             ConfigError: Not even `LEAST_STEPS` fit; it says what would be enough.
         """
         trainer = make_trainer(data, self.config, self.run, device)
-        last = max(trainer.pathwise_steps - 1, 0)
-        pathwise = max(_seconds_per_step(trainer, 0), _seconds_per_step(trainer, last)) if trainer.pathwise_steps else 0
+        last = trainer.pathwise_steps - 1
+        pathwise = max(_seconds_per_step(trainer, 0), _seconds_per_step(trainer, last)) if last >= 0 else 0
         share = self.config.learning.balance
         balancing = _seconds_per_step(trainer, trainer.pathwise_steps) if share > 0 else 0.0
         self.probes = _timed_probes(data.target, self.config)
@@ -331,9 +326,8 @@ def _seconds_per_step(trainer: Trainer, step: int) -> float:
 
 
 def _timed_probes(target: Target, config: RunConfig) -> TimedProbes:
-    asked = config.learning.coverage_proposals
+    asked, generator = config.learning.coverage_proposals, random_generator(config.seed, "time budget")
     count = min(MOST_PROBES, asked)
-    generator = random_generator(config.seed, "time budget")
     drawn, seconds = _timed(lambda: draw_probes(target, count, generator))
     return TimedProbes(drawn.points, asked / count, seconds * asked / count)
 

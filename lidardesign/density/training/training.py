@@ -25,18 +25,20 @@ import torch
 from torch.optim.adam import adam
 
 from lidardesign.config import LearningSettings
-from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.checkpoint import (
+    COUNTERS,
+    MOMENTS,
     check_resumable,
     clear_snapshots,
     load_arrays,
     save_arrays,
-    save_snapshot,
+    save_flow,
+    snapshot_name,
     snapshot_steps,
 )
 from lidardesign.density.training.losses import TOLERANCE_NATS, Pool, balancing_loss, pathwise_loss, round_trip_nats
+from lidardesign.density.training.quality import LearnedFlow
 from lidardesign.errors import DataError, DivergenceError, NumericalError
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.clock import phase
@@ -45,7 +47,6 @@ from lidardesign.run.manifest import record
 
 # How much of the means of gradients and of their squares a step keeps.
 BETAS = (0.9, 0.99)
-MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class Adam:
@@ -134,28 +135,20 @@ class LearnProgress:
     phase: str = "learning"
 
 
-@dataclass(frozen=True, eq=False)
-class _Snapshot:
-    """The arrays of a state, copied, and its counters."""
-
-    arrays: dict[str, np.ndarray]
-    state: dict[str, Any]
+# The arrays of a state, copied, and its counters.
+_State = tuple[dict[str, np.ndarray], dict[str, Any]]
 
 
-@dataclass
-class Trainer:
+@dataclass(eq=False)
+class Trainer(LearnedFlow):
     """The state of training: flow, optimiser, random stream and counters.
 
     `replan` is asked for other settings once, when balancing begins; they may differ in the number of balancing steps.
     `doubled_at` is the step from which on float64 replaced float32, None where it did not have to.
     """
 
-    flow: DesignFlow
-    target: Target
-    coordinates: Coordinates
     settings: LearningSettings
     run: Path
-    generator: torch.Generator
     pool: Pool
     step: int = 0
     skipped: int = 0
@@ -164,7 +157,7 @@ class Trainer:
     doubled_at: int | None = None
     seconds_before: float = 0.0
     replan: Callable[[Trainer], LearningSettings] | None = None
-    _snapshot: _Snapshot | None = None
+    _snapshot: _State | None = None
 
     def __post_init__(self) -> None:
         self.optimiser = Adam(self.flow.parameters(), self.settings.rate)
@@ -191,9 +184,8 @@ class Trainer:
         pathwise = self.step < self.pathwise_steps
         first, last = PATHWISE_RATES if pathwise else BALANCING_RATES
         begin, end = (0, self.pathwise_steps) if pathwise else (self.pathwise_steps, self.settings.steps)
-        share = (self.step - begin) / max(end - begin, 1)
-        decay = last + (first - last) * (1 + math.cos(math.pi * share)) / 2
-        return self.settings.rate * decay / 2**self.halvings
+        angle = math.pi * ((self.step - begin) / max(end - begin, 1))
+        return self.settings.rate * (last + (first - last) * (1 + math.cos(angle)) / 2) / 2**self.halvings
 
     def train(self, progress: Callable[[LearnProgress], None] | None = None) -> None:
         """Run the remaining steps, with checkpoints, one of them when it is interrupted; raises DivergenceError."""
@@ -203,15 +195,15 @@ class Trainer:
                 if self.step % SNAPSHOT_STEPS == 0 or self.step == self.pathwise_steps:
                     self._check_round_trip()
                 if self.step % SNAPSHOT_STEPS == 0 or self._snapshot is None:
-                    self._snapshot = self._taken()
+                    self._snapshot = self._state()
                     if time.perf_counter() - checkpointed > self.settings.checkpoint_seconds:
-                        self._save(self._snapshot)
+                        self._save(*self._snapshot)
                         checkpointed = time.perf_counter()
                 if self.replan is not None and self.step == self.pathwise_steps:
                     self.settings, self.replan = self.replan(self), None
                 loss, ess = self._advance()
                 if self.step in snapshot_steps(self.settings):
-                    save_snapshot(self.flow, self.run, self.step)
+                    save_flow(self.flow, self.run, snapshot_name(self.step), step=self.step)
                 if self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
                     seconds = self.seconds
                     left = seconds / self.step * (self.settings.steps - self.step)
@@ -229,9 +221,9 @@ class Trainer:
                         progress(LearnProgress(self.step, self.settings.steps, loss, ess, seconds, left))
         except KeyboardInterrupt:
             if self._snapshot is not None:
-                self._save(self._snapshot)
+                self._save(*self._snapshot)
             raise
-        self._save(self._taken())
+        self._save(*self._state())
 
     def _advance(self) -> tuple[float, float]:
         self.optimiser.rate = self._rate()
@@ -269,8 +261,7 @@ class Trainer:
         """Go on in float64 where balancing asks for densities that float32 gets wrong; the stream is left alone."""
         if self.step < self.pathwise_steps or next(self.flow.parameters()).dtype == torch.float64:
             return
-        off = round_trip_nats(self.flow, ROUND_TRIPS, torch.Generator().manual_seed(self.step))
-        if off > TOLERANCE_NATS:
+        if round_trip_nats(self.flow, ROUND_TRIPS, torch.Generator().manual_seed(self.step)) > TOLERANCE_NATS:
             self._double(self.step)
 
     def _double(self, step: int) -> None:
@@ -298,13 +289,13 @@ class Trainer:
         self.halvings += 1
         self.skipped_in_a_row = 0
         if self.halvings > HALVINGS_BEFORE_GIVING_UP:
-            self._save(self._snapshot)
+            self._save(*self._snapshot)
             raise DivergenceError(
                 f"learning diverged at step {self.step}: loss or gradient stayed non-finite after "
                 f"{self.halvings - 1} halvings of the step size; the last good state is {self.run / CHECKPOINT}",
                 hint="a smaller learning.rate, a larger density.sigma_m, or learning.dtype=float64",
             )
-        self._restore_arrays(self._snapshot.arrays)
+        self._restore_arrays(self._snapshot[0])
 
     def _state_arrays(self) -> dict[str, np.ndarray]:
         arrays = {f"flow.{name}": value.detach().cpu().numpy().copy() for name, value in self.flow.state_dict().items()}
@@ -314,7 +305,7 @@ class Trainer:
         arrays["generator"] = self.generator.get_state().numpy().copy()
         return arrays
 
-    def _restore_arrays(self, arrays: dict[str, np.ndarray], *, with_generator: bool = False) -> None:
+    def _restore_arrays(self, arrays: dict[str, np.ndarray]) -> None:
         prefix = "flow."
         flow = {key[len(prefix) :]: torch.as_tensor(value) for key, value in arrays.items() if key.startswith(prefix)}
         try:
@@ -327,19 +318,15 @@ class Trainer:
             ) from None
         for index, parameter in enumerate(self.flow.parameters()):
             start = f"adam.{index}."
-            found = {key[len(start) :]: torch.as_tensor(v) for key, v in arrays.items() if key.startswith(start)}
-            self.optimiser.state[parameter] = {name: _moved(name, value, parameter) for name, value in found.items()}
-        if with_generator:
-            self.generator.set_state(torch.as_tensor(arrays["generator"]))
+            moments = {key[len(start) :]: torch.as_tensor(v) for key, v in arrays.items() if key.startswith(start)}
+            self.optimiser.state[parameter] = {name: _moved(name, value, parameter) for name, value in moments.items()}
 
-    def _taken(self) -> _Snapshot:
-        """A copy of the present state."""
-        names = ("step", "skipped", "skipped_in_a_row", "halvings", "doubled_at")
-        counters = {name: getattr(self, name) for name in names}
-        return _Snapshot(self._state_arrays(), {**counters, "seconds": self.seconds})
+    def _state(self) -> _State:
+        counters = {name: getattr(self, name) for name in (*COUNTERS, "doubled_at")}
+        return self._state_arrays(), {**counters, "seconds": self.seconds}
 
-    def _save(self, snapshot: _Snapshot) -> None:
-        save_arrays(self.run, CHECKPOINT, snapshot.arrays, snapshot.state)
+    def _save(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
+        save_arrays(self.run, CHECKPOINT, arrays, state)
         if (self.run / PROGRESS).exists():
             record(self.run, [PROGRESS])
 
@@ -349,16 +336,16 @@ class Trainer:
         check_resumable(arrays, state, self.flow, self.generator, self.run / CHECKPOINT)
         if state.get("doubled_at") is not None:  # older checkpoints have no such entry
             self._double(state["doubled_at"])
-        self._restore_arrays(arrays, with_generator=True)
-        self.step, self.skipped = state["step"], state["skipped"]
-        self.skipped_in_a_row, self.halvings = state["skipped_in_a_row"], state["halvings"]
+        self._restore_arrays(arrays)
+        self.generator.set_state(torch.as_tensor(arrays["generator"]))
+        for name in COUNTERS:
+            setattr(self, name, state[name])
         self.seconds_before, self._started = state["seconds"], time.perf_counter()
         clear_snapshots(self.run, beyond=self.step)
         path = self.run / PROGRESS
         if path.exists():
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-            kept = [line for line in lines if _step_of(line) <= self.step]
-            write_atomic(path, "".join(line + "\n" for line in kept))
+            write_atomic(path, "".join(line + "\n" for line in lines if _step_of(line) <= self.step))
 
 
 def _moved(name: str, value: torch.Tensor, parameter: torch.Tensor) -> torch.Tensor:

@@ -166,7 +166,7 @@ def _local_tracer(shape: Shape) -> tuple[LocalTracer, np.ndarray, float]:
     """How rays are traced at a shape in its own frame, with the centre (3,) and radius [m] of a ball around it."""
     if isinstance(shape, Mesh):
         caster, counted = mesh_caster(shape), SecondCasts()
-        return partial(caster.trace, twice=counted), caster.centre_m, caster.radius_m
+        return partial(caster.first_hits, twice=counted), caster.centre_m, caster.radius_m
     group = PrimitiveGroup([(0, Body(shape))], 0)
 
     def trace(origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
