@@ -597,7 +597,7 @@ def test_a_scan_that_cannot_be_is_refused(tmp_path, options):
 def test_what_is_written_for_gazebo_fires_as_it_is_read(tmp_path):
     from lidardesign.export.common.names import read_xml
     from lidardesign.export.common.poses import mounts
-    from lidardesign.export.gazebo import read_sensor
+    from lidardesign.export.robots import read_sensor
 
     design = rig(3, counts=(9, 6), names=("a", "b"))
     rays = lay_out(design)

@@ -14,10 +14,10 @@ from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.export import mjcf
 from lidardesign.export.common.names import identifier
 from lidardesign.export.common.poses import mounts
 from lidardesign.export.registry import EXPORTERS
+from lidardesign.export.robots import read_mjcf
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
 
@@ -354,7 +354,7 @@ def test_a_document_type_is_refused(tmp_path):
     path = tmp_path / "x.xml"
     path.write_text('<!DOCTYPE mujoco [<!ENTITY a "b">]><mujoco>&a;</mujoco>')
     with pytest.raises(DataError, match="document type"):
-        mjcf.read_mjcf(path)
+        read_mjcf(path)
 
 
 @each_row("name", ["mjcf", "sdf", "urdf", "xacro"])

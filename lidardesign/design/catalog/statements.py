@@ -104,28 +104,29 @@ class PartFieldOfView(Statement):
         return self
 
 
-class Zones(Statement):
+class _Cells(Statement):
+    """Rows and columns of rays."""
+
+    columns: Count
+    rows: Count
+
+
+class Zones(_Cells):
     """Zones of equal angles, as of a multi-zone ranger: one ray at each zone's centre."""
 
     kind: Literal["zones"]
-    columns: Count
-    rows: Count
 
 
-class Pixels(Statement):
+class Pixels(_Cells):
     """Pixels of a camera behind a lens without distortion: even on its focal plane."""
 
     kind: Literal["pixels"]
-    columns: Count
-    rows: Count
 
 
-class Raster(Statement):
+class Raster(_Cells):
     """Steps of a two-dimensional scan, even in azimuth and elevation, at the centres of their cells."""
 
     kind: Literal["raster"]
-    columns: Count
-    rows: Count
 
 
 class Rings(Statement):

@@ -97,23 +97,17 @@ def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
         DataError: Numbers that no ray has, or directions that contradict each other.
     """
     azimuth, elevation = _angles(columns)
-    count = len(azimuth)
-    origin = np.zeros((count, 3))
-    notes = []
-    if ORIGIN[0] in columns.numbers:
-        origin = np.stack([columns.numbers[name] for name in ORIGIN], axis=1)
-    else:
-        notes.append("where rays start is not said: all start at the world's origin")
-    start = columns.numbers.get(START)
-    if start is None:
-        start = np.zeros(count)
-        notes.append("when gates start is not said: rays are heard from 0 m on")
-    else:
-        columns.refuse(start < 0, START, "negative", "0 m or more")
-    end = columns.numbers.get(END, np.full(count, np.inf))
-    if END in columns.numbers:
-        columns.refuse(end < start, END, "before the gate's start", "at least the gate's start")
-    times = columns.numbers.get(TIME, np.zeros(1))
+    unsaid = {
+        ORIGIN[0]: "where rays start is not said: all start at the world's origin",
+        START: "when gates start is not said: rays are heard from 0 m on",
+    }
+    notes = [note for name, note in unsaid.items() if name not in columns.numbers]
+    usual = {name: np.zeros(len(azimuth)) for name in (*ORIGIN, START)}
+    numbers = {**usual, END: np.full(len(azimuth), np.inf), TIME: np.zeros(1), **columns.numbers}
+    origin = np.stack([numbers[name] for name in ORIGIN], axis=1)
+    start, end, times = numbers[START], numbers[END], numbers[TIME]
+    columns.refuse(start < 0, START, "negative", "0 m or more")
+    columns.refuse(end < start, END, "before the gate's start", "at least the gate's start")
     even = np.linspace(times[0], times[-1], len(times))
     if np.abs(times - even).max() > EVEN_TIMES * max(abs(times[-1] - times[0]), np.abs(times).max()):
         notes.append(f"{TIME} is not held: rays fire evenly over a frame, in the order of the file")
@@ -131,13 +125,13 @@ def _angles(columns: RayColumns) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth and elevation of every ray (N,) [rad], those in radians bit for bit where they are given."""
     found: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray]] = {}
     numbers = columns.numbers
-    if RADIANS[0] in numbers:
-        found[RADIANS] = numbers[RADIANS[0]], numbers[RADIANS[1]]
-    if DEGREES[0] in numbers:
-        found[DEGREES] = np.radians(numbers[DEGREES[0]]), np.radians(numbers[DEGREES[1]])
-    for names, (azimuth, elevation) in found.items():
-        unit = "rad" if names is RADIANS else "degrees"
-        right = math.pi / 2 if names is RADIANS else 90.0
+    for names, unit, right, in_rad in (
+        (RADIANS, "rad", math.pi / 2, np.asarray),
+        (DEGREES, "degrees", 90.0, np.radians),
+    ):
+        if names[0] not in numbers:
+            continue
+        azimuth, elevation = (in_rad(numbers[name]) for name in names)
         columns.refuse(np.abs(azimuth) > 2 * math.pi * MOST_TURNS, names[0], "too many turns", "an angle in " + unit)
         beyond = np.abs(elevation) > math.pi / 2 + COARSE_SLACK
         columns.refuse(beyond, names[1], f"no elevation in {unit}", f"{-right:g} to {right:g}")

@@ -175,28 +175,6 @@ WIDEST = 1.001 * FULL_TURN
 INFINITE = ("inf", "infinity")
 
 
-@dataclass(frozen=True)
-class _Axis:
-    """One axis of a scan: so many angles from the first to the last [rad]."""
-
-    samples: int
-    low: float
-    high: float
-
-    @property
-    def angles_rad(self) -> np.ndarray:
-        """Shape (samples,); a single one is the first."""
-        return np.linspace(self.low, self.high, self.samples)
-
-    @property
-    def middle(self) -> float:
-        return (self.low + self.high) / 2 if self.samples > 1 else self.low
-
-    @property
-    def width(self) -> float:
-        return self.high - self.low if self.samples > 1 else 0.0
-
-
 def read_sdf(path: Path) -> Rig:
     """The lidars of a file.
 
@@ -262,13 +240,11 @@ def _sensor(scope: Scope, link: ElementTree.Element, element: ElementTree.Elemen
     scan = _needed(lidar, "scan", scope)
     across = _axis(_needed(scan, "horizontal", scope), scope, notes, WIDEST)
     rows = scan.find("vertical")
-    up = _Axis(1, 0.0, 0.0) if rows is None else _axis(rows, scope, notes, math.pi)
-    if across.samples * up.samples > MOST_RAYS:
-        raise DataError(
-            f"{across.samples} x {up.samples} rays", where=scope.where(scan), allowed=f"at most {MOST_RAYS}"
-        )
+    up = np.zeros(1) if rows is None else _axis(rows, scope, notes, math.pi)
+    if len(across) * len(up) > MOST_RAYS:
+        raise DataError(f"{len(across)} x {len(up)} rays", where=scope.where(scan), allowed=f"at most {MOST_RAYS}")
     pose = scope.in_world() @ scope.placed(element, link.get("name", ""))
-    azimuth, elevation = (values.reshape(-1) for values in np.meshgrid(across.angles_rad, up.angles_rad))
+    azimuth, elevation = (values.reshape(-1) for values in np.meshgrid(across, up))
     world = angles(direction(azimuth, elevation) @ pose[:3, :3].T)
     gate = np.tile(_gate(_needed(lidar, "range", scope), scope, notes), (len(azimuth), 1))
     for tag, note in (
@@ -279,8 +255,10 @@ def _sensor(scope: Scope, link: ElementTree.Element, element: ElementTree.Elemen
             notes[note] = None
     origin = np.tile(pose[:3, 3], (len(azimuth), 1))
     # the boresight is in the middle of the scan, upright as the sensor is
-    boresight = boresight_of(boresight_frame(across.middle, up.middle) @ pose[:3, :3].T)
-    aim = Aim(*boresight, (math.cos(up.middle) * across.width, up.width))
+    middles = [float(axis[0] + axis[-1]) / 2 for axis in (across, up)]
+    widths = [float(axis[-1] - axis[0]) for axis in (across, up)]
+    boresight = boresight_of(boresight_frame(*middles) @ pose[:3, :3].T)
+    aim = Aim(*boresight, (math.cos(middles[1]) * widths[0], widths[1]))
     return RigSensor(element.get("name", ""), origin, *world, gate, aim=aim)
 
 
@@ -296,7 +274,8 @@ def _number(element: ElementTree.Element, tag: str, scope: Scope) -> float:
     return numbers_of(child.text, 1, scope.where(child), tag)[0]
 
 
-def _axis(element: ElementTree.Element, scope: Scope, notes: dict[str, None], widest: float) -> _Axis:
+def _axis(element: ElementTree.Element, scope: Scope, notes: dict[str, None], widest: float) -> np.ndarray:
+    """The angles of one axis of a scan, shape (samples,) [rad]; a single one is the first."""
     samples = _number(element, "samples", scope)
     if not (1 <= samples <= MOST_RAYS and samples % 1 == 0):
         raise DataError(f"samples is {samples:g}", where=scope.where(element), allowed=f"1 to {MOST_RAYS}")
@@ -312,7 +291,7 @@ def _axis(element: ElementTree.Element, scope: Scope, notes: dict[str, None], wi
         notes["resolution is not held: Gazebo interpolates between the rays that are fired, `samples` of them"] = None
     if samples == 1 and low < high:
         notes["a scan of one sample looks along its min_angle, as in Gazebo"] = None
-    return _Axis(int(samples), low, high)
+    return np.linspace(low, high, int(samples))
 
 
 def _gate(element: ElementTree.Element, scope: Scope, notes: dict[str, None]) -> np.ndarray:

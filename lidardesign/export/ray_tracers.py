@@ -1,0 +1,400 @@
+"""Simulators that trace every ray by itself: HELIOS++, Mitsuba 3 and Robotec GPU Lidar.
+
+Scanner, platform and survey files for HELIOS++: one scanner per sensor, one channel per ray, one pulse of each.
+
+HELIOS++ fires along the y axis of a scanner and turns it by the channel's rotations about fixed axes: about x by the
+elevation, then about z by the azimuth less a quarter turn. Channels start at their own offset from the platform and
+have their own range limits, so any list of rays with any gates is held. A leg ends when the head has turned far enough:
+it turns by one degree in front of the only pulse, from -1 to 0, and the leg ends there.
+
+Scenes for Mitsuba 3 with mitransient: per sensor a film of gated histograms, its rays, and the light beside it.
+
+One radiancemeter per ray, all of them in a batch, one pixel each: directions are held exactly, whatever the layout. The
+light is a point at the sensor, so light straight there and back has the optical path length of twice the range, and a
+film that listens from twice the gate's start in bins of c times their duration is the gate. Scenes hold no shapes.
+
+Ray patterns for Robotec GPU Lidar and its Gazebo plugin: a pattern file per sensor, and the model that uses them.
+
+A pattern is one row-major 3 x 4 float32 matrix per ray, its pose in the sensor's frame (x forward, y left, z up); the
+ray looks along the third axis of its pose. The plugin has one range for all rays of a sensor and fires them at once;
+the library's own calls take a range and a time per ray, which is what the `.range2f` files (pairs of float32, metres)
+and the `.time1f` files (float32, milliseconds) are.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.sensor import DesignSpec
+from lidardesign.errors import DataError
+from lidardesign.estimates import Estimate
+from lidardesign.export.common.names import (
+    child,
+    document,
+    element,
+    identifier,
+    numbers,
+    read_xml,
+    renamed_note,
+    write_folder,
+)
+from lidardesign.export.common.poses import (
+    Mount,
+    Part,
+    Place,
+    design_losses,
+    fire_times_s,
+    gate_losses,
+    mounts,
+    places,
+    quaternion,
+    rays_of_parts,
+    rays_rounding,
+    require_rays,
+)
+from lidardesign.geometry.frames import rotations_of_quaternions
+from lidardesign.geometry.rays import Rays
+from lidardesign.numerics import unit_vectors
+from lidardesign.scene import SPEED_OF_LIGHT_M_S
+from lidardesign.space import angles, direction
+
+SCANNERS, PLATFORMS, SURVEY, SCENE = "scanners.xml", "platforms.xml", ".survey.xml", "scene.xml#scene"
+# HELIOS++ drops echoes whose rise begins before the gate does: a short pulse, in fine bins, loses little.
+PULSE_NS, BIN_NS = 0.1, 0.01
+# Peaks are told apart over a quarter of a pulse.
+WINDOW_NS = PULSE_NS / 4
+NS_PER_S = 1e9
+MM_PER_M = 1000
+
+
+def write_helios(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+    """Write the folder; returns notes of what the format cannot hold.
+
+    Raises:
+        DataError: The design has no rays, or the folder cannot be written.
+    """
+    require_rays(design, rays, "a HELIOS++ scanner")
+    pulse_hz = max(round(rate_hz), 1)
+    mounted = mounts(design, rays)
+    scanners = element("document")
+    surveys = {}
+    for mount in mounted:
+        _add_scanner(scanners, mount, rays.subset(mount.ray), pulse_hz)
+        # One leg of one pulse, at the place where the sensor's first ray starts
+        root = element("document")
+        survey = child(
+            root, "survey", name=f"{design.name}: {mount.sensor.name}", scene=SCENE,
+            platform=f"{PLATFORMS}#fixed", scanner=f"{SCANNERS}#{mount.name}",
+        )  # fmt: skip
+        child(survey, "FWFSettings", beamSampleQuality=1, binSize_ns=BIN_NS, winSize_ns=WINDOW_NS)
+        leg = child(survey, "leg")
+        x, y, z = rays.origin_m[mount.ray[0]].tolist()
+        child(leg, "platformSettings", x=x, y=y, z=z, onGround=False)
+        child(
+            leg, "scannerSettings", active=True, pulseFreq_hz=pulse_hz, scanAngle_deg=1, scanFreq_hz=0,
+            verticalAngleMin_deg=-1, verticalAngleMax_deg=1, headRotatePerSec_deg=pulse_hz,
+            headRotateStart_deg=-1, headRotateStop_deg=-0.5,
+        )  # fmt: skip
+        surveys[f"{mount.name}{SURVEY}"] = document(root)
+    # a platform that stands still, its scanner at its own place
+    platforms = element("document")
+    child(child(platforms, "platform", id="fixed", name="fixed", type="static"), "scannerMount", x=0, y=0, z=0)
+    lost_m = PULSE_NS / NS_PER_S * SPEED_OF_LIGHT_M_S
+    notes = [
+        *write_folder(path, {SCANNERS: document(scanners), PLATFORMS: document(platforms), **surveys}),
+        f"the surveys name the scene {SCENE}: put yours beside them, and give the folder to helios as --assets",
+        f"HELIOS++ drops returns up to {MM_PER_M * lost_m:.0f} mm behind a gate's start: the rise of a {PULSE_NS} ns "
+        "pulse must begin inside",
+        "all rays of a frame fire at once: their times within the frame are not held",
+    ]
+    if pulse_hz != rate_hz:
+        notes.append(f"{rate_hz:g} frames per second became {pulse_hz}: HELIOS++ knows whole numbers only")
+    return [*notes, *design_losses(design, mounted)]
+
+
+def _add_scanner(root: Element, mount: Mount, rays: Rays, pulse_hz: int) -> None:
+    """One sensor, its rays as channels; their places are offsets from the first one's."""
+    scanner = child(
+        root, "scanner", id=mount.name, name=mount.sensor.name, optics="rotating",
+        pulseFreqs_Hz=pulse_hz, pulseLength_ns=PULSE_NS, scanAngleMax_deg=1, scanAngleEffectiveMax_deg=1,
+        scanFreqMin_Hz=0, scanFreqMax_Hz=0, maxNOR=1, headRotatePerSecMax_deg=pulse_hz,
+    )  # fmt: skip
+    child(scanner, "FWFSettings", beamSampleQuality=1, binSize_ns=BIN_NS, winSize_ns=WINDOW_NS)
+    child(scanner, "headRotateAxis", x=0, y=0, z=1)
+    channels = child(scanner, "channels")
+    azimuth_deg, elevation_deg = (np.degrees(values) for values in angles(rays.direction))
+    for number, (x, y, z) in enumerate((rays.origin_m - rays.origin_m[0]).tolist()):
+        start, end = rays.gate_m[number].tolist()
+        origin = child(
+            child(channels, "channel", id=number, rangeMin_m=start, rangeMax_m=end), "beamOrigin", x=x, y=y, z=z
+        )
+        child(origin, "rot", axis="x", angle_deg=float(elevation_deg[number]))
+        child(origin, "rot", axis="z", angle_deg=float(azimuth_deg[number] - 90.0))
+
+
+def read_helios(path: Path, design: DesignSpec, rays: Rays) -> Rays:
+    """The rays of a folder that `write_helios` made of a design and its rays, with their sensors and times.
+
+    Raises:
+        DataError: The folder cannot be read, or holds something else.
+    """
+    path = Path(path)
+    scanners = {scanner.get("id"): scanner for scanner in read_xml(path / SCANNERS, "document")}
+    parts = [
+        _rays_of_scanner(mount.ray, scanners.get(mount.name), path / f"{mount.name}{SURVEY}")
+        for mount in mounts(design, rays)
+    ]
+    return rays_of_parts(rays, parts, str(path))
+
+
+def _rays_of_scanner(ray: np.ndarray, scanner: Element | None, survey: Path) -> Part:
+    settings = read_xml(survey, "document").find("survey/leg/platformSettings")
+    if scanner is None or settings is None:
+        raise DataError("holds no survey of this design", where=str(survey), hint="export it again")
+    channels = scanner.findall("channels/channel")
+    beams = scanner.findall("channels/channel/beamOrigin")
+    try:
+        place = np.array([float(settings.attrib[axis]) for axis in "xyz"])
+        gate = np.array([[float(one.attrib[name]) for name in ("rangeMin_m", "rangeMax_m")] for one in channels])
+        offset = np.array([[float(beam.attrib[axis]) for axis in "xyz"] for beam in beams])
+        turns = np.array([[float(rot.attrib["angle_deg"]) for rot in beam] for beam in beams])
+        elevation, yaw = np.radians(turns.reshape(-1, 2)).T
+        return ray, place + offset, direction(yaw + math.pi / 2, elevation), gate.reshape(-1, 2)
+    except (KeyError, ValueError) as error:
+        raise DataError(f"holds no survey of this design: {error}", where=str(survey)) from error
+
+
+def helios_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """What the written numbers lose."""
+    return rays_rounding(rays, read_helios(path, design, rays), path, times=False)
+
+
+SCENE_SUFFIX = ".xml"
+SAMPLES = 64
+# From the light to a surface and back to the sensor.
+DEPTH = 2
+
+
+def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+    """Write the folder; returns notes of what the format cannot hold.
+
+    Raises:
+        DataError: The design has no rays, or the folder cannot be written.
+    """
+    require_rays(design, rays, "a film")
+    mounted = mounts(design, rays)
+    found = places(mounted, rays)
+    notes = write_folder(path, {f"{one.name}{SCENE_SUFFIX}": document(_scene(one, rays)) for one in found})
+    notes += [
+        "scenes hold no shapes: include one of them in yours, or yours in it; each sensor is a scene of its own",
+        f"the light is one flash for all rays: only light straight there and back (max_depth {DEPTH}) is the ray's own",
+        f"gates end on whole bins of {MM_PER_M * Bandwidth().bin_m:.1f} mm; times within the frame are not held",
+    ]
+    # a film has one gate
+    wider = np.concatenate([np.abs(rays.gate_m[one.ray] - _gate_m(rays, one)).max(axis=1) for one in found])
+    if wider.any():
+        notes.append(
+            f"{np.count_nonzero(wider)} of {len(rays)} rays have gates of their own: their film has the narrowest gate "
+            f"that holds all of its rays, up to {wider.max():.3g} m wider"
+        )
+    if len(found) > len(mounted):
+        notes.append(f"rays of {len(mounted)} sensors start at {len(found)} places: each is a scene of its own")
+    return [*notes, *design_losses(design, mounted)]
+
+
+def _gate_m(rays: Rays, place: Place) -> tuple[float, float]:
+    """The narrowest gate that holds those of all rays of a place: start and end."""
+    gate = rays.gate_m[place.ray]
+    return float(gate[:, 0].min()), float(gate[:, 1].max())
+
+
+def _scene(place: Place, rays: Rays) -> Element:
+    """Integrator, rays with their film, and light."""
+    root = element("scene", {"version": "3.0.0"})
+    child(child(root, "integrator", type="transient_path"), "integer", name="max_depth", value=DEPTH)
+    batch = child(root, "sensor", type="batch", id=place.name)
+    _add_film(batch, place, rays)
+    child(child(batch, "sampler", type="independent"), "integer", name="sample_count", value=SAMPLES)
+    for number, ray in enumerate(place.ray.tolist()):
+        meter = child(batch, "sensor", type="radiancemeter", id=f"{place.name}_ray_{number}")
+        _add_vector(meter, "point", "origin", rays.origin_m[ray])
+        _add_vector(meter, "vector", "direction", rays.direction[ray])
+        film = child(meter, "film", type="hdrfilm")
+        for side in ("width", "height"):
+            child(film, "integer", name=side, value=1)
+        child(film, "rfilter", type="box")
+    light = child(root, "emitter", type="point", id=f"{place.name}_light")
+    _add_vector(light, "point", "position", place.origin_m)
+    child(light, "spectrum", name="intensity", value=1.0)
+    return root
+
+
+def _add_film(batch: Element, place: Place, rays: Rays) -> None:
+    """One pixel per ray, and the gate that they share as optical path lengths."""
+    readout = Bandwidth()
+    start, end = _gate_m(rays, place)
+    film = child(batch, "film", type="transient_hdr_film")
+    for name, value in (
+        ("width", len(place.ray)), ("height", 1), ("temporal_bins", int(readout.bins(end - start))),
+    ):  # fmt: skip
+        child(film, "integer", name=name, value=value)
+    child(film, "float", name="start_opl", value=2 * start)
+    child(film, "float", name="bin_width_opl", value=2 * readout.bin_m)
+    child(film, "rfilter", type="box")
+
+
+def _add_vector(parent: Element, tag: str, name: str, values: np.ndarray) -> None:
+    x, y, z = values.tolist()
+    child(parent, tag, name=name, x=x, y=y, z=z)
+
+
+def read_mitsuba(path: Path, design: DesignSpec, rays: Rays) -> Rays:
+    """The rays of a folder that `write_mitsuba` made of a design and its rays, with their sensors and times.
+
+    Raises:
+        DataError: The folder cannot be read, or holds something else.
+    """
+    found = places(mounts(design, rays), rays)
+    return rays_of_parts(
+        rays, [_rays_of_scene(one, Path(path) / f"{one.name}{SCENE_SUFFIX}") for one in found], str(path)
+    )
+
+
+def _rays_of_scene(place: Place, path: Path) -> Part:
+    root = read_xml(path, "scene")
+    film = {one.get("name"): float(one.get("value", "nan")) for one in root.findall("sensor/film/*[@value]")}
+    try:
+        origin, looking = (
+            np.array([[float(one.attrib[axis]) for axis in "xyz"] for one in root.findall(f"sensor/sensor/{tag}")])
+            for tag in ("point", "vector")
+        )
+        start, bins, width = (film[name] for name in ("start_opl", "temporal_bins", "bin_width_opl"))
+        gate = np.tile([start / 2, (start + bins * width) / 2], (len(origin), 1))
+        return place.ray, origin.reshape(-1, 3), unit_vectors(looking.reshape(-1, 3)), gate
+    except (KeyError, ValueError) as error:
+        raise DataError(f"holds no sensor of this design: {error}", where=str(path), hint="export it again") from error
+
+
+def mitsuba_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """What the written numbers lose, gates on whole bins that rays share included."""
+    return rays_rounding(rays, read_mitsuba(path, design, rays), path, times=False)
+
+
+MODEL, PATTERN, RANGES, TIMES = "model.sdf", ".mat3x4f", ".range2f", ".time1f"
+MS_PER_S = 1000.0
+POSE_NUMBERS = 6
+
+
+def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+    """Write the folder; returns notes of what the format cannot hold.
+
+    Raises:
+        DataError: The design has no rays, or the folder cannot be written.
+    """
+    require_rays(design, rays, "a ray pattern")
+    path = Path(path)
+    mounted = mounts(design, rays)
+    root = element("sdf", {"version": "1.9"})
+    model = child(root, "model", name=identifier(design.name))
+    child(model, "static", text=True)
+    link = child(model, "link", name="lidar")
+    files = {}
+    times_ms = MS_PER_S * fire_times_s(rays, rate_hz)
+    for mount in mounted:
+        files[f"{mount.name}{TIMES}"] = times_ms[mount.ray].astype("<f4").tobytes()
+        files[f"{mount.name}{PATTERN}"] = _matrices(mount, rays.subset(mount.ray)).astype("<f4").tobytes()
+        files[f"{mount.name}{RANGES}"] = rays.gate_m[mount.ray].astype("<f4").tobytes()
+        # A sensor with the plugin that fires its pattern
+        sensor = child(link, "sensor", name=mount.name, type="custom")
+        child(sensor, "pose", text=numbers([*rays.origin_m[mount.ray[0]], *mount.roll_pitch_yaw_rad]))
+        plugin = child(sensor, "plugin", filename="RGLServerPluginInstance", name="rgl::RGLServerPluginInstance")
+        start, end = mount.gate_m
+        limits = child(plugin, "range")
+        child(limits, "min", text=start)
+        child(limits, "max", text=end)
+        settings = {
+            "update_rate": float(rate_hz),
+            "update_on_paused_sim": False,
+            "topic": f"rgl/{mount.name}",
+            "frame": mount.name,
+            "pattern_preset_path": path.resolve() / f"{mount.name}{PATTERN}",
+        }
+        for tag, value in settings.items():
+            child(plugin, tag, text=value)
+    notes = [
+        *write_folder(path, {MODEL: document(root), **files}),
+        f"{MODEL} names the patterns by their absolute paths in {path.resolve()}: export again where they move",
+        f"the plugin fires all rays of a frame at once; the {TIMES} files hold when each fires, for "
+        "rgl_node_rays_set_time_offsets of the library",
+    ]
+    for lost in gate_losses(mounted):
+        notes += [lost, f"the {RANGES} files hold each ray's own gate, for rgl_node_rays_set_range of the library"]
+    names = [design.name, *(mount.sensor.name for mount in mounted)]
+    written = [identifier(design.name), *(mount.name for mount in mounted)]
+    return [*notes, *renamed_note(names, written), *design_losses(design, mounted)]
+
+
+def _matrices(mount: Mount, rays: Rays) -> np.ndarray:
+    """Poses of rays in their sensor's frame, which stands where the first of them starts, shape (K, 3, 4)."""
+    looking = rays.direction @ mount.sensor.frame.T
+    azimuth, _ = angles(looking)
+    across = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(rays))], axis=1)
+    offset = (rays.origin_m - rays.origin_m[0]) @ mount.sensor.frame.T
+    return np.stack([np.cross(across, looking), across, looking, offset], axis=2)
+
+
+def read_rgl(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
+    """The rays of a folder that `write_rgl` made of a design and its rays, with their sensors, and the frame rate [Hz].
+
+    Raises:
+        DataError: The folder cannot be read, or holds something else.
+    """
+    path = Path(path)
+    found = {sensor.get("name"): sensor for sensor in read_xml(path / MODEL, "sdf").findall("model/link/sensor")}
+    times_s, rates_hz, parts = np.zeros(len(rays)), [], []
+    for mount in mounts(design, rays):
+        pose, rate_hz = _pose_and_rate(found.get(mount.name), mount, path)
+        # The rays of one sensor: its pose, and its pattern in the frame of that
+        matrices = _float32_records(path / f"{mount.name}{PATTERN}", (3, 4))
+        gate = _float32_records(path / f"{mount.name}{RANGES}", (2,))
+        turn = rotations_of_quaternions(np.array(quaternion(*pose[3:])))
+        looking = unit_vectors(matrices[:, :, 2] @ turn.T)
+        parts.append((mount.ray, pose[:3] + matrices[:, :, 3] @ turn.T, looking, gate))
+        rates_hz.append(rate_hz)
+        times = _float32_records(path / f"{mount.name}{TIMES}", ()) / MS_PER_S
+        if len(times) != len(mount.ray):
+            raise DataError(f"holds {len(times)} times of {len(mount.ray)} rays", where=str(path / mount.name))
+        times_s[mount.ray] = times
+    held = rays_of_parts(rays, parts, str(path))
+    return Rays(held.origin_m, held.direction, held.gate_m, held.sensor, times_s), max(rates_hz)
+
+
+def _pose_and_rate(sensor: Element | None, mount: Mount, path: Path) -> tuple[list[float], float]:
+    try:
+        pose = [float(number) for number in ("" if sensor is None else sensor.findtext("pose", "")).split()]
+        rate_hz = float("" if sensor is None else sensor.findtext("plugin/update_rate", ""))
+    except ValueError as error:
+        raise DataError(f"holds no {mount.name}: {error}", where=str(path / MODEL), hint="export it again") from error
+    if len(pose) != POSE_NUMBERS:
+        raise DataError(f"holds no pose of {mount.name}", where=str(path / MODEL), hint="export it again")
+    return pose, rate_hz
+
+
+def _float32_records(path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    """The float32 records of a file as float64, shape (K, *shape)."""
+    try:
+        return np.fromfile(path, dtype="<f4").astype(np.float64).reshape(-1, *shape)
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot be read as a pattern: {error}", where=str(path), hint="export it again") from error
+
+
+def rgl_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """What the written numbers lose: patterns are float32."""
+    found, rate_hz = read_rgl(path, design, rays)
+    return rays_rounding(replace(rays, time_s=fire_times_s(rays, rate_hz)), found, path)
