@@ -455,5 +455,6 @@ def _check_rays(
     }
     if len({*counts.values()} - {None}) > 1:
         found = ", ".join(f"{name} {count}" for name, count in counts.items() if count is not None)
-        node = keys.get("rays", keys["sensors"])
-        raise node.error(f"contradicts another count of rays: {found}", hint="remove all but one")
+        raise keys.get("rays", keys["sensors"]).error(
+            f"contradicts another count of rays: {found}", hint="remove all but one"
+        )

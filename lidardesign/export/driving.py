@@ -103,7 +103,9 @@ def carla_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Esti
 
 def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
     grid = grid_of(mount)
-    field_deg = max(math.degrees(grid.azimuth_step_rad) * grid.columns, NARROWEST_DEG)
+    # from one azimuth to the next; 0 for one column
+    step_rad = (grid.azimuth_rad[1] - grid.azimuth_rad[0]) / max(grid.columns - 1, 1)
+    field_deg = max(math.degrees(step_rad) * grid.columns, NARROWEST_DEG)
     low_deg, high_deg = (math.degrees(value) for value in grid.elevation_rad)
     attributes = {
         "channels": str(grid.rows),
@@ -192,8 +194,11 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
     times_us = np.rint(fire_times_s(rays, rate_hz) * MICROSECONDS_PER_S)
     cycle_ns = round(NANOSECONDS_PER_S / rate_hz)
     if times_us.max() > MOST_US or cycle_ns < 1:
-        allowed = f"frames of a nanosecond to an hour: 0.0003 to {NANOSECONDS_PER_S:g}"
-        raise ConfigError(f"{rate_hz:g}", where="--rate-hz", allowed=allowed)
+        raise ConfigError(
+            f"{rate_hz:g}",
+            where="--rate-hz",
+            allowed=f"frames of a nanosecond to an hour: 0.0003 to {NANOSECONDS_PER_S:g}",
+        )
     mounted = mounts(design, rays)
     found = places(mounted, rays)
     seconds, nanoseconds = divmod(cycle_ns, NANOSECONDS_PER_S)

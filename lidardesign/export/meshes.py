@@ -22,7 +22,7 @@ from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
-from lidardesign.export.common.names import identifier, write_folder
+from lidardesign.export.common.names import identifier, numbers, write_folder
 from lidardesign.export.common.poses import angles_between, constraint_losses, rays_rounding, require_sensors
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import unit_vectors
@@ -194,13 +194,9 @@ def _solid(index: int, sensor: Sensor) -> str:
     facets = []
     for triangle in corners[FACETS]:
         normal = unit_vectors(np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0]))
-        vertices = "".join(f"   vertex {_numbers(corner)}\n" for corner in triangle)
-        facets.append(f" facet normal {_numbers(normal)}\n  outer loop\n{vertices}  endloop\n endfacet\n")
+        vertices = "".join(f"   vertex {numbers(corner)}\n" for corner in triangle)
+        facets.append(f" facet normal {numbers(normal)}\n  outer loop\n{vertices}  endloop\n endfacet\n")
     return f"solid {name}\n{''.join(facets)}endsolid {name}\n"
-
-
-def _numbers(values: np.ndarray) -> str:
-    return " ".join(map(repr, values.tolist()))
 
 
 def read_stl(path: Path) -> tuple[np.ndarray, np.ndarray]:

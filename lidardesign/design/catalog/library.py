@@ -66,15 +66,20 @@ class Library:
         """
         stem, colon, mode = name.partition(":")
         if stem not in self.files:
-            hint = (
-                suggest(stem, self.files) or "lidardesign catalog list shows all, and a path names a file of your own"
+            raise ConfigError(
+                f"there is no part {stem!r}",
+                where="catalog",
+                allowed=", ".join(self.names),
+                hint=suggest(stem, self.files)
+                or "lidardesign catalog list shows all, and a path names a file of your own",
             )
-            raise ConfigError(f"there is no part {stem!r}", where="catalog", allowed=", ".join(self.names), hint=hint)
         file = self.files[stem]
         if colon and mode not in file.modes:
-            allowed = ", ".join(file.modes) or f"{stem} alone: it has one mode"
             raise ConfigError(
-                f"{stem} has no mode {mode!r}", where="catalog", allowed=allowed, hint=suggest(mode, file.modes)
+                f"{stem} has no mode {mode!r}",
+                where="catalog",
+                allowed=", ".join(file.modes) or f"{stem} alone: it has one mode",
+                hint=suggest(mode, file.modes),
             )
         return Part.of_file(stem, file, mode or None, self.origins[stem])
 

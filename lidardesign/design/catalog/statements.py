@@ -21,7 +21,6 @@ Count = Annotated[int, Field(ge=1, le=MOST_RAYS)]
 
 
 def _check_text(text: str) -> str:
-    """Text that may be shown: not blank, and without characters that steer a terminal."""
     if not is_name(text):
         raise ValueError("is blank, or has characters that steer a terminal")
     return text
@@ -298,11 +297,10 @@ class PartFile(Figures):
     @model_validator(mode="after")
     def _complete(self) -> PartFile:
         for mode in self.modes or [None]:
-            figures = self.figures(mode)
-            of_mode = "" if mode is None else f" of mode {mode}"
-            for name in REQUIRED:
-                if name not in figures:
-                    raise ValueError(f"{name}{of_mode} is missing")
+            figures, of_mode = self.figures(mode), "" if mode is None else f" of mode {mode}"
+            missing = [name for name in REQUIRED if name not in figures]
+            if missing:
+                raise ValueError(f"{missing[0]}{of_mode} is missing")
             for name, statements in figures.items():
                 for statement in statements:
                     if statement.source not in self.sources:

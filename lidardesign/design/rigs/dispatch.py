@@ -116,8 +116,11 @@ def _check_text(path: Path, texts: list[tuple[int, str]]) -> None:
         return
     where = f"{path}:{texts[0][0]}" if texts else str(path)
     if kind != CSV:
-        found = "is no NPZ archive, but text" if kind == NPZ else "is no XML: it does not begin with <"
-        raise DataError(found, where=where, allowed=ALLOWED[kind])
+        raise DataError(
+            "is no NPZ archive, but text" if kind == NPZ else "is no XML: it does not begin with <",
+            where=where,
+            allowed=ALLOWED[kind],
+        )
     if texts and texts[0][1].strip().startswith("#"):
         raise DataError("begins with a comment", where=where, allowed=ALLOWED[kind], hint="leave out lines with #")
     separator = next((mark for mark in SEPARATORS if mark in plain), None)

@@ -77,8 +77,11 @@ def check_names(names: tuple[str, ...], where: str) -> None:
     unknown = [name for name in names if name not in COLUMNS]
     twice = sorted({name for name in names if names.count(name) > 1})
     if unknown or twice:
-        found = f"unknown columns {', '.join(map(repr, unknown))}" if unknown else f"{', '.join(twice)} given twice"
-        raise DataError(found, where=where, allowed=", ".join(COLUMNS))
+        raise DataError(
+            f"unknown columns {', '.join(map(repr, unknown))}" if unknown else f"{', '.join(twice)} given twice",
+            where=where,
+            allowed=", ".join(COLUMNS),
+        )
     for group in (ORIGIN, *LOOKS):
         given = [name for name in group if name in names]
         if given and len(given) < len(group):
@@ -228,8 +231,11 @@ def read_ray_npz(path: Path) -> Rig:
     if names is None:
         sensor_names = tuple(f"sensor_{int(index) + 1}" for index in used)
     elif names.ndim != 1 or names.dtype.kind != "U" or used[-1] >= len(names):
-        allowed = f"text, at least {int(used[-1]) + 1} names"
-        raise DataError(f"{NAMES} has shape {names.shape} and type {names.dtype}", where=str(path), allowed=allowed)
+        raise DataError(
+            f"{NAMES} has shape {names.shape} and type {names.dtype}",
+            where=str(path),
+            allowed=f"text, at least {int(used[-1]) + 1} names",
+        )
     else:
         sensor_names = tuple(str(names[int(index)]) for index in used)
     return rig_of_columns(RayColumns(numbers, sensor.reshape(-1), sensor_names, locate), "rays NPZ")
@@ -243,9 +249,6 @@ SENSOR_COLUMNS = (
 QUERY_COLUMN = "x_query"
 YAML_BEGINNINGS = ("{", "[", "- ", "#", "%")
 NOT_NEGATIVE = ("time_mean", "azimuth_sigma", "elevation_sigma", "time_sigma", "weight")
-# An elevation may exceed a right angle by its rounding in a file of few digits.
-ELEVATION_ROUNDING = COARSE_SLACK
-COVARIANCE_ROUNDING = COARSE_SLACK
 WEIGHT_SUM_TOLERANCE = SLACK
 
 
@@ -292,8 +295,11 @@ def _rows(path: Path) -> tuple[list[tuple[dict[str, float], str]], list[str]]:
         repeated = sorted({name for name in names if names.count(name) > 1})
         if missing or unknown or repeated:
             wrong = {"missing columns": missing, "unknown or repeated": [*unknown, *repeated]}
-            found = "; ".join(f"{what}: {', '.join(columns)}" for what, columns in wrong.items() if columns)
-            raise DataError(found, where=f"{path}:{lines[0][0]}", allowed=", ".join(SENSOR_COLUMNS))
+            raise DataError(
+                "; ".join(f"{what}: {', '.join(columns)}" for what, columns in wrong.items() if columns),
+                where=f"{path}:{lines[0][0]}",
+                allowed=", ".join(SENSOR_COLUMNS),
+            )
         lines = lines[1:]
     if not lines:
         raise DataError("has a header but no sensor", where=str(path))
@@ -318,20 +324,24 @@ def _numbers(where: str, cells: list[str], names: tuple[str, ...]) -> dict[str, 
     for column, (name, text) in enumerate(zip(names, cells, strict=True), 1):
         low, value = 0.0 if name in NOT_NEGATIVE else -math.inf, number_of(text)
         if value is None or not math.isfinite(value) or value < low:
-            allowed = "a finite number" if math.isinf(low) else "a finite number of at least 0"
-            raise DataError(f"{name} is {text.strip()!r}", where=f"{where}:{column}", allowed=allowed)
+            raise DataError(
+                f"{name} is {text.strip()!r}",
+                where=f"{where}:{column}",
+                allowed="a finite number" if math.isinf(low) else "a finite number of at least 0",
+            )
         row[name] = value
     return row
 
 
 def _sensor(row: dict[str, float], index: int, where: str) -> Sensor:
     elevation = row["elevation_mean"]
-    if abs(elevation) > math.pi / 2 + ELEVATION_ROUNDING:
+    # it may exceed a right angle by its rounding in a file of few digits
+    if abs(elevation) > math.pi / 2 + COARSE_SLACK:
         raise DataError(f"elevation_mean is {elevation!r}", where=where, allowed="radians from -pi/2 to pi/2")
     elevation = min(max(elevation, -math.pi / 2), math.pi / 2)
     xx, xy, xz, yy, yz, zz = (row[name] for name in SENSOR_COLUMNS[6:12])
     covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    if np.linalg.eigvalsh(covariance).min() < -COVARIANCE_ROUNDING * np.abs(covariance).max():
+    if np.linalg.eigvalsh(covariance).min() < -COARSE_SLACK * np.abs(covariance).max():
         raise DataError("the origin covariance has a negative eigenvalue", where=where)
     return Sensor(
         name=f"sensor_{index + 1}",

@@ -105,8 +105,11 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
     """
     total = sum(len(one.azimuth_rad) for one in rig.sensors)
     if not (1 <= total <= MOST_RAYS and len(rig.sensors) <= MOST_SENSORS):
-        found = f"describes {total} rays of {len(rig.sensors)} sensors"
-        raise DataError(found, where=str(path), allowed=f"1 to {MOST_RAYS} rays, at most {MOST_SENSORS} sensors")
+        raise DataError(
+            f"describes {total} rays of {len(rig.sensors)} sensors",
+            where=str(path),
+            allowed=f"1 to {MOST_RAYS} rays, at most {MOST_SENSORS} sensors",
+        )
     notes = [*rig.notes]
     unknown = sum(int(np.isinf(one.gate_m[:, 1]).sum()) for one in rig.sensors)
     if unknown and reach_m is None:
@@ -156,8 +159,11 @@ def _check_numbers(one: RigSensor, path: Path) -> None:
     for name, values, low in (("place", one.origin_m, -FARTHEST_M), ("gate", one.gate_m, 0.0)):
         wrong = ~((values >= low) & (values <= FARTHEST_M))
         if wrong.any():
-            found, allowed = f"a {name} of {one.name!r} is {values[wrong].flat[0]:g} m", f"{low:g} to {FARTHEST_M:g} m"
-            raise DataError(found, where=str(path), allowed=allowed)
+            raise DataError(
+                f"a {name} of {one.name!r} is {values[wrong].flat[0]:g} m",
+                where=str(path),
+                allowed=f"{low:g} to {FARTHEST_M:g} m",
+            )
     reversed_gates = one.gate_m[:, 1] < one.gate_m[:, 0]
     if reversed_gates.any():
         start, end = one.gate_m[reversed_gates][0]

@@ -103,8 +103,11 @@ class Scope:
                 raise DataError(f"the pose of {name!r} counts from itself", where=self.where(asking))
             return known
         if len(self.waiting) >= LONGEST_CHAIN:
-            message = f"the pose of {self.waiting[0]!r} counts from too many others, one after the other"
-            raise DataError(message, where=self.where(asking), allowed=f"at most {LONGEST_CHAIN}")
+            raise DataError(
+                f"the pose of {self.waiting[0]!r} counts from too many others, one after the other",
+                where=self.where(asking),
+                allowed=f"at most {LONGEST_CHAIN}",
+            )
         self.found[name] = None
         self.waiting.append(name)
         outer, _, inner = name.partition(SEPARATOR)
@@ -198,13 +201,19 @@ def read_sdf(path: Path) -> Rig:
         longer.append("::".join((scope.element.get("name", ""), link.get("name", ""), sensor.name)))
         rays += len(sensor.azimuth_rad)
         if rays > MOST_RAYS or len(sensors) > MOST_SENSORS:
-            allowed = f"at most {MOST_RAYS} rays of {MOST_SENSORS} sensors"
-            raise DataError("has more rays or sensors than a design", where=scope.where(element), allowed=allowed)
+            raise DataError(
+                "has more rays or sensors than a design",
+                where=scope.where(element),
+                allowed=f"at most {MOST_RAYS} rays of {MOST_SENSORS} sensors",
+            )
     if root.find(".//include") is not None:
         notes["models that the file includes are not read; copy their lidars into it"] = None
     if not sensors:
-        found = "has no lidar" + (": models that it includes are not read" if notes else "")
-        raise DataError(found, where=str(path), allowed=f"<sensor> of type {', '.join(TYPES)}")
+        raise DataError(
+            "has no lidar" + (": models that it includes are not read" if notes else ""),
+            where=str(path),
+            allowed=f"<sensor> of type {', '.join(TYPES)}",
+        )
     often = Counter(sensor.name for sensor in sensors)
     named = [
         replace(sensor, name=full) if often[sensor.name] > 1 else sensor
@@ -305,6 +314,9 @@ def _gate(element: ElementTree.Element, scope: Scope, notes: dict[str, None]) ->
     if element.find("min") is None:
         notes["when gates start is not said: rays are heard from 0 m on"] = None
     if not 0 <= bounds["min"] <= bounds["max"]:
-        found = f"range from {bounds['min']:g} to {bounds['max']:g} m"
-        raise DataError(found, where=scope.where(element), allowed="0 <= min <= max")
+        raise DataError(
+            f"range from {bounds['min']:g} to {bounds['max']:g} m",
+            where=scope.where(element),
+            allowed="0 <= min <= max",
+        )
     return np.array([bounds["min"], bounds["max"]])

@@ -52,7 +52,10 @@ LEAST_REACH_RAD = 0.005
 SEEN_SHARE = 0.99
 # Of so many things in view the nearest says how far from them a ray looks.
 NEAR_POINTS = 400
-GATE_BOUNDS = ("start_low", "start_high", "end_low", "end_high", "width_low", "width_high")
+# What bounds fix of a component that is a part.
+SHAPE_BOUNDS = (
+    "spread_low", "spread_high", "start_low", "start_high", "end_low", "end_high", "width_low", "width_high",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,28 +125,24 @@ def shapes_of(part: Part, space: DesignSpace) -> list[PartShape]:
 
 def shaped_bounds(bounds: Bounds, shapes: Sequence[PartShape | None], axes: Axes) -> Bounds:
     """Bounds whose components have the shapes of parts and nothing else; None leaves one as it was."""
-    spread = [np.array(bounds.spread_low, dtype=np.float64), np.array(bounds.spread_high, dtype=np.float64)]
-    gates = {name: np.array(getattr(bounds, name), dtype=np.float64) for name in GATE_BOUNDS}
+    columns = {name: np.array(getattr(bounds, name), dtype=np.float64) for name in SHAPE_BOUNDS}
     for row, shape in enumerate(shapes):
-        if shape is None:
-            continue
-        for side in spread:
-            side[row] = shape.spread_rad(bounds.interval, axes)
-        start, end = shape.gate_m
-        for name, value in zip(GATE_BOUNDS, (start, start, end, end, end - start, end - start), strict=True):
-            gates[name][row] = value
-    return replace(bounds, spread_low=spread[0], spread_high=spread[1], **gates)
+        if shape is not None:
+            spread, (start, end) = shape.spread_rad(bounds.interval, axes), shape.gate_m
+            values = (spread, spread, start, start, end, end, end - start, end - start)
+            for name, value in zip(SHAPE_BOUNDS, values, strict=True):
+                columns[name][row] = value
+    return replace(bounds, **columns)
 
 
 def shaped_mixture(mixture: Mixture, shapes: Sequence[PartShape | None], interval: float, axes: Axes) -> Mixture:
     """Components that stand where they stood, with the shapes of parts; None leaves one as it was."""
     spread, middle, depth = mixture.spread_rad.copy(), mixture.range_m.copy(), mixture.spread_range_m.copy()
     for row, shape in enumerate(shapes):
-        if shape is None:
-            continue
-        start, end = shape.gate_m
-        spread[row] = shape.spread_rad(interval, axes)
-        middle[row], depth[row] = (start + end) / 2, (end - start) / (2 * interval)
+        if shape is not None:
+            start, end = shape.gate_m
+            spread[row] = shape.spread_rad(interval, axes)
+            middle[row], depth[row] = (start + end) / 2, (end - start) / (2 * interval)
     return replace(mixture, spread_rad=spread, range_m=middle, spread_range_m=depth)
 
 

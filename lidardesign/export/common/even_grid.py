@@ -44,11 +44,6 @@ class EvenGrid:
     def __len__(self) -> int:
         return self.columns * self.rows
 
-    @property
-    def azimuth_step_rad(self) -> float:
-        """From one azimuth to the next; 0 for one column."""
-        return (self.azimuth_rad[1] - self.azimuth_rad[0]) / max(self.columns - 1, 1)
-
     def directions(self) -> np.ndarray:
         """Unit vectors row by row upwards, each row by growing azimuth, shape (rows * columns, 3)."""
         azimuth = np.linspace(*self.azimuth_rad, self.columns)
