@@ -11,15 +11,20 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.constraints.check import ConstraintCheck, check_design
 from lidardesign.design.constraints.document import MOST_FITTED, Constraints, wants_parts
-from lidardesign.design.constraints.feasibility import check_feasible
+from lidardesign.design.constraints.feasibility import BandwidthBudget, check_feasible
 from lidardesign.design.constraints.origins import placement_notes, snap_to_space
 from lidardesign.design.files import design_document
-from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_estimate, missing_samples
+from lidardesign.design.layouts.layout import (
+    FitProblem,
+    FittedDesign,
+    Layout,
+    fit_sensors,
+    likelihood_estimate,
+    missing_samples,
+)
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, lay_out, layout_of, own_count
-from lidardesign.design.layouts.sensor_fit import FitProblem, fit_sensors
 from lidardesign.design.mixture.bounds import sensor_groups
 from lidardesign.design.mixture.support import Retarget, Support, conditioned, fixed_conditions
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Gates, LayoutName, Sensor

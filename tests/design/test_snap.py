@@ -14,9 +14,9 @@ from support.command_line import caller, make_run
 from support.tables import each_row
 
 from lidardesign.design.catalog.library import find_part, load_library
-from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints, wants_parts
+from lidardesign.design.constraints.feasibility import BandwidthBudget
 from lidardesign.design.files import design_document, design_from_document, load_design
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
@@ -286,7 +286,7 @@ def test_losses_are_what_the_mixture_loses_by_each_part_alone():
 
 def fitted_ensemble(sensors=2):
     """A fit of the samples, as snapping is given it."""
-    from lidardesign.design.layouts.sensor_fit import FitProblem, fit_sensors
+    from lidardesign.design.layouts.layout import FitProblem, fit_sensors
 
     budget = BandwidthBudget.of(Constraints(), None)
     request = FitProblem(

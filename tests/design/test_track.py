@@ -24,8 +24,7 @@ from lidardesign.design.fit import fit, rays_at
 from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.scan import fit_track
-from lidardesign.design.layouts.track import interpolated, placed, travels
-from lidardesign.design.layouts.track_kmeans import TrackSamples, aimed_rays
+from lidardesign.design.layouts.track import TrackSamples, aimed_rays, interpolated, placed, travels
 from lidardesign.design.sensor import DesignSpec, Sensor, Track
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.run.yaml import dump_yaml, parse_yaml
@@ -201,7 +200,7 @@ def test_places_where_a_ray_sees_nothing_are_bridged():
 
 
 def test_every_update_of_the_cells_lowers_their_cost(monkeypatch):
-    from lidardesign.design.layouts import track_kmeans as module
+    from lidardesign.design.layouts import track as module
 
     costs = []
     cost = module._cost

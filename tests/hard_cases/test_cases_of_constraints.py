@@ -209,7 +209,7 @@ class TestContradictions:
             raise AssertionError("samples were asked for before the constraints")
 
         for step in ("restrict_samples", "pin_samples", "choose_mounts", "fit_groups"):
-            monkeypatch.setattr(f"lidardesign.design.layouts.sensor_fit.{step}", never)
+            monkeypatch.setattr(f"lidardesign.design.layouts.layout.{step}", never)
         samples = Samples(FACE.sample(10, np.random.default_rng(0)), np.zeros(10), np.zeros(10), FACE)
         files = [(values, {}) for values, _ in CONTRADICTIONS.values()]
         for values, asked in files if kind == "file" else [one[:2] for one in BUDGETS.values()]:

@@ -28,9 +28,8 @@ from lidardesign.design.layouts.gates import (
     rays_in_fields,
 )
 from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent
-from lidardesign.design.layouts.layout import FittedDesign, Layout, missing_samples, shares_of
+from lidardesign.design.layouts.layout import FitProblem, FittedDesign, Layout, missing_samples, shares_of
 from lidardesign.design.layouts.quantise import lloyd, samples_for
-from lidardesign.design.layouts.sensor_fit import FitProblem
 from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.sensor import (
     DesignSpec,

@@ -15,7 +15,7 @@ with the range, 7.6 mm with origins and directions, 3.8 mm with the mean surface
 origins free in a 10 cm box at 196 rays 25 mm with origins and directions, 11.3 mm with the mean surface.
 
 Of samples with a free condition, as the position of a robot that drives by, a scan is a track: rays for every value of
-it. Where they aim is said in `track_kmeans`: cells of what is observed, at every value of the condition. The gate of a
+it. Where they aim is said in `track`: cells of what is observed, at every value of the condition. The gate of a
 ray is the central level of what its samples observe, projected onto it, over `GATE_REACH` knots on either side, inside
 the constraints at every knot and therefore in between. The kernel of knot p is its hat function, so the bandwidth is
 the distance of knots, and every sample counts once in all. Knots lie 0.1 m apart, over which what is seen of a scene
@@ -29,15 +29,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
 from lidardesign.design.constraints.document import Constraints, SensorRules, wants_parts
+from lidardesign.design.constraints.feasibility import BandwidthBudget, fit_within_budget
 from lidardesign.design.constraints.origins import free_boxes, is_mounted, origin_box
 from lidardesign.design.layouts.gates import admissible_gates, central_intervals, members, ray_gates, rays_in_fields
-from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_estimate, missing_samples, shares_of
+from lidardesign.design.layouts.layout import (
+    FitProblem,
+    FittedDesign,
+    Layout,
+    admitted_samples,
+    group_samples,
+    likelihood_estimate,
+    missing_samples,
+    shares_of,
+)
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY, lloyd
-from lidardesign.design.layouts.sensor_fit import FitProblem, admitted_samples, group_samples
-from lidardesign.design.layouts.track import TRAVELLED, boresight_azimuth, interpolated
-from lidardesign.design.layouts.track_kmeans import TrackSamples, aimed_rays
+from lidardesign.design.layouts.track import TRAVELLED, TrackSamples, aimed_rays, boresight_azimuth, interpolated
 from lidardesign.design.mixture.bounds import Bounds, Group, bounds_of
 from lidardesign.design.mixture.em import EMResult, mixture_of_labels
 from lidardesign.design.mixture.ensemble import Ensemble, GroupSamples, sensors_of

@@ -1,26 +1,64 @@
-"""Rays along a track: where each ray looks and listens at any position between the knots.
+r"""Rays along a track: where each ray looks and listens at any position between the knots.
 
 Directions and gates are linear in between, so they are continuous, pass through the knots exactly, and keep every
 bound on elevation, azimuth, start, end and width that both neighbouring knots keep: each is a convex set per ray.
+
+Cells along a condition: where the rays of a track aim, and which samples are theirs.
+
+Rays divide what is observed: the mean surface of the scenes, seen from the sensor, in metres. With hat functions
+h_p(x) over the knots, ray n aims at $c_n(x) = \sum_p h_p(x) c_{p,n}$, and what is minimised is
+
+$$\sum_i w_i \min_n |y_i - c_n(x_i)| + \frac{\kappa}{2} \sum_{p,n} |c_{p-1,n} - 2 c_{p,n} + c_{p+1,n}|^2,$$
+
+y_i the surface point of a sample relative to its own origin, x_i its own condition value, w_i its importance weight
+per area that faces the ray. No sample is moved or cut off, rays stay themselves, and knots where a ray sees nothing
+are bridged straight. Distances count once, not squared, so that more rays go to where surfaces often are (their
+density is as the root of the surface's, not the third root). Cells, then knots by their normal equations with
+weights w / |y - c|, are updated in turn (Weiszfeld 1937): the sum falls with every update. It starts from Lloyd's
+cells at each knot, begun at the neighbouring knot's, outward from the knot with most samples, where the best of
+several seedings is taken.
+
+Measured on warehouse shelves (40 held-out, 24 positions, rays' hits without gates), as miss rate in % with 6, 12,
+18 rays, each at its global optimum: directions and squares 19.5, 15.7, 10.6; surface points and squares 20.1, 13.0,
+7.7; surface points and distances, per facing area, 19.6, 11.3, 6.7; chosen greedily with the training scenes' own
+boxes in hand 18.8, 9.1, 5.2.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidardesign.design.layouts.quantise import lloyd
+from lidardesign.design.mixture.features import Axes, Features, ray_features
 from lidardesign.design.mixture.support import condition_text
 from lidardesign.design.sensor import DesignSpec, Sensor, Track, interval_factor
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
-from lidardesign.numerics import wrap_angle, wrap_turn
-from lidardesign.space import DIMENSIONS
+from lidardesign.numerics import ROUNDING, SLACK, effective_count, wrap_angle, wrap_turn
+from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, DesignSpace, angles
 
 # Conditions that a sensor can travel along: where a ray starts, not where it looks.
 TRAVELLED = DIMENSIONS[:3]
+# The bending's weight kappa relative to the pull of one ray's samples at one knot.
+ROUGHNESS = 1.0
+LLOYD_ITERATIONS = 15
+SWEEPS = 30
+# Sweeps end when one lowers the cost by less than this share.
+SMALLEST_GAIN = 1e-4
+STARTS = 12
+# Nearer samples than this share of the mean distance pull no harder.
+SMALLEST_DISTANCE = 0.01
+# Mean elevations closer than this are the same row [rad].
+ORDER_DECIMALS = 9
+# So many distances of samples to rays are held at once.
+BLOCK = 500_000
+# Roughness relative to the mass of a knot that keeps the normal equations solvable where a ray sees nothing.
+SMALLEST_STIFFNESS = SLACK
 
 
 def placed(design: DesignSpec, at: Mapping[str, float]) -> DesignSpec:
@@ -166,3 +204,174 @@ def _moved(origin_m: np.ndarray, moves: Mapping[int, float]) -> np.ndarray:
     for axis, value in moves.items():
         moved[..., axis] = value
     return moved
+
+
+@dataclass(frozen=True, eq=False)
+class TrackSamples:
+    """Weighted samples along a condition, and the knots that they lie between.
+
+    Arguments:
+        points: Design points, shape (M, 6).
+        weights: Summing to 1, shape (M,).
+        left: The knot on the left of each sample, shape (M,).
+        share: How far it is from there to the next knot, 0 to 1, shape (M,).
+        knots: Shape (P,).
+        dimension: Index of the condition.
+        space: The design space.
+    """
+
+    points: np.ndarray
+    weights: np.ndarray
+    left: np.ndarray
+    share: np.ndarray
+    knots: np.ndarray
+    dimension: int
+    space: DesignSpace
+
+    @classmethod
+    def of(
+        cls, points: np.ndarray, weights: np.ndarray, knots: np.ndarray, dimension: int, space: DesignSpace
+    ) -> TrackSamples:
+        """Samples with weights that need not sum to 1, none of them beyond the first or last of ascending knots."""
+        values = points[:, dimension]
+        left = np.clip(np.searchsorted(knots, values, side="right") - 1, 0, len(knots) - 2)
+        share = np.clip((values - knots[left]) / (knots[left + 1] - knots[left]), 0.0, 1.0)
+        return cls(points, weights / weights.sum(), left, share, knots, dimension, space)
+
+    def near(self, knot: int, reach: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """Samples within `reach` knots of one, and their hat function's weights times their own, shape (W,)."""
+        hat = 1 - np.abs(self.left + self.share - knot) / reach
+        chosen = np.flatnonzero(hat > 0)
+        return chosen, self.weights[chosen] * hat[chosen]
+
+    def between(self, values: np.ndarray, labels: np.ndarray) -> np.ndarray:
+        """Knot values (P, N, ...) of each sample's ray at its own condition, shape (M, ...)."""
+        share = self.share.reshape(-1, *[1] * (values.ndim - 2))
+        return (1 - share) * values[self.left, labels] + share * values[self.left + 1, labels]
+
+
+def aimed_rays(along: TrackSamples, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """What the rays aim at, relative to the sensor, at the knots (P, N, 3), and the ray of each sample (M,)."""
+    features = Features.of(along.points, along.weights, Axes.of(along.space), along.space)
+    surface = ray_features(features) - along.points[:, :3]
+    power = (AZIMUTH in along.space.free) + (ELEVATION in along.space.free)
+    mass = along.weights * np.linalg.norm(surface, axis=1) ** power
+    weighted = replace(along, weights=mass / mass.sum())
+    centres = _started(weighted, surface, count, generator)
+    labels, distance = _nearest(along, surface, centres)
+    nearest_m = SMALLEST_DISTANCE * float(weighted.weights @ distance)
+    stiffness = ROUGHNESS / max(float(weighted.weights @ distance), ROUNDING) / (count * len(along.knots))
+    cost = math.inf
+    for _ in range(SWEEPS):
+        before, cost = cost, _cost(weighted, distance, centres, stiffness)
+        if before - cost <= SMALLEST_GAIN * cost:
+            break
+        pulls = weighted.weights / np.maximum(distance, max(nearest_m, ROUNDING))
+        centres = _smoothed(along, surface, pulls, labels, centres, stiffness)
+        labels, distance = _nearest(along, surface, centres)
+    # Rays by where they look on average: an order that does not depend on the seeding
+    azimuth, elevation = angles(centres.mean(axis=0))
+    order = np.lexsort((azimuth, np.round(elevation, ORDER_DECIMALS)))
+    return centres[:, order], np.argsort(order)[labels]
+
+
+def _cost(along: TrackSamples, distance: np.ndarray, centres: np.ndarray, stiffness: float) -> float:
+    """What every sweep lowers: the weighted mean distance and the cost of bends [m]."""
+    bends = np.square(np.diff(centres, n=2, axis=0)).sum()
+    return float(along.weights @ distance) + stiffness / 2 * float(bends)
+
+
+def _started(along: TrackSamples, surface: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Lloyd's cells at each knot, each begun at its neighbour's, from the best known knot outward: (P, N, 3)."""
+    windows = [along.near(knot) for knot in range(len(along.knots))]
+    first = int(np.argmax([effective_count(weights) for _, weights in windows]))
+    centres = np.empty((len(windows), count, 3))
+    centres[first] = _best_start(*_window(surface, windows[first]), count, generator)
+    outward = [(knot - 1, knot) for knot in range(first + 1, len(windows))]
+    outward += [(knot + 1, knot) for knot in reversed(range(first))]
+    for before, knot in outward:
+        points, weights = _window(surface, windows[knot])
+        centres[knot] = centres[before]
+        if len(points) > count and weights.max(initial=0.0) > 0:
+            fresh, _ = lloyd(points, weights, count, generator, iterations=LLOYD_ITERATIONS, start=centres[before])
+            centres[knot] = _matched(centres[before], fresh)
+    return centres
+
+
+def _matched(before: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+    """Centres (N, 3) in the order in which all of them together moved least: emptied cells may change places."""
+    # slow to import
+    from scipy.optimize import linear_sum_assignment
+
+    squared = np.square(before[:, None] - fresh[None]).sum(axis=2)
+    return fresh[linear_sum_assignment(squared)[1]]
+
+
+def _window(surface: np.ndarray, window: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    chosen, weights = window
+    return surface[chosen], weights
+
+
+def _best_start(points: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Lloyd's cells with the smallest sum of distances among several seedings, shape (N, 3)."""
+    best, least = np.empty(0), math.inf
+    for _ in range(STARTS):
+        centres, labels = lloyd(points, weights, count, generator, iterations=LLOYD_ITERATIONS)
+        cost = float(weights @ np.linalg.norm(points - centres[labels], axis=1))
+        if cost < least:
+            best, least = centres, cost
+    return best
+
+
+def _nearest(along: TrackSamples, surface: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The ray that aims nearest to each sample at the sample's own condition, and its distance, shape (M,)."""
+    labels = np.empty(len(surface), dtype=np.int64)
+    order = np.argsort(along.left, kind="stable")
+    starts = np.searchsorted(along.left[order], np.arange(len(along.knots)))
+    size = max(BLOCK // centres.shape[1], 1)
+    for knot, (first, last) in enumerate(itertools.pairwise(starts)):
+        for start in range(first, last, size):
+            part = order[start : min(start + size, last)]
+            labels[part] = _nearest_between(surface[part], along.share[part, None], centres[knot], centres[knot + 1])
+    here = along.between(centres, labels)
+    return labels, np.linalg.norm(here - surface, axis=1)
+
+
+def _nearest_between(surface: np.ndarray, share: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The nearest ray of samples (W, 3) between two knots with aims (N, 3): |c|^2 - 2 y c decides, shape (W,)."""
+    squares = np.stack([(left * left).sum(axis=1), (left * right).sum(axis=1), (right * right).sum(axis=1)])
+    hats = np.concatenate([(1 - share) ** 2, 2 * share * (1 - share), share**2], axis=1)
+    # one matrix product: its factors are as long as a sample's hats and points, not as the rays are many
+    sides = np.concatenate([hats, -2 * (1 - share) * surface, -2 * share * surface], axis=1)
+    return (sides @ np.concatenate([squares, left.T, right.T])).argmin(axis=1)
+
+
+def _smoothed(
+    along: TrackSamples,
+    surface: np.ndarray,
+    pulls: np.ndarray,
+    labels: np.ndarray,
+    centres: np.ndarray,
+    stiffness: float,
+) -> np.ndarray:
+    """The knots' best aims for given cells and weights: a least-squares problem per ray, shape (P, N, 3)."""
+    knots, count, _ = centres.shape
+    rows, share = labels * knots + along.left, along.share
+    matrix = np.zeros(count * knots * knots)
+    for down, down_share in ((0, 1 - share), (1, share)):
+        for across, across_share in ((0, 1 - share), (1, share)):
+            place = (rows + down) * knots + along.left + across
+            matrix += np.bincount(place, pulls * down_share * across_share, len(matrix))
+    size = count * knots
+    right = [
+        np.bincount(rows, pulls * (1 - share) * column, size) + np.bincount(rows + 1, pulls * share * column, size)
+        for column in surface.T
+    ]
+    normal = matrix.reshape(count, knots, knots)
+    # a ray that sees nothing anywhere stays where it was
+    still = SMALLEST_STIFFNESS * stiffness
+    # The quadratic form of summed squared second differences, shape (P, P)
+    second = np.diff(np.eye(knots), n=2, axis=0)
+    normal += stiffness * (second.T @ second) + still * np.eye(knots)
+    wanted = np.stack(right, axis=-1).reshape(count, knots, 3) + still * centres.transpose(1, 0, 2)
+    return np.linalg.solve(normal, wanted).transpose(1, 0, 2)

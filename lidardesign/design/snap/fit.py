@@ -16,8 +16,8 @@ import numpy as np
 
 from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.catalog.library import Pose, interleaved, part_rays, part_sensor
-from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.constraints.document import Constraints, SensorRules, rules_of
+from lidardesign.design.constraints.feasibility import BandwidthBudget
 from lidardesign.design.constraints.origins import fix_origins
 from lidardesign.design.files import MOST_TABLE_RAYS
 from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent

@@ -18,8 +18,8 @@ import numpy as np
 from lidardesign.config import FILE_NAME as CONFIG_FILE
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import EM_SAMPLES, RESTARTS
+from lidardesign.design.layouts.layout import HELD_OUT_SHARE
 from lidardesign.design.layouts.rays import layout_of
-from lidardesign.design.layouts.sensor_fit import HELD_OUT_SHARE
 from lidardesign.design.mixture.bounds import Bounds, bounds_of, sensor_groups
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features

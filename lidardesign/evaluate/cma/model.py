@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth, split_budget
-from lidardesign.design.constraints.budget import BIN_MARGIN, BandwidthBudget
+from lidardesign.design.constraints.feasibility import BIN_MARGIN, BandwidthBudget
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.track import boresight_azimuth
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec, Sensor, Track, interval_factor
