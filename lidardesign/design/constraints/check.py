@@ -33,6 +33,7 @@ LIGHT_M_PER_S = 299792458.0
 SAME_PLACE_M = 1e-3
 PICOSECOND_S = 1e-12
 AXES = ("x_m", "y_m", "z_m")
+ANGLES = ("horizontal", "vertical")
 
 
 @dataclass(frozen=True)
@@ -96,10 +97,9 @@ def _over(common: Mapping[str, Any], special: Mapping[str, Any] | None) -> dict[
     """An entry of `each` over the common keys."""
     result = dict(common)
     for key, value in (special or {}).items():
-        if isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
-            result[key] = _over(result[key], value)
-        elif value is not None:
-            result[key] = value
+        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
+        if value is not None:
+            result[key] = _over(result[key], value) if both else value
     return result
 
 
@@ -125,11 +125,18 @@ def _between(name: str, value: float, rules: Any, highest: float | None = None) 
     return checks
 
 
+def _within_space(name: str, key: str, space: Mapping[str, Any], *values: float) -> ConstraintCheck:
+    """A check of a value, or of the first and the last of several, against both ends of the space along a dimension."""
+    low, high = (float(end) for end in space[key])
+    kept = values[0] >= low - _slack(low) and values[-1] <= high + _slack(high)
+    value = list(values) if len(values) > 1 else values[0]
+    return ConstraintCheck(f"{name}.space.{key}", [low, high], value, bool(kept))
+
+
 def _consistency(name: str, sensor: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
     """Reported intervals against means and spreads; agreement is no news, a contradiction is."""
     spread, view = sensor["spread"], sensor["field_of_view_rad"]
-    axes = ("horizontal", "vertical")
-    pairs = [(f"field_of_view_rad.{axis}", view[axis], 2 * z * spread[f"{axis}_rad"]) for axis in axes]
+    pairs = [(f"field_of_view_rad.{axis}", view[axis], 2 * z * spread[f"{axis}_rad"]) for axis in ANGLES]
     start, end = sensor["gate_m"]["start"], sensor["gate_m"]["end"]
     mean = sensor.get("range_m")
     if mean is not None:
@@ -167,10 +174,9 @@ def _origin(
             kept = all(test(value, limit) for value, limit in zip(mean, meant, strict=True))
             checks.append(ConstraintCheck(f"{name}.origin.{key}", list(bound), list(mean), bool(kept)))
     principal = np.sqrt(np.maximum(np.linalg.eigvalsh(np.array(covariance, dtype=np.float64)), 0.0))
-    thickness, spread = float(principal[0]), float(principal[-1])
-    largest = _get(rules, "origin", "spread_m", "max")
-    checks += _between(f"{name}.origin.spread_m", spread, {"max": largest})
-    checks += _between(f"{name}.origin.thickness_m", thickness, _get(rules, "origin", "thickness_m"))
+    spread = float(principal[-1])
+    checks += _between(f"{name}.origin.spread_m", spread, {"max": _get(rules, "origin", "spread_m", "max")})
+    checks += _between(f"{name}.origin.thickness_m", float(principal[0]), _get(rules, "origin", "thickness_m"))
     if _get(rules, "origin", "fixed_m") is not None:
         checks.append(ConstraintCheck(f"{name}.origin.fixed_m.spread", 0.0, spread, spread == 0.0))
     return checks
@@ -201,18 +207,17 @@ def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], s
 
 def _intervals(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
     """Gate and field of view: the worse of the reported and the recomputed interval is checked."""
-    values: dict[str, list[float]] = {}
     spread, view = sensor["spread"], sensor["field_of_view_rad"]
-    for axis in ("horizontal", "vertical"):
-        both = (view[axis], 2 * z * spread[f"{axis}_rad"])
-        values[f"field_of_view.{axis}_deg"] = [math.degrees(angle) for angle in both]
     gates = [(sensor["gate_m"]["start"], sensor["gate_m"]["end"])]
     mean = sensor.get("range_m")
     if mean is not None:
         half = z * spread["range_m"]
         gates.append((max(mean - half, 0.0), mean + half))
-    values["gate.start_m"] = [start for start, _ in gates]
-    values["gate.end_m"] = [end for _, end in gates]
+    values = {
+        f"field_of_view.{axis}_deg": [math.degrees(view[axis]), math.degrees(2 * z * spread[f"{axis}_rad"])]
+        for axis in ANGLES
+    }
+    values["gate.start_m"], values["gate.end_m"] = (list(ends) for ends in zip(*gates, strict=True))
     values["gate.width_m"] = [end - start for start, end in gates]
     checks = []
     for key, found in values.items():
@@ -222,32 +227,24 @@ def _intervals(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z
 
 def _inside_space(name: str, sensor: Mapping[str, Any], space: Mapping[str, Any]) -> list[ConstraintCheck]:
     """Gates and mean origins inside the design space; origins are listed where they are not."""
-    near, far = (float(end) for end in space["range_m"])
-    start, end = float(sensor["gate_m"]["start"]), float(sensor["gate_m"]["end"])
-    inside = start >= near - _slack(near) and end <= far + _slack(far)
-    checks = [ConstraintCheck(f"{name}.space.range_m", [near, far], [start, end], bool(inside))]
-    for value, key in zip(sensor["origin_m"]["mean"], AXES, strict=True):
-        low, high = (float(end) for end in space[key])
-        if not low - _slack(low) <= value <= high + _slack(high):
-            checks.append(ConstraintCheck(f"{name}.space.{key}", [low, high], value, False))
-    return checks
+    gate = _within_space(name, "range_m", space, float(sensor["gate_m"]["start"]), float(sensor["gate_m"]["end"]))
+    places = zip(AXES, sensor["origin_m"]["mean"], strict=True)
+    origins = [_within_space(name, axis, space, value) for axis, value in places]
+    return [gate, *(check for check in origins if not check.satisfied)]
 
 
-def _mounts(
-    sensors: Sequence[Mapping[str, Any]], own_rules: Sequence[Mapping[str, Any]]
-) -> list[ConstraintCheck]:
+def _mounts(sensors: Sequence[Mapping[str, Any]], own_rules: Sequence[Mapping[str, Any]]) -> list[ConstraintCheck]:
     """Every mounted sensor is at one of its mounts without any spread, and no other one is there."""
     checks, taken = [], []
     for index, (sensor, own) in enumerate(zip(sensors, own_rules, strict=True)):
-        mounts = _get(own, "origin", "mounts_m")
+        mounts, mean = _get(own, "origin", "mounts_m"), list(sensor["origin_m"]["mean"])
         if not mounts:
             continue
-        mean, name = list(sensor["origin_m"]["mean"]), str(sensor.get("name", index))
         still = not np.any(sensor["origin_m"]["covariance"])
         there = [mount for mount in mounts if all(abs(a - b) <= _slack(b) for a, b in zip(mean, mount, strict=True))]
         kept = bool(there) and there[0] not in taken and still
         taken += there[:1]
-        checks.append(ConstraintCheck(f"{name}.origin.mounts_m", mounts, mean, kept))
+        checks.append(ConstraintCheck(f"{sensor.get('name', index)}.origin.mounts_m", mounts, mean, kept))
     return checks
 
 
@@ -256,11 +253,7 @@ def _excluded(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z:
     mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"]["covariance"]
     reach = [z * math.sqrt(max(covariance[axis][axis], 0.0)) for axis in range(3)]
     low, high = ([m + sign * r for m, r in zip(mean, reach, strict=True)] for sign in (-1, 1))
-    value = {"low_m": low, "high_m": high}
-    return [
-        ConstraintCheck(f"{name}.origin.exclude[{index}]", box, value, not _reaches_into(low, high, box))
-        for index, box in enumerate(_boxes(rules))
-    ]
+    return _outside(name, low, high, rules)
 
 
 def _excluded_travel(
@@ -268,15 +261,22 @@ def _excluded_travel(
 ) -> list[ConstraintCheck]:
     """The excluded boxes that sensors pass through on their way along a track."""
     axis = AXES.index(track["dimension"])
-    checks: list[ConstraintCheck] = []
+    failed: list[ConstraintCheck] = []
     for sensor in sensors:
         low, high = list(sensor["origin_m"]["mean"]), list(sensor["origin_m"]["mean"])
         low[axis], high[axis] = track["knots_m"][0], track["knots_m"][-1]
-        for index, box in enumerate(_boxes(rules)):
-            check = ConstraintCheck(f"track.origin.exclude[{index}]", box, {"low_m": low, "high_m": high}, False)
-            if _reaches_into(low, high, box) and check not in checks:
-                checks.append(check)
-    return checks
+        checks = _outside("track", low, high, rules)
+        failed += [check for check in checks if not check.satisfied and check not in failed]
+    return failed
+
+
+def _outside(name: str, low: list[float], high: list[float], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
+    """An interval of origins against every excluded box."""
+    value = {"low_m": low, "high_m": high}
+    return [
+        ConstraintCheck(f"{name}.origin.exclude[{index}]", box, value, not _reaches_into(low, high, box))
+        for index, box in enumerate(_boxes(rules))
+    ]
 
 
 def _boxes(rules: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -324,12 +324,8 @@ def _track(track: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> li
             for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
                 checks += _between(f"{name}.gate.{key}", value, _get(rules, "gate", key))
             if space is not None:
-                near, far = (float(value) for value in space["range_m"])
-                inside = start >= near - _slack(near) and end <= far + _slack(far)
-                checks.append(ConstraintCheck(f"{name}.space.range_m", [near, far], [start, end], bool(inside)))
-                low, high = (float(value) for value in space["elevation_rad"])
-                inside = low - _slack(low) <= elevation <= high + _slack(high)
-                checks.append(ConstraintCheck(f"{name}.space.elevation_rad", [low, high], elevation, bool(inside)))
+                checks.append(_within_space(name, "range_m", space, start, end))
+                checks.append(_within_space(name, "elevation_rad", space, elevation))
                 low, high = (float(value) for value in space["azimuth_rad"])
                 past = (azimuth - low) % (2 * math.pi)
                 inside = past <= high - low + _slack(math.pi) or past >= 2 * math.pi - _slack(math.pi)
@@ -337,10 +333,7 @@ def _track(track: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> li
             failed += [check for check in checks if not check.satisfied]
     if space is None:
         return failed
-    low, high = (float(value) for value in space[track["dimension"]])
-    first, last = track["knots_m"][0], track["knots_m"][-1]
-    inside = first >= low - _slack(low) and last <= high + _slack(high)
-    return [*failed, ConstraintCheck(f"track.space.{track['dimension']}", [low, high], [first, last], bool(inside))]
+    return [*failed, _within_space("track", track["dimension"], space, track["knots_m"][0], track["knots_m"][-1])]
 
 
 def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[ConstraintCheck]:
@@ -349,20 +342,19 @@ def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[Cons
     widths = _widths(document, bin_m)
     total = None if widths is None else sum(count for _, count in widths)
     checks = []
-    declared = document.get("rays")
+    declared, limit = document.get("rays"), budget.get("bandwidth_mbps")
     if declared is not None and total is not None and declared != total:
         checks.append(ConstraintCheck("rays", declared, total, False))
     if budget.get("rays") is not None:
-        found = total if total is not None else declared
-        checks.append(ConstraintCheck("budget.rays", budget["rays"], found, found == budget["rays"]))
-    limit = budget.get("bandwidth_mbps")
+        count = total if total is not None else declared
+        checks.append(ConstraintCheck("budget.rays", budget["rays"], count, count == budget["rays"]))
     if limit is not None:
-        found = None
+        mbps = None
         if widths is not None:
             bins = sum(count * max(math.ceil(width / bin_m * (1 - BIN_ROUNDING)), 1) for width, count in widths)
-            found = bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6
-        kept = found is not None and found <= limit + _slack(limit)
-        checks.append(ConstraintCheck("budget.bandwidth_mbps", limit, found, kept))
+            mbps = bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6
+        kept = mbps is not None and mbps <= limit + _slack(limit)
+        checks.append(ConstraintCheck("budget.bandwidth_mbps", limit, mbps, kept))
     return checks
 
 
@@ -376,9 +368,8 @@ def _widths(document: Mapping[str, Any], bin_m: float) -> list[tuple[float, int]
     if table:
         return [(end - start, 1) for start, end in zip(table["gate_start_m"], table["gate_end_m"], strict=True)]
     if not track:
-        if any(sensor.get("rays") is None for sensor in sensors):
-            return None
-        return [(s["gate_m"]["end"] - s["gate_m"]["start"], int(s["rays"])) for s in sensors]
+        is_open = any(sensor.get("rays") is None for sensor in sensors)
+        return None if is_open else [(s["gate_m"]["end"] - s["gate_m"]["start"], int(s["rays"])) for s in sensors]
     width = np.array(track["gate_end_m"], dtype=np.float64) - np.array(track["gate_start_m"], dtype=np.float64)
     places = [width]
     for left, right in zip(width[:-1] / bin_m, width[1:] / bin_m, strict=True):
@@ -403,8 +394,7 @@ def _snap(name: str, index: int, document: Mapping[str, Any], snap: Any) -> list
     named = keys.get("parts") or []
     allowed = named or "the catalogue"
     if sensor.get("part") is None:
-        kept = keys.get("otherwise") == "keep"
-        return [ConstraintCheck(f"{name}.snap", allowed, "a sensor of its own", kept)]
+        return [ConstraintCheck(f"{name}.snap", allowed, "a sensor of its own", keys.get("otherwise") == "keep")]
     part = _admitted_part(str(sensor["part"]), named)
     if part is None:
         return [ConstraintCheck(f"{name}.snap", allowed, sensor["part"], False)]
@@ -429,17 +419,17 @@ def _admitted_part(name: str, named: Sequence[str]) -> Part | None:
         return None
     stem = name.partition(":")[0]
     file = Path(library.origins[stem])
-    for path, entry, mode in entries:
-        same = entry == stem if path is None else path in (file, file.parent)
-        if same and mode in ("", part.mode):
-            return part
-    return None if named else part
+    admitted = any(
+        (entry == stem if path is None else path in (file, file.parent)) and mode in ("", part.mode)
+        for path, entry, mode in entries
+    )
+    return part if admitted or not named else None
 
 
 def _differences(part: Part, index: int, sensor: Mapping[str, Any], table: Mapping[str, Any] | None) -> str | None:
     """What a sensor is that the part is not; None where both are the same."""
     view = sensor["field_of_view_rad"]
-    for key, expected in zip(("horizontal", "vertical"), part.field_of_view_rad, strict=True):
+    for key, expected in zip(ANGLES, part.field_of_view_rad, strict=True):
         if abs(view[key] - expected) > COARSE_SLACK:
             return f"a {key} field of view of {view[key]:g} instead of {expected:g} rad"
     (near, far), gate = part.range_m, sensor["gate_m"]
@@ -454,8 +444,8 @@ def _differences(part: Part, index: int, sensor: Mapping[str, Any], table: Mappi
     azimuth, elevation = (np.asarray(table[key], dtype=np.float64)[own] for key in ("azimuth_rad", "elevation_rad"))
     aimed = sensor["boresight"]
     frame = boresight_frame(aimed["azimuth_rad"], aimed["elevation_rad"], aimed.get("roll_rad") or 0.0)
-    local = direction(azimuth, elevation) @ (boresight_frame(*part.centre_rad).T @ frame).T
-    away, ray = cKDTree(part.directions).query(local)
+    to_part = (boresight_frame(*part.centre_rad).T @ frame).T
+    away, ray = cKDTree(part.directions).query(direction(azimuth, elevation) @ to_part)
     starts = np.stack([np.asarray(table[f"origin_{axis}"], dtype=np.float64)[own] for axis in AXES], axis=1)
     moved = np.abs(starts - np.asarray(sensor["origin_m"]["mean"])).max(axis=1, initial=0.0) > COARSE_SLACK
     same = len(part.directions) - len(np.unique(part.directions, axis=0))
