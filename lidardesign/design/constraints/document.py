@@ -19,7 +19,7 @@ Entries of `each` apply to the first, second, ... sensor over the common keys.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal
@@ -130,8 +130,7 @@ class Origin(_Keys):
 
     @model_validator(mode="after")
     def _distinct_mounts(self) -> Origin:
-        mounts = [tuple(mount) for mount in self.mounts_m or []]
-        if len(set(mounts)) < len(mounts):
+        if len({tuple(mount) for mount in self.mounts_m or []}) < len(self.mounts_m or []):
             raise ValueError("the mounts must differ")
         return self
 
@@ -275,15 +274,13 @@ class Constraints(SensorConstraints):
             ConfigError: Unknown keys, wrong types, numbers outside their physical range.
         """
         if values is not None and not isinstance(values, Mapping):
-            found = type(values).__name__
-            raise ConfigError(f"found one {found}", where=where, allowed="a mapping, as `gate: {...}`")
+            raise ConfigError(f"found one {type(values).__name__}", where=where, allowed="a mapping, as `gate: {...}`")
 
         def named(path: tuple[str | int, ...], *, key: bool = False) -> str:
             return where
 
         # YAML writes an empty section as null; it says nothing
-        given = _without_empty(dict(values or {}))
-        return check_model(cls, given, locate or named)
+        return check_model(cls, _without_empty(dict(values or {})), locate or named)
 
     @cached_property
     def rules(self) -> tuple[SensorRules, ...]:
@@ -311,21 +308,14 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _key_paths(values: Mapping[str, Any], prefix: str = "") -> list[str]:
+def _key_paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """The keys of plain values at every depth, joined by dots."""
-    paths = []
     for key, value in values.items():
-        paths.append(prefix + key)
+        yield prefix + key
         if isinstance(value, Mapping):
-            paths += _key_paths(value, f"{prefix}{key}.")
-    return paths
+            yield from _key_paths(value, f"{prefix}{key}.")
 
 
 def _without_empty(values: dict[str, Any]) -> dict[str, Any]:
-    kept = {}
-    for key, value in values.items():
-        if isinstance(value, dict):
-            kept[key] = _without_empty(value)
-        elif value is not None:
-            kept[key] = value
-    return kept
+    given = {key: value for key, value in values.items() if value is not None}
+    return {key: _without_empty(value) if isinstance(value, dict) else value for key, value in given.items()}

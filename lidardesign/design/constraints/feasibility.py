@@ -8,6 +8,7 @@ Keeping a bandwidth budget: how many rays it pays for, and which common gate wid
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -57,14 +58,19 @@ def check_feasible(
     count = constraints.sensors
     if count.min is not None and count.max is not None and count.min > count.max:
         _refuse(f"at least {count.min} and at most {count.max} sensors", ["sensors.min", "sensors.max"])
-    named = [("sensors.count", count.count, count.count), ("--sensors", sensors, sensors)]
-    named += [("sensors.min", count.min, None), ("sensors.max", None, count.max)]
-    named.append(("each", len(constraints.each) or None, None))
-    for low_name, low, _ in named:
-        for high_name, _, high in named:
-            if low is not None and high is not None and low > high:
-                _refuse(f"{low} sensors wanted, but at most {high} admitted", [low_name, high_name])
-    least = _least_sensors(constraints, sensors)
+    named = [
+        ("sensors.count", count.count, count.count),
+        ("--sensors", sensors, sensors),
+        ("sensors.min", count.min, None),
+        ("sensors.max", None, count.max),
+        ("each", len(constraints.each) or None, None),
+    ]
+    for (low_name, low, _), (high_name, _, high) in itertools.product(named, named):
+        if low is not None and high is not None and low > high:
+            _refuse(f"{low} sensors wanted, but at most {high} admitted", [low_name, high_name])
+    # of equal numbers the option is named
+    lows = [_Bound(low, name) for name, low, _ in (named[1], *named) if low is not None]
+    least = max(lows, key=lambda bound: bound.value, default=_Bound(1, ""))
     # Every mounted sensor needs a mount of its own
     most = most_mounted(constraints.rules)
     if most is not None and most < least.value:
@@ -137,8 +143,7 @@ def _check_excluded(rules: SensorRules, space: DesignSpace) -> None:
         return
 
     def has_room(**changes: object) -> bool:
-        changed = replace(rules, origin=origin.model_copy(update=changes))
-        return len(free_boxes(changed, space).low_m) > 0
+        return len(free_boxes(replace(rules, origin=origin.model_copy(update=changes)), space).low_m) > 0
 
     if has_room():
         return
@@ -217,37 +222,25 @@ def _check_gate(rules: SensorRules, space: DesignSpace) -> None:
     width_low = bounds("width_m", "min", zero)
     width_high = bounds("width_m", "max", *([] if thick else [_Bound(0.0, "space.range_m")]))
     text = "no gate can satisfy this"
-    found: list[tuple[str, list[str]]] = []
+    conflicts: list[tuple[str, list[str]]] = []
     for lows, highs in ((start_low, start_high), (end_low, end_high), (width_low, width_high)):
         for low, high in itertools.product(lows, highs):
             if low.value > high.value + AGREEMENT:
-                found.append((f"{text}: at least {low.value:g} and at most {high.value:g} m", [low.name, high.name]))
+                message = f"{text}: at least {low.value:g} and at most {high.value:g} m"
+                conflicts.append((message, [low.name, high.name]))
     for start, width, end in itertools.product(start_low, width_low, end_high):
         room = end.value - start.value
         if width.value > room + AGREEMENT or (thick and room <= 0):
-            told = f"starts at {start.value:g} m or later, is at least {width.value:g} m wide"
-            told = f"{text}: it {told}, and ends at {end.value:g} m or earlier"
-            found.append((told, [start.name, width.name, end.name]))
+            message = f"{text}: it starts at {start.value:g} m or later, is at least {width.value:g} m wide"
+            names = [start.name, width.name, end.name]
+            conflicts.append((f"{message}, and ends at {end.value:g} m or earlier", names))
     for end, width, start in itertools.product(end_low, width_high, start_high):
         if end.value - width.value > start.value + AGREEMENT:
-            told = f"ends at {end.value:g} m or later, is at most {width.value:g} m wide"
-            told = f"{text}: it {told}, and starts at {start.value:g} m or earlier"
-            found.append((told, [end.name, width.name, start.name]))
-    if found:
-        _refuse(*min(found, key=lambda conflict: len(set(conflict[1]) - {""})))
-
-
-def _least_sensors(constraints: Constraints, sensors: int | None) -> _Bound:
-    """The smallest number of sensors that the constraints admit, and where it stands."""
-    count = constraints.sensors
-    named = [
-        (sensors, "--sensors"),
-        (count.count, "sensors.count"),
-        (count.min, "sensors.min"),
-        (len(constraints.each) or None, "each"),
-    ]
-    bounds = [_Bound(value, name) for value, name in named if value is not None]
-    return max(bounds, key=lambda b: b.value, default=_Bound(1, ""))
+            message = f"{text}: it ends at {end.value:g} m or later, is at most {width.value:g} m wide"
+            names = [end.name, width.name, start.name]
+            conflicts.append((f"{message}, and starts at {start.value:g} m or earlier", names))
+    if conflicts:
+        _refuse(*min(conflicts, key=lambda conflict: len(set(conflict[1]) - {""})))
 
 
 def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least: _Bound, asked: int | None) -> None:
@@ -281,8 +274,8 @@ def most_rays(constraints: Constraints) -> int | None:
     if budget.bandwidth_mbps is None:
         return None
     narrowest = min(least_width(rules)[0] for rules in constraints.rules)
-    each_mbps = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz).mbps_of_widths([narrowest], 1)
-    return max(int(budget.bandwidth_mbps / each_mbps), 1)
+    model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
+    return max(int(budget.bandwidth_mbps / model.mbps_of_widths([narrowest], 1)), 1)
 
 
 def least_width(rules: SensorRules) -> tuple[float, list[str]]:
@@ -318,8 +311,7 @@ class BandwidthBudget:
         """The read-out that a constraint file and an option ask for."""
         budget = constraints.budget
         names = ["budget.rays"] if budget.rays is not None else ["--rays"] if rays is not None else []
-        for rules in constraints.rules:
-            names += least_width(rules)[1]
+        names += [name for rules in constraints.rules for name in least_width(rules)[1]]
         model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
         wanted = budget.rays if rays is None else rays
         return cls(model, budget.bandwidth_mbps, wanted, tuple(dict.fromkeys(names)))
@@ -335,8 +327,7 @@ class BandwidthBudget:
     def affordable_rays(self, widths_m: np.ndarray, weights: np.ndarray) -> int:
         """The number of rays that the budget pays for, at least one per sensor (which may exceed it)."""
         bins_per_ray = float(np.dot(weights / np.sum(weights), self.model.bins(widths_m)))
-        per_ray = bins_per_ray * self.model.mbps_of_widths(np.zeros(1), 1)
-        rays = int((self.limit_mbps or 0.0) / per_ray)
+        rays = int((self.limit_mbps or 0.0) / (bins_per_ray * self.model.mbps_of_widths(np.zeros(1), 1)))
         # largest remainders may hand spare rays to the wider gates
         while rays > len(widths_m) and not self.fits(widths_m, weights, rays):
             rays -= 1
@@ -392,11 +383,7 @@ def _affordable_bins(budget: BandwidthBudget, widths: np.ndarray, weights: np.nd
     counts = split_budget(weights, rays)
     bins = budget.model.bins(widths)
     unit = budget.model.mbps_of_widths(np.zeros(1), 1)
-    low, high = 1, int(bins.max())
-    while low < high:
-        middle = (low + high + 1) // 2
-        if unit * int(np.dot(counts, np.minimum(bins, middle))) <= (budget.limit_mbps or 0.0):
-            low = middle
-        else:
-            high = middle - 1
-    return low
+    wider = range(2, int(bins.max()) + 1)
+    return 1 + bisect.bisect_right(
+        wider, budget.limit_mbps or 0.0, key=lambda cap: unit * int(np.dot(counts, np.minimum(bins, cap)))
+    )

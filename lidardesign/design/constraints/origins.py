@@ -54,17 +54,15 @@ def origin_box(rules: SensorRules, space: DesignSpace) -> tuple[np.ndarray, np.n
     if rules.origin.high_m is not None:
         high = np.minimum(high, rules.origin.high_m)
     if rules.origin.fixed_m is not None:
-        fixed = np.array(rules.origin.fixed_m)
         free = np.isin(np.arange(3), space.free)
-        low = high = np.where(free, fixed, np.array(space.low[:3]))
+        low = high = np.where(free, np.array(rules.origin.fixed_m), np.array(space.low[:3]))
     return low, np.maximum(low, high)
 
 
 def excluded_boxes(rules: SensorRules) -> Boxes:
     """The boxes that a sensor's constraints exclude, flat ones included."""
-    boxes = rules.origin.exclude or []
-    low, high = ([getattr(box, key) for box in boxes] for key in ("low_m", "high_m"))
-    return Boxes(np.array(low, dtype=np.float64).reshape(-1, 3), np.array(high, dtype=np.float64).reshape(-1, 3))
+    corners = [(box.low_m, box.high_m) for box in rules.origin.exclude or []]
+    return Boxes(*np.array(corners, dtype=np.float64).reshape(-1, 2, 3).transpose(1, 0, 2))
 
 
 def inside_excluded(origins_m: np.ndarray, rules: SensorRules) -> np.ndarray:
@@ -86,8 +84,7 @@ def free_boxes(rules: SensorRules, space: DesignSpace) -> Boxes:
     bottoms, tops = excluded_boxes(rules)
     held = np.where(fixed, (bottoms < middle) & (middle < tops), bottoms < tops).all(axis=1)
     bottoms, tops = bottoms[held], tops[held]
-    inside = (((bottoms < high) & (tops > low)) | fixed).all(axis=1).any()
-    kept = ~fixed & inside
+    kept = ~fixed & (((bottoms < high) & (tops > low)) | fixed).all(axis=1).any()
     free = Boxes(np.where(kept, low, -np.inf)[None], np.where(kept, high, np.inf)[None])
     for bottom, top in zip(bottoms, tops, strict=True):
         free = _without(free, bottom, top, low, high, ~fixed)
@@ -113,8 +110,7 @@ def _without(
         return Boxes(old[:, :3], -old[:, 3:])
     fresh = np.concatenate([np.concatenate(lows), -np.concatenate(highs)], axis=1)
     # those that leave next to no room inside [low, high] along some axis are none
-    size = np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0)
-    needed = np.minimum(SMALLEST_GAP * size, (high - low) / 2)
+    needed = np.minimum(SMALLEST_GAP * np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0), (high - low) / 2)
     room = np.minimum(-fresh[:, 3:], high) - np.maximum(fresh[:, :3], low)
     fresh = fresh[(room > needed)[:, axes].all(axis=1)]
     # no old box lies in a fresh one, which is part of another old box
@@ -185,20 +181,19 @@ def fix_origins(rules: Sequence[SensorRules], places: Sequence[Mount | None]) ->
     """The rules with sensor i fixed at the i-th place, where there is one, and no mounts left to choose for others."""
     own = [replace(rules_of(rules, sensor), index=sensor) for sensor in range(len(places))]
     fixed = [one if place is None else fix_origin(one, place) for one, place in zip(own, places, strict=True)]
-    further = replace(rules[-1], origin=rules[-1].origin.model_copy(update={"mounts_m": None}), index=len(places))
-    return (*fixed, further)
+    unmounted = rules[-1].origin.model_copy(update={"mounts_m": None})
+    return (*fixed, replace(rules[-1], origin=unmounted, index=len(places)))
 
 
 def placement_notes(rules: Sequence[SensorRules]) -> tuple[str, ...]:
     """What rules say without effect: mounts in excluded boxes, and excluded boxes without volume."""
     notes = []
     for one in rules:
-        left, listed = mounts_of(one), one.origin.mounts_m or []
-        name = one.path("origin.exclude")
-        if len(left) < len(listed):
-            places = ", ".join(str(mount) for mount in listed if tuple(mount) not in left)
-            mounts = one.path("origin.mounts_m")
-            notes.append(f"{len(listed) - len(left)} of {len(listed)} {mounts} left out, inside {name}: {places}")
+        listed, name = one.origin.mounts_m or [], one.path("origin.exclude")
+        lost = [str(mount) for mount in listed if tuple(mount) not in mounts_of(one)]
+        if lost:
+            share = f"{len(lost)} of {len(listed)} {one.path('origin.mounts_m')}"
+            notes.append(f"{share} left out, inside {name}: {', '.join(lost)}")
         for number, box in enumerate(one.origin.exclude or []):
             if not all(low < high for low, high in zip(box.low_m, box.high_m, strict=True)):
                 notes.append(f"{name}[{number}] has no volume and excludes nothing")
@@ -246,8 +241,5 @@ def axes_outside(low_m: Sequence[float], high_m: Sequence[float], space: DesignS
 def place_text(low_m: Sequence[float], high_m: Sequence[float]) -> str:
     """A box of origins for people, as `x 0.451, y -1 to 1, z 0 m`."""
     ends = [tuple(f"{round(end, 6) + 0.0:.7g}" for end in pair) for pair in zip(low_m, high_m, strict=True)]
-    told = [
-        f"{name} {low}" if low == high else f"{name} {low} to {high}"
-        for name, (low, high) in zip("xyz", ends, strict=True)
-    ]
-    return f"{', '.join(told)} m"
+    sides = (low if low == high else f"{low} to {high}" for low, high in ends)
+    return ", ".join(f"{axis} {side}" for axis, side in zip("xyz", sides, strict=True)) + " m"

@@ -6,6 +6,7 @@ anything of where sensors are, the rig says nothing of it. Where sensors look is
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -52,12 +53,11 @@ def rig_constraints(
     shared = {key: own[key] for key in SHARED if key in own}
     given = own.get("each", [])
     each = [*given, *({} for _ in rig.sensors[len(given) :])]
-    document: dict[str, Any] = {"sensors": {"count": len(rig.sensors)}, "budget": {}}
-    if rig.rays and rays is None:
-        document["budget"] = {"rays": rig.rays}
-    if "sensors" in own:
+    document: dict[str, Any] = {
         # count, and min with max, exclude one another
-        document["sensors"] = own["sensors"]
+        "sensors": own.get("sensors", {"count": len(rig.sensors)}),
+        "budget": {"rays": rig.rays} if rig.rays and rays is None else {},
+    }
     result = merged(document, {key: own[key] for key in own if key not in ("sensors", "each")})
     like = [_of_sensor(sensor, space) for sensor in rig.sensors]
     # entries beyond the rig's sensors stay: there are then too many, which is found where all contradictions are
@@ -65,9 +65,8 @@ def rig_constraints(
     wanted = [merged(shared, entry) for entry in each]
     placed = [any(key in entry.get("origin", {}) for key in PLACES) for entry in wanted]
     _check_places(rig, space, placed, hint)
-    for bounds, own_place in zip(like, placed, strict=True):
-        if own_place:
-            bounds.pop("origin", None)
+    for bounds in itertools.compress(like, placed):
+        bounds.pop("origin", None)
     result["each"] = [merged(bounds, entry) for bounds, entry in zip(like, wanted, strict=True)]
     return Constraints.from_mapping(result, where=f"--like {rig.name}")
 
@@ -134,12 +133,11 @@ def moved_notes(rig: DesignSpec, space: DesignSpace, constraints: Constraints) -
 def rig_notes(rig: DesignSpec, constraints: Constraints, asked: Constraints) -> list[str]:
     """What a rig's likeness says, one line each, for people."""
     sensors, own = len(rig.sensors), asked.as_document()
-    said = [f"{sensors} sensor" + "s" * (sensors > 1)]
-    if constraints.budget.rays is not None and asked.budget.rays is None:
-        said.append(f"{constraints.budget.rays} rays")
-    lines = [f"like {rig.name}: {', '.join(said)}, at its places, fields of view and gates no wider"]
-    narrow = math.radians(SMALLEST_FIELD_DEG)
-    single = sum(max(sensor.field_of_view_rad) <= narrow for sensor in rig.sensors)
+    has_rays = constraints.budget.rays is not None and asked.budget.rays is None
+    rays = f", {constraints.budget.rays} rays" if has_rays else ""
+    counts = f"{sensors} sensor{'s' * (sensors > 1)}{rays}"
+    lines = [f"like {rig.name}: {counts}, at its places, fields of view and gates no wider"]
+    single = sum(max(sensor.field_of_view_rad) <= math.radians(SMALLEST_FIELD_DEG) for sensor in rig.sensors)
     if single:
         lines.append(f"{single} of {sensors} sensors have no field of view: that of the fit is not bounded")
     if own:
