@@ -87,8 +87,7 @@ class Bounds:
 
     def take(self, rows: np.ndarray) -> Bounds:
         """The bounds of some components, in their order."""
-        arrays = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "interval"}
-        return replace(self, **arrays)
+        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "interval"})
 
     def narrowed(self, width_m: float) -> Bounds:
         """The same with gates no wider than a common cap [m], never below a component's least width.
@@ -136,8 +135,8 @@ class Floors:
     @classmethod
     def of(cls, features: Features) -> Floors:
         """Floors relative to the scale of the data."""
-        count = len(features.axes.origin)
-        origin = float(features.scale[:count].min()) if count else 1.0
+        axes = features.axes.origin
+        origin = float(features.scale[: len(axes)].min()) if axes else 1.0
         reach = float(features.scale[-1]) if features.axes.range else 1.0
         return cls(RELATIVE_FLOOR * origin, RELATIVE_FLOOR * features.angular_scale, RELATIVE_FLOOR * reach)
 
@@ -145,9 +144,8 @@ class Floors:
 def clip_azimuth(azimuth_rad: np.ndarray, bounds: Bounds) -> np.ndarray:
     """The nearest admissible azimuth on the circle, shape (K,) [rad]."""
     offset = wrap_angle(azimuth_rad - bounds.azimuth_centre)
-    free = bounds.azimuth_half >= math.pi
     clipped = bounds.azimuth_centre + np.clip(offset, -bounds.azimuth_half, bounds.azimuth_half)
-    return np.where(free, azimuth_rad, clipped)
+    return np.where(bounds.azimuth_half >= math.pi, azimuth_rad, clipped)
 
 
 def inward(low: float, high: float) -> tuple[float, float]:
@@ -173,9 +171,7 @@ def sensor_groups(rules: Sequence[SensorRules], space: DesignSpace, count: int) 
     return [Group(pins, tuple(sensors)) for pins, sensors in members.items()]
 
 
-def bounds_of(
-    rules: Sequence[SensorRules], space: DesignSpace, sensors: tuple[int, ...], interval: float
-) -> Bounds:
+def bounds_of(rules: Sequence[SensorRules], space: DesignSpace, sensors: tuple[int, ...], interval: float) -> Bounds:
     """The bounds of some sensors' components, one row each.
 
     Arguments:
@@ -206,13 +202,12 @@ def _bounds_row(rules: SensorRules, space: DesignSpace, interval: float) -> dict
     size = np.maximum(*(np.where(np.isfinite(side), np.abs(side), 0.0) for side in (free_low, free_high)))
     step = np.minimum(INWARD * size, (free_high - free_low) / 4)
     centre, half = _azimuth_arc(rules, space) if axes.horizontal else (0.0, math.pi)
-    lowest, highest = -math.pi / 2, math.pi / 2
+    poles = lowest, highest = -math.pi / 2, math.pi / 2
     if axes.vertical:
         elevation = rules.boresight.elevation_deg
         lowest = max(space.low[ELEVATION], lowest if elevation.min is None else math.radians(elevation.min))
         highest = min(space.high[ELEVATION], highest if elevation.max is None else math.radians(elevation.max))
-        if (lowest, highest) != (-math.pi / 2, math.pi / 2):
-            lowest, highest = inward(lowest, highest)
+        lowest, highest = poles if (lowest, highest) == poles else inward(lowest, highest)
     fields_deg = [
         inward(field.min or 0.0, 360.0 if field.max is None else field.max)
         for field in (rules.field_of_view.horizontal_deg, rules.field_of_view.vertical_deg)
@@ -241,10 +236,9 @@ def _azimuth_arc(rules: SensorRules, space: DesignSpace) -> tuple[float, float]:
     low, high = azimuth_interval(rules, space)
     if not space.full_azimuth:
         # the larger common piece of two arcs that meet
-        pieces = []
-        for turns in (-2, -1, 0, 1, 2):
-            shift = 2 * math.pi * (turns - math.floor((low - space.low[AZIMUTH]) / (2 * math.pi)))
-            pieces.append((max(low + shift, space.low[AZIMUTH]), min(high + shift, space.high[AZIMUTH])))
+        behind = math.floor((low - space.low[AZIMUTH]) / (2 * math.pi))
+        shifts = [2 * math.pi * (turns - behind) for turns in (-2, -1, 0, 1, 2)]
+        pieces = [(max(low + shift, space.low[AZIMUTH]), min(high + shift, space.high[AZIMUTH])) for shift in shifts]
         low, high = max(pieces, key=lambda piece: piece[1] - piece[0])
         low, high = (low, high) if low <= high else ((low + high) / 2, (low + high) / 2)
     if high - low >= 2 * math.pi:

@@ -120,7 +120,7 @@ def mixture_of_labels(features: Features, labels: np.ndarray, bounds: Bounds) ->
     mass = np.bincount(labels, features.weights, minlength=count)
     source = np.where(mass > SMALLEST_MASS, np.arange(count), mass.argmax())
     azimuth, elevation = mean_directions(features, labels, count)
-    blank = Mixture(
+    placed = Mixture(
         weights=mass[source] / mass[source].sum(),
         origin_m=np.tile(features.points[0, :3], (count, 1)),
         origin_covariance_m2=np.zeros((count, 3, 3)),
@@ -132,7 +132,6 @@ def mixture_of_labels(features: Features, labels: np.ndarray, bounds: Bounds) ->
         spread_range_m=np.zeros(count),
     )
     floors = Floors.of(features)
-    placed = blank
     for step in (1.0, 0.0) if axes.angular else (0.0,):
         statistics = label_statistics(placed, features, labels)
         rows = Statistics(statistics.log_likelihood, mass[source], statistics.phi[source], statistics.tangent[source])
@@ -144,19 +143,19 @@ def seed_mixture(features: Features, bounds: Bounds, generator: np.random.Genera
     """k-means++ seeds, a few Lloyd steps, and components from the cells, each where its bounds admit it."""
     chosen = generator.choice(len(features), min(SEED_SAMPLES, len(features)), replace=False)
     part = features.subset(np.sort(chosen)) if len(chosen) < len(features) else features
-    embedding = np.ascontiguousarray(part.embedding)
-    _, labels = lloyd(embedding, part.weights, len(bounds), generator, iterations=SEED_LLOYD_ITERATIONS)
+    seeds = np.ascontiguousarray(part.embedding)
+    _, labels = lloyd(seeds, part.weights, len(bounds), generator, iterations=SEED_LLOYD_ITERATIONS)
     return mixture_of_labels(part, _match_cells(part, labels, bounds), bounds)
 
 
 def _match_cells(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarray:
     """Labels renumbered so that each cell has the component whose bounds it violates least."""
-    count = len(bounds)
+    count, unit = len(bounds), features.scale.max() if len(features.scale) else 1.0
     cost = np.zeros((count, count))
     azimuth, elevation = mean_directions(features, labels, count)
     mass = np.maximum(np.bincount(labels, features.weights, minlength=count), SMALLEST_CELL)
-    means = np.stack([np.bincount(labels, features.weights * column, minlength=count) for column in features.points.T])
-    means = (means / mass).T
+    sums = [np.bincount(labels, features.weights * column, minlength=count) for column in features.points.T]
+    means = (np.stack(sums) / mass).T
     for component in range(count):
         one = bounds.take(np.full(count, component))
         turned = wrap_angle(clip_azimuth(azimuth, one) - azimuth) / features.angular_scale
@@ -165,7 +164,6 @@ def _match_cells(features: Features, labels: np.ndarray, bounds: Bounds) -> np.n
         high = np.maximum(np.minimum(bounds.origin_high[component], bounds.free_high[component]), low)
         moved = nearest_in_boxes(means[:, :3], low, high) - means[:, :3]
         reach = np.clip(means[:, 5], one.start_low, one.end_high) - means[:, 5]
-        unit = features.scale.max() if len(features.scale) else 1.0
         cost[component] = np.square(turned) + np.square(tilted) + (np.square(moved).sum(1) + np.square(reach)) / unit**2
     if not cost.any() or (cost == cost[0]).all():
         return labels
@@ -214,22 +212,18 @@ def _best_seed(features: Features, bounds: Bounds, generator: np.random.Generato
     part = features
     if len(features) > SCREEN_SAMPLES:
         part = features.subset(np.sort(generator.choice(len(features), SCREEN_SAMPLES, replace=False)))
-    runs = [run_em(one, part, bounds, iterations=RESTART_ITERATIONS) for one in seeds]
-    runs.sort(key=lambda run: -run.log_likelihood)
-    best = [run_em(run.mixture, features, bounds, iterations=RESTART_ITERATIONS) for run in runs[:FINALISTS]]
-    return max(best, key=lambda run: run.log_likelihood).mixture
-
-
-def dead_components(mixture: Mixture, features: Features) -> np.ndarray:
-    """Which components explain less than two effective samples, shape (K,) bool."""
-    return mixture.weights * effective_count(features.weights) < min(DEAD_SAMPLES, len(features) / len(mixture))
+    runs = [run_em(seed, part, bounds, iterations=RESTART_ITERATIONS) for seed in seeds]
+    finalists = sorted(runs, key=lambda run: -run.log_likelihood)[:FINALISTS]
+    runs = [run_em(run.mixture, features, bounds, iterations=RESTART_ITERATIONS) for run in finalists]
+    return max(runs, key=lambda run: run.log_likelihood).mixture
 
 
 def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
     """Give dead components half of the heaviest one's samples and go on, where the likelihood gains."""
     notes: list[str] = []
+    fewest = min(DEAD_SAMPLES, len(features) / len(bounds))
     for _ in range(MOST_REVIVALS):
-        dead = np.flatnonzero(dead_components(result.mixture, features))
+        dead = np.flatnonzero(result.mixture.weights * effective_count(features.weights) < fewest)
         if not len(dead):
             break
         labels = responsibilities(result.mixture, features).argmax(axis=1)

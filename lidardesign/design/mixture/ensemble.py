@@ -86,20 +86,18 @@ class Ensemble:
     @property
     def weights(self) -> np.ndarray:
         """Shares of the rays in the order of the sensors, summing to 1."""
-        weights = np.empty(len(self.order))
         pairs = zip(self.parts, self.results, strict=True)
-        weights[self.order] = np.concatenate([part.share * result.mixture.weights for part, result in pairs])
+        weights = self._in_order([part.share * result.mixture.weights for part, result in pairs])
         return weights / weights.sum()
 
     @property
     def widths_m(self) -> np.ndarray:
         """Gate widths in the order of the sensors [m]."""
-        widths = np.empty(len(self.order))
         pairs = zip(self.parts, self.results, strict=True)
-        widths[self.order] = np.concatenate(
-            [2 * part.bounds.interval * result.mixture.spread_range_m for part, result in pairs]
-        )
-        return widths
+        return self._in_order([2 * part.bounds.interval * result.mixture.spread_range_m for part, result in pairs])
+
+    def _in_order(self, values: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate(values)[np.argsort(self.order)]
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -148,9 +146,8 @@ def sensors_of(ensemble: Ensemble, space: DesignSpace, level: float) -> tuple[Se
         for part, result in zip(ensemble.parts, ensemble.results, strict=True)
         for row in range(len(part.bounds))
     ]
-    placed = [rows[i] for i in np.argsort(ensemble.order, kind="stable")]
-    placed = [replace(s, weight=float(w)) for s, w in zip(placed, ensemble.weights, strict=True)]
-    return _named(placed)
+    order = np.argsort(ensemble.order, kind="stable")
+    return _named([replace(rows[i], weight=float(w)) for i, w in zip(order, ensemble.weights, strict=True)])
 
 
 def heaviest_first(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
@@ -164,11 +161,8 @@ def _named(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
 
 def _sensor(part: GroupSamples, mixture: Mixture, row: int, space: DesignSpace, level: float) -> Sensor:
     axes: Axes = part.features.axes
-    origin = np.array(space.low[:3], dtype=np.float64)
-    for axis, pin in enumerate(part.group.pins):
-        if pin is not None:
-            origin[axis] = pin
-    free = list(axes.origin)
+    fixed = [low if pin is None else pin for low, pin in zip(space.low[:3], part.group.pins, strict=True)]
+    origin, free = np.array(fixed, dtype=np.float64), list(axes.origin)
     origin[free] = mixture.origin_m[row, free]
     covariance = np.zeros((3, 3))
     covariance[np.ix_(free, free)] = mixture.origin_covariance_m2[row][np.ix_(free, free)]
@@ -222,8 +216,8 @@ def choose_mounts(
             seen = {n: _greedy(views, options[:n]) for n in counts}
             count = min(n for n in counts if seen[n][1] >= ENOUGH_SHARE * together)
             chosen = seen[count][0]
-    fixed = fix_origins(rules, [chosen.get(sensor) for sensor in range(count)])
-    return fixed, [count] if common else counts
+    places = [chosen.get(sensor) for sensor in range(count)]
+    return fix_origins(rules, places), [count] if common else counts
 
 
 def _views(
@@ -252,9 +246,7 @@ def _views(
     return views
 
 
-def _greedy(
-    views: dict[tuple[int, Mount], np.ndarray], options: list[list[Mount]]
-) -> tuple[dict[int, Mount], float]:
+def _greedy(views: dict[tuple[int, Mount], np.ndarray], options: list[list[Mount]]) -> tuple[dict[int, Mount], float]:
     """The mount of each mounted sensor, and how much of the density they see together."""
     seen = np.zeros(len(next(iter(views.values()))))
     left = {sensor: list(mounts) for sensor, mounts in enumerate(options) if mounts}
@@ -288,8 +280,8 @@ def add_couplings(ensemble: Ensemble, sensors: tuple[Sensor, ...]) -> tuple[Sens
             continue
         share = responsibilities(trace.mixture, part.features) * part.features.weights[:, None]
         for column, index in enumerate(part.group.sensors):
-            found = coupling_of(sensors[index], part.features.points, share[:, column])
-            coupled[index] = replace(sensors[index], coupling=found)
+            coupling = coupling_of(sensors[index], part.features.points, share[:, column])
+            coupled[index] = replace(sensors[index], coupling=coupling)
     return tuple(coupled)
 
 
@@ -360,12 +352,11 @@ def _regression(covariates: np.ndarray, values: np.ndarray, weights: np.ndarray)
     centred = covariates - share @ covariates
     deviation = values - share @ values
     scale = np.sqrt(share @ np.square(centred))
-    varies = scale > 0
-    unit = np.where(varies, scale, 1.0)
+    unit = np.where(scale > 0, scale, 1.0)
     standard = centred / unit
     variances, axes = np.linalg.eigh(standard.T @ (share[:, None] * standard))
     carried = variances > SMALLEST_VARIANCE_SHARE * max(variances[-1], 0.0)
     inverse = np.where(carried, 1.0 / np.where(carried, variances, 1.0), 0.0)
     slopes = axes @ (inverse * (axes.T @ (standard.T @ (share * deviation))))
     left = deviation - standard @ slopes
-    return np.where(varies, slopes / unit, 0.0), float(np.sqrt(share @ np.square(left)))
+    return np.where(scale > 0, slopes / unit, 0.0), float(np.sqrt(share @ np.square(left)))

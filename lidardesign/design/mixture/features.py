@@ -166,8 +166,8 @@ def ray_features(features: Features) -> np.ndarray:
         aiming = np.delete(aiming, len(features.axes.origin), axis=1)
     if not features.axes.origin:
         return np.ascontiguousarray(aiming)
-    pool = slice(0, NEIGHBOUR_POOL)
-    near = cKDTree(aiming[pool]).query(aiming, k=min(NEIGHBOURS, len(aiming)))[1].reshape(len(aiming), -1)
+    tree = cKDTree(aiming[:NEIGHBOUR_POOL])
+    near = tree.query(aiming, k=min(NEIGHBOURS, len(aiming)))[1].reshape(len(aiming), -1)
     share = features.weights[near]
     points = features.points.copy()
     # far from all of the density neighbours weigh nothing together, and there is no mean

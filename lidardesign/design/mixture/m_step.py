@@ -95,9 +95,8 @@ def _fit_origins(
         thinnest=np.square(bounds.origin_thickness) if count == 3 else np.full(len(mixture), np.inf),
     )
     old = mixture.origin_m[:, axes], mixture.origin_covariance_m2[:, axes][:, :, axes]
-    point, best = best_origins(mean, scatter, limits, *old)
-    origin[:, axes] = point
-    covariance[np.ix_(range(len(mixture)), axes, axes)] = best
+    block = np.ix_(range(len(mixture)), axes, axes)
+    origin[:, axes], covariance[block] = best_origins(mean, scatter, limits, *old)
     return origin, covariance
 
 
@@ -132,11 +131,10 @@ def fit_gate(mean: np.ndarray, variance: np.ndarray, bounds: Bounds, floor: floa
         away = np.where(bound, mean - np.where(bound, edge, 0.0), 0.0)
         root = (-away * slope + np.sqrt(np.square(away * slope) + 4 * (variance + np.square(away)))) / 2
         candidates += [np.where(bound, root, low), np.where(bound, np.abs(away) / z, low)]
-    for one, other in ((bounds.end_low, bounds.start_low), (bounds.end_high, bounds.start_high)):
-        both = np.isfinite(one) & np.isfinite(other)
-        candidates.append((np.where(both, one, 0.0) - np.where(both, other, 0.0)) / (2 * z))
-    spreads = np.stack(candidates)
-    spreads = np.clip(spreads, low, high)
+    for end, start in ((bounds.end_low, bounds.start_low), (bounds.end_high, bounds.start_high)):
+        both = np.isfinite(end) & np.isfinite(start)
+        candidates.append((np.where(both, end, 0.0) - np.where(both, start, 0.0)) / (2 * z))
+    spreads = np.clip(np.stack(candidates), low, high)
     lower = np.maximum(bounds.start_low + z * spreads, bounds.end_low - z * spreads)
     upper = np.minimum(bounds.start_high + z * spreads, bounds.end_high - z * spreads)
     means = np.minimum(np.maximum(mean, lower), np.maximum(upper, lower))
@@ -170,8 +168,8 @@ def _fit_directions(
     along = np.einsum("kij,kj->ki", old[:, 1:], new[:, 0]) / (1 + local[:, :1])
     transported = old[:, 1:] - along[:, :, None] * total[:, None]
     turn = np.einsum("kij,kmj->kim", new[:, 1:], transported)
-    moment = tangent[:, :, 1:] - mean[:, :, None] * taken[:, None] - taken[:, :, None] * mean[:, None]
-    moment = moment + taken[:, :, None] * taken[:, None]
+    crossed = mean[:, :, None] * taken[:, None]
+    moment = tangent[:, :, 1:] - crossed - np.swapaxes(crossed, 1, 2) + taken[:, :, None] * taken[:, None]
     moment = turn @ moment @ np.swapaxes(turn, 1, 2)
     previous = np.arctan2(-turn[:, 0, 1], turn[:, 0, 0]) if axes.angular == 2 else np.zeros(len(mixture))
     roll, spread = fit_field(moment, previous, bounds, floors.angle_rad, axes.angular == 2)
@@ -191,25 +189,13 @@ def _move_boresights(
     cosine = np.cos(mixture.elevation_rad)
     offset = wrap_angle(mixture.azimuth_rad - bounds.azimuth_centre)
     usable = (bounds.azimuth_half < math.pi) & (cosine > POLE_COSINE)
-    low = np.stack(
-        [
-            np.where(usable, (-bounds.azimuth_half - offset) * cosine, -np.inf),
-            bounds.elevation_low - mixture.elevation_rad,
-        ],
-        1,
-    )
-    high = np.stack(
-        [
-            np.where(usable, (bounds.azimuth_half - offset) * cosine, np.inf),
-            bounds.elevation_high - mixture.elevation_rad,
-        ],
-        1,
-    )
+    low_tilt, high_tilt = (bound - mixture.elevation_rad for bound in (bounds.elevation_low, bounds.elevation_high))
+    low = np.where(usable, (-bounds.azimuth_half - offset) * cosine, -np.inf)
+    high = np.where(usable, (bounds.azimuth_half - offset) * cosine, np.inf)
+    low = np.stack([low, np.where(bounds.elevation_low <= -math.pi / 2, -np.inf, low_tilt)], 1)
+    high = np.stack([high, np.where(bounds.elevation_high >= math.pi / 2, np.inf, high_tilt)], 1)
     precision = rotation @ (np.square(1 / mixture.spread_rad)[:, :, None] * np.swapaxes(rotation, 1, 2))
-    low[:, 1] = np.where(bounds.elevation_low <= -math.pi / 2, -np.inf, low[:, 1])
-    high[:, 1] = np.where(bounds.elevation_high >= math.pi / 2, np.inf, high[:, 1])
-    step = box_quadratic_minimum(precision, east_north, np.minimum(low, high), high)
-    step = step * np.array(used, dtype=np.float64)
+    step = box_quadratic_minimum(precision, east_north, np.minimum(low, high), high) * np.array(used, dtype=np.float64)
     level = frames(mixture.azimuth_rad, mixture.elevation_rad, np.zeros(len(mixture)))
     forward = np.einsum("kj,kji->ki", sphere_exp(step), level)
     azimuth = np.arctan2(forward[:, 1], forward[:, 0]) if used[0] else mixture.azimuth_rad
@@ -238,8 +224,7 @@ def fit_field(
     eigen = 0.5 * np.arctan2(2 * moment[:, 0, 1], moment[:, 0, 0] - moment[:, 1, 1])
     # the axis called horizontal is the eigenvector nearer to it
     eigen = np.where(np.abs(eigen) > LARGEST_ROLL_RAD, eigen - np.copysign(math.pi / 2, eigen), eigen)
-    zero = np.zeros(len(moment))
-    limit = np.full(len(moment), LARGEST_ROLL_RAD)
+    zero, limit = np.zeros(len(moment)), np.full(len(moment), LARGEST_ROLL_RAD)
     turned = wrap_angle(2 * np.asarray(previous)) / 2
     turned = np.where(np.abs(turned) > LARGEST_ROLL_RAD, zero, turned)
     rolls_tried = np.stack([eigen, zero, limit, -limit, turned]) if rolls else zero[None]

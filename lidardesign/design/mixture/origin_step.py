@@ -195,8 +195,8 @@ def _scaled(
         linear = (others * precision * scatter[:, axis]).sum(axis=1)
         tilt = (others * shift).sum(axis=1)
         sides = tuple(side[:, axis] for side in box.sides)
-        best = _best_axis((own * scatter[:, axis, axis], own, linear, tilt), mean[:, axis], sides, box)
-        precision[:, axis], shift[:, axis] = best
+        form = own * scatter[:, axis, axis], own, linear, tilt
+        precision[:, axis], shift[:, axis] = _best_axis(form, mean[:, axis], sides, box)
     moved = np.clip(mean - shift / precision, box.low, box.high)
     ratio = 1 / precision / deviations
     return moved, covariance * ratio[:, :, None] * ratio[:, None, :]

@@ -76,10 +76,9 @@ def admissible(points: np.ndarray, rules: Sequence[SensorRules], space: DesignSp
         low, high = origin_box(one, space)
         inside = ((points[:, :3] >= low - TOLERANCE) & (points[:, :3] <= high + TOLERANCE)).all(axis=1)
         inside &= ~inside_excluded(points[:, :3], one)
-        if one.gate.start_m.min is not None:
-            inside &= points[:, RANGE] >= one.gate.start_m.min
-        if one.gate.end_m.max is not None:
-            inside &= points[:, RANGE] <= one.gate.end_m.max
+        start, end = one.gate.start_m.min, one.gate.end_m.max
+        inside &= points[:, RANGE] >= (-math.inf if start is None else start)
+        inside &= points[:, RANGE] <= (math.inf if end is None else end)
         widest = one.field_of_view.horizontal_deg.max, one.field_of_view.vertical_deg.max
         ends = one.boresight.azimuth_deg, one.boresight.elevation_deg
         if None not in widest and any(value is not None for end in ends for value in (end.min, end.max)):
@@ -166,8 +165,7 @@ def reaim_samples(
 
 def _per_scene_volume(points: np.ndarray, log_target: np.ndarray, space: DesignSpace) -> np.ndarray:
     """log p* per volume of observed scene points instead of per chart volume of direction and range."""
-    free = space.free
-    power = (AZIMUTH in free) + (ELEVATION in free)
+    power = (AZIMUTH in space.free) + (ELEVATION in space.free)
     with np.errstate(divide="ignore"):
         jacobian = power * np.log(points[:, RANGE])
         if space.measure == "angles" and power == 2:
@@ -243,17 +241,15 @@ def at_condition(
         )
     # the nearest samples in a random order; distances are shares of each condition's bounds
     order = generator.permutation(len(samples))
-    squared = np.zeros(len(samples))
-    for name, value in condition.items():
-        index = DIMENSIONS.index(name)
+    squared, values = np.zeros(len(samples)), {DIMENSIONS.index(name): value for name, value in condition.items()}
+    for index, value in values.items():
         extent = samples.space.high[index] - samples.space.low[index]
         if extent > 0:
             squared += np.square((samples.points[order, index] - value) / extent)
     near = np.sort(np.argsort(squared, kind="stable")[:count])
     order, nearest = order[near], np.argsort(squared[near], kind="stable")
     points = samples.points[order].copy()
-    for name, value in condition.items():
-        points[:, DIMENSIONS.index(name)] = value
+    points[:, list(values)] = list(values.values())
     log_target = np.asarray(retarget(points), dtype=np.float64)
     if log_target.shape != (len(points),) or np.isnan(log_target).any():
         raise NumericalError(f"the target density is NaN at {condition_text(condition)}", where="--at")
