@@ -193,8 +193,7 @@ def _fit_parts(request: FitProblem) -> FittedDesign:
     """Sensors, and the parts of the catalogue that they become."""
     # the parts have gates of their own: the budget is theirs
     free = replace(request, budget=replace(request.budget, limit_mbps=None, rays=None))
-    fitted = fit_sensors(free)
-    notes: tuple[str, ...] = ()
+    fitted, notes = fit_sensors(free), ()
     fixed = fix_part_origins(request.rules, fitted.sensors)
     if fixed is not None:
         fitted = fit_sensors(replace(free, rules=fixed, sensors=len(fitted.sensors)))
@@ -321,12 +320,9 @@ def _error_estimates(
     if all(support.mass is not None for support in supports):
         widest = max(supports, key=lambda support: support.total)
         # The standard error of the share m of the density inside the constraints, of weights that sum to 1 in all
-        inside = float(np.square(widest.weights).sum())
-        everything = float(np.square(samples.weights).sum())
-        mass = widest.total
-        estimates["admissible_mass"] = Estimate(
-            widest.total, math.sqrt((1 - mass) ** 2 * inside + mass**2 * max(everything - inside, 0.0))
-        )
+        mass, inside = widest.total, float(np.square(widest.weights).sum())
+        outside = max(float(np.square(samples.weights).sum()) - inside, 0.0)
+        estimates["admissible_mass"] = Estimate(mass, math.sqrt((1 - mass) ** 2 * inside + mass**2 * outside))
     counts = [sensor.rays for sensor in sensors]
     if None not in counts:
         rays = np.array(counts, dtype=np.float64)

@@ -23,7 +23,6 @@ from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_d
 from lidardesign.design.fit import fit, rays_at
 from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.layouts.scan import fit_track
 from lidardesign.design.layouts.track import TrackSamples, aimed_rays, interpolated, placed, travels
 from lidardesign.design.sensor import DesignSpec, Sensor, Track
 from lidardesign.errors import ConfigError, InfeasibleError
@@ -75,9 +74,8 @@ def test_a_scan_of_a_density_with_a_condition_is_a_track(free):
 def test_knots_lie_a_tenth_of_a_metre_apart_or_as_far_as_the_samples_ask(free):
     # 12,000 samples of equal weight, 40 for each ray of a knot
     assert len(free.design.track.knots) == 12_000 // (8 * 40) + 1
-    many = fit_track(shelves(40_000), rays=4).design.track
+    many = fit(shelves(40_000), layout="scan", rays=4).design.track
     np.testing.assert_allclose(np.diff(many.knots), 0.1)
-    assert len(fit_track(SAMPLES, rays=8, knots=5).design.track.knots) == 5
 
 
 def test_rays_look_at_the_shelves_wherever_the_robot_is(free):
@@ -433,11 +431,9 @@ def test_an_origin_box_shortens_the_travel():
     assert result.admissible_mass == pytest.approx(1 / 4.5, abs=0.02)
 
 
-def test_a_track_needs_its_number_of_rays_and_of_knots():
+def test_a_track_needs_its_number_of_rays():
     with pytest.raises(ConfigError, match="--rays N"):
         fit(SAMPLES, layout="scan")
-    with pytest.raises(ConfigError, match="1 knots"):
-        fit_track(SAMPLES, rays=2, knots=1)
 
 
 # --- files
@@ -558,9 +554,11 @@ def test_the_checked_bandwidth_is_that_of_the_dearest_position(widths):
     assert found <= max(Bandwidth().mbps_of_widths(row) for row in worst) + 1e-9
 
 
-def test_the_error_of_a_tracks_likelihood_is_its_spread_over_other_samples():
+def test_the_error_of_a_tracks_likelihood_is_its_spread_over_other_samples(monkeypatch):
+    monkeypatch.setattr("lidardesign.design.layouts.scan.KNOT_SPACING_M", 2.25)
     repeats = 24
-    found = [fit_track(shelves(1500, seed), rays=2, knots=3) for seed in range(repeats)]
-    stated = np.mean([one.log_likelihood.error for one in found])
-    spread = np.std([one.log_likelihood.value for one in found])
+    tracks = [fit(shelves(1500, seed), layout="scan", rays=2) for seed in range(repeats)]
+    assert {len(one.design.track.knots) for one in tracks} == {3}
+    stated = np.mean([one.error_estimates["log_likelihood"].error for one in tracks])
+    spread = np.std([one.log_likelihood for one in tracks])
     assert stated == pytest.approx(spread, rel=4 / math.sqrt(2 * repeats))

@@ -94,10 +94,9 @@ def _density_tangent(sensor: Sensor, count: int, seen: Members, seed: int) -> np
     wide fields at their rims, and rays would be sparse there. In two dimensions the centres' density follows the
     square root of the samples' (Zador 1982): more rays where the density is, and none of its thin parts left without.
     """
-    field = field_on_sphere(sensor)
+    field, most = field_on_sphere(sensor), samples_for(count)
     generator = random_generator(seed, "density layout")
     tangent, weights = seen.tangent, seen.weights
-    most = samples_for(count)
     if count and len(seen) > most:
         tangent, weights = tangent[systematic_draw(weights, most, generator)], np.ones(most)
     if count == 0 or len(np.unique(tangent, axis=0)) < count:
@@ -155,7 +154,8 @@ def shared_rays(design: DesignSpec, shares: np.ndarray, samples: Samples, seed: 
         seed: For the quantisation.
     """
     seen = _Seen.of(design, samples)
-    places, place = np.unique([sensor.origin_m for sensor in design.sensors], axis=0, return_inverse=True)
+    origins = np.array([sensor.origin_m for sensor in design.sensors], dtype=np.float64)
+    places, place = np.unique(origins, axis=0, return_inverse=True)
     place = place.reshape(-1)
     directions, sensors, ranges, weights, rays, count = [], [], [], [], [], 0
     for index in range(len(places)):
@@ -183,8 +183,8 @@ def shared_rays(design: DesignSpec, shares: np.ndarray, samples: Samples, seed: 
     heard = RayRanges(np.concatenate(ranges), np.concatenate(weights), np.concatenate(rays), count)
     gate = _priced_gates(design, heard, sensor, samples)
     order = np.lexsort((looking[:, 0], looking[:, 1], np.round(looking[:, 2], ORDER_DECIMALS), sensor))
-    origin = np.array([s.origin_m for s in design.sensors], dtype=np.float64)[sensor[order]]
-    return Rays(origin, looking[order], gate[order], sensor[order], fire_times(count, DEFAULT_RATE_HZ))
+    sensor = sensor[order]
+    return Rays(origins[sensor], looking[order], gate[order], sensor, fire_times(count, DEFAULT_RATE_HZ))
 
 
 def _cells(
@@ -213,8 +213,7 @@ def _cells(
 def _priced_gates(design: DesignSpec, heard: RayRanges, sensor: np.ndarray, samples: Samples) -> np.ndarray:
     """Gates by what rays hear, inside their sensors' bounds and the design's bandwidth, shape (N, 2) [m]."""
     constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
-    sensors = tuple(range(len(design.sensors)))
-    bounds = bounds_of(constraints.rules, samples.space, sensors, interval_factor(design.level)).take(sensor)
+    bounds = bounds_of(constraints.rules, samples.space, tuple(sensor.tolist()), interval_factor(design.level))
     return gates_within(heard, bounds, design.level, *bandwidth_limit(constraints, len(sensor)))
 
 
@@ -240,5 +239,4 @@ def bandwidth_limit(constraints: Constraints, rays: int) -> tuple[Bandwidth, int
     model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
     if budget.bandwidth_mbps is None:
         return model, None
-    one_bin = model.mbps_of_widths(np.zeros(1))
-    return model, max(int(budget.bandwidth_mbps / one_bin), rays)
+    return model, max(int(budget.bandwidth_mbps / model.mbps_of_widths(np.zeros(1))), rays)

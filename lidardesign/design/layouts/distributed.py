@@ -125,10 +125,10 @@ def owned(
         fired.append(own)
         if share == 0:
             continue
-        one = rules_of(constraints.rules, index)
-        low, high = origin_box(one, space)
+        rules = rules_of(constraints.rules, index)
+        low, high = origin_box(rules, space)
         inside = ((own[:, :3] >= low - ROUNDING_M) & (own[:, :3] <= high + ROUNDING_M)).all(axis=1)
-        inside &= ~inside_excluded(own[:, :3], one)
+        inside &= ~inside_excluded(own[:, :3], rules)
         inside &= in_region(sensor, own) & space.contains(own) & (weights > 0)
         score = np.where(inside, np.log(share) + log_joint_density(sensor, own, smallest_m=smallest), -np.inf)
         better = score > best
@@ -142,10 +142,9 @@ def in_region(sensor: Sensor, points: np.ndarray) -> np.ndarray:
     origin, tangent, _ = relative(sensor, points)
     inside = (np.abs(tangent) <= np.array(sensor.field_of_view_rad) / 2 + FIELD_ROUNDING_RAD).all(axis=1)
     spreads, axes = principal_axes(sensor)
-    along = origin @ axes
     # so many standard deviations within which the level of a normal vector of so many dimensions lies
     radius = float(np.sqrt(chdtri(len(spreads), 1 - sensor.level))) if len(spreads) else 0.0
-    return inside & (np.square(along / spreads).sum(axis=1) <= radius**2)
+    return inside & (np.square(origin @ axes / spreads).sum(axis=1) <= radius**2)
 
 
 def principal_axes(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
@@ -170,8 +169,7 @@ def log_joint_density(sensor: Sensor, points: np.ndarray, *, smallest_m: float) 
     angular, depth = np.maximum(angular, SMALLEST_ANGLE_RAD), max(depth, smallest_m)
     squares = np.square((origin @ axes) / spreads).sum(axis=1) + np.square((tangent - mean_angle) / angular).sum(axis=1)
     squares += np.square((range_m + sensor.range_m - mean_range) / depth)
-    angle = np.hypot(tangent[:, 0], tangent[:, 1])
-    log_jacobian = np.log(angle_over_sine(angle))
+    log_jacobian = np.log(angle_over_sine(np.hypot(tangent[:, 0], tangent[:, 1])))
     return -squares / 2 - np.log(spreads).sum() - np.log(angular).sum() - np.log(depth) + log_jacobian
 
 
@@ -215,15 +213,11 @@ class DistributedLayout(Layout):
             own, number = fired[index], int(own_count)
             if samples is None or number == 0 or len(np.unique(own[:, :RANGE], axis=0)) < number:
                 # Lowest and highest origins of a sensor's rays, outside the excluded boxes, shape (2, 3) [m]
-                one = rules_of(constraints.rules, index)
-                low, high = origin_box(one, space)
-                free = free_boxes(one, space)
+                rules = rules_of(constraints.rules, index)
+                box, free = np.stack(origin_box(rules, space)), free_boxes(rules, space)
                 if len(free.low_m):
                     reach = interval_factor(sensor.level) * np.sqrt(np.diag(sensor.origin_covariance_m2))
-                    beside, beyond = box_around(np.asarray(sensor.origin_m), reach, free)
-                    low = np.clip(beside, low, high)
-                    high = np.clip(beyond, low, high)
-                box = np.stack([low, high])
+                    box = np.clip(box_around(np.asarray(sensor.origin_m), reach, free), *box)
                 parts.append(_gaussian_rays(sensor, number, bounds, box, space))
             else:
                 generator = random_generator(seed, "distributed layout", index)
@@ -286,9 +280,18 @@ def _picked(part: Features, log_target: np.ndarray, count: int, generator: np.ra
     picked = _best_near(labels, away, log_target, NEAR_SHARE)
     scene, origins = observed_point(part.points), part.points[:, :3]
     looking = direction(part.points[:, AZIMUTH], part.points[:, ELEVATION])
+
+    def filled(picked: np.ndarray) -> np.ndarray:
+        # as many others as are missing: distinct rays, those farthest from all rays first
+        if len(picked) == count:
+            return picked
+        _, away = nearest_lines(scene, origins[picked], looking[picked])
+        everyone = np.concatenate([picked, np.argsort(-away, kind="stable")])
+        _, first = np.unique(part.points[everyone, :RANGE], axis=0, return_index=True)
+        return everyone[np.sort(first)[:count]]
+
     for _ in range(LINE_ITERATIONS):
-        cells, away = nearest_lines(scene, origins[picked], looking[picked])
-        picked = _with_missing(picked, away, part.points, count)
+        picked = filled(picked)
         cells, _ = nearest_lines(scene, origins[picked], looking[picked])
         order = np.argsort(cells, kind="stable")
         cost = np.empty(len(cells))
@@ -296,19 +299,8 @@ def _picked(part: Features, log_target: np.ndarray, count: int, generator: np.ra
             if len(cell):
                 cost[cell] = mean_squares(scene[cell], part.weights[cell], origins[cell], looking[cell])
         picked = _best_near(cells, cost, log_target, NEAR_LINE_SHARE)
-    _, away = nearest_lines(scene, origins[picked], looking[picked])
-    picked = _with_missing(picked, away, part.points, count)
+    picked = filled(picked)
     return picked[np.lexsort(part.points[picked, :RANGE].T)]
-
-
-def _with_missing(picked: np.ndarray, away: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Picked samples, and as many others as are missing: distinct rays, those farthest from all rays first."""
-    if len(picked) == count:
-        return picked
-    farthest = np.argsort(-away, kind="stable")
-    everyone = np.concatenate([picked, farthest])
-    _, first = np.unique(points[everyone, :RANGE], axis=0, return_index=True)
-    return everyone[np.sort(first)[:count]]
 
 
 def _best_near(labels: np.ndarray, away: np.ndarray, log_target: np.ndarray, share: float) -> np.ndarray:
@@ -319,8 +311,7 @@ def _best_near(labels: np.ndarray, away: np.ndarray, log_target: np.ndarray, sha
     rank = np.empty(len(labels), dtype=np.int64)
     rank[order] = np.arange(len(labels)) - starts[labels[order]]
     near = rank < np.maximum(np.ceil(share * sizes[labels]), 1)
-    ranked = np.lexsort((away, np.where(near, -log_target, np.inf), labels))
-    return ranked[starts[sizes > 0]]
+    return np.lexsort((away, np.where(near, -log_target, np.inf), labels))[starts[sizes > 0]]
 
 
 def _gaussian_rays(
@@ -350,8 +341,7 @@ def _gaussian_rays(
     _, middle = conditional_means(sensor, origin, tangent)
     reach = interval_factor(sensor.level) * depth
     gate = np.clip(np.stack([middle - reach, middle + reach], axis=1), *sensor.gate_m)
-    empty = gate[:, 1] <= gate[:, 0]
-    gate[empty] = sensor.gate_m
+    gate[gate[:, 1] <= gate[:, 0]] = sensor.gate_m
     gate = bounded_gates(gate, sensor, bounds.take(np.zeros(count, dtype=np.int64)))
     return rays[:, :3], direction(rays[:, AZIMUTH], rays[:, ELEVATION]), gate
 

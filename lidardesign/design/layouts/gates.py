@@ -83,8 +83,15 @@ def admissible_gates(wanted_m: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, 
     """
     centre, half = wanted_m.mean(axis=1), np.diff(wanted_m, axis=1)[:, 0] / 2
     smallest = THINNEST_GATE_M / (2 * bounds.interval)
-    spread = np.maximum(half / bounds.interval, smallest)
-    return fit_gate(centre, np.square(spread), bounds, smallest)
+    return fit_gate(centre, np.square(np.maximum(half / bounds.interval, smallest)), bounds, smallest)
+
+
+def admitted_gates(wanted_m: np.ndarray, bounds: Bounds) -> np.ndarray:
+    """Start and end of the gates that `admissible_gates` finds, shape (K, 2) [m]."""
+    centre, spread = admissible_gates(wanted_m, bounds)
+    half = bounds.interval * spread
+    # half an ulp may take a gate that starts at 0 below it
+    return np.maximum(np.stack([centre - half, centre + half], axis=1), 0.0)
 
 
 def bounded_gates(wanted: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndarray:
@@ -97,10 +104,7 @@ def bounded_gates(wanted: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndar
     if end <= start:
         return np.tile([start, end], (len(wanted), 1))
     inner = replace(bounds, start_low=np.full(len(wanted), start), end_high=np.full(len(wanted), end))
-    centre, spread = admissible_gates(wanted, inner)
-    half = bounds.interval * spread
-    moved = np.clip(np.stack([centre - half, centre + half], axis=1), start, end)
-    return np.where(broken[:, None], moved, wanted)
+    return np.where(broken[:, None], np.clip(admitted_gates(wanted, inner), start, end), wanted)
 
 
 # Prices are bisected on a logarithmic scale, from this share of the dearest one.
@@ -146,26 +150,21 @@ def gates_within(heard: RayRanges, bounds: Bounds, level: float, model: Bandwidt
     """
     heard, wide = _admissible(heard, bounds, level)
 
-    def admitted(gates: np.ndarray) -> np.ndarray:
-        centre, spread = admissible_gates(gates, bounds)
-        half = bounds.interval * spread
-        return np.maximum(np.stack([centre - half, centre + half], axis=1), 0.0)
-
     def fits(gates: np.ndarray) -> bool:
         return most_bins is None or int(model.bins(gates[:, 1] - gates[:, 0]).sum()) <= most_bins
 
-    found = admitted(wide)
-    if fits(found):
-        return found
+    gates = admitted_gates(wide, bounds)
+    if fits(gates):
+        return gates
     prices = _Prices.of(heard, wide)
     # no interval as long as a bin is worth this price
     dear = float(np.log(2 * max(prices.until.max(), TINY) / model.bin_m))
     cheap = dear + float(np.log(CHEAPEST))
     for _ in range(BISECTIONS):
         middle = (cheap + dear) / 2
-        gates = admitted(prices.gates(float(np.exp(middle))))
+        gates = admitted_gates(prices.gates(float(np.exp(middle))), bounds)
         cheap, dear = (cheap, middle) if fits(gates) else (middle, dear)
-    return admitted(prices.gates(float(np.exp(dear))))
+    return admitted_gates(prices.gates(float(np.exp(dear))), bounds)
 
 
 def _admissible(heard: RayRanges, bounds: Bounds, level: float) -> tuple[RayRanges, np.ndarray]:
@@ -193,16 +192,15 @@ class _Prices:
         ranges, weights, ray = heard.range_m[inside], heard.weights[inside], heard.ray[inside]
         order = np.lexsort((ranges, ray))
         ranges, weights, ray = ranges[order], weights[order], ray[order]
-        starts = np.searchsorted(ray, np.arange(heard.count))
-        place = np.arange(len(ray)) - starts[ray]
+        place = np.arange(len(ray)) - np.searchsorted(ray, np.arange(heard.count))[ray]
         width = int(place.max(initial=0)) + 1
         # rows are filled up with their own last range, which holds nothing more
         table = np.tile(wide.mean(axis=1)[:, None], (1, width))
         held = np.zeros((heard.count, width))
         table[ray, place], held[ray, place] = ranges, weights
-        lengths = np.bincount(ray, minlength=heard.count)
-        last = table[np.arange(heard.count), np.maximum(lengths - 1, 0)]
-        table = np.where(np.arange(width) < np.maximum(lengths, 1)[:, None], table, last[:, None])
+        lengths = np.maximum(np.bincount(ray, minlength=heard.count), 1)
+        last = table[np.arange(heard.count), lengths - 1]
+        table = np.where(np.arange(width) < lengths[:, None], table, last[:, None])
         mean = max(held.sum() / heard.count, TINY)
         until = np.cumsum(held, axis=1) / mean
         return cls(table, until - held / mean, until)
@@ -210,9 +208,8 @@ class _Prices:
     def gates(self, price: float) -> np.ndarray:
         """The gates of a price per metre, shape (N, 2) [m]."""
         opening = self.before - price * self.range_m
-        lowest = np.minimum.accumulate(opening, axis=1)
+        lowest, rows = np.minimum.accumulate(opening, axis=1), np.arange(len(opening))
         end = (self.until - price * self.range_m - lowest).argmax(axis=1)
-        rows = np.arange(len(end))
         reached = np.arange(opening.shape[1]) <= end[:, None]
         start = np.where(reached, opening, np.inf).argmin(axis=1)
         return np.stack([self.range_m[rows, start], self.range_m[rows, end]], axis=1)
@@ -260,8 +257,7 @@ def members(design: DesignSpec, points: np.ndarray, weights: np.ndarray) -> list
     """
     observed = observed_point(points)
     smallest = SMALLEST_LENGTH * (float(np.mean([sensor.range_m for sensor in design.sensors])) or 1.0)
-    best = np.full(len(points), -np.inf)
-    owner = np.full(len(points), -1)
+    best, owner = np.full(len(points), -np.inf), np.full(len(points), -1)
     tangent, distance = np.zeros((len(points), 2)), np.zeros(len(points))
     for index, (sensor, weight) in enumerate(zip(design.sensors, design.weights, strict=True)):
         if weight == 0:
@@ -271,10 +267,14 @@ def members(design: DesignSpec, points: np.ndarray, weights: np.ndarray) -> list
         better = score > best
         best[better], owner[better] = score[better], index
         tangent[better], distance[better] = angles[better], ranges[better]
-    return [
-        _inside(sensor, np.flatnonzero((owner == index) & (weights > 0)), tangent, distance, weights)
-        for index, sensor in enumerate(design.sensors)
-    ]
+    seen = []
+    for index, sensor in enumerate(design.sensors):
+        start, end = sensor.gate_m
+        inside = (owner == index) & (weights > 0) & (distance >= start) & (distance < end)
+        inside &= (np.abs(tangent) <= np.array(sensor.field_of_view_rad) / 2 + FIELD_ROUNDING_RAD).all(axis=1)
+        rows = np.flatnonzero(inside)
+        seen.append(Members(rows, tangent[rows], distance[rows], weights[rows]))
+    return seen
 
 
 def seen_from(sensor: Sensor, observed_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -302,20 +302,8 @@ def log_density(sensor: Sensor, tangent: np.ndarray, range_m: np.ndarray, *, sma
     angular = np.maximum([sensor.spread_horizontal_rad, sensor.spread_vertical_rad], SMALLEST_ANGLE_RAD)
     depth = max(sensor.spread_range_m, smallest_m)
     squares = np.square(tangent / angular).sum(axis=1) + np.square((range_m - sensor.range_m) / depth)
-    angle = np.hypot(tangent[:, 0], tangent[:, 1])
-    log_jacobian = np.log(angle_over_sine(angle))
+    log_jacobian = np.log(angle_over_sine(np.hypot(tangent[:, 0], tangent[:, 1])))
     return -squares / 2 - np.log(angular).sum() - np.log(depth) + log_jacobian
-
-
-def _inside(
-    sensor: Sensor, index: np.ndarray, tangent: np.ndarray, distance: np.ndarray, weights: np.ndarray
-) -> Members:
-    half_field = np.array(sensor.field_of_view_rad) / 2 + FIELD_ROUNDING_RAD
-    start, end = sensor.gate_m
-    within = (np.abs(tangent[index]) <= half_field).all(axis=1)
-    within &= (distance[index] >= start) & (distance[index] < end)
-    kept = index[within]
-    return Members(kept, tangent[kept], distance[kept], weights[kept])
 
 
 class GridLayout(Layout):
@@ -330,16 +318,19 @@ class GridLayout(Layout):
 
     def lay_out(self, spec: DesignSpec, count: int, samples: Samples | None, gates: Gates, seed: int) -> Rays:
         """See `Layout`."""
-        shares = shares_of(spec, count)
-        tangents = [
-            grid_tangent(*field_on_sphere(sensor), int(n)) for sensor, n in zip(spec.sensors, shares, strict=True)
-        ]
-        if gates == "sensor":
-            return rays_in_fields(spec, tangents)
-        if samples is None:
-            raise missing_samples(spec, count, gates)
-        seen = members(spec, samples.points, samples.weights)
-        return rays_in_fields(spec, tangents, ray_gates(spec, tangents, seen, samples.space))
+        shares = zip(spec.sensors, shares_of(spec, count), strict=True)
+        tangents = [grid_tangent(*field_on_sphere(sensor), int(n)) for sensor, n in shares]
+        return rays_with_gates(spec, tangents, samples, gates)
+
+
+def rays_with_gates(spec: DesignSpec, tangents: Sequence[np.ndarray], samples: Samples | None, gates: Gates) -> Rays:
+    """Rays at angles (N, 2) [rad] as `rays_in_fields`, with their sensors' gates or with their own of the samples."""
+    if gates == "sensor":
+        return rays_in_fields(spec, tangents)
+    if samples is None:
+        raise missing_samples(spec, sum(map(len, tangents)), gates)
+    seen = members(spec, samples.points, samples.weights)
+    return rays_in_fields(spec, tangents, ray_gates(spec, tangents, seen, samples.space))
 
 
 def rays_in_fields(spec: DesignSpec, tangents: Sequence[np.ndarray], gate_m: np.ndarray | None = None) -> Rays:

@@ -22,8 +22,7 @@ def grid_rows(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndar
         return np.zeros(0, dtype=np.int64)
     rows = _row_count(horizontal_rad, vertical_rad, count)
     # floor((2 i n + rows) / (2 rows)) rounds i n / rows half up in whole numbers, without a rounding error
-    edges = (2 * np.arange(rows + 1, dtype=np.int64) * count + rows) // (2 * rows)
-    return np.diff(edges)
+    return np.diff((2 * np.arange(rows + 1, dtype=np.int64) * count + rows) // (2 * rows))
 
 
 def _row_count(horizontal_rad: float, vertical_rad: float, count: int) -> int:

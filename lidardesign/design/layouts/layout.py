@@ -276,16 +276,14 @@ class Layout(ABC):
             counts = split_budget(np.array([sensor.weight for sensor in sensors]), fitted.rays)
             design = replace(design, sensors=_with_rays(sensors, counts))
             if not self.leaves_rays_open(request.gates):
-                table = self._ray_table(design, request)
+                here = placed(design, design.at) if design.at else design
+                with phase("rays"):
+                    rays = self.lay_out(here, design.rays, request.samples, request.gates, request.seed)
+                table = rays.as_angles()
                 counts = np.bincount(table.sensor, minlength=len(sensors))
                 design = replace(design, sensors=_with_rays(sensors, counts), ray_table=table)
         score = likelihood_estimate(fitted.ensemble, fitted.supports)
         return FittedDesign(design, score, fitted.supports, fitted.ensemble.notes)
-
-    @phase("rays")
-    def _ray_table(self, design: DesignSpec, request: FitProblem) -> Rays:
-        here = placed(design, design.at) if design.at else design
-        return self.lay_out(here, design.rays, request.samples, request.gates, request.seed).as_angles()
 
     @abstractmethod
     def lay_out(self, spec: DesignSpec, count: int, samples: Samples | None, gates: Gates, seed: int) -> Rays:

@@ -140,8 +140,8 @@ def _checked(features: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.
     features = np.asarray(features, dtype=np.float64)
     weights = np.asarray(weights, dtype=np.float64)
     if features.ndim != 2 or not features.size or weights.shape != features.shape[:1]:
-        found = f"features of shape {features.shape} with weights of shape {weights.shape}"
-        raise ConfigError(found, where="quantisation", allowed="(N, F) and (N,), at least one point")
+        shapes = f"features of shape {features.shape} with weights of shape {weights.shape}"
+        raise ConfigError(shapes, where="quantisation", allowed="(N, F) and (N,), at least one point")
     if not (np.isfinite(features).all() and np.isfinite(weights).all()):
         raise ConfigError("features or weights are NaN or infinite", where="quantisation")
     if weights.min() < 0 or weights.max() <= 0:
@@ -154,8 +154,8 @@ def _checked(features: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.
 def _started(start: np.ndarray, count: int, offset: np.ndarray) -> np.ndarray:
     start = np.asarray(start, dtype=np.float64)
     if start.shape != (count, len(offset)) or not np.isfinite(start).all():
-        found = f"a start of shape {start.shape}"
-        raise ConfigError(found, where="quantisation", allowed=f"{(count, len(offset))}, finite")
+        allowed = f"{(count, len(offset))}, finite"
+        raise ConfigError(f"a start of shape {start.shape}", where="quantisation", allowed=allowed)
     return start - offset
 
 
@@ -184,10 +184,8 @@ def _seed(points: np.ndarray, weights: np.ndarray, count: int, generator: np.ran
     if len(points) > SEED_POOL * count:
         pool = generator.choice(len(points), SEED_POOL * count, replace=False, shuffle=False)
         points, weights = points[pool], weights[pool]
-    draws = generator.uniform(size=count)
-    chosen = np.empty(count, dtype=np.int64)
-    squared = np.full(len(points), 1.0)
-    for k, draw in enumerate(draws):
+    chosen, squared = np.empty(count, dtype=np.int64), np.full(len(points), 1.0)
+    for k, draw in enumerate(generator.uniform(size=count)):
         mass = weights * squared
         cumulative = np.cumsum(mass)
         if cumulative[-1] > 0:
@@ -219,8 +217,7 @@ def _assign(nearest: Nearest, weights: np.ndarray, centres: np.ndarray) -> tuple
     counts = np.bincount(labels, minlength=len(centres))
     empty = np.flatnonzero(counts == 0)
     waiting = list(empty)
-    worst = np.argsort(-weights * np.square(distance), kind="stable") if waiting else ()
-    for point in worst:
+    for point in np.argsort(-weights * np.square(distance), kind="stable") if waiting else ():
         if not waiting:
             break
         if counts[labels[point]] > 1:

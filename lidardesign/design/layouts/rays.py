@@ -139,10 +139,9 @@ def lay_out(
         if gates is None:
             gates = gates_of(design) if samples is not None or layout.extends_origins else "sensor"
         if samples is not None and samples.space.conditioned:
-            needed = layout.needs_samples(here, total, gates)
             # where the sensors alone will do, samples that cannot be moved are left out
-            asked = needed or (retarget is not None and layout.uses_samples(here, total, gates))
-            samples = conditioned(samples, home, retarget) if asked else None
+            asked = layout.uses_samples if retarget is not None else layout.needs_samples
+            samples = conditioned(samples, home, retarget) if asked(here, total, gates) else None
         rays = layout.lay_out(here, total, samples, gates, seed)
     if rate_hz != DEFAULT_RATE_HZ:
         rays = replace(rays, time_s=fire_times(total, rate_hz))

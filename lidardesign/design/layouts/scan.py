@@ -32,7 +32,7 @@ import numpy as np
 from lidardesign.design.constraints.document import Constraints, SensorRules, wants_parts
 from lidardesign.design.constraints.feasibility import BandwidthBudget, fit_within_budget
 from lidardesign.design.constraints.origins import free_boxes, is_mounted, origin_box
-from lidardesign.design.layouts.gates import admissible_gates, central_intervals, members, ray_gates, rays_in_fields
+from lidardesign.design.layouts.gates import admissible_gates, admitted_gates, central_intervals, rays_with_gates
 from lidardesign.design.layouts.layout import (
     FitProblem,
     FittedDesign,
@@ -51,7 +51,7 @@ from lidardesign.design.mixture.ensemble import Ensemble, GroupSamples, sensors_
 from lidardesign.design.mixture.features import Axes, Features, ray_features
 from lidardesign.design.mixture.mixture import Mixture, log_density
 from lidardesign.design.mixture.support import check_support, fixed_conditions, restrict_samples
-from lidardesign.design.sensor import DEFAULT_LEVEL, DesignSpec, Gates, Sensor, Track, interval_factor
+from lidardesign.design.sensor import DesignSpec, Gates, Sensor, Track, interval_factor
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.estimates import Estimate
 from lidardesign.geometry.rays import Rays
@@ -114,14 +114,7 @@ class ScanLayout(Layout):
     def fit(self, request: FitProblem) -> FittedDesign:
         """See `Layout`; of samples with a free condition, a track."""
         if request.samples.space.conditioned:
-            return fit_track(
-                request.samples,
-                rays=request.budget.rays,
-                constraints=request.constraints,
-                level=request.level,
-                seed=request.seed,
-                name=request.name,
-            )
+            return fit_track(request)
         count = request.budget.rays
         if count is None:
             raise ConfigError("a scan needs its number of rays", where="--layout scan", hint="give --rays N")
@@ -152,13 +145,7 @@ class ScanLayout(Layout):
                 where=spec.name,
                 allowed=f"{len(spec.sensors)} rays, or `rays` for every sensor",
             )
-        tangents = [np.zeros((int(n), 2)) for n in shares_of(spec, count)]
-        if gates == "sensor":
-            return rays_in_fields(spec, tangents)
-        if samples is None:
-            raise missing_samples(spec, count, gates)
-        seen = members(spec, samples.points, samples.weights)
-        return rays_in_fields(spec, tangents, ray_gates(spec, tangents, seen, samples.space))
+        return rays_with_gates(spec, [np.zeros((int(n), 2)) for n in shares_of(spec, count)], samples, gates)
 
 
 class TrackLayout(ScanLayout):
@@ -194,8 +181,8 @@ def _fit_cells(samples: GroupSamples, count: int, request: FitProblem) -> Ensemb
         mixture = _gates_of_cells(mixture, features, labels, limits, request.level)
         values = log_density(mixture, features)
         score = float(features.weights @ values)
-        part = GroupSamples(group, 1.0, features, bounds)
-        return Ensemble((part,), (EMResult(mixture, score, (score,), values=values),))
+        result = EMResult(mixture, score, (score,), values=values)
+        return Ensemble((GroupSamples(group, 1.0, features, bounds),), (result,))
 
     return fit_within_budget(
         scan(bounds),
@@ -222,34 +209,17 @@ def _gates_of_cells(mixture: Mixture, features: Features, labels: np.ndarray, bo
 
 
 @phase("track")
-def fit_track(
-    samples: Samples,
-    *,
-    rays: int | None = None,
-    constraints: Constraints | None = None,
-    level: float = DEFAULT_LEVEL,
-    seed: int = 0,
-    name: str = "design",
-    knots: int | None = None,
-) -> FittedDesign:
-    """Rays for every value of the one condition that the samples leave free.
+def fit_track(request: FitProblem) -> FittedDesign:
+    """Rays for every value of the one condition that the samples leave free, uniform over its bounds.
 
-    Arguments:
-        samples: Weighted samples of the density, its condition uniform over its bounds.
-        rays: Rays per position; None takes the budget's.
-        constraints: Bounds that every ray keeps at every position; a bandwidth is that of the worst position.
-        level: The share of what a ray sees that its gate holds.
-        seed: Root of the quantisation's stream.
-        name: The design's name.
-        knots: How many; None chooses from the samples.
+    Every ray keeps the constraints at every position; a bandwidth is that of the worst position.
 
     Raises:
         ConfigError: The space has not just one condition that a sensor can travel along, or no number of rays.
         InfeasibleError: Constraints that hold too little of the density or that no track keeps.
     """
-    constraints = Constraints() if constraints is None else constraints
+    samples, constraints, level, read_out = request.samples, request.constraints, request.level, request.budget
     dimension = _travelled(samples.space)
-    read_out = BandwidthBudget.of(constraints, rays)
     if read_out.rays is None:
         raise ConfigError("a track needs its number of rays per position", where="--layout scan", hint="give --rays N")
     group = Group((None, None, None), tuple(range(read_out.rays)))
@@ -257,22 +227,18 @@ def fit_track(
     support = restrict_samples(samples, constraints.rules, group)
     support = replace(support, mass=support.total)
     check_support(support, group, mass=support.total, several=False)
-    if knots is None:
-        usual = math.ceil((high - low) / KNOT_SPACING_M - SLACK)
-        affordable = int(support.effective / (read_out.rays * SAMPLES_PER_CELL))
-        knots = max(min(usual, affordable), 1) + 1
-    elif knots < 2:
-        raise ConfigError(f"{knots} knots", where="track", allowed="2 or more")
-    places = np.linspace(low, high, knots)
+    usual = math.ceil((high - low) / KNOT_SPACING_M - SLACK)
+    affordable = int(support.effective / (read_out.rays * SAMPLES_PER_CELL))
+    places = np.linspace(low, high, max(min(usual, affordable), 1) + 1)
     used = support.weights > 0
     along = TrackSamples.of(support.points[used], support.weights[used], places, dimension, samples.space)
     bounds = bounds_of(constraints.rules, samples.space, group.sensors, interval_factor(level))
-    centres, labels = aimed_rays(along, read_out.rays, random_generator(seed, "track"))
+    centres, labels = aimed_rays(along, read_out.rays, random_generator(request.seed, "track"))
     azimuth, elevation = _admitted(centres, along, bounds)
     track = _with_gates(along, labels, azimuth, elevation, bounds, level, read_out)
     sensors, score = _track_sensors(along, labels, track, bounds, level)
     design = DesignSpec(
-        name=name, sensors=sensors, layout="scan", rays=read_out.rays, constraints=constraints.as_document(),
+        name=request.name, sensors=sensors, layout="scan", rays=read_out.rays, constraints=constraints.as_document(),
         level=level, track=track, at=fixed_conditions(samples.space),
     )  # fmt: skip
     return FittedDesign(design, score, [support])
@@ -348,11 +314,10 @@ def _admitted(centres: np.ndarray, along: TrackSamples, bounds: Bounds) -> tuple
         elevation = np.full_like(elevation, space.low[ELEVATION])
     if AZIMUTH not in space.free:
         return np.full_like(azimuth, space.low[AZIMUTH]), elevation
-    bound = bounds.azimuth_half < math.pi
     offset = azimuth - bounds.azimuth_centre
     offset -= 2 * math.pi * np.round(offset / (2 * math.pi))
     clipped = bounds.azimuth_centre + np.clip(offset, -bounds.azimuth_half, bounds.azimuth_half)
-    return np.where(bound, clipped, np.unwrap(azimuth, axis=0)), elevation
+    return np.where(bounds.azimuth_half < math.pi, clipped, np.unwrap(azimuth, axis=0)), elevation
 
 
 def _with_gates(
@@ -373,14 +338,10 @@ def _with_gates(
     knots, count = azimuth.shape
 
     def track(limits: Bounds) -> Track:
-        if RANGE not in along.space.free:
-            gate = np.full((knots, count, 2), along.space.low[RANGE])
-            return Track(DIMENSIONS[along.dimension], along.knots, azimuth, elevation, gate, np.arange(count))
-        rows = limits.take(np.tile(np.arange(count), knots))
-        centre, spread = admissible_gates(wanted.reshape(-1, 2), rows)
-        half = limits.interval * spread
-        # half an ulp may take a gate that starts at 0 below it
-        gate = np.maximum(np.stack([centre - half, centre + half], axis=1), 0.0).reshape(knots, count, 2)
+        gate = np.full((knots, count, 2), along.space.low[RANGE])
+        if RANGE in along.space.free:
+            rows = limits.take(np.tile(np.arange(count), knots))
+            gate = admitted_gates(wanted.reshape(-1, 2), rows).reshape(knots, count, 2)
         return Track(DIMENSIONS[along.dimension], along.knots, azimuth, elevation, gate, np.arange(count))
 
     def worst_widths(fitted: Track) -> np.ndarray:
@@ -470,9 +431,11 @@ def _components(
     count = len(track.sensor)
     mixture = mixture_of_labels(features, labels[chosen], bounds).with_weights(np.full(count, 1.0 / count))
     start, end = track.gate_m[knot].T
-    mixture = replace(mixture, range_m=(start + end) / 2, spread_range_m=(end - start) / (2 * bounds.interval))
-    if features.axes.horizontal:
-        mixture = replace(mixture, azimuth_rad=track.azimuth_rad[knot])
-    if features.axes.vertical:
-        mixture = replace(mixture, elevation_rad=track.elevation_rad[knot])
+    mixture = replace(
+        mixture,
+        azimuth_rad=track.azimuth_rad[knot] if features.axes.horizontal else mixture.azimuth_rad,
+        elevation_rad=track.elevation_rad[knot] if features.axes.vertical else mixture.elevation_rad,
+        range_m=(start + end) / 2,
+        spread_range_m=(end - start) / (2 * bounds.interval),
+    )
     return float(weights.sum()), mixture, features

@@ -128,7 +128,7 @@ def interpolated(track: Track, at: float) -> tuple[np.ndarray, np.ndarray, np.nd
     Raises:
         ConfigError: The position lies beyond the track's ends, or is no number.
     """
-    first, last = float(track.knots[0]), float(track.knots[-1])
+    first, last = travels(track)
     if not (math.isfinite(at) and first <= at <= last):
         raise ConfigError(
             f"{track.dimension}={at:g} is beyond the ends of the track",
@@ -185,8 +185,9 @@ def _moves(design: DesignSpec, at: Mapping[str, float]) -> dict[int, float]:
     """The coordinates of origins that change. Only origins move; a design for one direction is not one for another."""
     for name, value in at.items():
         if name not in DIMENSIONS:
-            allowed = ", ".join(DIMENSIONS)
-            raise ConfigError(f"{name!r} is no dimension of the design space", where="--at", allowed=allowed)
+            raise ConfigError(
+                f"{name!r} is no dimension of the design space", where="--at", allowed=", ".join(DIMENSIONS)
+            )
         if not math.isfinite(value):
             raise ConfigError(f"{name}={value}", where="--at", allowed="a finite number")
         if name not in TRAVELLED and design.at.get(name) != value:
@@ -283,14 +284,15 @@ def _cost(along: TrackSamples, distance: np.ndarray, centres: np.ndarray, stiffn
 
 def _started(along: TrackSamples, surface: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
     """Lloyd's cells at each knot, each begun at its neighbour's, from the best known knot outward: (P, N, 3)."""
-    windows = [along.near(knot) for knot in range(len(along.knots))]
+    near = [along.near(knot) for knot in range(len(along.knots))]
+    windows = [(surface[chosen], weights) for chosen, weights in near]
     first = int(np.argmax([effective_count(weights) for _, weights in windows]))
     centres = np.empty((len(windows), count, 3))
-    centres[first] = _best_start(*_window(surface, windows[first]), count, generator)
+    centres[first] = _best_start(*windows[first], count, generator)
     outward = [(knot - 1, knot) for knot in range(first + 1, len(windows))]
     outward += [(knot + 1, knot) for knot in reversed(range(first))]
     for before, knot in outward:
-        points, weights = _window(surface, windows[knot])
+        points, weights = windows[knot]
         centres[knot] = centres[before]
         if len(points) > count and weights.max(initial=0.0) > 0:
             fresh, _ = lloyd(points, weights, count, generator, iterations=LLOYD_ITERATIONS, start=centres[before])
@@ -305,11 +307,6 @@ def _matched(before: np.ndarray, fresh: np.ndarray) -> np.ndarray:
 
     squared = np.square(before[:, None] - fresh[None]).sum(axis=2)
     return fresh[linear_sum_assignment(squared)[1]]
-
-
-def _window(surface: np.ndarray, window: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    chosen, weights = window
-    return surface[chosen], weights
 
 
 def _best_start(points: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -333,8 +330,7 @@ def _nearest(along: TrackSamples, surface: np.ndarray, centres: np.ndarray) -> t
         for start in range(first, last, size):
             part = order[start : min(start + size, last)]
             labels[part] = _nearest_between(surface[part], along.share[part, None], centres[knot], centres[knot + 1])
-    here = along.between(centres, labels)
-    return labels, np.linalg.norm(here - surface, axis=1)
+    return labels, np.linalg.norm(along.between(centres, labels) - surface, axis=1)
 
 
 def _nearest_between(surface: np.ndarray, share: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
