@@ -73,8 +73,8 @@ class ShellCompletion(_COMPLETION.ShellComplete):  # type: ignore[misc, name-def
 
     def format_completion(self, item: Any) -> str:
         """A candidate and the first sentence of what it is."""
-        words = " ".join((item.help or "").split()).partition(". ")[0].rstrip(".")
-        return f"{item.value}\t{words}"
+        sentence, _, _ = " ".join((item.help or "").split()).partition(". ")
+        return f"{item.value}\t{sentence.rstrip('.')}"
 
     def complete(self) -> str:
         """The answer to the shell."""
@@ -168,7 +168,7 @@ def source_of(command: str, parameter: Any) -> Any:
 
 
 def _tasks(context: Any, current: str) -> Items:
-    """Names of installed tasks; none of them is imported."""
+    # none of them is imported
     from importlib.metadata import entry_points
 
     return [(name, "a task") for name in sorted({entry.name for entry in entry_points(group="lidardesign.tasks")})]
@@ -190,36 +190,30 @@ def _detectors(context: Any, current: str) -> Items:
 
 
 def _baselines(context: Any, current: str) -> Items:
-    """Names of baselines; behind `catalog:` parts."""
     if current.startswith("catalog:"):
         return [(f"catalog:{name}", words) for name, words in _parts(context, current)]
     return list(BASELINES.items())
 
 
 def _effects(context: Any, current: str) -> Items:
-    """Words for effects, or names between commas."""
     from lidardesign.simulate.detector.detector import EFFECTS
 
     before, comma, _ = current.rpartition(",")
     words = () if comma else ("auto", "all", "none", "audit")
-    names = [name for name in EFFECTS if name not in before.split(",")]
-    return [(f"{before}{comma}{name}", "an effect") for name in (*words, *names)]
+    names = (*words, *(name for name in EFFECTS if name not in before.split(",")))
+    return [(f"{before}{comma}{name}", "an effect") for name in names]
 
 
 def _conditions(context: Any, current: str) -> Items:
-    """Conditions of the run's density, as `x_m=`."""
     space = _run_document(context).get("space")
     names = space.get("condition") if isinstance(space, dict) else None
     return [(f"{name}=", "a condition") for name in names or () if isinstance(name, str)]
 
 
 def _weights(context: Any, current: str) -> Items:
-    """Keys of the run's task that only say what counts more in the density."""
     task = _task_of_run(context)
-    if task is None:
-        return []
-    weighing = getattr(task, "weighing_keys", ())
-    return [item for item in _keys(task.Config, "", current) if item[0].partition("=")[0] in weighing]
+    keys = () if task is None else _keys(task.Config, "", current)
+    return [item for item in keys if item[0].partition("=")[0] in getattr(task, "weighing_keys", ())]
 
 
 def _configuration_keys(context: Any, current: str) -> Items:
@@ -245,7 +239,6 @@ def _configuration_keys(context: Any, current: str) -> Items:
 
 
 def _constraint_keys(context: Any, current: str) -> Items:
-    """Keys of constraints, as `gate.width_m.max=`."""
     from lidardesign.design.constraints.document import CATALOG, Constraints
 
     items = [item for item in _keys(Constraints, "", current) if not item[0].startswith("each")]
@@ -270,9 +263,8 @@ def _words_of(annotation: Any) -> tuple[str, ...]:
     """The values of a key that takes one of a few words."""
     if get_origin(annotation) is Literal:
         return tuple(str(value) for value in get_args(annotation))
-    if annotation is bool:
-        return ("true", "false")
-    return tuple(word for part in get_args(annotation) for word in _words_of(part))
+    words = tuple(word for part in get_args(annotation) for word in _words_of(part))
+    return ("true", "false") if annotation is bool else words
 
 
 def _given(context: Any, *metavars: str) -> Iterator[str]:
@@ -288,7 +280,6 @@ def _given(context: Any, *metavars: str) -> Iterator[str]:
 
 
 def _task_of_run(context: Any) -> Task | None:
-    """The task of the run that a command line names."""
     from lidardesign.registry import load_task
 
     name = _run_document(context).get("task_name")

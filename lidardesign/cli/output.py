@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rich.console import Console as RichConsole
     from rich.progress import Progress
 
-    from lidardesign.workflow.plans import RequestPlan
+    from lidardesign.workflow.run_folder import RequestPlan
 
 
 SCHEMA_VERSION = 1
@@ -46,6 +46,8 @@ NUMBA_CACHE = "numba/core/caching.py"
 NO_MEMORY = "can't allocate memory"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 STDOUT, STDERR = 1, 2
+# The line of a progress bar that is there from its beginning, as rich numbers them.
+FIRST_LINE = 0
 # Commands that only read a run wait for its writer no longer than this.
 SHORT_WAIT_S = 0.5
 
@@ -88,12 +90,12 @@ class Output:
     clock: Clock = field(default_factory=Clock)
 
     def rich(self, *, stderr: bool = False) -> RichConsole:
-        """A rich console; it honours NO_COLOR and prints plain text where there is no terminal."""
+        """A rich console; it honours NO_COLOR, prints plain text where there is no terminal, and text as it is."""
         from rich.console import Console as RichConsole
 
         file = sys.stderr if stderr else self.stream
         width = None if file.isatty() or "COLUMNS" in os.environ else PLAIN_WIDTH
-        return RichConsole(file=file, highlight=False, width=width)
+        return RichConsole(file=file, highlight=False, markup=False, width=width)
 
     def note(self, text: str) -> None:
         """Print a note on stderr, unless --quiet."""
@@ -104,9 +106,7 @@ class Output:
         """Print what the program has to remark, marked as a note."""
         self.note(f"note: {text}")
 
-    def result(
-        self, document: dict[str, Any], show: Callable[[RichConsole], None], *, show_costs: bool = True
-    ) -> None:
+    def result(self, document: dict[str, Any], show: Callable[[RichConsole], None], *, show_costs: bool = True) -> None:
         """Give the result, as JSON or shown for people, and where the time went until now.
 
         Arguments:
@@ -125,16 +125,17 @@ class Output:
             show_times(timings, peak_memory_bytes(), rich)
 
     @contextlib.contextmanager
-    def progress(self, *columns: str) -> Iterator[Progress | None]:
-        """A progress bar with further fields as columns, on a terminal; None where there is none."""
+    def progress(self, label: str, *columns: str) -> Iterator[Progress | None]:
+        """A progress bar with a line (FIRST_LINE) and further fields as columns, on a terminal; else None."""
         if self.quiet or not sys.stderr.isatty():
             yield None
             return
         from rich.progress import BarColumn, Progress, TextColumn
 
         shown = [TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %")]
-        fields = [TextColumn("{task.fields[" + name + "]}") for name in columns]
-        with Progress(*shown, *fields, console=self.rich(stderr=True), transient=True) as bar:
+        shown += [TextColumn("{task.fields[" + name + "]}") for name in columns]
+        with Progress(*shown, console=self.rich(stderr=True), transient=True) as bar:
+            bar.add_task(label, total=None, **dict.fromkeys(columns, ""))
             yield bar
 
 
@@ -160,8 +161,7 @@ def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Output]:
     """
     output = Output(json=json, quiet=quiet, debug=debug, stream=sys.stdout)
     try:
-        guard = _guarded_stdout(output) if json else contextlib.nullcontext()
-        with guard, running(output.clock), offered_input():
+        with _guarded_stdout(output) if json else contextlib.nullcontext(), running(output.clock), offered_input():
             yield output
         output.stream.flush()
     except typer.Exit:
@@ -206,7 +206,6 @@ def close_stdout_guard() -> None:
 
 
 def _is_of_process(stream: TextIO) -> bool:
-    """Whether a stream is the standard output that other processes and compiled code print on, too."""
     try:
         return stream.fileno() == STDOUT
     except (AttributeError, OSError, ValueError):
@@ -234,17 +233,15 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
     cause: BaseException | None = error
     while cause is not None:  # compiled kernels that return into an interruption make it a SystemError
         if isinstance(cause, KeyboardInterrupt):
-            error = cause
-            break
+            kind, code = "interrupted", EXIT_INTERRUPTED
+            if isinstance(cause, TerminatedError):
+                kind, code = "terminated", EXIT_TERMINATED
+            further = output.when_interrupted()
+            text = f"{kind}: {further}" if further else kind
+            return {"kind": kind, "message": text}, code, text
         cause = cause.__cause__
     if isinstance(error, LidardesignError):
         return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
-    if isinstance(error, KeyboardInterrupt):
-        terminated = isinstance(error, TerminatedError)
-        kind, code = ("terminated", EXIT_TERMINATED) if terminated else ("interrupted", EXIT_INTERRUPTED)
-        further = output.when_interrupted()
-        text = f"{kind}: {further}" if further else kind
-        return {"kind": kind, "message": text}, code, text
     # torch says so by a name or by words of its own
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or NO_MEMORY in str(error):
         text = "the computer has no memory left; a smaller batch, field_resolution or preset needs less"
@@ -255,8 +252,11 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
         if error.errno in DISK_FULL and not error.filename:
             document["hint"] = "make room where the output, the temporary files or numba's cache (NUMBA_CACHE_DIR) go"
     elif folder := _damaged_cache(error):
-        message = f"{folder}: the cache of compiled code is damaged"
-        document = {"kind": "system", "message": message, "hint": "remove its files *.nbi and *.nbc"}
+        document = {
+            "kind": "system",
+            "message": f"{folder}: the cache of compiled code is damaged",
+            "hint": "remove its files *.nbi and *.nbc",
+        }
     else:
         text = f"{type(error).__name__}: {' '.join(str(error).split())}"
         hint = "this is a fault of lidardesign; --debug shows where, please report it"
@@ -270,12 +270,11 @@ def _damaged_cache(error: BaseException) -> str | None:
     """The folder of numba's cache where an error came of reading it: files that are cut or changed are no pickles."""
     trace = error.__traceback__
     while trace is not None:
-        frame = trace.tb_frame
+        frame, trace = trace.tb_frame, trace.tb_next
         if frame.f_code.co_filename.replace(os.sep, "/").endswith(NUMBA_CACHE):
             folder = getattr(frame.f_locals.get("self"), "_cache_path", None)
             if folder is not None:
                 return str(folder)
-        trace = trace.tb_next
     return None
 
 
@@ -301,24 +300,20 @@ def show_plan(plan: RequestPlan, output: Output) -> None:
     document = plan.as_dict()
     lines = [f"{document['command']} would", *(f"  {step}" for step in document["steps"])]
     for entry in document["reads"]:
-        size = entry["bytes"]
-        large = size is not None and size >= BYTES_PER_MEGABYTE
-        text = "" if size is None else f" ({size / BYTES_PER_MEGABYTE:.1f} MB)" if large else f" ({size:,} bytes)"
-        lines.append(f"read   {'standard input' if entry['path'] == STDIO else entry['path']}{text}")
+        size = entry["bytes"] or 0
+        text = f" ({size / BYTES_PER_MEGABYTE:.1f} MB)" if size >= BYTES_PER_MEGABYTE else f" ({size:,} bytes)"
+        place = "standard input" if entry["path"] == STDIO else entry["path"]
+        lines.append(f"read   {place}{'' if entry['bytes'] is None else text}")
     for entry in document["writes"]:
-        replaces = " (replaced)" if entry["replaces"] else ""
-        lines.append(f"write  {'standard output' if entry['path'] == STDIO else entry['path']}{replaces}")
+        place = "standard output" if entry["path"] == STDIO else entry["path"]
+        lines.append(f"write  {place}{' (replaced)' if entry['replaces'] else ''}")
     if not document["writes"]:
         lines.append("write  nothing")
     if document["before"]:
         lines.append(f"time   {document['before']['of']} took {document['before']['seconds']:.1f} s")
     lines.append("nothing was done: leave out --dry-run to do it")
 
-    def show(rich: RichConsole) -> None:
-        for line in lines:
-            rich.print(line, soft_wrap=True, markup=False)
-
-    output.result(document, show, show_costs=False)
+    output.result(document, lambda rich: rich.print("\n".join(lines), soft_wrap=True), show_costs=False)
 
 
 def claim_stdout(output: Output, *, dry_run: bool = False, **files: Path | None) -> None:
@@ -339,8 +334,8 @@ def claim_stdout(output: Output, *, dry_run: bool = False, **files: Path | None)
     if output.json:
         asking.append("--json")
     if len(asking) > 1:
-        hint = f"give {asking[0]} a file"
-        raise ConfigError(f"{' and '.join(asking)} both write to standard output", where=asking[0], hint=hint)
+        problem = f"{' and '.join(asking)} both write to standard output"
+        raise ConfigError(problem, where=asking[0], hint=f"give {asking[0]} a file")
     if not dry_run:
         output.stream = io.StringIO() if output.quiet else sys.stderr
 
@@ -398,37 +393,27 @@ def claim_outputs(
     """Claim what a command will write: standard output for `-`, a page for the report, folders that are not there.
 
     Raises:
-        ConfigError: As of `claim_stdout` and `check_page`.
+        ConfigError: As of `claim_stdout`, or a report whose name says that it is something else than a page.
     """
     claim_stdout(output, dry_run=dry_run, csv=csv, report=report)
-    check_page(report)
+    # pipes and devices have any name
+    is_page = report is not None and (report.is_file() or not report.exists())
+    if is_page and report.suffix.lower() not in ("", *PAGE_SUFFIXES):
+        raise ConfigError(
+            f"{report.name} is no name of an HTML page",
+            where="--report",
+            allowed=", ".join(PAGE_SUFFIXES),
+            hint=f"--report {report.with_suffix('.html')}; a browser prints it as PDF",
+        )
     note_new_folders([path for path in (csv, report, plots) if path is not None], output)
-
-
-def check_page(report: Path | None) -> None:
-    """Refuse a report whose name says that it is something else than a page; pipes and devices have any name.
-
-    Raises:
-        ConfigError: So it is.
-    """
-    if report is None or is_output(report) or report.suffix.lower() in ("", *PAGE_SUFFIXES):
-        return
-    if report.exists() and not report.is_file():
-        return
-    raise ConfigError(
-        f"{report.name} is no name of an HTML page",
-        where="--report",
-        allowed=", ".join(PAGE_SUFFIXES),
-        hint=f"--report {report.with_suffix('.html')}; a browser prints it as PDF",
-    )
 
 
 def note_new_folders(paths: Iterable[Path], output: Output) -> None:
     """Say which folders are made for files, so that a misspelt one is seen; each once, by its topmost new part."""
     new: dict[Path, Path] = {}
     for path in paths:
-        missing = [] if is_output(path) else [parent for parent in path.parents if not parent.exists()]
-        if missing:
+        missing = [parent for parent in path.parents if not parent.exists()]
+        if missing and not is_output(path):
             new.setdefault(missing[-1], path)
     for folder, path in new.items():
         output.note(f"note: there is no folder {folder} yet; it is made for {path}")

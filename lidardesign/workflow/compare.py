@@ -20,6 +20,8 @@ from lidardesign.workflow.designs import Design
 from lidardesign.workflow.evaluate import common_run, evaluation_request
 from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, reach_beside, read_design, run_of
 
+NO_SCORES: dict[str, Any] = {"metric": None, "scenes": None, "rows": [], "paired": []}
+
 
 def compare_designs(
     files: tuple[Path, Path],
@@ -55,17 +57,13 @@ def compare_designs(
         }
         for design in designs
     ]
-    scores: dict[str, Any] = {"metric": None, "scenes": None, "rows": [], "paired": []}
     pairs = [pair.as_dict() for pair in paired_sensors(*specifications)]
-    if run is not None:
-        scores = _scores(run, designs, rays, seed, notes)
+    scores = NO_SCORES if run is None else _scores(run, designs, rays, seed, notes)
     return {"designs": entries, "sensors": pairs, **scores}
 
 
 @phase("designs")
-def _read(
-    files: tuple[Path, Path], run_folder: Path | None, notes: Notes
-) -> tuple[list[Design], RunFolder | None]:
+def _read(files: tuple[Path, Path], run_folder: Path | None, notes: Notes) -> tuple[list[Design], RunFolder | None]:
     """Both designs under names that differ, and the run whose scenes they are scored in, if one is known."""
     given = [RunFolder.open(run_folder)] if run_folder is not None else []
     reach_m = reach_beside(files, given)
@@ -107,8 +105,8 @@ def _scores(
         )
         difference = paired_difference(first.per_scene, second.per_scene, request.seed)
         paired.insert(0, Paired(first.design, second.design, first.rays, *difference, rays_b=second.rays))
-        named = {(row.design, row.rays) for row in (first, second)}
-        rows = [first, second, *(row for row in rows if (row.design, row.rays) not in named)]
+        own_rows = {(row.design, row.rays): row for row in (first, second)}
+        rows = [first, second, *(row for row in rows if (row.design, row.rays) not in own_rows)]
     metric = evaluation.metric
     return {
         "metric": {"name": metric.name, "unit": metric.unit, "better": metric.better, "worst": metric.worst},

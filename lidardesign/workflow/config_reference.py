@@ -105,10 +105,8 @@ def kind_of_value(annotation: Any) -> str:
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return kind_of_value(parts[0])
-    if origin is Literal:
-        return " or ".join(str(part) for part in parts)
-    if origin in (Union, UnionType):
-        return " or ".join(kind_of_value(part) for part in parts)
+    if origin in (Literal, Union, UnionType):
+        return " or ".join(str(part) if origin is Literal else kind_of_value(part) for part in parts)
     if origin is tuple and len(set(parts)) == 1:
         return f"{len(parts)} {kind_of_value(parts[0])}s"
     if origin in (list, tuple, set) and parts:
@@ -126,10 +124,9 @@ def config_template(
     Raises:
         ConfigError: A choice says nothing that the task takes.
     """
-    paths = [parse_override(text).path for text in overrides]
     chosen = {
         (str(path[0]), str(path[1])) if path[0] in SECTIONS and len(path) > 1 else ("task", str(path[0]))
-        for path in paths
+        for path in (parse_override(text).path for text in overrides)
     }
     name = check_choice(preset or "standard", "--preset", PRESETS)
     if preset is not None:
@@ -146,17 +143,17 @@ def config_template(
 
 def default_document(task: Task, preset: str) -> dict[str, Any]:
     """The defaults of a task that has none for something that it needs, so that no configuration follows."""
+
+    def defaults_of(model: type[BaseModel], suggested: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: suggested.get(key, _default(info)) for key, info in model.model_fields.items()}
+
     learning = {**PRESET_LEARNING[preset], **task.defaults.learning.get(preset, {})}
-    sections = {
-        "task": (task.Config, {}),
-        "density": (DensitySettings, task.defaults.density),
-        "learning": (LearningSettings, learning),
+    return {
+        "task": defaults_of(task.Config, {}),
+        "space": None,
+        "density": defaults_of(DensitySettings, task.defaults.density),
+        "learning": defaults_of(LearningSettings, learning),
     }
-    defaults = {
-        section: {key: suggested.get(key, _default(info)) for key, info in model.model_fields.items()}
-        for section, (model, suggested) in sections.items()
-    }
-    return {"task": defaults["task"], "space": None, "density": defaults["density"], "learning": defaults["learning"]}
 
 
 def config_text(
@@ -207,7 +204,6 @@ def _section(
 
 
 def _bounds(info: FieldInfo) -> Sequence[str]:
-    """The bounds of a number, in words: `from 0`, `below 1`."""
     bounds = [
         words.format(f"{getattr(part, name):g}")
         for part in info.metadata
@@ -227,7 +223,6 @@ def _comment(text: str, indent: str = "") -> list[str]:
 
 
 def _entry(key: str, value: Any, *, on: bool) -> str:
-    """A key and its value as YAML, commented out where it is a default."""
     text = dump_yaml({key: value}).rstrip("\n")
     if text.startswith("{") and text.endswith("}"):  # a single value, which stands on a line of its own here
         text = text[1:-1]
@@ -272,9 +267,8 @@ def _config_schema(task: Task | None) -> dict[str, Any]:
         schema.pop("required", None)
         return schema
 
-    pair = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
     bounds = {
-        "anyOf": [{"type": "number"}, pair],
+        "anyOf": [{"type": "number"}, {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}],
         "description": "bounds [low, high], or one number that fixes it",
     }
     space = {

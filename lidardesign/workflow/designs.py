@@ -73,8 +73,8 @@ class Design(DesignSource):
         cls, request: FitRequest, *, progress: Callable[[Round], None] | None = None, notes: Notes = log_note
     ) -> Design:
         """The design that a request comes to; it is not saved yet."""
-        fit = fit_design(request, progress=progress, notes=notes)
-        return cls(fit.result.design, request.run, None, fit.result, fit.refinement)
+        result, refinement = fit_design(request, progress=progress, notes=notes)
+        return cls(result.design, request.run, None, result, refinement)
 
     @property
     def name(self) -> str:

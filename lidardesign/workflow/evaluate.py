@@ -27,13 +27,14 @@ from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.task import scoring_settings
 from lidardesign.workflow.designs import Design, html_table
-from lidardesign.workflow.plans import RequestPlan, last_time
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
     MANIFEST,
     SAMPLES,
     Notes,
+    RequestPlan,
     RunFolder,
+    last_time,
     log_note,
     reach_beside,
     read_design,
@@ -96,11 +97,13 @@ class ScoreOptions:
             baseline_of(name, where="--baseline")
         seconds = self.cma_seconds
         if seconds is not None and not (math.isfinite(seconds) and seconds >= LEAST_CMA_SECONDS):
-            allowed = f"a finite number from {LEAST_CMA_SECONDS:g}"
-            raise ConfigError(f"{seconds:g} s", where="--cma-seconds", allowed=allowed)
+            raise ConfigError(
+                f"{seconds:g} s", where="--cma-seconds", allowed=f"a finite number from {LEAST_CMA_SECONDS:g}"
+            )
         if seconds is not None and CMA not in self.baselines:
-            hint = f"add --baseline {CMA}, or leave it out"
-            raise ConfigError("nothing is searched for", where="--cma-seconds", hint=hint)
+            raise ConfigError(
+                "nothing is searched for", where="--cma-seconds", hint=f"add --baseline {CMA}, or leave it out"
+            )
         tolerances = {"--range-tolerance-mm": self.range_tolerance_mm, "--return-tolerance": self.return_tolerance}
         for option, value in tolerances.items():
             if value is not None and not (math.isfinite(value) and value > 0):
@@ -115,10 +118,12 @@ class ScoreOptions:
         audit = self.effects.strip() == "audit"
         choice = parse_effects("auto" if audit else self.effects)
         detector = load_detector(self.detector)
-        usual, given_mm = Tolerance.of(detector), self.range_tolerance_mm
-        range_m = usual.range_m if given_mm is None else given_mm / MILLIMETRES
-        return_share = usual.lost if self.return_tolerance is None else self.return_tolerance
-        return Planner(detector, choice, Tolerance(range_m, return_share)), audit
+        tolerance = Tolerance.of(detector)
+        if self.range_tolerance_mm is not None:
+            tolerance = replace(tolerance, range_m=self.range_tolerance_mm / MILLIMETRES)
+        if self.return_tolerance is not None:
+            tolerance = replace(tolerance, lost=self.return_tolerance)
+        return Planner(detector, choice, tolerance), audit
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +223,6 @@ class ScoreRequest:
             "--accuracy": options.accuracy,
         }
         given = [f"{name} {value}" for name, value in settings.items() if value not in (None, (), [], False)]
-        samples = [run.folder / SAMPLES] if run.has_samples else []
         written = [
             f"{path}/" if option == "--plots" else path for option, path in (outputs or {}).items() if path is not None
         ]
@@ -234,8 +238,7 @@ class ScoreRequest:
             ],
             [
                 *(design.name if design.path is None else design.path for design in self.designs),
-                *(run.folder / name for name in (CONFIGURATION, MANIFEST)),
-                *samples,
+                *(run.folder / name for name in (CONFIGURATION, MANIFEST, *([SAMPLES] if run.has_samples else ()))),
             ],
             [*written, run.folder / MANIFEST],
             {"designs": names, "rays": counts, "baselines": list(self.baselines), **settings},
@@ -271,10 +274,9 @@ class ScoreRequest:
         with nullcontext(outermost_clock()) if outermost_clock() else running() as clock:
             request = self.evaluation_request(searching)
             with workers_of(check_workers(str(self.options.workers)), most=len(request.test)) as scorer:
-                scoring = request
                 if scorer is not None:
                     scorer.prepare(request)
-                    scoring = replace(request, scorer=scorer)
+                scoring = request if scorer is None else replace(request, scorer=scorer)
                 evaluation = score_designs(scoring, progress=progress)
             timings = clock.timings()
         return Scores(evaluation, replace(request, cma=replace(request.cma, show=None)), self.learned, timings, self)
@@ -340,8 +342,9 @@ class Scores:
             from lidardesign.evaluate.accuracy.probes import AccuracyRequest
             from lidardesign.evaluate.accuracy.sweeps import measure_accuracy
 
-            asked = AccuracyRequest(run.config, run.folder, request, self.evaluation)
-            accuracy = measure_accuracy(asked, progress=progress)
+            accuracy = measure_accuracy(
+                AccuracyRequest(run.config, run.folder, request, self.evaluation), progress=progress
+            )
         return replace(self, evaluation=replace(self.evaluation, accuracy=accuracy))
 
     @phase("writing")
@@ -437,9 +440,10 @@ def collect_designs(
             designs.append(Design(design, run_of(design, target), target))
     seen: dict[object, Design] = {}
     for design in designs:
-        seen.setdefault(id(design) if design.path is None else design.path.resolve(), design)
-    # they may be renamed: a user's own keep their names
-    return [Design(design.specification, design.run, design.path) for design in seen.values()], runs
+        # they may be renamed: a user's own keep their names
+        copy = Design(design.specification, design.run, design.path)
+        seen.setdefault(id(design) if design.path is None else design.path.resolve(), copy)
+    return list(seen.values()), runs
 
 
 def name_apart(designs: list[Design]) -> list[Design]:
@@ -452,7 +456,9 @@ def name_apart(designs: list[Design]) -> list[Design]:
     for design in designs:
         alike.setdefault(design.name, []).append(design)
     for name, group in alike.items():
-        folders = [_home(design) for design in group]
+        # of their runs, or of their files
+        places = [each.run.folder if each.run else each.path.parent if each.path else Path() for each in group]
+        folders = [place.resolve().name for place in places]
         for design, folder in zip(group, folders, strict=True):
             # files of one folder, as rig.csv and rig.sdf, differ in their endings alone
             ending = design.path.suffix if design.path is not None and folders.count(folder) > 1 else ""
@@ -464,12 +470,6 @@ def name_apart(designs: list[Design]) -> list[Design]:
     if twice:
         raise ConfigError(f"two designs are called {twice!r}", hint="rename one of the files")
     return designs
-
-
-def _home(design: Design) -> str:
-    """The name of the folder that a design is told apart by."""
-    folder = design.run.folder if design.run else design.path.parent if design.path else Path()
-    return folder.resolve().name
 
 
 def common_run(designs: Sequence[Design], runs: Sequence[RunFolder]) -> RunFolder:
@@ -486,17 +486,14 @@ def common_run(designs: Sequence[Design], runs: Sequence[RunFolder]) -> RunFolde
             hint="give the run folder too: lidardesign evaluate RUN DESIGN",
         )
 
-    def scenes_key(run: RunFolder) -> tuple[Any, ...]:
-        """What runs share whose designs are scored in the same scenes."""
-        return run.config.task_name, scoring_settings(run.task, run.config.task), run.config.space
-
-    first = candidates[0]
-    for other in candidates[1:]:
-        if scenes_key(other) != scenes_key(first):
-            raise ConfigError(
-                f"{first.folder} and {other.folder} differ in task, configuration or design space",
-                hint="evaluate them one by one: scores of different scenes do not compare",
-            )
+    # what runs share whose designs are scored in the same scenes
+    keys = [(run.config.task_name, scoring_settings(run.task, run.config.task), run.config.space) for run in candidates]
+    first, others = candidates[0], [run for run, key in zip(candidates, keys, strict=True) if key != keys[0]]
+    if others:
+        raise ConfigError(
+            f"{first.folder} and {others[0].folder} differ in task, configuration or design space",
+            hint="evaluate them one by one: scores of different scenes do not compare",
+        )
     if not designs:
         raise DataError("the run has no designs yet", where=str(first.folder), hint=f"lidardesign fit {first.folder}")
     return first

@@ -17,8 +17,16 @@ from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.run.files import STDIO, is_input
-from lidardesign.workflow.plans import RequestPlan, last_time
-from lidardesign.workflow.run_folder import CONFIGURATION, MANIFEST, Notes, RunFolder, folder_of, log_note, run_of
+from lidardesign.workflow.run_folder import (
+    CONFIGURATION,
+    MANIFEST,
+    Notes,
+    RequestPlan,
+    RunFolder,
+    folder_of,
+    last_time,
+    log_note,
+)
 from lidardesign.workflow.run_samples import RunTarget, Weighting, may_need_samples, weighted_samples
 
 # Formats that hold sensors only, so that the number of rays may stay open.
@@ -46,9 +54,7 @@ class DesignSource:
 
     def opened_run(self) -> RunFolder | None:
         """The run that it came from, if it is there."""
-        if self.run is not None or self.path is None:
-            return self.run
-        return run_of(self.specification, self.path)
+        return self.run or (None if self.folder is None else RunFolder.open(self.folder))
 
     @property
     def leaves_rays_open(self) -> bool:
@@ -173,8 +179,7 @@ class ExportRequest:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        name = self.exporter.name
-        layout = layout_of(self.source.specification)
+        name, layout = self.exporter.name, layout_of(self.source.specification)
         if self.rays is not None and name in WITHOUT_RAYS and not layout.one_sensor_per_ray:
             # of a scan another number of rays is another number of sensors
             raise ConfigError(f"{name} holds sensors, not rays", where="--rays", hint="leave it out")
@@ -189,10 +194,8 @@ class ExportRequest:
         source, design, exporter = self.source, self.source.specification, self.exporter
         if self.at or design.track is not None:
             placed(design, self.at)
-        count = self.rays
-        if exporter.name in WITHOUT_RAYS:
-            count = None
-        elif count is None:
+        count = None if exporter.name in WITHOUT_RAYS else self.rays
+        if count is None and exporter.name not in WITHOUT_RAYS:
             count = source.largest_budget() if source.leaves_rays_open else own_count(design)
         content = "its sensors" if count is None else f"its {count} rays"
         place = "".join(f" at {key} = {value:g}" for key, value in self.at.items())
@@ -217,17 +220,17 @@ class ExportRequest:
             notes: Called with every note.
         """
         file, exporter = self.target if file is None else file, self.exporter
-        sensors_only = exporter.name in WITHOUT_RAYS
-        design, rays = self.source.lay_out(self.rays, self.at, self.seed, may_stay_open=sensors_only, notes=notes)
+        open_rays = exporter.name in WITHOUT_RAYS
+        design, rays = self.source.lay_out(self.rays, self.at, self.seed, may_stay_open=open_rays, notes=notes)
         with phase("writing"):
             lost = tuple(exporter.write(design, rays, file, self.rate_hz))
         with phase("reading back"):
             rounding = exporter.rounding(design, rays, file)
         for note in lost:
             notes(note)
-        return Exported(
-            self.target, exporter.name, len(rays), len(design.sensors), _written_bytes(file), lost, rounding
-        )
+        written = [path for path in (file, *file.rglob("*")) if path.is_file()]
+        size = sum(path.stat().st_size for path in written) if written or file.is_dir() else None
+        return Exported(self.target, exporter.name, len(rays), len(design.sensors), size, lost, rounding)
 
 
 def exporter_of(name: str | None, path: Path | None = None) -> Exporter:
@@ -274,10 +277,3 @@ def check_frame_rate(rate_hz: float | None) -> None:
     """
     if rate_hz is not None and not (math.isfinite(rate_hz) and rate_hz > 0):
         raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed="a finite number above 0")
-
-
-def _written_bytes(target: Path) -> int | None:
-    """What was written [bytes], of a folder all files; None for what is no file, as a pipe."""
-    if target.is_dir():
-        return sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
-    return target.stat().st_size if target.is_file() else None

@@ -18,14 +18,15 @@ from lidardesign.design.snap.parts import parts_of
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.manifest import verify
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
-from lidardesign.workflow.plans import RequestPlan, last_time
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
     MANIFEST,
     SAMPLES,
     Notes,
+    RequestPlan,
     RunFolder,
     check_name,
+    last_time,
     log_note,
     reach_of,
     read_design,
@@ -135,16 +136,15 @@ class FitRequest:
             DataError: The rig cannot be read.
             InfeasibleError: The rig stands where the run's sensors may not.
         """
-        asked = load_constraints(options.constraints, notes=notes)
+        defaults, asked = run.task.defaults, load_constraints(options.constraints, notes=notes)
         if asked is None and base is not None:
             asked = Constraints()
-        defaults = run.task.defaults
         constraints, layout, names = _with_rig(options, asked, run, notes)
         if constraints is not None:
             constraints, moved = snap_to_space(constraints, run.config.space)
             for note in moved:
                 notes(note)
-        rules = Constraints() if constraints is None else constraints
+        rules = constraints or Constraints()
         layout = layout or _usual_layout(rules, base, run)
         if options.sensors is not None and LAYOUTS[layout].one_sensor_per_ray:
             raise ConfigError(
@@ -155,7 +155,7 @@ class FitRequest:
         level = options.level if options.level is not None else base.level if base else defaults.level
         if not LEVELS[0] <= level <= LEVELS[1]:
             raise ConfigError(f"{level:g}", where="--level", allowed=f"{LEVELS[0]:g} to {LEVELS[1]:g}")
-        open_budget = LAYOUTS[layout].leaves_rays_open(options.gates)
+        most_rays = None if LAYOUTS[layout].leaves_rays_open(options.gates) else max(defaults.rays)
         return cls(
             run,
             options.name or ("fit" if asked is None else "constrained"),
@@ -165,7 +165,7 @@ class FitRequest:
             {
                 "sensors": _sensors(options.sensors, rules, base, defaults.sensors),
                 "layout": layout,
-                "rays": _rays(options.rays, rules, base, None if open_budget else max(defaults.rays)),
+                "rays": _rays(options.rays, rules, base, most_rays),
                 "gates": options.gates,
                 "level": level,
             },
@@ -195,8 +195,8 @@ class FitRequest:
         run.config.space.at(self.at)
         verify(run.folder, SAMPLES)
         if self.constraints is not None:
-            counted = choices["sensors"] if isinstance(choices["sensors"], int) else None
-            check_feasible(self.constraints, run.config.space, sensors=counted, rays=choices["rays"])
+            count = choices["sensors"] if isinstance(choices["sensors"], int) else None
+            check_feasible(self.constraints, run.config.space, sensors=count, rays=choices["rays"])
         settings = {
             **choices,
             "name": self.name,
@@ -229,8 +229,7 @@ class FitRequest:
         if constraints:
             steps.append(f"keep to constraints of {', '.join(constraints)}; check them on the finished file")
         if self.refine:
-            task = self.run.task.name
-            steps.append(f"refine it in up to {self.refine} rounds on training scenes of task {task}")
+            steps.append(f"refine it in up to {self.refine} rounds on training scenes of task {self.run.task.name}")
         return steps
 
 
@@ -246,9 +245,9 @@ def _with_rig(
         raise ConfigError(f"{layout} beside --like", where="--layout", allowed=", ".join(allowed))
     rig = read_design(Path(options.like), notes, reach_of([run]))
     own, space = Constraints() if asked is None else asked, run.config.space
-    keys = [key for key in PLACE_KEYS if key in type(run.config.task).model_fields]
-    others = "the keys x_m, y_m and z_m of its space"
-    hint = f"learn with {' / '.join(keys) or others} for the rig's places: lidardesign tasks show {run.task.name}"
+    keys = " / ".join(key for key in PLACE_KEYS if key in type(run.config.task).model_fields)
+    keys = keys or "the keys x_m, y_m and z_m of its space"
+    hint = f"learn with {keys} for the rig's places: lidardesign tasks show {run.task.name}"
     constraints = rig_constraints(rig, space, own, rays=options.rays, hint=hint)
     for line in (*rig_notes(rig, constraints, own), *moved_notes(rig, space, constraints)):
         notes(line)
@@ -269,11 +268,8 @@ def _sensors(
 ) -> int | str | None:
     """The number of sensors: the user's, then what the constraints ask for, the design's, the task's."""
     bounds = constraints.sensors
-    if asked is not None or bounds.count is not None:
+    if asked is not None or bounds.count is not None or is_mounted(constraints.rules):  # mounts say how many
         return asked if asked is not None else bounds.count
-    if is_mounted(constraints.rules):
-        # the mounts say how many
-        return None
     usual = max(len(base.sensors) if base else usual, len(constraints.each))
     return min(max(usual, bounds.min or usual), bounds.max or usual)
 
@@ -290,11 +286,9 @@ def _rays(asked: int | None, constraints: Constraints, base: DesignSpec | None, 
 def _weighting(settings: tuple[str, ...], base: DesignSpec | None, notes: Notes) -> Weighting:
     """How samples are weighted: by the user's settings, else as they were for the design."""
     own = Weighting.of(base) if base else Weighting()
-    if not settings:
-        return own
-    if own.reweighting is not None:
+    if settings and own.reweighting is not None:
         notes("with --weight the design's refinement is left out; --refine finds another")
-    return Weighting(settings)
+    return Weighting(settings) if settings else own
 
 
 def load_constraints(
@@ -332,7 +326,6 @@ def load_constraints(
 
 
 def _check_parts(constraints: Constraints) -> Constraints:
-    """Constraints whose parts of the catalogue are all known; refused before anything is fitted."""
     for rules in constraints.rules:
         if rules.snap is not None and rules.snap.parts is not None:
             parts_of(rules.snap)

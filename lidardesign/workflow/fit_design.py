@@ -6,8 +6,8 @@ The rounds of `--refine` run in `evaluate.refinement.Refiner.run`; here are its 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,23 +58,27 @@ class Fitter:
         settings_alone = replace(request.weighting, reweighting=None, range_spread_m=0.0)
         self.target = RunTarget(request.run, weighting=settings_alone)
         request.run.config.space.at(request.at)
-        self.base = self._base(settings_alone)
         self._has_noted_condition = False
+        with phase("samples"):
+            self.base = load_samples(request.run.folder)
+            self._check_effective_samples(LEARN_LONGER)
+            if request.weighting.settings:
+                before = self.base.effective_sample_size
+                self.base = settings_alone.log_target(self.base, self.target)
+                self._check_effective_samples("a setting nearer to what was learned, or learn with it")
+                now, settings = self.base.effective_sample_size, ", ".join(request.weighting.settings)
+                notes(f"with {settings} the samples have ESS {now:.2f}, as learned {before:.2f}")
 
-    @phase("samples")
-    def _base(self, weighting: Weighting) -> Samples:
-        """The samples of the run under the settings."""
-        samples = load_samples(self.request.run.folder)
-        _check_effective_samples(samples, self.request.run, LEARN_LONGER)
-        settings = weighting.settings
-        if not settings:
-            return samples
-        weighted = weighting.log_target(samples, self.target)
-        hint = "a setting nearer to what was learned, or learn with it"
-        _check_effective_samples(weighted, self.request.run, hint)
-        now, before = weighted.effective_sample_size, samples.effective_sample_size
-        self.notes(f"with {', '.join(settings)} the samples have ESS {now:.2f}, as learned {before:.2f}")
-        return weighted
+    def _check_effective_samples(self, hint: str) -> None:
+        """Refuse samples of which too few are effective to fit anything to, whatever the constraints."""
+        effective = self.base.effective_sample_size * len(self.base)
+        if effective < LEAST_SAMPLES:
+            raise DataError(
+                f"the density is too rough: its {len(self.base)} samples are worth {effective:.0f}",
+                where=str(self.request.run.folder),
+                allowed=f"at least {LEAST_SAMPLES}",
+                hint=hint,
+            )
 
     def samples(self, weighting: Weighting) -> Samples:
         """What designs are laid out by: of all conditions, weighted."""
@@ -84,16 +88,19 @@ class Fitter:
 
     def retarget(self, factor: Reweighting | None) -> Callable[[np.ndarray], np.ndarray]:
         """log p* with a factor; the target itself is prepared once."""
-        if factor is None:
-            return self.target
-        return lambda points: self.target(points) + factor.log_factor(points)
+        return self.target if factor is None else lambda points: self.target(points) + factor.log_factor(points)
 
     @phase("fitting")
     def fit(self, weighting: Weighting, samples: Samples, **choices: Any) -> FitResult:
         """The design under a weighting, from its samples."""
         request, retarget = self.request, self.retarget(weighting.reweighting)
         if request.at:
-            samples = self._at(samples, retarget)
+            count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (request.choices.get("rays") or 0))
+            samples = at_condition(samples, request.at, retarget, count, random_generator(request.seed, "condition"))
+            if not self._has_noted_condition:
+                place, ess = condition_text(request.at), samples.effective_sample_size
+                self.notes(f"at {place} {len(samples)} samples have ESS {ess:.2f}")
+            self._has_noted_condition = True
         return fit_samples(
             samples,
             constraints=request.constraints,
@@ -103,67 +110,29 @@ class Fitter:
             **{**request.choices, **choices},
         )
 
-    def _at(self, samples: Samples, retarget: Callable[[np.ndarray], np.ndarray]) -> Samples:
-        """The samples at the request's conditions."""
-        request = self.request
-        count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (request.choices.get("rays") or 0))
-        moved = at_condition(samples, request.at, retarget, count, random_generator(request.seed, "condition"))
-        if not self._has_noted_condition:
-            ess = moved.effective_sample_size
-            self.notes(f"at {condition_text(request.at)} {len(moved)} samples have ESS {ess:.2f}")
-        self._has_noted_condition = True
-        return moved
-
     @cached_property
     def may_spread(self) -> bool:
         """Whether samples may be spread in range: not where weights at other places have to be worked out for them."""
         constraints = self.request.constraints
-        if self.request.at:
-            return False
-        if constraints is None:
-            return True
+        if self.request.at or constraints is None:
+            return not self.request.at
         members = sensor_groups(constraints.rules, self.base.space, max(len(constraints.each), 1) + 1)
         return not is_mounted(constraints.rules) and all(pin is None for group in members for pin in group.pins)
 
 
-def _check_effective_samples(samples: Samples, run: RunFolder, hint: str) -> None:
-    """Refuse samples of which too few are effective to fit anything to, whatever the constraints.
-
-    Raises:
-        DataError: They are fewer than a fit needs.
-    """
-    effective = samples.effective_sample_size * len(samples)
-    if effective < LEAST_SAMPLES:
-        raise DataError(
-            f"the density is too rough: its {len(samples)} samples are worth {effective:.0f}",
-            where=str(run.folder),
-            allowed=f"at least {LEAST_SAMPLES}",
-            hint=hint,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class FitOutcome:
-    """What a request came to.
-
-    Arguments:
-        result: The fit; its design says where it came from, its checks are of the design's own text.
-        refinement: How refinement went, as plain values; None without.
-    """
-
-    result: FitResult
-    refinement: Mapping[str, Any] | None = None
-
-
 def fit_design(
     request: FitRequest, *, progress: Callable[[Round], None] | None = None, notes: Notes = log_note
-) -> FitOutcome:
+) -> tuple[FitResult, Mapping[str, Any] | None]:
     """Fit the design of a request, refine it if asked to, and check it; nothing is written.
 
     Arguments:
         request: What is asked for.
         progress: Called with every round of refinement.
         notes: Called with every note.
+
+    Returns:
+        The fit, whose design says where it came from and whose checks are of the design's own text; and how refinement
+        went, as plain values, None without.
 
     Raises:
         ConfigError: Choices that do not fit together, or a task that cannot be refined for.
@@ -198,8 +167,8 @@ def fit_design(
     design = replace(design, provenance={**design.provenance, **origin})
     with phase("writing"):
         checks = check_written(design, request)
-    satisfied = all(check.satisfied for check in checks)
-    return FitOutcome(replace(result, design=design, constraints=checks, satisfied=satisfied), document)
+    # broken ones were refused
+    return replace(result, design=design, constraints=checks, satisfied=True), document
 
 
 def check_written(design: DesignSpec, request: FitRequest) -> list[ConstraintCheck]:
@@ -252,7 +221,7 @@ def _refined(request: FitRequest, rounds: int, progress: Callable[[Round], None]
     fitter = Fitter(request, notes)
     start = weighting.reweighting
     look, judge = refinement_scenes(request)
-    gating = _Gating(fitter, look)
+    gating = cache(lambda: _gating(run, look))
     refiner = Refiner(
         run.task,
         lambda factor, shape: _trial(fitter, replace(weighting, reweighting=factor), shape, gating),
@@ -275,28 +244,20 @@ def _attention(fitter: Fitter, start: Reweighting | None) -> Attention:
     places = observed_point(fitter.base.resample(ANCHOR_POOL, random_generator(seed, "anchor places")))
     if start is not None:
         return Attention.at(start.points_m, places)
-    positions = len(conditions_of(run.task, run.config.task, run.config.space))
-    return Attention.over(places, random_generator(seed, "anchors"), anchors_for(positions))
+    count = anchors_for(len(conditions_of(run.task, run.config.task, run.config.space)))
+    return Attention.over(places, random_generator(seed, "anchors"), count)
 
 
-class _Gating:
-    """Gates by returns, from the scenes that are looked at and those that were learned from; made when asked for."""
+def _gating(run: RunFolder, look: Sequence[Scene]) -> Gating:
+    """Gates by returns, from the scenes that are looked at and those that were learned from."""
+    from lidardesign.evaluate.refinement import Gating
+    from lidardesign.simulate.simulate import build_casters
 
-    def __init__(self, fitter: Fitter, look: list[Scene]) -> None:
-        self._fitter, self._look = fitter, look
-
-    @cached_property
-    def gating(self) -> Gating:
-        """The gating, with casters of all scenes."""
-        from lidardesign.evaluate.refinement import Gating
-        from lidardesign.simulate.simulate import build_casters
-
-        run = self._fitter.request.run
-        scenes = [*self._look, *run.scenes("train", run.config.seed)]
-        return Gating([(s, build_casters(s)) for s in scenes], run.config.space, run.config.density.sigma_m)
+    casters = [(scene, build_casters(scene)) for scene in (*look, *run.scenes("train", run.config.seed))]
+    return Gating(casters, run.config.space, run.config.density.sigma_m)
 
 
-def _trial(fitter: Fitter, weighting: Weighting, shape: Shape, gating: _Gating) -> Trial:
+def _trial(fitter: Fitter, weighting: Weighting, shape: Shape, gating: Callable[[], Gating]) -> Trial:
     """A design of a weighting, and its rays at every condition.
 
     Raises:
@@ -315,7 +276,7 @@ def _trial(fitter: Fitter, weighting: Weighting, shape: Shape, gating: _Gating) 
     count = result.design.rays or request.judged_rays
     if shape.traced_gates:
         rays = layouts(result.design, count, samples, at=conditions[0])
-        design = gating.gating(result.design, rays, shape.range_spread_m)
+        design = gating()(result.design, rays, shape.range_spread_m)
         document = design_document(design)
         checks = [] if constraints is None else list(check_design(document, constraints, run.config.space))
         result = replace(result, design=design, constraints=checks)

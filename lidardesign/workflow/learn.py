@@ -21,8 +21,17 @@ from lidardesign.run.manifest import note, read_manifest, start_manifest
 from lidardesign.run.yaml import dump_yaml, leaves, load_yaml, parse_yaml
 from lidardesign.task import Task, notes_of
 from lidardesign.workflow.learning_budget import GOAL, Goal, Learner, checked_goal, resumed_goal
-from lidardesign.workflow.plans import EarlierRun, RequestPlan, last_time
-from lidardesign.workflow.run_folder import CONFIGURATION, MANIFEST, SAMPLES, Notes, log_note, settings_texts
+from lidardesign.workflow.run_folder import (
+    CONFIGURATION,
+    MANIFEST,
+    SAMPLES,
+    EarlierRun,
+    Notes,
+    RequestPlan,
+    last_time,
+    log_note,
+    settings_texts,
+)
 
 if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress, LearnResult
@@ -114,17 +123,15 @@ class LearnRequest:
         goal = checked_goal(options.tolerance, options.time_budget_s, choices)
         plugin = load_task(task)
         folder = Path("runs") / task if options.out is None else Path(options.out)
-        begun = False
-        if options.resume:
-            if not folder.is_dir():
-                raise DataError("there is no run to resume", where=str(folder), hint="leave out --resume to start it")
-            begun = not _was_killed_before_it_began(folder)
-            if not begun:
-                notes("nothing of the run was kept yet; it starts from the beginning")
+        if options.resume and not folder.is_dir():
+            raise DataError("there is no run to resume", where=str(folder), hint="leave out --resume to start it")
+        begun = options.resume and not _was_killed_before_it_began(folder)
         if begun:
             goal = resumed_goal(goal, folder)
             plugin, settings = _resumed_settings(plugin, folder, choices)
         else:
+            if options.resume:
+                notes("nothing of the run was kept yet; it starts from the beginning")
             check_can_start(folder)
             settings = resolve(plugin, **choices)
         request = cls(plugin, folder, settings, goal, options.device, begun, config_file, options.command)
@@ -145,15 +152,13 @@ class LearnRequest:
 
     def plan(self) -> RequestPlan:
         """What learning would do."""
-        settings = self.settings
-        learning, goal = settings.learning, self.goal
+        settings, learning, goal = self.settings, self.settings.learning, self.goal
+        length = f"{learning.steps:,} steps of {learning.batch:,} points"
         if goal.tolerance is not None:
             length = f"until at most {goal.tolerance:g} of its mass is in the wrong place, in stages from "
             length += f"{learning.steps // 8:,} steps"
         elif goal.time_budget_s is not None:
             length = f"as many steps as end within {goal.time_budget_s:g} s"
-        else:
-            length = f"{learning.steps:,} steps of {learning.batch:,} points"
         steps = [
             f"{'go on with' if self.has_checkpoint else 'learn'} task {self.task.name}, preset {settings.preset}, "
             f"seed {settings.seed}, on {self.device}",
@@ -185,17 +190,17 @@ class LearnRequest:
             DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
         """
         folder = self.folder
+        learner = Learner(self.task, folder, self.device, progress, outermost_clock() or Clock())
         with _new_folder(folder), run_lock(folder):
             if not self.begun:
                 check_can_start(folder)  # another process may have been faster
             with self._undone_on_failure():
                 if not self.begun:
                     # Write what the run is before anything is learned; the configuration last
-                    start_manifest(self.folder, command=list(self.command), seed=self.settings.seed)
+                    start_manifest(folder, command=list(self.command), seed=self.settings.seed)
                     if not self.goal.is_none:
-                        note(self.folder, **{GOAL: self.goal.as_dict()})
-                    save_run_config(self.settings, self.folder)
-                learner = Learner(self.task, folder, self.device, progress, outermost_clock() or Clock())
+                        note(folder, **{GOAL: self.goal.as_dict()})
+                    save_run_config(self.settings, folder)
                 try:
                     return learner.learn(self.settings, self.goal, resume=self.has_checkpoint)
                 except DataError as error:
@@ -222,8 +227,14 @@ class LearnRequest:
         try:
             yield
         except BaseException:
-            if not self.begun:
-                _take_away(self.folder)
+            entries = [entry for entry in self.folder.iterdir() if entry.name != LOCK]
+            nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
+            if not self.begun and nothing_learned and not has_stages(self.folder):
+                with contextlib.suppress(OSError):
+                    # without its configuration a run has not begun, whatever else is left of it
+                    (self.folder / CONFIGURATION).unlink(missing_ok=True)
+                    for entry in entries:
+                        shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
             raise
 
 
@@ -241,17 +252,10 @@ def learning_advice(result: LearnResult) -> list[str]:
 
 def result_document(result: LearnResult) -> dict[str, Any]:
     """What `lidardesign learn --json` prints of a result."""
+    figures = ("task", "seconds", "steps", "ess", "kl_nats", "log_z", "coverage", "misplaced", "goal")
     return {
         "run": str(result.run),
-        "task": result.task,
-        "seconds": result.seconds,
-        "steps": result.steps,
-        "ess": result.ess,
-        "kl_nats": result.kl_nats,
-        "log_z": result.log_z,
-        "coverage": result.coverage,
-        "misplaced": result.misplaced,
-        "goal": result.goal,
+        **{name: getattr(result, name) for name in figures},
         "notes": list(result.notes),
         "error_estimates": result.as_dict()["error_estimates"],
     }
@@ -260,28 +264,24 @@ def result_document(result: LearnResult) -> dict[str, Any]:
 def _time_of_twin(run: Path, settings: Mapping[str, Any]) -> EarlierRun | None:
     """How long learning took in another run in the same folder, whose configuration has the same sections."""
     for manifest in sorted(run.absolute().parent.glob(f"*/{MANIFEST}")):
-        other = manifest.parent
-        try:
-            sections = load_yaml(other / CONFIGURATION).mapping
-        except LidardesignError:
-            continue
-        before = last_time(other, "learn")
-        if before is not None and all(sections.get(name) == value for name, value in settings.items()):
-            return EarlierRun(before.seconds, f"learning {other.name}, which has the same settings,")
+        before = last_time(manifest.parent, "learn")
+        with contextlib.suppress(LidardesignError):
+            sections = load_yaml(manifest.with_name(CONFIGURATION)).mapping
+            if before is not None and all(sections.get(name) == value for name, value in settings.items()):
+                return EarlierRun(before.seconds, f"learning {manifest.parent.name}, which has the same settings,")
     return None
 
 
 def _paths_in(config: BaseModel) -> list[Path]:
-    """The files and folders that a task's configuration names."""
 
     def within(value: Any) -> list[Path]:
-        if isinstance(value, Path):
-            return [value]
         if isinstance(value, dict):
             value = list(value.values())
         if isinstance(value, list | tuple):
             return [path for item in value for path in within(item)]
-        return _paths_in(value) if hasattr(value, "model_fields_set") else []
+        if hasattr(value, "model_fields_set"):
+            return _paths_in(value)
+        return [value] if isinstance(value, Path) else []
 
     return within([value for _, value in config])
 
@@ -295,8 +295,12 @@ def check_can_start(run: Path) -> None:
     if run.is_file():
         raise ConfigError("is a file", where=f"--out {run}", allowed="a folder that is new or empty")
     if run.is_dir() and not _was_killed_before_it_began(run):
-        hint = "continue it with --resume, or give another --out"
-        raise ConfigError("the folder is not empty", where=f"--out {run}", allowed="a new or empty folder", hint=hint)
+        raise ConfigError(
+            "the folder is not empty",
+            where=f"--out {run}",
+            allowed="a new or empty folder",
+            hint="continue it with --resume, or give another --out",
+        )
 
 
 def _was_killed_before_it_began(run: Path) -> bool:
@@ -324,9 +328,8 @@ def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tu
         new[steps] = old[steps]
     for path in [*old, *new]:
         if old.get(path) != new.get(path):
-            key = ".".join(map(str, path))
             raise ConfigError(
-                f"the run was started with {key} = {old.get(path)!r}, not {new.get(path)!r}",
+                f"the run was started with {'.'.join(map(str, path))} = {old.get(path)!r}, not {new.get(path)!r}",
                 where=str(run / CONFIGURATION),
                 hint="resume without options, or start a new run with another --out",
             )
@@ -350,21 +353,8 @@ def _new_folder(run: Path) -> Iterator[None]:
         raise
 
 
-def _take_away(run: Path) -> None:
-    entries = [entry for entry in run.iterdir() if entry.name != LOCK]
-    nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
-    if not nothing_learned or has_stages(run):
-        return
-    with contextlib.suppress(OSError):
-        # without its configuration a run has not begun, whatever else is left of it
-        (run / CONFIGURATION).unlink(missing_ok=True)
-        for entry in entries:
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
-
-
 def has_stages(run: Path) -> bool:
     """Whether trainings were finished on the way to a tolerance: what they reached can be gone on from."""
-    try:
+    with contextlib.suppress(DataError):
         return bool((read_manifest(run).get(GOAL) or {}).get("stages"))
-    except DataError:
-        return False
+    return False

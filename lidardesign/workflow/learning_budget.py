@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,8 @@ from lidardesign.task import Task
 if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress, LearnResult
     from lidardesign.density.training.schedule import ToleranceGoal
+
+    Train = Callable[..., LearnResult]
 
 TOLERANCE, TIME_BUDGET = "--tolerance", "--time-budget"
 # More is a mistake in the unit; the numbers of steps that it makes are beyond what a file may hold.
@@ -54,9 +57,7 @@ class Goal:
 
     def as_dict(self) -> dict[str, Any]:
         """What the manifest has of it before anything is learned."""
-        if self.tolerance is not None:
-            return {"tolerance": self.tolerance}
-        return {"time_budget_s": self.time_budget_s}
+        return {"time_budget_s": self.time_budget_s} if self.tolerance is None else {"tolerance": self.tolerance}
 
 
 def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Mapping[str, Any]) -> Goal:
@@ -73,16 +74,14 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
         raise ConfigError("both decide the number of steps", where=f"{TOLERANCE}, {TIME_BUDGET}", allowed="one of them")
     if tolerance is not None and not 0 < tolerance < 1:
         raise ConfigError(f"{tolerance:g}", where=TOLERANCE, allowed="a share between 0 and 1, as 0.1")
-    keys = {text.partition("=")[0].strip() for text in given["overrides"]}
+    keys, path = {text.partition("=")[0].strip() for text in given["overrides"]}, given["config_file"]
     if time_budget_s is None:
-        return Goal(tolerance, fixed_fields=given["config_file"] is not None or FIELDS_KEY in keys)
+        return Goal(tolerance, fixed_fields=path is not None or FIELDS_KEY in keys)
     if not 0 < time_budget_s <= LONGEST_S:
         raise ConfigError(f"{time_budget_s:g}", where=TIME_BUDGET, allowed="seconds above 0, a year at most")
     if STEPS_KEY in keys:
         raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
-    if given["config_file"] is not None:
-        # Refuse a configuration file that sets what the time decides
-        path = given["config_file"]
+    if path is not None:
         document, key = load_yaml(path), tuple(STEPS_KEY.split("."))
         if key in dict(leaves(document.value)):
             where = f"{TIME_BUDGET}, {document.locate(key)}"
@@ -133,15 +132,15 @@ class Learner:
         with phase("libraries"):
             from lidardesign.density.learn import learn as learn_density
 
+        train = partial(learn_density, self.task, run=self.run, device=self.device, progress=self.progress)
         if goal.tolerance is not None:
-            return self._to_tolerance(config, goal, resume)
+            return self._to_tolerance(config, goal, resume, train)
         if goal.time_budget_s is not None and not resume:
-            return self._within(config, goal.time_budget_s)
-        result = learn_density(self.task, config, self.run, resume=resume, device=self.device, progress=self.progress)
+            return self._within(config, goal.time_budget_s, train)
+        result = train(config, resume=resume)
         return result if goal.is_none else replace(result, goal=read_manifest(self.run)[GOAL])
 
-    def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool) -> LearnResult:
-        from lidardesign.density.learn import learn as learn_density
+    def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool, train: Train) -> LearnResult:
         from lidardesign.density.learn import prepare_training_data
         from lidardesign.density.training.schedule import goal_of, learn_to_tolerance
 
@@ -151,15 +150,7 @@ class Learner:
         data = prepare_training_data(self.task, config)
 
         def once(staged: RunConfig, going_on: bool) -> LearnResult:
-            return learn_density(
-                self.task,
-                staged,
-                self.run,
-                resume=going_on,
-                data=data,
-                device=self.device,
-                progress=self.progress,
-            )
+            return train(staged, resume=going_on, data=data)
 
         result, reached = learn_to_tolerance(config, self.run, begun, once, resume=resume)
         tried = ", ".join(f"{stage.misplaced:.3g} with {stage.steps}" for stage in reached.stages)
@@ -184,9 +175,8 @@ class Learner:
         begun = ToleranceGoal(goal.tolerance, config.learning.steps, (), chosen.misplaced)
         return replace(config, density=chosen.density), begun, chosen.note
 
-    def _within(self, config: RunConfig, time_budget_s: float) -> LearnResult:
+    def _within(self, config: RunConfig, time_budget_s: float, train: Train) -> LearnResult:
         from lidardesign.density.learn import choose_device, prepare_training_data
-        from lidardesign.density.learn import learn as learn_density
         from lidardesign.density.training.schedule import Timekeeper
 
         place, startup = choose_device(self.device), self._startup_s()
@@ -194,15 +184,7 @@ class Learner:
         data = prepare_training_data(self.task, config)
         with phase("planning"):
             planned = keeper.plan(data, place)
-        result = learn_density(
-            self.task,
-            planned,
-            self.run,
-            data=data,
-            replan=keeper.replan,
-            device=self.device,
-            progress=self.progress,
-        )
+        result = train(planned, data=data, replan=keeper.replan)
         plan = keeper.planned
         summary = (
             f"{plan.pathwise_steps} + {plan.balancing_steps} steps fit into {time_budget_s:g} s: "
@@ -218,9 +200,7 @@ class Learner:
         return STARTUP_S if age is None or age - self.clock.seconds > MOST_STARTUP_S else age - self.clock.seconds
 
     def _whole(self, result: LearnResult, note: str, goal: dict[str, Any]) -> LearnResult:
-        """A result with all the time that its goal took."""
-        seconds = round(self.clock.seconds, 3)
-        return replace(result, notes=(*result.notes, note), goal=goal, seconds=seconds)
+        return replace(result, notes=(*result.notes, note), goal=goal, seconds=round(self.clock.seconds, 3))
 
 
 def _age_s() -> float | None:
@@ -240,9 +220,8 @@ def check_met(result: LearnResult, goal: Goal) -> None:
     """
     if goal.tolerance is None or result.goal["met"]:
         return
-    error = result.error_estimates["misplaced"].error
+    error, fields = result.error_estimates["misplaced"].error, result.goal["target_misplaced"]
     doubt = "" if error is None else f" +- {error:.2g}"
-    fields = result.goal["target_misplaced"]
     if fields:
         doubt += f", and {fields:.2g} of the target's by its distance fields,"
     raise ThresholdError(

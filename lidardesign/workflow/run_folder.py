@@ -1,13 +1,17 @@
-"""Run folders and the designs in and beside them: opened, read, and traced back to where they came from."""
+"""Run folders and the designs in and beside them: opened, read, and traced back to where they came from.
+
+Also what a request on them would do, read and write, and how long it took before: what `--dry-run` prints.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +21,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
-from lidardesign.run.files import is_input, is_there, readable
+from lidardesign.run.files import STDIO, is_input, is_there, readable
 from lidardesign.run.manifest import changed_since_recorded, read_manifest, versions
 from lidardesign.scene import Scene
 from lidardesign.space import RANGE
@@ -117,22 +121,19 @@ def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = Non
     if difference is not None:
         notes(f"{path} {difference}")
     # only what was read from others has notes
-    further = design.provenance.get("notes")
-    if "source" in design.provenance and isinstance(further, list):
-        for note in further:
-            notes(f"{path}: {note}")
+    further = design.provenance.get("notes") if "source" in design.provenance else None
+    for note in further if isinstance(further, list) else ():
+        notes(f"{path}: {note}")
     return design
 
 
 def _difference(path: Path) -> str | None:
     """In what a design differs from the one that its run's manifest has, where it lies in a run."""
     folder, run = path.absolute().parent, path.absolute().parent.parent
-    if folder.name != DESIGN_FOLDER or not path.is_file() or not (run / MANIFEST).is_file():
-        return None
-    try:
-        return changed_since_recorded(run, f"{DESIGN_FOLDER}/{path.name}")
-    except DataError:  # whatever needs the manifest says that it is damaged
-        return None
+    if folder.name == DESIGN_FOLDER and path.is_file() and (run / MANIFEST).is_file():
+        with contextlib.suppress(DataError):  # whatever needs the manifest says that it is damaged
+            return changed_since_recorded(run, f"{DESIGN_FOLDER}/{path.name}")
+    return None
 
 
 def open_target(path: Path, notes: Notes = log_note) -> tuple[RunFolder | None, DesignSpec | None]:
@@ -161,11 +162,9 @@ def run_of(design: DesignSpec, path: Path) -> RunFolder | None:
 def folder_of(design: DesignSpec, path: Path) -> Path | None:
     """The folder of the run that a design came from, if it is there: its provenance names it relative to its file."""
     named = design.provenance.get("run")
-    if not isinstance(named, str):
-        return None
-    folder = Path(os.path.normpath(path.parent / named))
+    folder = Path(os.path.normpath(path.parent / named)) if isinstance(named, str) else None
     # a design that was copied elsewhere names a folder that is none of its run's
-    return folder if (folder / MANIFEST).is_file() else None
+    return folder if folder is not None and (folder / MANIFEST).is_file() else None
 
 
 def need_run(run: RunFolder | None, path: Path | str) -> RunFolder:
@@ -222,15 +221,11 @@ def reach_beside(files: Iterable[Path], runs: Sequence[RunFolder]) -> float | No
     if runs:
         return reach_of(runs)
     for path in files:
-        if is_input(path):
-            continue
-        try:
-            run = run_of(load_design(path), path)
-        except LidardesignError:
-            # whoever reads it for good says what is wrong with it
-            continue
-        if run is not None:
-            return reach_of([run])
+        # whoever reads it for good says what is wrong with it
+        with contextlib.suppress(LidardesignError):
+            run = None if is_input(path) else run_of(load_design(path), path)
+            if run is not None:
+                return reach_of([run])
     return None
 
 
@@ -240,3 +235,83 @@ def settings_texts(settings: Sequence[str] | Mapping[str, Any]) -> tuple[str, ..
         return tuple(settings)
     texts = {key: value if isinstance(value, str | Path) else json.dumps(value) for key, value in settings.items()}
     return tuple(f"{key}={value}" for key, value in texts.items())
+
+
+@dataclass(frozen=True)
+class EarlierRun:
+    """How long something like a request took before.
+
+    Arguments:
+        seconds: Wall time [s].
+        name: What took it.
+    """
+
+    seconds: float
+    name: str
+
+
+@dataclass(frozen=True)
+class RequestPlan:
+    """What a request would do.
+
+    Arguments:
+        command: The command that does the same.
+        steps: What it would do, one line each, in order.
+        reads: Files and folders that it would read.
+        writes: Files and folders that it would write; a folder's name ends in a stroke.
+        settings: What it would do it with, as plain values.
+        before: How long that took before, where that is known.
+    """
+
+    command: str
+    steps: Sequence[str]
+    reads: Sequence[Path | str] = ()
+    writes: Sequence[Path | str] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    before: EarlierRun | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The document of `--dry-run --json`."""
+        return {
+            "dry_run": True,
+            "command": self.command,
+            "steps": list(self.steps),
+            "reads": [
+                {"path": str(path), "bytes": (os.path.getsize(path) if _is_file(path) else None)} for path in self.reads
+            ],
+            "writes": [{"path": str(path), "replaces": _is_file(path)} for path in self.writes],
+            "settings": dict(self.settings),
+            "before": None if self.before is None else {"seconds": self.before.seconds, "of": self.before.name},
+        }
+
+    def check_writable(self) -> None:
+        """Refuse places where nothing can be written.
+
+        Raises:
+            DataError: A file stands where a folder would be, a folder where a file would, or writing is forbidden.
+        """
+        for path in (path for path in map(str, self.writes) if path != STDIO):
+            target, is_folder = Path(path), path.endswith("/")
+            if target.is_dir() and not is_folder:
+                raise DataError("is a folder", where=path, hint="give the name of a file")
+            if target.is_file() and is_folder:
+                raise DataError("is a file", where=str(target), hint="give a new folder, or one that is there")
+            there = next(parent for parent in (target, *target.absolute().parents) if parent.exists())
+            if there != target and not there.is_dir():
+                raise DataError(f"cannot be made: {there} is a file", where=path, hint="give another place")
+            if not os.access(there, os.W_OK):
+                raise DataError(f"cannot be written: {there} is read-only", where=path, hint="give another place")
+
+
+def _is_file(path: Path | str) -> bool:
+    return str(path) != STDIO and os.path.isfile(path)
+
+
+def last_time(run: Path | None, command: str) -> EarlierRun | None:
+    """How long a command took the last time on a run, as its manifest has it; None where it does not."""
+    try:
+        entry = {} if run is None else read_manifest(run).get("timings", {}).get(command)
+    except DataError:  # whoever needs the manifest says what is wrong with it
+        return None
+    seconds = entry.get("seconds") if isinstance(entry, dict) else None
+    return EarlierRun(seconds, f"the last {command} of {run}") if isinstance(seconds, int | float) else None

@@ -76,8 +76,8 @@ class Weighting:
         listed = isinstance(settings, Sequence) and not isinstance(settings, str)
         if not (listed and all(isinstance(text, str) for text in settings)):
             raise ConfigError(f"set is {settings!r}", where=where, allowed="a list of KEY=VALUE", hint=FIT_AGAIN)
-        number = isinstance(spread, int | float) and not isinstance(spread, bool)
-        if not (number and 0 <= spread <= WIDEST_SPREAD_M):
+        is_number = isinstance(spread, int | float) and not isinstance(spread, bool)
+        if not (is_number and 0 <= spread <= WIDEST_SPREAD_M):
             allowed = f"0 to {WIDEST_SPREAD_M:g}"
             raise ConfigError(f"range_spread_m is {spread!r}", where=where, allowed=allowed, hint=FIT_AGAIN)
         factors = document.get("factors")
@@ -86,14 +86,9 @@ class Weighting:
 
     def as_document(self) -> dict[str, Any]:
         """Plain values, as they stand in the provenance of a design."""
-        document: dict[str, Any] = {}
-        if self.settings:
-            document["set"] = list(self.settings)
-        if self.range_spread_m:
-            document["range_spread_m"] = self.range_spread_m
-        if self.reweighting is not None:
-            document["factors"] = self.reweighting.as_document()
-        return document
+        factors = None if self.reweighting is None else self.reweighting.as_document()
+        document = {"set": list(self.settings), "range_spread_m": self.range_spread_m, "factors": factors}
+        return {key: value for key, value in document.items() if value}
 
     def log_target(self, samples: Samples, target: RunTarget) -> Samples:
         """The samples with the log p* that they have under the settings and the factor; ranges stay."""
@@ -105,9 +100,8 @@ class Weighting:
 
     def spread(self, samples: Samples, seed: int) -> Samples:
         """The samples spread in range, where that was found to gain something."""
-        if not self.range_spread_m:
-            return samples
-        return samples.spread_in_range(self.range_spread_m, random_generator(seed, "range spread"))
+        generator = random_generator(seed, "range spread")
+        return samples.spread_in_range(self.range_spread_m, generator) if self.range_spread_m else samples
 
 
 class RunTarget:
@@ -120,8 +114,7 @@ class RunTarget:
     """
 
     def __init__(self, run: RunFolder, visibility: str | None = None, weighting: Weighting | None = None) -> None:
-        self._run, self._visibility = run, visibility
-        self._weighting = Weighting() if weighting is None else weighting
+        self._run, self._visibility, self._weighting = run, visibility, weighting or Weighting()
 
     @cached_property
     def _target(self) -> Target:
@@ -147,8 +140,7 @@ def weighted_samples(run: RunFolder, weighting: Weighting, target: RunTarget) ->
     Raises:
         DataError: The samples are damaged, or all weights are zero.
     """
-    samples = weighting.log_target(load_samples(run.folder), target)
-    return weighting.spread(samples, run.config.seed)
+    return weighting.spread(weighting.log_target(load_samples(run.folder), target), run.config.seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,8 +212,7 @@ def twin_without_visibility(design: DesignSpec, run: RunFolder, layouts: Layouts
     )
     if not len(samples):
         raise DataError("no ray of the design space comes near a target", where=f"--baseline {TWIN_NAME}")
-    target = layouts.targets[TWIN_NAME]
-    return fitted_twin(design, samples, name=TWIN_NAME, retarget=target), samples
+    return fitted_twin(design, samples, name=TWIN_NAME, retarget=layouts.targets[TWIN_NAME]), samples
 
 
 def learned_density(run: RunFolder) -> Density | None:

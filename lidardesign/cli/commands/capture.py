@@ -10,15 +10,12 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.output import Output, claim_outputs, command, keep_times, written_file
-from lidardesign.cli.tables.designs import number
-from lidardesign.cli.tables.grids import print_table
+from lidardesign.cli.tables.grids import RichConsole, number, print_table
 from lidardesign.errors import ConfigError, DataError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.files import is_input, is_there
 
 if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
-
     from lidardesign.evaluate.captures.score import CaptureEvaluation
     from lidardesign.geometry.rays import Rays
 
@@ -35,41 +32,6 @@ COLUMNS = {
     "photons_per_ray": "photons\nper ray",
 }
 
-EstimatorOption = Annotated[
-    str,
-    typer.Option(
-        "--estimator", metavar="peak|matched", help="Range from the highest bin, or from the log-matched filter."
-    ),
-]
-FalseAlarm = Annotated[
-    float, typer.Option("--false-alarm", metavar="P", help="Probability that background alone is taken for a return.")
-]
-Within = Annotated[
-    float | None,
-    typer.Option(
-        "--within-deg",
-        metavar="DEG",
-        help="Largest angle between a ray and the pixel that stands for it.",
-        show_default="the spacing of the pixels",
-    ),
-]
-Outlier = Annotated[
-    float, typer.Option("--outlier-mm", metavar="MM", help="Returns that are off by more are outliers.")
-]
-Reference = Annotated[
-    Path | None,
-    typer.Option(
-        "--reference",
-        metavar="MESH",
-        help="The true surface, in metres in the design's frame.",
-        show_default="through the capture's true ranges",
-    ),
-]
-CsvFile = Annotated[
-    Path | None,
-    typer.Option("--csv", metavar="FILE", help="Write every ray's range and point as CSV.", show_default=False),
-]
-
 
 def capture(
     file: Annotated[Path, typer.Argument(metavar="CAPTURE", readable=False, help="Captured histograms, .npz or .mat.")],
@@ -79,12 +41,41 @@ def capture(
     ],
     rays: options.RayCount = None,
     at: options.At = None,
-    estimator: EstimatorOption = "peak",
-    false_alarm: FalseAlarm = 0.01,
-    within_deg: Within = None,
-    outlier_mm: Outlier = 10.0,
-    reference: Reference = None,
-    csv: CsvFile = None,
+    estimator: Annotated[
+        str,
+        typer.Option(
+            "--estimator", metavar="peak|matched", help="Range from the highest bin, or from the log-matched filter."
+        ),
+    ] = "peak",
+    false_alarm: Annotated[
+        float,
+        typer.Option("--false-alarm", metavar="P", help="Probability that background alone is taken for a return."),
+    ] = 0.01,
+    within_deg: Annotated[
+        float | None,
+        typer.Option(
+            "--within-deg",
+            metavar="DEG",
+            help="Largest angle between a ray and the pixel that stands for it.",
+            show_default="the spacing of the pixels",
+        ),
+    ] = None,
+    outlier_mm: Annotated[
+        float, typer.Option("--outlier-mm", metavar="MM", help="Returns that are off by more are outliers.")
+    ] = 10.0,
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            "--reference",
+            metavar="MESH",
+            help="The true surface, in metres in the design's frame.",
+            show_default="through the capture's true ranges",
+        ),
+    ] = None,
+    csv: Annotated[
+        Path | None,
+        typer.Option("--csv", metavar="FILE", help="Write every ray's range and point as CSV.", show_default=False),
+    ] = None,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -107,13 +98,13 @@ def capture(
 
         place = options.parse_at(at)
         scanned = [_rays_and_run(path, rays, place, seed or 0, output) for path in designs]
-        named = list(zip(_distinct_names(designs), (listed for listed, _ in scanned), strict=True))
+        named = list(zip(_distinct_names(designs), (fired for fired, _ in scanned), strict=True))
         with phase("capture"):
             captured = load_capture(file)
         within_rad = default_within_rad(captured) if within_deg is None else math.radians(within_deg)
         estimation = Estimation(estimator, false_alarm)  # type: ignore[arg-type]
-        settings = CaptureSettings(estimation, within_rad, outlier_mm / 1000.0, reference)
         with phase("scoring"):
+            settings = CaptureSettings(estimation, within_rad, outlier_mm / 1000.0, reference)
             evaluation = evaluate_capture(captured, named, settings)
         for note in evaluation.notes:
             output.remark(note)
@@ -139,8 +130,12 @@ def _rays_and_run(
         raise DataError("no such design", where=str(path), hint="give design files or files of export --format galvo")
     if not is_input(path) and is_galvo_file(path):
         if count is not None or at:
-            allowed = "a design file with --rays and --at"
-            raise ConfigError("holds its rays already", where=str(path), allowed=allowed, hint="leave them out")
+            raise ConfigError(
+                "holds its rays already",
+                where=str(path),
+                allowed="a design file with --rays and --at",
+                hint="leave them out",
+            )
         rays = read_galvo(path)
     else:
         specification = read_design(path, output.remark)
@@ -162,8 +157,6 @@ def _distinct_names(files: list[Path]) -> list[str]:
 
 
 def _show(document: dict[str, Any], evaluation: CaptureEvaluation, rich: RichConsole) -> None:
-    from rich.markup import escape
-
     start, end = document["window_m"]
     rich.print(
         f"{document['pixels']} pixels, {document['bins']} bins of {number(document['bin_ps'])} ps from {start:.4g} to "
@@ -172,22 +165,20 @@ def _show(document: dict[str, Any], evaluation: CaptureEvaluation, rich: RichCon
     )
     rich.print(f"outliers: more than {number(document['outlier_mm'])} mm from {evaluation.ranges_from}", soft_wrap=True)
     if evaluation.surface_from is not None:
-        rich.print(escape(f"Chamfer distance: to {evaluation.surface_from}"), soft_wrap=True)
+        rich.print(f"Chamfer distance: to {evaluation.surface_from}", soft_wrap=True)
     text = ("design", "gate")
     lines = [[row["design"], row["gate"], *(number(row[name]) for name in COLUMNS)] for row in document["rows"]]
     print_table(None, (*text, *COLUMNS.values()), lines, rich, text=text)
     rich.print(_standard_errors(evaluation), soft_wrap=True)
     for path in document["files"]:
-        rich.print(f"wrote {escape(path)}", soft_wrap=True)
+        rich.print(f"wrote {path}", soft_wrap=True)
 
 
 def _standard_errors(evaluation: CaptureEvaluation) -> str:
-    """The largest standard errors of the designs' figures, in one line."""
     designs = [row.estimates() for row in evaluation.rows if not row.baseline]
     parts = []
     for name, words in (("outliers_percent", "outliers"), ("range_error_mm", "range errors")):
         known = [row[name] for row in designs if name in row]
         if known:
-            worst = max(estimate.error or 0.0 for estimate in known)
-            parts.append(f"{words} up to {number(worst, 2)} {known[0].unit}")
+            parts.append(f"{words} up to {number(max(each.error or 0.0 for each in known), 2)} {known[0].unit}")
     return f"standard errors over other rays: {', '.join(parts) or 'none, as no return can be judged'}"

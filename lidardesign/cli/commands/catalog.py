@@ -45,39 +45,6 @@ Klux = Annotated[
     ),
 ]
 
-Out = Annotated[
-    Path | None, typer.Option("--out", metavar="FILE.yaml", help="Write a design of the part.", show_default=False)
-]
-AtOrigin = Annotated[
-    str | None, typer.Option("--at-origin", metavar="X,Y,Z", help="Where it stands, in metres.", show_default="0,0,0")
-]
-Azimuth = Annotated[
-    float | None, typer.Option("--azimuth-deg", metavar="DEG", help="Azimuth of its forward axis.", show_default="0")
-]
-Elevation = Annotated[
-    float | None,
-    typer.Option("--elevation-deg", metavar="DEG", help="Elevation of its forward axis.", show_default="0"),
-]
-Roll = Annotated[
-    float | None, typer.Option("--roll-deg", metavar="DEG", help="Roll about its forward axis.", show_default="0")
-]
-Rays = Annotated[
-    int | None,
-    typer.Option("--rays", metavar="N", min=1, max=1_000_000, help="Rays per frame.", show_default="all that it has"),
-]
-Parts = Annotated[
-    int | None,
-    typer.Option("--parts", metavar="N", min=1, max=1000, help="Parts.", show_default="as many as the rays need"),
-]
-Arrange = Annotated[
-    str | None,
-    typer.Option(
-        "--arrange",
-        metavar="interleaved|beside",
-        help="Several parts see the same with rays between each other's, or fields side by side.",
-        show_default="interleaved",
-    ),
-]
 
 catalog_app = typer.Typer(help="List real parts, or show one and write a design of it.", invoke_without_command=True)
 
@@ -137,14 +104,43 @@ def show(
     own: Own = None,
     reflectance: Reflectance = None,
     klux: Klux = None,
-    out: Out = None,
-    at_origin: AtOrigin = None,
-    azimuth: Azimuth = None,
-    elevation: Elevation = None,
-    roll: Roll = None,
-    rays: Rays = None,
-    parts: Parts = None,
-    arrange: Arrange = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE.yaml", help="Write a design of the part.", show_default=False)
+    ] = None,
+    at_origin: Annotated[
+        str | None,
+        typer.Option("--at-origin", metavar="X,Y,Z", help="Where it stands, in metres.", show_default="0,0,0"),
+    ] = None,
+    azimuth: Annotated[
+        float | None,
+        typer.Option("--azimuth-deg", metavar="DEG", help="Azimuth of its forward axis.", show_default="0"),
+    ] = None,
+    elevation: Annotated[
+        float | None,
+        typer.Option("--elevation-deg", metavar="DEG", help="Elevation of its forward axis.", show_default="0"),
+    ] = None,
+    roll: Annotated[
+        float | None, typer.Option("--roll-deg", metavar="DEG", help="Roll about its forward axis.", show_default="0")
+    ] = None,
+    rays: Annotated[
+        int | None,
+        typer.Option(
+            "--rays", metavar="N", min=1, max=1_000_000, help="Rays per frame.", show_default="all that it has"
+        ),
+    ] = None,
+    parts: Annotated[
+        int | None,
+        typer.Option("--parts", metavar="N", min=1, max=1000, help="Parts.", show_default="as many as the rays need"),
+    ] = None,
+    arrange: Annotated[
+        str | None,
+        typer.Option(
+            "--arrange",
+            metavar="interleaved|beside",
+            help="Several parts see the same with rays between each other's, or fields side by side.",
+            show_default="interleaved",
+        ),
+    ] = None,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -182,7 +178,6 @@ def show(
 
 
 def _check_conditions(reflectance: float | None, klux: float | None) -> None:
-    """Refuse conditions that no target and no light can have."""
     if reflectance is not None and not 0 < reflectance <= 100:
         raise ConfigError(f"found {reflectance:g}", where="--reflectance", allowed="a percentage above 0, at most 100")
     if klux is not None and not 0 <= klux <= 1000:
@@ -201,21 +196,17 @@ def _under(part: Part, reflectance: float | None, klux: float | None) -> Part:
 
 
 def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> DesignSpec:
-    """The design of a part that the options ask for."""
-    from lidardesign.design.catalog.library import interleaved, part_design, parts_for, side_by_side
+    import numpy as np
+
+    from lidardesign.design.catalog.library import Pose, interleaved, part_design, parts_for, side_by_side
     from lidardesign.design.sensor import MOST_RAYS
+    from lidardesign.space import FARTHEST_M
 
     count, number = given["--rays"], given["--parts"]
     arrange = check_choice(given["--arrange"] or ARRANGEMENTS[0], "--arrange", ARRANGEMENTS)
     needed = number or (1 if count is None else parts_for(part, count))
     if needed == 1 and given["--arrange"] is not None:
         raise ConfigError("is for several parts", where="--arrange", hint="--parts N")
-    # Where the options put the first part
-    import numpy as np
-
-    from lidardesign.design.catalog.library import Pose
-    from lidardesign.space import FARTHEST_M
-
     degrees = {option: given[option] or 0.0 for option in ("--azimuth-deg", "--elevation-deg", "--roll-deg")}
     for option, value in degrees.items():
         most = 90 if option == "--elevation-deg" else 360
@@ -226,7 +217,7 @@ def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> Des
         origin = np.array([float(item) for item in (text or "0,0,0").split(",")])
     except ValueError:
         origin = np.zeros(0)
-    if origin.shape != (3,) or not np.isfinite(origin).all() or np.abs(origin).max() > FARTHEST_M:
+    if origin.shape != (3,) or not (np.abs(origin) <= FARTHEST_M).all():
         allowed = f"three numbers, as 0.5,0,1.8 [m], each at most {FARTHEST_M:g}"
         raise ConfigError(f"found {text!r}", where="--at-origin", allowed=allowed)
     pose = Pose(origin, *(math.radians(value) for value in degrees.values()))

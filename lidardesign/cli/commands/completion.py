@@ -100,9 +100,8 @@ def completion(
 ) -> None:
     """Print the script that completes commands, options, tasks, keys, formats, parts, runs and designs in a shell."""
     with command(json=json, quiet=quiet, debug=debug) as output:
-        script = SCRIPTS[check_choice(shell, "SHELL", tuple(SCRIPTS))]
-        document = {"shell": shell, "script": script}
-        output.result(document, lambda rich: print(script, end="", file=output.stream), show_costs=False)
+        document = {"shell": shell, "script": SCRIPTS[check_choice(shell, "SHELL", tuple(SCRIPTS))]}
+        output.result(document, lambda rich: print(document["script"], end="", file=output.stream), show_costs=False)
 
 
 def answer_shell(app: typer.Typer) -> int:

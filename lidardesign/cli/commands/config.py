@@ -72,18 +72,16 @@ def schema(
             raise ConfigError(f"the schema of {kind} has no task", where="--task", allowed="with config")
         _check_new(out)
         document = schema_of(kind, None if task is None else load_task(task))
-        text = json_format.dumps(document, indent=2, ensure_ascii=False) + "\n"
-        _write(text, {"kind": kind, "schema": document}, out, output)
+        text = json_format.dumps(document, indent=2, ensure_ascii=False)
+        _write(f"{text}\n", {"kind": kind, "schema": document}, out, output)
 
 
 def _check_new(out: Path | None) -> None:
-    """Refuse a file that is there: it may hold somebody's settings."""
     if out is not None and not is_output(out) and out.exists():
         raise ConfigError("is there already", where=f"--out {out}", hint="give another --out, or remove it")
 
 
 def _write(text: str, document: dict[str, Any], out: Path | None, output: Output) -> None:
-    """Write a text, or print it where no file is named."""
     from lidardesign.run.files import write_atomic
 
     file = None if out is None or is_output(out) else out

@@ -5,21 +5,28 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, claim_outputs, command, is_output, keep_times, show_plan, written_file
-from lidardesign.cli.tables.designs import number
-from lidardesign.cli.tables.scores import show_evaluation
+from lidardesign.cli.output import (
+    FIRST_LINE,
+    Output,
+    claim_outputs,
+    command,
+    is_output,
+    keep_times,
+    show_plan,
+    written_file,
+)
+from lidardesign.cli.tables.grids import RichConsole, number
+from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
 from lidardesign.errors import ConfigError, ThresholdError
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
     from rich.progress import Progress as RichProgress
-    from rich.progress import TaskID
 
     from lidardesign.evaluate.cma.candidate import Show
     from lidardesign.evaluate.cma.search import Progress
@@ -35,140 +42,126 @@ BASELINE_HELP = (
 )
 
 
-Targets = Annotated[
-    list[Path],
-    typer.Argument(metavar="RUN|DESIGN", readable=False, help="Run folders (all their designs) and design files."),
-]
-RayCounts = Annotated[
-    list[int] | None,
-    typer.Option(
-        "--rays",
-        metavar="N",
-        min=1,
-        max=1_000_000,
-        help="Rays per frame and position; repeatable. A fixed pattern is left out beyond its own number.",
-        show_default="the task's and those of smaller fixed patterns",
-    ),
-]
-Baseline = Annotated[
-    list[str] | None, typer.Option("--baseline", metavar="NAME", help=BASELINE_HELP, show_default=False)
-]
-Report = Annotated[
-    Path | None,
-    typer.Option(
-        "--report", metavar="FILE.html", help="Write one HTML page: tables, curves, 3D view.", show_default=False
-    ),
-]
-Plots = Annotated[
-    Path | None,
-    typer.Option(
-        "--plots",
-        metavar="DIR",
-        help="Write pictures for papers into this folder, as PNG and SVG: scene, density, scores, differences, "
-        "constraints, effects, accuracy, times.",
-        show_default=False,
-    ),
-]
-Csv = Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the rows as CSV.", show_default=False)]
-Surroundings = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Judge by other scenes than were learned: a key of the task, as illuminance_lux=100000 or test=10, that "
-        "leaves the design space as it is; repeatable.",
-        show_default=False,
-    ),
-]
-FailAbove = Annotated[
-    float | None,
-    typer.Option(
-        "--fail-above",
-        metavar="VALUE",
-        help="Exit 1 if a design scores worse, in the metric's unit.",
-        show_default=False,
-    ),
-]
-WithAccuracy = Annotated[
-    bool,
-    typer.Option(
-        "--accuracy",
-        help="Also measure what accuracy costs in time here: errors and seconds of every numerical choice, for this "
-        "task and run, and the cheapest setting that is good enough. Takes minutes.",
-    ),
-]
-Workers = Annotated[
-    str,
-    typer.Option(
-        "--workers",
-        metavar="N|tcp://HOST:PORT",
-        help="What scores held-out scenes: so many processes of this machine, or the workers of a dask scheduler "
-        "(extra: cluster). The scores are the same.",
-    ),
-]
-CmaSeconds = Annotated[
-    float | None,
-    typer.Option(
-        "--cma-seconds",
-        metavar="SECONDS",
-        help="Wall time of each search of `--baseline cma`: one per number of rays, and one per bandwidth of the first "
-        "design.",
-        show_default="60",
-    ),
-]
-Effects = Annotated[
-    str,
-    typer.Option(
-        "--effects",
-        metavar="auto|all|none|audit|LIST",
-        help="Physical effects: those that each scene calls for, all, none, or names between commas; audit: as auto, "
-        "and every row under all effects too (exit 1 where a score moves by more than the metric's tolerance).",
-    ),
-]
-Detector = Annotated[
-    str,
-    typer.Option(
-        "--detector",
-        metavar="NAME|FILE",
-        help="What measures: ideal, single-photon, consumer-8x8, or a YAML file.",
-    ),
-]
-RangeTolerance = Annotated[
-    float | None,
-    typer.Option(
-        "--range-tolerance-mm",
-        metavar="MM",
-        help="What all skipped effects together may change of ranges, rms.",
-        show_default="a tenth of a bin, or 1, and at most the metric's tolerance where it is a length",
-    ),
-]
-ReturnTolerance = Annotated[
-    float | None,
-    typer.Option(
-        "--return-tolerance",
-        metavar="SHARE",
-        help="What all skipped effects together may change of returns.",
-        show_default="0.001",
-    ),
-]
-
-
 def evaluate(
-    targets: Targets,
-    rays: RayCounts = None,
-    baseline: Baseline = None,
-    cma_seconds: CmaSeconds = None,
-    effects: Effects = "auto",
-    detector: Detector = "ideal",
-    range_tolerance_mm: RangeTolerance = None,
-    return_tolerance: ReturnTolerance = None,
-    overrides: Surroundings = None,
-    report: Report = None,
-    plots: Plots = None,
-    csv: Csv = None,
-    fail_above: FailAbove = None,
-    workers: Workers = "1",
-    accuracy: WithAccuracy = False,
+    targets: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN|DESIGN", readable=False, help="Run folders (all their designs) and design files."),
+    ],
+    rays: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--rays",
+            metavar="N",
+            min=1,
+            max=1_000_000,
+            help="Rays per frame and position; repeatable. A fixed pattern is left out beyond its own number.",
+            show_default="the task's and those of smaller fixed patterns",
+        ),
+    ] = None,
+    baseline: Annotated[
+        list[str] | None, typer.Option("--baseline", metavar="NAME", help=BASELINE_HELP, show_default=False)
+    ] = None,
+    cma_seconds: Annotated[
+        float | None,
+        typer.Option(
+            "--cma-seconds",
+            metavar="SECONDS",
+            help="Wall time of each search of `--baseline cma`: one per number of rays, and one per bandwidth of the "
+            "first design.",
+            show_default="60",
+        ),
+    ] = None,
+    effects: Annotated[
+        str,
+        typer.Option(
+            "--effects",
+            metavar="auto|all|none|audit|LIST",
+            help="Physical effects: those that each scene calls for, all, none, or names between commas; audit: as "
+            "auto, and every row under all effects too (exit 1 where a score moves by more than the metric's "
+            "tolerance).",
+        ),
+    ] = "auto",
+    detector: Annotated[
+        str,
+        typer.Option(
+            "--detector",
+            metavar="NAME|FILE",
+            help="What measures: ideal, single-photon, consumer-8x8, or a YAML file.",
+        ),
+    ] = "ideal",
+    range_tolerance_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--range-tolerance-mm",
+            metavar="MM",
+            help="What all skipped effects together may change of ranges, rms.",
+            show_default="a tenth of a bin, or 1, and at most the metric's tolerance where it is a length",
+        ),
+    ] = None,
+    return_tolerance: Annotated[
+        float | None,
+        typer.Option(
+            "--return-tolerance",
+            metavar="SHARE",
+            help="What all skipped effects together may change of returns.",
+            show_default="0.001",
+        ),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Judge by other scenes than were learned: a key of the task, as illuminance_lux=100000 or test=10, "
+            "that leaves the design space as it is; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            "--report", metavar="FILE.html", help="Write one HTML page: tables, curves, 3D view.", show_default=False
+        ),
+    ] = None,
+    plots: Annotated[
+        Path | None,
+        typer.Option(
+            "--plots",
+            metavar="DIR",
+            help="Write pictures for papers into this folder, as PNG and SVG: scene, density, scores, differences, "
+            "constraints, effects, accuracy, times.",
+            show_default=False,
+        ),
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="FILE", help="Write the rows as CSV.", show_default=False)
+    ] = None,
+    fail_above: Annotated[
+        float | None,
+        typer.Option(
+            "--fail-above",
+            metavar="VALUE",
+            help="Exit 1 if a design scores worse, in the metric's unit.",
+            show_default=False,
+        ),
+    ] = None,
+    workers: Annotated[
+        str,
+        typer.Option(
+            "--workers",
+            metavar="N|tcp://HOST:PORT",
+            help="What scores held-out scenes: so many processes of this machine, or the workers of a dask scheduler "
+            "(extra: cluster). The scores are the same.",
+        ),
+    ] = "1",
+    accuracy: Annotated[
+        bool,
+        typer.Option(
+            "--accuracy",
+            help="Also measure what accuracy costs in time here: errors and seconds of every numerical choice, for "
+            "this task and run, and the cheapest setting that is good enough. Takes minutes.",
+        ),
+    ] = False,
     dry_run: options.DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
@@ -208,58 +201,50 @@ def evaluate(
             written = _write_files(scores, *files)
         document = {**scores.as_dict(), "files": [str(path) for path in written]}
         keep_times(request.run.folder, "evaluate", output)
-        shown = {**document, "notes": []} if output.quiet else document
 
         def show(rich: RichConsole) -> None:
             if scores.evaluation.accuracy is not None:
-                from lidardesign.cli.tables.scores import show_accuracy
-
                 show_accuracy(scores.evaluation.accuracy, rich)
-            show_evaluation(shown, written, rich)
+            show_evaluation({**document, "notes": []} if output.quiet else document, written, rich)
 
         output.result(document, show)
-        _check_threshold(scores.evaluation, fail_above)
+        if fail_above is not None:
+            _check_threshold(scores.evaluation, fail_above)
         _check_audit(scores.evaluation)
 
 
 def _score(request: ScoreRequest, output: Output) -> Scores:
-    """The scores, with a bar for scenes and one for each search of the baseline cma."""
-    with output.progress("row") as bar:
-        line = bar.add_task("evaluating", total=None, row="") if bar else None
+    with output.progress("evaluating", "row") as bar:
 
         def show(done: int, total: int, row: str = "") -> None:
-            if bar is not None and line is not None:
-                bar.update(line, completed=done, total=total, row=row)
+            if bar is not None:
+                bar.update(FIRST_LINE, completed=done, total=total, row=row)
 
         return request.score(show, search_display(request, output, bar))
 
 
 def search_display(request: ScoreRequest, output: Output, bar: RichProgress | None) -> Show:
     """What shows the best score of each search in a bar; without one, a note when it begins."""
-    lines: dict[str, TaskID] = {}
-    begun: set[str] = set()
+    lines: dict[str, Any] = {}
 
     def show(label: str, progress: Progress) -> None:
-        if bar is None:
-            if label not in begun:
-                output.note(f"{label}: searching for {request.cma_seconds:g} s ...")
-            begun.add(label)
-            return
         if label not in lines:
-            lines[label] = bar.add_task(label, total=1.0, row="")
-        best = f"best {progress.best:.4g} {request.run.task.metric.unit}"
-        bar.update(lines[label], completed=progress.share, row=best)
+            lines[label] = bar.add_task(label, total=1.0, row="") if bar else None
+            if bar is None:
+                output.note(f"{label}: searching for {request.cma_seconds:g} s ...")
+        if bar is not None:
+            best = f"best {progress.best:.4g} {request.run.task.metric.unit}"
+            bar.update(lines[label], completed=progress.share, row=best)
 
     return show
 
 
 def _with_accuracy(scores: Scores, output: Output) -> Scores:
-    with output.progress("sweep") as bar:
-        line = bar.add_task("measuring accuracy", total=None, sweep="") if bar else None
+    with output.progress("measuring accuracy", "sweep") as bar:
 
         def show(done: int, total: int, sweep: str) -> None:
-            if bar is not None and line is not None:
-                bar.update(line, completed=done, total=total, sweep=sweep)
+            if bar is not None:
+                bar.update(FIRST_LINE, completed=done, total=total, sweep=sweep)
             elif sweep:
                 output.note(f"accuracy: {sweep} ...")
 
@@ -268,7 +253,6 @@ def _with_accuracy(scores: Scores, output: Output) -> Scores:
 
 @phase("writing")
 def _write_files(scores: Scores, report: Path | None, plots: Path | None, csv: Path | None) -> list[Path]:
-    """Write rows, pictures and report, the last two of one drawing's material."""
     written: list[Path] = []
     if csv is not None:
         with written_file(csv) as file:
@@ -284,15 +268,12 @@ def _write_files(scores: Scores, report: Path | None, plots: Path | None, csv: P
     return written
 
 
-def _check_threshold(evaluation: Evaluation, limit: float | None) -> None:
+def _check_threshold(evaluation: Evaluation, limit: float) -> None:
     """Exit 1 where a design is worse than the limit; baselines do not count."""
-    if limit is None:
-        return
     from lidardesign.evaluate.results import worse_than_threshold
 
-    missed = worse_than_threshold(evaluation, limit)
+    missed, unit = worse_than_threshold(evaluation, limit), evaluation.metric.unit
     if missed:
-        unit = evaluation.metric.unit
         bound = "at most" if evaluation.metric.better == "lower" else "at least"
         rows = ", ".join(f"{row.design} with {row.rays} rays: {number(row.value)} {unit}" for row in missed)
         raise ThresholdError(rows, where="--fail-above", allowed=f"{bound} {limit:g} {unit}")
@@ -301,14 +282,13 @@ def _check_threshold(evaluation: Evaluation, limit: float | None) -> None:
 def _check_audit(evaluation: Evaluation) -> None:
     """Exit 1 where skipped effects change a row by more than the metric's tolerance."""
     audit = evaluation.audit
-    if audit is None or not audit.failed:
-        return
-    rows = ", ".join(f"{row.design} with {row.rays} rays by {number(abs(row.difference))}" for row in audit.failed)
-    there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
-    raise ThresholdError(
-        f"skipped effects move {rows} {audit.unit}",
-        where="--effects audit",
-        allowed=f"at most {audit.tolerance:g} {audit.unit}, the metric's tolerance",
-        hint="--effects all, or a smaller --range-tolerance-mm or --return-tolerance; skipped: "
-        + ", ".join(name for name in audit.skipped if name in there),
-    )
+    if audit is not None and audit.failed:
+        rows = ", ".join(f"{row.design} with {row.rays} rays by {number(abs(row.difference))}" for row in audit.failed)
+        there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
+        raise ThresholdError(
+            f"skipped effects move {rows} {audit.unit}",
+            where="--effects audit",
+            allowed=f"at most {audit.tolerance:g} {audit.unit}, the metric's tolerance",
+            hint="--effects all, or a smaller --range-tolerance-mm or --return-tolerance; skipped: "
+            + ", ".join(name for name in audit.skipped if name in there),
+        )

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.output import Output, claim_stdout, command, keep_times, note_new_folders, show_plan, written_file
+from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
-
-if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
-
-    from lidardesign.estimates import Estimate
 
 
 def export(
@@ -82,11 +77,16 @@ def export(
             exported = request.write(file, output.remark)
         if source.folder is not None:
             keep_times(source.folder, "export", output)
-        content = f"{exported.rays} rays" if exported.rays else f"{exported.sensors} sensors"
 
         def show(rich: RichConsole) -> None:
-            rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False)
-            rich.print(_rounding_line(exported.rounding), soft_wrap=True, markup=False)
+            content = f"{exported.rays} rays" if exported.rays else f"{exported.sensors} sensors"
+            lost = [
+                f"{name.removesuffix(f'_{estimate.unit}')} {estimate.error:.2g} {estimate.unit}".rstrip()
+                for name, estimate in exported.rounding.items()
+                if estimate.error
+            ]
+            rich.print(f"wrote {target} ({content})", soft_wrap=True)
+            rich.print(f"read back: {'off by at most ' if lost else 'exact'}{', '.join(lost)}", soft_wrap=True)
 
         output.result({"design": str(design), **exported.as_dict()}, show)
 
@@ -94,35 +94,8 @@ def export(
 def _list(output: Output) -> None:
     from lidardesign.export.registry import EXPORTERS
 
-    formats = [
-        {
-            "name": name,
-            "suffix": exporter.suffix,
-            "summary": exporter.summary,
-            "reader": exporter.reader,
-            "checked": exporter.checked,
-            "folder": exporter.folder,
-        }
-        for name, exporter in EXPORTERS.items()
-    ]
-
-    def show(rich: RichConsole) -> None:
-        from rich.markup import escape
-        from rich.table import Table
-
-        table = Table("format", "suffix", "what it is", "for", "how that is checked")
-        for entry in formats:
-            table.add_row(*(escape(str(entry[key])) for key in ("name", "suffix", "summary", "reader", "checked")))
-        rich.print(table)
-
-    output.result({"formats": formats}, show, show_costs=False)
-
-
-def _rounding_line(rounding: Mapping[str, Estimate]) -> str:
-    """What reading the file back showed, in one line."""
-    lost = [
-        f"{name.removesuffix(f'_{estimate.unit}')} {estimate.error:.2g} {estimate.unit}".rstrip()
-        for name, estimate in rounding.items()
-        if estimate.error
-    ]
-    return f"read back: off by at most {', '.join(lost)}" if lost else "read back: exact"
+    keys = ("suffix", "summary", "reader", "checked", "folder")
+    formats = [{"name": name, **{key: getattr(exporter, key) for key in keys}} for name, exporter in EXPORTERS.items()]
+    headings = ("format", "suffix", "what it is", "for", "how that is checked")
+    rows = [(entry["name"], *(entry[key] for key in keys[:-1])) for entry in formats]
+    output.result({"formats": formats}, lambda rich: rich.print(text_table(headings, rows)), show_costs=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,12 +10,11 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.output import Output, command, keep_times, show_plan
-from lidardesign.cli.tables.designs import number, show_fit
+from lidardesign.cli.tables.designs import show_fit
+from lidardesign.cli.tables.grids import RichConsole, number, text_table
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
-
     from lidardesign.evaluate.refinement import Round
     from lidardesign.workflow.fit import FitRequest
 
@@ -94,32 +93,31 @@ def _round_text(entry: Round, unit: str) -> str:
 
 
 def _show_refinement(document: Mapping[str, Any], rich: RichConsole) -> None:
-    """Print what every round of a refinement brought."""
-    from rich.markup import escape
-    from rich.table import Table
 
     scenes, unit = document["scenes"], document["unit"]
     title = (
         f"refinement: {scenes['looked_at']} training scenes to look at, score on {scenes['judged_on']} others "
         f"({number(document['start'])} to {number(document['end'])} {unit})"
     )
-    table = Table(title=title, title_justify="left")
-    for heading in ("round", "change", unit, "Mbit/s", "kept", "s"):
-        table.add_column(heading, justify="left" if heading == "change" else "right")
-    rounds: Sequence[Mapping[str, Any]] = document["rounds"]
-    for entry in rounds:
-        figures = (number(entry["score"]), number(entry["bandwidth_mbps"], 3), "yes" if entry["kept"] else "no")
-        table.add_row(str(entry["round"]), escape(entry["change"]), *figures, number(entry["seconds"], 2))
-    rich.print(table)
-
-
-Target = Annotated[
-    Path, typer.Argument(metavar="RUN|DESIGN", readable=False, help="A run folder, or a design that came from one.")
-]
+    rows = [
+        (
+            str(entry["round"]),
+            entry["change"],
+            number(entry["score"]),
+            number(entry["bandwidth_mbps"], 3),
+            "yes" if entry["kept"] else "no",
+            number(entry["seconds"], 2),
+        )
+        for entry in document["rounds"]
+    ]
+    figures = ("round", unit, "Mbit/s", "kept", "s")
+    rich.print(text_table(("round", "change", *figures[1:]), rows, title, figures))
 
 
 def constrain(
-    target: Target,
+    target: Annotated[
+        Path, typer.Argument(metavar="RUN|DESIGN", readable=False, help="A run folder, or a design that came from one.")
+    ],
     constraints: Annotated[
         Path | None,
         typer.Option("--constraints", metavar="FILE", help="YAML file; keys: docs/constraints.md.", show_default=False),
@@ -169,9 +167,7 @@ def constrain(
         )
         run, design = open_target(target, output.remark)
         files = [path for path in (target if design else None, constraints) if path is not None]
-        request = FitRequest.resolve(
-            need_run(run, target), chosen, design, files=files, notes=output.remark
-        )
+        request = FitRequest.resolve(need_run(run, target), chosen, design, files=files, notes=output.remark)
         if dry_run:
             return show_plan(request.plan(), output)
         run_fit(request, output)

@@ -2,43 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
+from lidardesign.cli.output import FIRST_LINE, Output, command, keep_times, show_plan
+from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
+    from rich.progress import Progress
 
     from lidardesign.density.learn import LearnProgress, LearnResult
 
-Tolerance = Annotated[
-    float | None,
-    typer.Option(
-        "--tolerance",
-        metavar="SHARE",
-        help="Learn until at most this share of the density's mass is in the wrong place, in stages of doubled steps "
-        "from an eighth to four times those of the preset; exit 1 when none is good enough.",
-        show_default=False,
-    ),
-]
-TimeBudget = Annotated[
-    float | None,
-    typer.Option(
-        "--time-budget",
-        metavar="SECONDS",
-        help="Learn as many steps as let the command end within this time; they are planned from its own first steps.",
-        show_default=False,
-    ),
-]
+FIGURES = (
+    ("ESS", "ess", "", "share of the samples that count"),
+    ("KL", "kl_nats", " nats", "from the learned density to the target"),
+    ("log Z", "log_z", "", "of the target density"),
+    ("coverage", "coverage", "", "share of the target's mass that the density reaches"),
+    ("misplaced", "misplaced", "", "share of the density's mass in the wrong place"),
+)
 
 
 def learn(
@@ -60,8 +48,26 @@ def learn(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run from its last checkpoint.")
     ] = False,
-    tolerance: Tolerance = None,
-    time_budget: TimeBudget = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            "--tolerance",
+            metavar="SHARE",
+            help="Learn until at most this share of the density's mass is in the wrong place, in stages of doubled "
+            "steps from an eighth to four times those of the preset; exit 1 when none is good enough.",
+            show_default=False,
+        ),
+    ] = None,
+    time_budget: Annotated[
+        float | None,
+        typer.Option(
+            "--time-budget",
+            metavar="SECONDS",
+            help="Learn as many steps as let the command end within this time; they are planned from its own first "
+            "steps.",
+            show_default=False,
+        ),
+    ] = None,
     dry_run: options.DryRun = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -92,8 +98,8 @@ def learn(
         if dry_run:
             return show_plan(request.plan(), output)
         output.when_interrupted = request.resume_hint
-        with _progress(output) as progress:
-            result = request.run(progress)
+        with output.progress("learning", "loss", "ess", "left") as bar:
+            result = request.run(_progress(bar, output))
         keep_times(request.folder, "learn", output, wait_s=WAIT_S)
         result = replace(result, notes=(*result.notes, *learning_advice(result)))
         further = [] if output.quiet else [note for note in result.notes if note not in task_notes]
@@ -101,51 +107,36 @@ def learn(
         check_met(result, request.goal)
 
 
-@contextlib.contextmanager
-def _progress(output: Output) -> Iterator[Callable[[LearnProgress], None]]:
-    """A function that shows the progress: a bar on a terminal, else one note per phase."""
-    with output.progress("loss", "ess", "left") as bar:
-        line = bar.add_task("learning", total=None, loss="", ess="", left="") if bar else None
-        phase = ""
+def _progress(bar: Progress | None, output: Output) -> Callable[[LearnProgress], None]:
+    """A function that shows the progress: in a bar, else by one note per phase."""
+    begun: list[str] = []
 
-        def show(now: Any) -> None:
-            nonlocal phase
-            if bar is None or line is None:
-                if now.phase != phase:
-                    output.note(f"{now.phase} ...")
-            else:
-                bar.update(
-                    line,
-                    description=now.phase,
-                    completed=now.step,
-                    total=now.steps or None,
-                    loss=f"loss {now.loss:.3f}" if now.loss is not None else "",
-                    ess=f"ESS {now.ess:.2f}" if now.ess is not None else "",
-                    left=f"{now.seconds_left:.0f} s left" if now.seconds_left is not None else "",
-                )
-            phase = now.phase
+    def show(now: LearnProgress) -> None:
+        if bar is not None:
+            bar.update(
+                FIRST_LINE,
+                description=now.phase,
+                completed=now.step,
+                total=now.steps or None,
+                loss=f"loss {now.loss:.3f}" if now.loss is not None else "",
+                ess=f"ESS {now.ess:.2f}" if now.ess is not None else "",
+                left=f"{now.seconds_left:.0f} s left" if now.seconds_left is not None else "",
+            )
+        elif begun[-1:] != [now.phase]:
+            begun.append(now.phase)
+            output.note(f"{now.phase} ...")
 
-        yield show
+    return show
 
 
 def _show(result: LearnResult, notes: list[str], rich: RichConsole) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    def row(name: str, key: str, unit: str, what: str) -> None:
+    rows = []
+    for name, key, unit, what in FIGURES:
         estimate = result.error_estimates[key]
         error = "unknown" if estimate.error is None else f"{estimate.error:.2g}"
-        table.add_row(name, f"{estimate.value:.3f}{unit}", error, what)
-
-    title = f"learned {escape(str(result.task))}"
-    table = Table("", "value", "standard error", "", title=title, title_justify="left")
-    row("ESS", "ess", "", "share of the samples that count")
-    row("KL", "kl_nats", " nats", "from the learned density to the target")
-    row("log Z", "log_z", "", "of the target density")
-    row("coverage", "coverage", "", "share of the target's mass that the density reaches")
-    row("misplaced", "misplaced", "", "share of the density's mass in the wrong place")
-    table.add_row("time", f"{result.seconds:.1f} s", "", f"{result.steps} steps")
-    rich.print(table)
+        rows.append((name, f"{estimate.value:.3f}{unit}", error, what))
+    rows.append(("time", f"{result.seconds:.1f} s", "", f"{result.steps} steps"))
+    rich.print(text_table(("", "value", "standard error", ""), rows, f"learned {result.task}"))
     for note in notes:
-        rich.print(f"note: {escape(note)}")
-    rich.print(f"run: {escape(str(result.run))}", soft_wrap=True)
+        rich.print(f"note: {note}")
+    rich.print(f"run: {result.run}", soft_wrap=True)

@@ -9,14 +9,12 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.output import command
-from lidardesign.cli.tables.designs import number, show_constraints, show_design
-from lidardesign.cli.tables.grids import print_table
+from lidardesign.cli.tables.designs import show_constraints, show_design
+from lidardesign.cli.tables.grids import RichConsole, number, print_table
 from lidardesign.errors import LidardesignError
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
-
     from lidardesign.design.compare import Readout
 
 
@@ -49,15 +47,13 @@ def show(
         except LidardesignError as error:  # its run is not needed to show a design
             if specification.constraints:
                 output.remark(f"the design space is not checked: {error}")
-        space = None if run is None else run.config.space
-        checks = []
+        space, checks = None if run is None else run.config.space, []
         if specification.constraints:
             checks = check_design(design_document(specification), specification.constraints, space)
         for line in () if space is None else outside_notes(specification, space):
             output.remark(line)
         specification = placed(specification, condition) if condition else specification
         readout = readout_of(specification)
-        rooms = [room_of(check) for check in checks]
         document = {
             "design": str(design),
             "name": specification.name,
@@ -70,7 +66,7 @@ def show(
             "constraints": specification.constraints,
             "checks": [
                 {**check.as_dict(), "room": left.room, "tight": left.is_tight}
-                for check, left in zip(checks, rooms, strict=True)
+                for check, left in zip(checks, map(room_of, checks), strict=True)
             ],
             "bandwidth": readout.as_dict(),
             "provenance": specification.provenance,
@@ -85,27 +81,13 @@ def show(
 
 
 def _show_readout(readout: Readout, rich: RichConsole) -> None:
-    """Print the bandwidth, and the read-out that it is of."""
-    model = readout.model
-    low, high = number(readout.low_mbps), number(readout.high_mbps)
+    model, low, high = readout.model, number(readout.low_mbps), number(readout.high_mbps)
     span = low if low == high else f"{low} .. {high}"
     rays = "each ray in a frame" if readout.rays is None else f"{readout.rays} rays per frame"
     bins = f"({number(model.bin_ps)} ps bins of {number(model.bits_per_bin)} bits, {number(model.rate_hz)} frames/s)"
-    rich.print(f"bandwidth: {span} Mbit/s for {rays}", soft_wrap=True, markup=False)
-    rich.print(bins, soft_wrap=True, markup=False)
+    rich.print(f"bandwidth: {span} Mbit/s for {rays}\n{bins}", soft_wrap=True)
 
 
-RayCounts = Annotated[
-    list[int] | None,
-    typer.Option(
-        "--rays",
-        metavar="N",
-        min=1,
-        max=1_000_000,
-        help="Rays per frame at which scores are compared; repeatable.",
-        show_default="both as they are, else the task's",
-    ),
-]
 # What rounding leaves of no difference is none.
 DECIMALS = 6
 SCORE_COLUMNS = ("design", "rays", "value", "95 % interval", "failures", "Mbit/s")
@@ -120,7 +102,17 @@ def compare(
     ],
     second: Annotated[Path, typer.Argument(metavar="OTHER", readable=False, help="The design to compare it with.")],
     space_of: options.SpaceOf = None,
-    rays: RayCounts = None,
+    rays: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--rays",
+            metavar="N",
+            min=1,
+            max=1_000_000,
+            help="Rays per frame at which scores are compared; repeatable.",
+            show_default="both as they are, else the task's",
+        ),
+    ] = None,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -136,13 +128,11 @@ def compare(
 
 
 def _show(document: dict[str, Any], rich: RichConsole) -> None:
-    from rich.markup import escape
-
     for place, design in zip(("first", "second"), document["designs"], strict=True):
         sensors = "1 sensor" if design["sensors"] == 1 else f"{design['sensors']} sensors"
         cost = design["bandwidth"]
         rays = "rays left open" if cost["rays"] is None else f"{cost['rays']} rays, {number(cost['high_mbps'])} Mbit/s"
-        rich.print(escape(f"{place}: {design['name']}, {sensors}, layout {design['layout']}, {rays}"), soft_wrap=True)
+        rich.print(f"{place}: {design['name']}, {sensors}, layout {design['layout']}, {rays}", soft_wrap=True)
     lines = []
     for pair in document["sensors"]:
         apart, cells = pair["difference"], ["-"] * len(SENSOR_COLUMNS[2:])
@@ -157,8 +147,9 @@ def _show(document: dict[str, Any], rich: RichConsole) -> None:
     metric = document["metric"]
     if metric is None:
         return
-    title = f"{metric['name']} [{metric['unit']}], {metric['better']} is better"
-    title += f", over {document['scenes']} held-out scenes"
+    title = (
+        f"{metric['name']} [{metric['unit']}], {metric['better']} is better, over {document['scenes']} held-out scenes"
+    )
     rows = [
         [
             row["design"],
@@ -168,9 +159,9 @@ def _show(document: dict[str, Any], rich: RichConsole) -> None:
         ]
         for row in document["rows"]
     ]
-    print_table(escape(title), SCORE_COLUMNS, rows, rich)
+    print_table(title, SCORE_COLUMNS, rows, rich)
     for pair in document["paired"]:
-        rich.print(escape(_verdict(pair, metric)), soft_wrap=True)
+        rich.print(_verdict(pair, metric), soft_wrap=True)
 
 
 def _signed(value: float, decimals: int = 2) -> str:
@@ -185,5 +176,5 @@ def _verdict(pair: dict[str, Any], metric: dict[str, Any]) -> str:
     span += f"{number(high, 3)}, with {rays} rays"
     if low <= 0 <= high:
         return f"{span}: no difference is shown"
-    lower, higher = (pair["a"], pair["b"]) if pair["difference"] < 0 else (pair["b"], pair["a"])
-    return f"{span}: {lower if metric['better'] == 'lower' else higher} is better"
+    first_is_better = (pair["difference"] < 0) == (metric["better"] == "lower")
+    return f"{span}: {pair['a'] if first_is_better else pair['b']} is better"

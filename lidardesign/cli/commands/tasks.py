@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import command
+from lidardesign.cli.output import FIRST_LINE, command
+from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.run.clock import phase
 
-if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
-
 MEBIBYTE = 2**20
-OUTCOMES = {"pass": "[green]pass[/green]", "fail": "[bold red]FAIL[/bold red]", "skip": "[dim]skip[/dim]"}
+OUTCOMES = {"pass": ("pass", "green"), "fail": ("FAIL", "bold red"), "skip": ("skip", "dim")}
 
 tasks_app = typer.Typer(help="List, show, check or begin tasks.", invoke_without_command=True)
 
@@ -54,14 +52,13 @@ def list_(
 
 
 def _show_list(entries: list[dict[str, Any]], rich: RichConsole) -> None:
-    from rich.markup import escape
-    from rich.table import Table
+    from rich.text import Text
 
-    table = Table("task", "what it is", "from")
+    rows = []
     for item in entries:
-        text = f"[red]broken:[/red] {escape(item['error'])}" if item["error"] else escape(item["summary"])
-        table.add_row(escape(item["name"]), text, escape(item["distribution"]))
-    rich.print(table)
+        text = Text.assemble(("broken:", "red"), f" {item['error']}") if item["error"] else item["summary"]
+        rows.append((item["name"], text, item["distribution"]))
+    rich.print(text_table(("task", "what it is", "from"), rows))
 
 
 @tasks_app.command("show")
@@ -83,53 +80,52 @@ def show(
 
 
 def _show_task(document: Mapping[str, Any], rich: RichConsole) -> None:
-    from rich.markup import escape
-    from rich.table import Table
+    from rich.text import Text
 
-    metric, defaults, space = document["metric"], document["defaults"], document["space"]
-    rich.print(f"[bold]{escape(document['name'])}[/bold]: {escape(document['summary'])}")
-    rich.print(f"metric: {escape(metric['name'])} \\[{escape(metric['unit'])}], {metric['better']} is better")
-    # a scan has as many sensors as rays
     from lidardesign.design.layouts.rays import LAYOUTS
 
+    metric, defaults, space = document["metric"], document["defaults"], document["space"]
+    rich.print(Text.assemble((document["name"], "bold"), f": {document['summary']}"))
+    rich.print(f"metric: {metric['name']} [{metric['unit']}], {metric['better']} is better")
+    # a scan has as many sensors as rays
     layout = LAYOUTS.get(defaults["layout"])
     sensors = "" if layout is not None and layout.one_sensor_per_ray else f"{defaults['sensors']} sensors, "
     usual = f"{sensors}layout {defaults['layout']}, level {defaults['level']:g}"
-    rich.print(f"defaults: {usual}, evaluated at {', '.join(map(str, defaults['rays']))} rays", markup=False)
+    rich.print(f"defaults: {usual}, evaluated at {', '.join(map(str, defaults['rays']))} rays")
     _show_keys(document["config"], "configuration (--set KEY=VALUE)", rich)
     if space:
-        rich.print("design space (--set space.KEY=[LOW,HIGH])", style="italic", markup=False)
-        table = Table("dimension", "from", "to", "")
+        rich.print("design space (--set space.KEY=[LOW,HIGH])", style="italic")
+        rows = []
         for name, bounds in space.items():
             if isinstance(bounds, list) and len(bounds) == 2 and name.endswith(("_m", "_rad")):
                 low, high = bounds
                 kind = "a condition (--at)" if name in space["condition"] else "fixed" if low == high else "designed"
-                table.add_row(name, f"{low:.4g}", f"{high:.4g}", kind)
-        rich.print(table)
+                rows.append((name, f"{low:.4g}", f"{high:.4g}", kind))
+        rich.print(text_table(("dimension", "from", "to", ""), rows))
     else:
-        rich.print("design space: follows from the configuration (--set space.KEY=[LOW,HIGH])", markup=False)
+        rich.print("design space: follows from the configuration (--set space.KEY=[LOW,HIGH])")
     _show_keys(document["density"], "target density (--set density.KEY=VALUE)", rich)
     _show_keys(document["learning"], "learning, preset standard (--set learning.KEY=VALUE)", rich)
 
 
 def _show_keys(entries: list[dict[str, Any]], title: str, rich: RichConsole) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table("key", "takes", "default", "what it is", title=title, title_justify="left")
-    for entry in entries:
-        default = "required" if entry["required"] else _yaml_value(entry["default"])
-        table.add_row(*(escape(text) for text in (entry["key"], entry["type"], default, entry["description"])))
-    rich.print(table)
+    rows = [
+        (
+            entry["key"],
+            entry["type"],
+            "required" if entry["required"] else _yaml_value(entry["default"]),
+            entry["description"],
+        )
+        for entry in entries
+    ]
+    rich.print(text_table(("key", "takes", "default", "what it is"), rows, title))
 
 
 def _yaml_value(value: Any) -> str:
     """A default as one would write it in YAML; a dash where it is left empty."""
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "[" + ", ".join(map(str, value)) + "]" if isinstance(value, list | tuple) else str(value)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(str, value)) + "]"
+    return "-" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 @tasks_app.command("check")
@@ -158,12 +154,11 @@ def check(
 
         request = CheckRequest(name, config, tuple(overrides or ()), seed, Limits(seconds, memory_mb * MEBIBYTE))
         findings = []
-        with output.progress("law") as bar, phase("contract"):
-            line = bar.add_task("contract", total=len(LAWS) + 1, law="") if bar else None
+        with output.progress("contract", "law") as bar, phase("contract"):
             for finding in check_in_process(request):
                 findings.append(finding)
-                if bar is not None and line is not None:
-                    bar.update(line, completed=len(findings), law=finding.law)
+                if bar is not None:
+                    bar.update(FIRST_LINE, completed=len(findings), total=len(LAWS) + 1, law=finding.law)
         counts = {outcome: sum(finding.outcome == outcome for finding in findings) for outcome in OUTCOMES}
         laws = [finding.as_dict() for finding in findings]
         document = {"task": name, "keeps": not counts["fail"], **counts, "laws": laws}
@@ -172,20 +167,18 @@ def check(
 
 
 def _show_laws(document: Mapping[str, Any], rich: RichConsole) -> None:
-    from rich.markup import escape
-    from rich.table import Table
+    from rich.text import Text
 
-    table = Table("law", "", "what was found", title=escape(f"task {document['task']}"), title_justify="left")
+    table = text_table(("law", "", "what was found"), title=f"task {document['task']}")
     group = ""
     for law in document["laws"]:
         if group and law["group"] != group:
             table.add_section()
         group = law["group"]
-        table.add_row(escape(law["law"]), OUTCOMES[law["outcome"]], escape(law["detail"]))
+        table.add_row(law["law"], Text(*OUTCOMES[law["outcome"]]), law["detail"])
     rich.print(table)
     rich.print(
-        f"{document['pass']} laws hold, {document['fail']} do not, {document['skip']} do not apply or were not reached",
-        markup=False,
+        f"{document['pass']} laws hold, {document['fail']} do not, {document['skip']} do not apply or were not reached"
     )
 
 
@@ -211,8 +204,8 @@ def new(
 
         def show_files(rich: RichConsole) -> None:
             for path in written:
-                rich.print(f"  {path}", markup=False)
+                rich.print(f"  {path}")
             advice = f"next: pip install --editable '{folder}[test]', then lidardesign tasks check {name}"
-            rich.print(advice, markup=False, soft_wrap=True)
+            rich.print(advice, soft_wrap=True)
 
         output.result({"task": name, "folder": folder, "files": written}, show_files, show_costs=False)

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from lidardesign.cli.tables.grids import RichConsole, number, text_table
+
 if TYPE_CHECKING:
     import numpy as np
-    from rich.console import Console as RichConsole
-    from rich.table import Table
 
     from lidardesign.design.constraints.check import ConstraintCheck
     from lidardesign.design.sensor import DesignSpec, Sensor, Track
@@ -19,17 +19,7 @@ ERROR_DIGITS = 2
 # Relative errors below what `number` shows of a figure are left out.
 SMALLEST_ERROR = 1e-4
 SPACE_MARK = ".space."
-
-
-def number(value: Any, digits: int = 4) -> str:
-    """A figure, a text, or a list or mapping of them, for people; a dash where there is none."""
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {number(item, digits)}" for name, item in value.items())
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(number(item, digits) for item in value) + "]"
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return "-"
-    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+SNAP_FIGURES = ("loss\n[nats]", "field of view\n[deg]", "gate\n[m]", "rays", "Mbit/s")
 
 
 def with_error(estimate: dict[str, Any]) -> str:
@@ -43,84 +33,67 @@ def with_error(estimate: dict[str, Any]) -> str:
 
 def show_design(design: DesignSpec, rich: RichConsole) -> None:
     """Print a design's sensors as a table, with angles in degrees; a place that all share stands above it."""
-    from rich.markup import escape
-
     if design.track is not None:
         _show_track(design, design.track, rich)
         return
     rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
     sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
-    title = f"{escape(design.name)}: {sensors}, layout {design.layout}, {rays}"
+    title = f"{design.name}: {sensors}, layout {design.layout}, {rays}"
     if design.at:
-        title += ", at " + escape(", ".join(f"{name}={value:g}" for name, value in design.at.items()))
+        title += ", at " + ", ".join(f"{name}={value:g}" for name, value in design.at.items())
     places = [_place(sensor) for sensor in design.sensors]
     together = len(set(places)) == 1
     if together:
         title += f"\nall at {places[0]} m"
     origin = () if together else ("origin [m]",)
-    angles = ("azimuth\n[deg]", "elevation\n[deg]", "field of view\n[deg]")
-    table = _table(title, ("sensor",), ("weight", "rays", *origin, *angles, "gate [m]"))
-    for sensor, place in list(zip(design.sensors, places, strict=True))[:MOST_ROWS]:
-        horizontal, vertical = sensor.field_of_view_rad
-        start, end = sensor.gate_m
-        table.add_row(
-            escape(sensor.name),
+    figures = ("weight", "rays", *origin, "azimuth\n[deg]", "elevation\n[deg]", "field of view\n[deg]", "gate [m]")
+    rows = [
+        (
+            sensor.name,
             f"{sensor.weight:.3f}",
             number(sensor.rays),
             *(() if together else (place,)),
             f"{math.degrees(sensor.azimuth_rad):.2f}",
             f"{math.degrees(sensor.elevation_rad):.2f}",
-            f"{math.degrees(horizontal):.2f} x {math.degrees(vertical):.2f}",
-            f"{start:.3f} - {end:.3f}",
+            " x ".join(f"{math.degrees(angle):.2f}" for angle in sensor.field_of_view_rad),
+            " - ".join(f"{end:.3f}" for end in sensor.gate_m),
         )
-    rich.print(table)
+        for sensor, place in list(zip(design.sensors, places, strict=True))[:MOST_ROWS]
+    ]
+    rich.print(text_table(("sensor", *figures), rows, title, figures, overflow="fold"))
     if len(design.sensors) > MOST_ROWS:
         rich.print(f"... and {len(design.sensors) - MOST_ROWS} more sensors; --json lists all")
-
-
-def _table(title: str, texts: Sequence[str], figures: Sequence[str]) -> Table:
-    """A table whose cells wrap: columns of text on the left, figures to their right."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left")
-    for heading in texts:
-        table.add_column(escape(heading), justify="left", overflow="fold")
-    for heading in figures:
-        table.add_column(escape(heading), justify="right", overflow="fold")
-    return table
 
 
 def _show_track(design: DesignSpec, track: Track, rich: RichConsole) -> None:
     """Print the rays of a track as a table: from where to where each looks and listens over its travel."""
     from numpy import degrees
-    from rich.markup import escape
 
     from lidardesign.design.layouts.track import travels
 
     first, last = travels(track)
-    title = f"{escape(design.name)}: {len(track.sensor)} rays at every {track.dimension} from {first:g} to {last:g}"
+    title = f"{design.name}: {len(track.sensor)} rays at every {track.dimension} from {first:g} to {last:g}"
     title += f" (travel {last - first:g} m, {len(track.knots)} knots)\nsensors in the middle of their travel"
-    headings = ("azimuth\n[deg]", "elevation\n[deg]", "gate start\n[m]", "gate end\n[m]", "gate width\n[m]")
-    table = _table(title + f", at {_place(design.sensors[0])} m", ("ray",), headings)
-    for ray, sensor in list(enumerate(track.sensor))[:MOST_ROWS]:
-        gate = track.gate_m[:, ray]
-        table.add_row(
-            escape(design.sensors[sensor].name),
+    title += f", at {_place(design.sensors[0])} m"
+    figures = ("azimuth\n[deg]", "elevation\n[deg]", "gate start\n[m]", "gate end\n[m]", "gate width\n[m]")
+    rows = [
+        (
+            design.sensors[sensor].name,
             _span(degrees(track.azimuth_rad[:, ray]), 2),
             _span(degrees(track.elevation_rad[:, ray]), 2),
-            _span(gate[:, 0], 3),
-            _span(gate[:, 1], 3),
-            _span(gate[:, 1] - gate[:, 0], 3),
+            _span(track.gate_m[:, ray, 0], 3),
+            _span(track.gate_m[:, ray, 1], 3),
+            _span(track.gate_m[:, ray, 1] - track.gate_m[:, ray, 0], 3),
         )
-    rich.print(table)
+        for ray, sensor in list(enumerate(track.sensor))[:MOST_ROWS]
+    ]
+    rich.print(text_table(("ray", *figures), rows, title, figures, overflow="fold"))
     if len(track.sensor) > MOST_ROWS:
         rich.print(f"... and {len(track.sensor) - MOST_ROWS} more rays; --json lists all")
     rich.print(f"--at {track.dimension}=VALUE shows the rays at one place")
 
 
 def _span(values: np.ndarray, decimals: int) -> str:
-    """The smallest and the largest value; one where they look the same."""
     low, high = (f"{round(float(v), decimals) + 0.0:.{decimals}f}" for v in (values.min(), values.max()))
     return low if low == high else f"{low} .. {high}"
 
@@ -137,30 +110,24 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
 
     The bounds of the design space hold for every sensor; they are shown where they are broken.
     """
-    from rich.markup import escape
-    from rich.table import Column, Table
+    from rich.text import Text
 
     from lidardesign.design.constraints.slack import room_of
 
-    # names are needed whole, to loosen what they name
-    name = Column("constraint", overflow="fold")
-    table = Table(name, "bound", "value", "left", "holds", title="constraints", title_justify="left")
+    rows = []
     for check in checks:
-        if SPACE_MARK in check.name and check.satisfied:
-            continue
-        holds = "yes" if check.satisfied else "[bold]no[/bold]"
-        holds += ", tight" if check.satisfied and room_of(check).is_tight else ""
-        bound, value = (escape(number(figure, 6)) for figure in (check.bound, check.value))
-        table.add_row(escape(check.name), bound, value, _left(check), holds)
-    if table.row_count:
+        if SPACE_MARK not in check.name or not check.satisfied:
+            left = room_of(check)
+            holds = ("yes, tight" if left.is_tight else "yes") if check.satisfied else Text("no", style="bold")
+            rows.append((check.name, number(check.bound, 6), number(check.value, 6), _left(*left), holds))
+    if rows:
+        table = text_table(("constraint", "bound", "value", "left", "holds"), rows, "constraints")
+        table.columns[0].overflow = "fold"  # names are needed whole, to loosen what they name
         rich.print(table)
 
 
-def _left(check: ConstraintCheck) -> str:
+def _left(room: float | None, share: float | None) -> str:
     """How far a value is inside its bound, with the share of the bound that this is."""
-    from lidardesign.design.constraints.slack import room_of
-
-    room, share = room_of(check)
     if room is None or room < 0:
         return "-"
     # what is left below the rounding of the checks themselves is nothing
@@ -171,8 +138,6 @@ def _left(check: ConstraintCheck) -> str:
 
 def show_fit(document: dict[str, Any], design: DesignSpec, checks: Sequence[Any], rich: RichConsole) -> None:
     """Print what `fit` and `constrain` made."""
-    from rich.markup import escape
-
     show_design(design, rich)
     if "snap" in document:
         _show_snap(document["snap"], rich)
@@ -184,32 +149,30 @@ def show_fit(document: dict[str, Any], design: DesignSpec, checks: Sequence[Any]
     rays = estimates.get("rays")
     if rays is not None and rays["error"] > 0:
         rich.print(f"whole rays: {number(rays['error'], 2)} of {rays['value']:.0f} are not where the weights say")
-    rich.print(f"design: {escape(str(document['design']))}", soft_wrap=True)
+    rich.print(f"design: {document['design']}", soft_wrap=True)
 
 
 def _show_snap(snap: Mapping[str, Any], rich: RichConsole) -> None:
     """Print which part every sensor became; of each figure what was fitted, then what the part has."""
-    from rich.markup import escape
-
-    headings = ("loss\n[nats]", "field of view\n[deg]", "gate\n[m]", "rays", "Mbit/s")
-    table = _table("sensors as parts of the catalogue: fitted > part", ("sensor", "part"), headings)
 
     def both(figures: Mapping[str, Any], text: Callable[[Any], str]) -> str:
         fitted, part = text(figures["fitted"]), text(figures["part"])
         return fitted if fitted == part else f"{fitted} > {part}"
 
-    for row in snap["sensors"]:
-        name = "stays a sensor" if row["part"] is None else row["part"] + (", turned" if row["turned"] else "")
-        table.add_row(
-            escape(row["sensor"]),
-            escape(name),
+    rows = [
+        (
+            row["sensor"],
+            "stays a sensor" if row["part"] is None else row["part"] + (", turned" if row["turned"] else ""),
             f"{row['loss_nats']:.3f}",
             both(row["field_of_view_rad"], lambda angles: " x ".join(f"{math.degrees(a):.1f}" for a in angles)),
             both(row["gate_m"], lambda gate: " - ".join(f"{end:.2f}" for end in gate)),
             both(row["rays"], str),
             both(row["bandwidth_mbps"], number),
         )
-    rich.print(table)
+        for row in snap["sensors"]
+    ]
+    title, figures = "sensors as parts of the catalogue: fitted > part", SNAP_FIGURES
+    rich.print(text_table(("sensor", "part", *figures), rows, title, figures, overflow="fold"))
     fitted, parts = (snap["log_likelihood"][key] for key in ("fitted", "parts"))
     rich.print(
         f"log-likelihood as fitted {number(fitted)}, as parts {number(parts)} nats; losses are of one sensor alone"

@@ -1,16 +1,56 @@
-"""Tables of figures that stay in one piece on narrow terminals."""
+"""Figures as text, tables of text, and tables of figures that stay in one piece on narrow terminals."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
+    from rich.console import Console
     from rich.table import Table
+
+RichConsole: TypeAlias = "Console"
 
 # Wider than any terminal: what a table takes where nothing limits it.
 UNBOUNDED = 10_000
+
+
+def number(value: Any, digits: int = 4) -> str:
+    """A figure, a text, or a list or mapping of them, for people; a dash where there is none."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {number(item, digits)}" for name, item in value.items())
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(number(item, digits) for item in value) + "]"
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "-"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def text_table(
+    headings: Sequence[str],
+    rows: Iterable[Sequence[Any]] = (),
+    title: str | None = None,
+    figures: Sequence[str] = (),
+    **column: Any,
+) -> Table:
+    """A table of text whose cells wrap.
+
+    Arguments:
+        headings: One per column.
+        rows: The cells of each row.
+        title: Above it on the left, if there is one.
+        figures: Headings of columns that keep to the right.
+        column: What every column has, as rich's `add_column` takes it.
+    """
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for heading in headings:
+        table.add_column(heading, justify="right" if heading in figures else "left", **column)
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def print_table(
@@ -24,7 +64,7 @@ def print_table(
     """Print a table; where it is too wide it loses its lines, then brackets go below, then columns follow in parts.
 
     Arguments:
-        title: Rich markup, above the table, if there is one.
+        title: Above the table, if there is one.
         headings: One per column.
         lines: The cells of each line, plain text.
         rich: Where it is printed.
@@ -33,14 +73,16 @@ def print_table(
     """
     # a table's own title would wrap at the table's width
     if title is not None:
-        rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
-    table = _table(headings, lines, text)
+        rich.print(title, style="italic", soft_wrap=True)
+    table = _grid([headings, *lines], text)
     if not _fits(table, rich):
         _lighten(table)
         if not _fits(table, rich):
-            folded = [_folded(line, headings, text) for line in (headings, *lines)]
-            table = _table(folded[0], folded[1:], text)
-            _lighten(table)
+            folded = [
+                [cell if name in text else cell.replace(" (", "\n(") for cell, name in zip(line, headings, strict=True)]
+                for line in (headings, *lines)
+            ]
+            table = _lighten(_grid(folded, text))
             if not wraps and not _fits(table, rich):
                 _print_parts(folded, text, rich)
                 return
@@ -53,37 +95,23 @@ def _print_parts(lines: Sequence[Sequence[str]], text: Sequence[str], rich: Rich
     rest = [column for column in range(len(lines[0])) if column not in names]
     while rest:
         for count in range(len(rest), 0, -1):
-            shown = [[line[column] for column in names + rest[:count]] for line in lines]
-            table = _table(shown[0], shown[1:], text)
-            _lighten(table)
+            table = _lighten(_grid([[line[column] for column in names + rest[:count]] for line in lines], text))
             if _fits(table, rich):
                 break
         rich.print(table)
         rest = rest[count:]
 
 
-def _folded(line: Sequence[str], headings: Sequence[str], text: Sequence[str]) -> list[str]:
-    pairs = zip(line, headings, strict=True)
-    return [cell if heading in text else cell.replace(" (", "\n(") for cell, heading in pairs]
+def _grid(lines: Sequence[Sequence[str]], text: Sequence[str]) -> Table:
+    return text_table(lines[0], lines[1:], figures=[heading for heading in lines[0] if heading not in text])
 
 
-def _table(headings: Sequence[str], lines: Sequence[Sequence[str]], text: Sequence[str]) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table()
-    for heading in headings:
-        table.add_column(escape(heading), justify="left" if heading in text else "right")
-    for line in lines:
-        table.add_row(*map(escape, line))
-    return table
-
-
-def _lighten(table: Table) -> None:
+def _lighten(table: Table) -> Table:
     """Leave out all lines but the one under the headings."""
     from rich import box
 
     table.box, table.show_edge, table.pad_edge, table.padding = box.SIMPLE, False, False, (0, 1, 0, 0)
+    return table
 
 
 def _fits(table: Table, rich: RichConsole) -> bool:

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from lidardesign.cli.tables.designs import number
+from lidardesign.cli.tables.grids import RichConsole, number, text_table
 from lidardesign.design.catalog.part import Part, conditions_of, disagreements
 
-if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
-
-COLUMNS = ("part", "kind", "rays", "field of view\n[deg]", "range [m]", "range holds", "rate\n[Hz]")
-WORDS = ("part", "kind", "range holds")
-READ_OUT = ("histogram\n[Mbit/s]", "processed\n[Mbit/s]")
+FIGURES = ("rays", "field of view\n[deg]", "range [m]", "rate\n[Hz]", "histogram\n[Mbit/s]", "processed\n[Mbit/s]")
+COLUMNS = ("part", "kind", *FIGURES[:3], "range holds", *FIGURES[3:])
 LONGEST_LIST = 8
 
 
@@ -56,81 +52,70 @@ def part_document(part: Part) -> dict[str, Any]:
 
 def show_parts(parts: Sequence[Part], rich: RichConsole) -> None:
     """Print one row per part and mode; a mode stands under its part."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table()
-    for heading in (*COLUMNS, *READ_OUT):
-        table.add_column(escape(heading), justify="left" if heading in WORDS else "right", no_wrap=True)
+    table = text_table(COLUMNS, figures=FIGURES, no_wrap=True)
     above = None
     for part in parts:
         widths = [high - low for low, high in (part.view.azimuth, part.view.elevation)]
         is_round = part.view.shape == "ellipse" and widths[0] == widths[1]
         near, far = part.range_m
-        # no source may say where the range begins
-        reach = f"{near:.3g} - {far:.4g}" if "near_m" in part.figures else f"? - {far:.4g}"
         stated = part.figures["far_m"][0]
         held = [] if stated.reflectance_percent is None else [f"{stated.reflectance_percent:g} %"]
         if stated.illuminance_klux is not None:
             held.append(f"{stated.illuminance_klux:g} klux" if stated.illuminance_klux else "dark")
         stem = part.name.partition(":")[0]
-        name, above = f"  :{part.mode}" if above == stem else part.name, stem
         table.add_row(
-            escape(name),
+            f"  :{part.mode}" if above == stem else part.name,
             part.kind,
             str(part.rays),
             f"{widths[0]:g} round" if is_round else " x ".join(f"{width:.4g}" for width in widths),
-            reach,
-            escape(", ".join(held) or "-"),
+            # no source may say where the range begins
+            f"{near:.3g} - {far:.4g}" if "near_m" in part.figures else f"? - {far:.4g}",
+            ", ".join(held) or "-",
             number(part.rate_hz),
             number(part.histogram_mbps, 3),
             number(part.processed_mbps, 3),
         )
+        above = stem
     rich.print(table)
-    rich.print("catalog show NAME, or NAME:MODE, gives every figure with its source", markup=False)
+    rich.print("catalog show NAME, or NAME:MODE, gives every figure with its source")
 
 
 def show_part(part: Part, document: dict[str, Any], rich: RichConsole) -> None:
     """Print every figure of a part with its conditions and source, and what follows from them."""
-    from rich.markup import escape
-    from rich.table import Table
+    from rich.text import Text
 
-    rich.print(f"[bold]{escape(part.name)}[/bold]: {escape(part.product)}, {part.kind}")
-    rich.print(part.summary, markup=False)
+    rich.print(Text.assemble((part.name, "bold"), f": {part.product}, {part.kind}"))
+    rich.print(part.summary)
     if part.modes:
-        rich.print(f"mode {part.mode} of {', '.join(part.modes)}", markup=False)
-    table = Table("figure", "value", "conditions", "source", "note")
+        rich.print(f"mode {part.mode} of {', '.join(part.modes)}")
+    table = text_table(("figure", "value", "conditions", "source", "note"))
     for name, statements in part.figures.items():
         label = name + (" (!)" if name in document["disagreements"] else "")
         for statement in statements:
-            cells = (label, _figure(statement), conditions_of(statement), statement.source, statement.note or "")
-            table.add_row(*(escape(cell) for cell in cells))
+            source, note = statement.source, statement.note or ""
+            table.add_row(label, _figure(statement), conditions_of(statement), source, note)
             label = ""
     rich.print(table)
     for key, source in part.sources.items():
         parts = [source.title, source.kind, source.publisher, source.revision and f"revision {source.revision}"]
-        rich.print(f"{key}: {', '.join(text for text in parts if text)}", markup=False, soft_wrap=True)
+        rich.print(f"{key}: {', '.join(text for text in parts if text)}", soft_wrap=True)
     histograms, processed = part.histogram_mbps, part.processed_mbps
     costs = [
         "no source says how long its histograms are" if histograms is None else f"histograms {histograms:.3g} Mbit/s",
         "no source says how long its frames are" if processed is None else f"processed {processed:.3g} Mbit/s",
     ]
-    cost = f"{part.rays} rays at {part.rate_hz:g} Hz; read-out: {', '.join(costs)}"
-    rich.print(cost, markup=False, soft_wrap=True)
+    rich.print(f"{part.rays} rays at {part.rate_hz:g} Hz; read-out: {', '.join(costs)}", soft_wrap=True)
     if document["disagreements"]:
         names = ", ".join(document["disagreements"])
-        rich.print(f"sources disagree about {names}; the first figure is used", markup=False, soft_wrap=True)
+        rich.print(f"sources disagree about {names}; the first figure is used", soft_wrap=True)
     if "design" in document:
-        count = document["sensors"]
-        sensors = "1 part" if count == 1 else f"{count} parts"
-        rich.print(f"wrote {document['design']} ({document['design_rays']} rays of {sensors})", markup=False)
+        sensors = "1 part" if document["sensors"] == 1 else f"{document['sensors']} parts"
+        rich.print(f"wrote {document['design']} ({document['design_rays']} rays of {sensors})")
 
 
 def _figure(statement: Any) -> str:
-    """What a statement says, without where it comes from."""
-    values = statement.model_dump(exclude_none=True)
-    for key in ("source", "note", "at", "reflectance_percent", "illuminance_klux", "detection_percent"):
-        values.pop(key, None)
+    further = {"source", "note", "at", "reflectance_percent", "illuminance_klux", "detection_percent"}
+    values = statement.model_dump(exclude_none=True, exclude=further)
     if list(values) == ["value"]:
         return number(values["value"], 6)
     if values.get("shape") == "rectangle":
@@ -139,6 +124,7 @@ def _figure(statement: Any) -> str:
     texts = []
     for key, value in values.items():
         is_long = isinstance(value, list) and len(value) > LONGEST_LIST
-        text = f"{len(value)} from {value[0]:g} to {value[-1]:g}" if is_long else number(value, 5)
-        texts.append(f"{key} {text}")
+        texts.append(
+            f"{key} {len(value)} from {value[0]:g} to {value[-1]:g}" if is_long else f"{key} {number(value, 5)}"
+        )
     return " ".join([*words, ", ".join(texts)])

@@ -7,13 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.cli.tables.designs import number
-from lidardesign.cli.tables.grids import print_table
+from lidardesign.cli.tables.grids import RichConsole, number, print_table
 from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
-
     from lidardesign.evaluate.accuracy.settings import Accuracy, Measurement, Sweep
 
 
@@ -26,90 +23,79 @@ DECIMALS = 4
 
 def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) -> None:
     """Print an evaluation for people; its JSON form holds more (all pairs, all intervals)."""
-    from rich.markup import escape
-
-    metric = document["metric"]
-    figure = f"{metric['name']} [{metric['unit']}], {metric['better']} is better"
-    scenes = f"over {document['scenes']} held-out scenes" + "".join(f", {text}" for text in document.get("set", []))
-    _show_rows(document["rows"], escape(f"{figure}, {scenes}"), rich)
+    metric, matched = document["metric"], document["equal_bandwidth"]
+    _show_rows(document, rich)
     _show_errors(document, rich)
-    designs = {row["design"] for row in document["rows"]} - {row["design"] for row in document["equal_bandwidth"]}
+    designs = {row["design"] for row in document["rows"]} - {row["design"] for row in matched}
     against = [pair for pair in document["paired"] if pair["b"] not in designs]
-    unit = escape(metric["unit"])
-    title = f"difference to each baseline \\[{unit}], scene by scene, with its 95 % interval"
+    title = f"difference to each baseline [{metric['unit']}], scene by scene, with its 95 % interval"
     cells = [
         f"{number(pair['difference'], 3)} ({number(pair['ci_low'], 3)} to {number(pair['ci_high'], 3)})"
         for pair in against
     ]
     _show_grid(title, [(pair["a"], pair["rays"], pair["b"]) for pair in against], cells, rich)
-    matched = document["equal_bandwidth"]
-    title = f"baselines with as much bandwidth as the design: value \\[{unit}] (rays)"
+    title = f"baselines with as much bandwidth as the design: value [{metric['unit']}] (rays)"
     cells = [f"{number(row['value'])} ({row['rays']})" for row in matched]
     _show_grid(title, [(row["matched_to"], row["matched_rays"], row["design"]) for row in matched], cells, rich)
     _show_effects(document, rich)
     if "audit" in document:
-        from rich.markup import escape
-
-        audit = document["audit"]
-        unit = audit["unit"]
-        there = {effect["name"] for effect in document["effects"] if effect["bound"] or effect["lost"]}
-        skipped = ", ".join(_words(name) for name in audit["skipped"] if name in there) or "nothing that is there"
-        verdict = "passed" if audit["passed"] else "failed"
-        title = f"audit {verdict}: the plan skips {skipped}; rows may move by {audit['tolerance']:g} {unit}"
-        planned, everything = f"planned\n[{unit}]", f"all effects\n[{unit}]"
-        moves = "difference (95 % interval)"
-        headings = ("design", "bandwidth\nof", "rays", planned, everything, moves, "seconds\nof both")
-        # as many as show hundredths of what is tolerated
-        tolerance = audit["tolerance"]
-        decimals = max(0, 2 - math.floor(math.log10(tolerance))) if tolerance > 0 else DECIMALS
-        lines = []
-        for row in audit["rows"]:
-            # adding zero takes the sign from a rounded -0
-            figures = (round(row[name], decimals) + 0.0 for name in ("difference", "ci_low", "ci_high"))
-            moved, low, high = (f"{value:.{decimals}f}" for value in figures)
-            times = f"{number(row['seconds'], 2)}, {number(row['seconds_everything'], 2)}"
-            scores = (number(row["planned"]), number(row["everything"]))
-            matched = row.get("matched_to", "-")
-            lines.append([row["design"], matched, str(row["rays"]), *scores, f"{moved} ({low} to {high})", times])
-        print_table(escape(title), headings, lines, rich, text=headings[:2])
+        _show_audit(document["audit"], document["effects"], rich)
     for note in document.get("notes", []):
-        rich.print(f"note: {escape(note)}", soft_wrap=True)
+        rich.print(f"note: {note}", soft_wrap=True)
     for path in written:
-        rich.print(f"wrote {escape(str(path))}", soft_wrap=True)
+        rich.print(f"wrote {path}", soft_wrap=True)
 
 
-def _show_rows(rows: Sequence[Entry], title: str, rich: RichConsole) -> None:
-    detail = next((name for row in rows for name in row["details"]), None)
-    further = [] if detail is None else [detail.replace("_", " ")]
+def _show_rows(document: Entry, rich: RichConsole) -> None:
+    metric, rows = document["metric"], document["rows"]
+    title = f"{metric['name']} [{metric['unit']}], {metric['better']} is better, over {document['scenes']} held-out "
+    title += ", ".join(["scenes", *document.get("set", [])])
+    details = [name for row in rows for name in row["details"]][:1]
+    further = [name.replace("_", " ") for name in details]
     headings = ("design", "rays", "value", "95 % interval", "failures", *further, "Mbit/s", "seconds")
     lines = []
     for row in rows:
         interval = f"{number(row['ci_low'])} - {number(row['ci_high'])}"
-        extra = [] if detail is None else [row["details"].get(detail)]
+        extra = [row["details"].get(name) for name in details]
         cells = (row["rays"], row["value"], interval, row["failures"], *extra, row["bandwidth_mbps"])
         lines.append([row["design"], *(number(cell) for cell in cells), number(row["seconds"], 2)])
     print_table(title, headings, lines, rich)
 
 
+def _show_audit(audit: Entry, effects: Sequence[Entry], rich: RichConsole) -> None:
+    unit, tolerance = audit["unit"], audit["tolerance"]
+    there = {effect["name"] for effect in effects if effect["bound"] or effect["lost"]}
+    skipped = ", ".join(_words(name) for name in audit["skipped"] if name in there) or "nothing that is there"
+    verdict = "passed" if audit["passed"] else "failed"
+    title = f"audit {verdict}: the plan skips {skipped}; rows may move by {tolerance:g} {unit}"
+    scores = (f"planned\n[{unit}]", f"all effects\n[{unit}]", "difference (95 % interval)")
+    headings = ("design", "bandwidth\nof", "rays", *scores, "seconds\nof both")
+    # as many as show hundredths of what is tolerated
+    decimals = max(0, 2 - math.floor(math.log10(tolerance))) if tolerance > 0 else DECIMALS
+    lines = []
+    for row in audit["rows"]:
+        # adding zero takes the sign from a rounded -0
+        figures = (round(row[name], decimals) + 0.0 for name in ("difference", "ci_low", "ci_high"))
+        moved, low, high = (f"{value:.{decimals}f}" for value in figures)
+        cells = (str(row["rays"]), number(row["planned"]), number(row["everything"]), f"{moved} ({low} to {high})")
+        times = f"{number(row['seconds'], 2)}, {number(row['seconds_everything'], 2)}"
+        lines.append([row["design"], row.get("matched_to", "-"), *cells, times])
+    print_table(title, headings, lines, rich, text=headings[:2])
+
+
 def _show_errors(document: Entry, rich: RichConsole) -> None:
-    """How far designs' scores and their differences may be off, the widest of each."""
-    designs = {pair["a"] for pair in document["paired"]}
-    values = [row["half_width"] for row in document["rows"] if row["design"] in designs]
-    differences = [pair["half_width"] for pair in document["paired"]]
-    if not differences:
-        return
-    unit = document["metric"]["unit"]
-    rich.print(
-        f"over other scenes, designs' values may be off by up to {number(max(values), 2)} {unit}, "
-        f"their differences by up to {number(max(differences), 2)} {unit} (half of the 95 % intervals)",
-        markup=False,
-    )
+    designs, unit = {pair["a"] for pair in document["paired"]}, document["metric"]["unit"]
+    if designs:
+        value = max(row["half_width"] for row in document["rows"] if row["design"] in designs)
+        difference = max(pair["half_width"] for pair in document["paired"])
+        rich.print(
+            f"over other scenes, designs' values may be off by up to {number(value, 2)} {unit}, "
+            f"their differences by up to {number(difference, 2)} {unit} (half of the 95 % intervals)"
+        )
 
 
 def _show_grid(title: str, places: Sequence[tuple[str, int, str]], cells: Sequence[str], rich: RichConsole) -> None:
     """One line per design and number of rays, one column per baseline; places have these three."""
-    if not places:
-        return
     columns = list(dict.fromkeys(column for _, _, column in places))
     lines: dict[tuple[str, int], dict[str, str]] = {}
     for (design, rays, column), cell in zip(places, cells, strict=True):
@@ -117,16 +103,15 @@ def _show_grid(title: str, places: Sequence[tuple[str, int, str]], cells: Sequen
     rows = [
         [design, str(rays), *(line.get(column, "-") for column in columns)] for (design, rays), line in lines.items()
     ]
-    print_table(title, ("design", "rays", *columns), rows, rich)
+    if rows:
+        print_table(title, ("design", "rays", *columns), rows, rich)
 
 
 def _show_effects(document: Entry, rich: RichConsole) -> None:
     """What was simulated and why; one line where nothing is called for."""
-    from rich.markup import escape
-
     from lidardesign.evaluate.report.tables import plain_number
 
-    detector, effects = escape(document["detector"]), document["effects"]
+    detector, effects = document["detector"], document["effects"]
     if not any(effect["on"] or effect["bound"] or effect["lost"] for effect in effects):
         rich.print(f"effects: none called for with the detector {detector}", soft_wrap=True)
         return
@@ -137,10 +122,9 @@ def _show_effects(document: Entry, rich: RichConsole) -> None:
     for effect in effects:
         bounds = [plain_number(MILLIMETRES * effect["bound"], 3), plain_number(effect["lost"], 2)]
         cost = plain_number(effect["seconds"], 2, tiny=SHORT_S)
+        on = "no" if effect["missing"] is None else "missing"
         if effect["on"]:
             on = "yes" if effect["scenes_on"] == 1 else f"in {100 * effect['scenes_on']:.0f} %"
-        else:
-            on = "no" if effect["missing"] is None else "missing"
         lines.append([_words(effect["name"]), on, *bounds, cost, effect["reason"]])
     headings = ("effect", "on", "range [mm]", "returns", "cost [s]", "reason")
     print_table(title, headings, lines, rich, text=("effect", "on", "reason"), wraps=True)
@@ -175,10 +159,9 @@ def show_times(timings: Mapping[str, float], memory_bytes: int | None, rich: Ric
 
 def show_accuracy(accuracy: Accuracy, rich: RichConsole) -> None:
     """Print every sweep, the roughest measurement first, and the verdict on each."""
-    from rich.markup import escape
+    from rich.text import Text
 
     for sweep in accuracy.sweeps:
-
         unit = f" [{sweep.unit}]" if sweep.unit else ""
         title = f"{sweep.knob}: {sweep.error_of}{unit}, against {sweep.against}; seconds of {sweep.work}"
         further = list(dict.fromkeys(name for measurement in sweep.measurements for name in measurement.values))
@@ -187,25 +170,26 @@ def show_accuracy(accuracy: Accuracy, rich: RichConsole) -> None:
             for measurement in sweep.measurements
         ]
         # a sentence, which wraps like those below the table
-        rich.print(f"[italic]{escape(title)}[/italic]")
+        rich.print(title, style="italic")
         print_table(None, ("setting", "error", "+-", "seconds", "memory", *further), lines, rich, text=("setting",))
-        rich.print(f"{escape(sweep.verdict)}; tolerance {sweep.tolerance:.3g}{escape(unit)}: {escape(sweep.because)}")
+        rich.print(f"{sweep.verdict}; tolerance {sweep.tolerance:.3g}{unit}: {sweep.because}")
         if sweep.note:
-            rich.print(f"note: {escape(sweep.note)}")
+            rich.print(f"note: {sweep.note}")
         rich.print()
-    taken = sum(accuracy.seconds.values())
-    rich.print(f"accuracy measured in {taken:.0f} s; [bold]*[/bold] is what to choose, (run) what this run does")
-    off = [sweep for sweep in accuracy.sweeps if sweep.default is not None and sweep.chosen is not sweep.default]
-    for sweep in off:
-        rich.print(f"note: {escape(sweep.knob)}: {escape(sweep.verdict)}")
+    taken = f"accuracy measured in {sum(accuracy.seconds.values()):.0f} s; "
+    rich.print(Text.assemble(taken, ("*", "bold"), " is what to choose, (run) what this run does"))
+    for sweep in accuracy.sweeps:
+        if sweep.default is not None and sweep.chosen is not sweep.default:
+            rich.print(f"note: {sweep.knob}: {sweep.verdict}")
 
 
 def _cells(measurement: Measurement, sweep: Sweep) -> tuple[str, ...]:
     marks = (" *" if measurement is sweep.chosen else "") + (" (run)" if measurement.default else "")
-    error = "reference" if measurement.reference else _figure(measurement.error)
-    spread = "" if measurement.reference else _figure(measurement.uncertainty)
+    error = (
+        ("reference", "") if measurement.reference else (_figure(measurement.error), _figure(measurement.uncertainty))
+    )
     memory = "" if measurement.memory_bytes is None else f"{measurement.memory_bytes / MEBIBYTE:.0f} MiB"
-    return measurement.setting + marks, error, spread, _figure(measurement.seconds), memory
+    return measurement.setting + marks, *error, _figure(measurement.seconds), memory
 
 
 def _figure(value: float | None) -> str:
