@@ -36,14 +36,12 @@ from lidardesign.evaluate.results import (
     effect_notes,
     summaries,
 )
-from lidardesign.evaluate.scene_scores import Progress, score_lists
+from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.statistics import bootstrap_interval, paired_difference
 from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
-from lidardesign.scene import Scene
 from lidardesign.simulate.plan import EffectPlan, Planner
-from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import Score, conditions_of, notes_of
 
 # Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
@@ -200,16 +198,11 @@ def _optimised(
 
 def _judge(request: EvaluationRequest, lists: Sequence[Positions]) -> list[float]:
     """The mean score of sets of rays on a few training scenes, turned so that lower is better."""
-    sign = 1.0 if request.task.metric.better == "lower" else -1.0
-    values = [_values(request, scene, lists) for scene in request.train[:JUDGED_SCENES]]
-    return (sign * np.mean(values, axis=0)).tolist() if values else [0.0] * len(lists)
-
-
-def _values(request: EvaluationRequest, scene: Scene, lists: Sequence[Positions]) -> list[float]:
-    """Scores in a training scene, with the physics that it calls for."""
-    casters, planner = build_casters(scene), request.planner
-    physics = planner.physics(planner.plan(scene, [rays for one in lists for rays in one], casters), request.seed)
-    return [score.value for score, _ in score_lists(request.task, scene, lists, casters, physics)]
+    objective = TrainingObjective(request.task, request.train[:JUDGED_SCENES], request.planner, request.seed)
+    if not objective.scenes:
+        return [0.0] * len(lists)
+    # one row per scene, whose rows are added one after the other
+    return np.array(objective.values(lists, range(len(objective.scenes))).T, order="C").mean(axis=0).tolist()
 
 
 # A second cast from beside also finds what a ray just passes: of rays in all directions, 2 in a million (measured).

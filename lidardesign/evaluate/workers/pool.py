@@ -33,8 +33,6 @@ from lidardesign.registry import load_task
 MOST_TRIES = 3
 # Jobs beyond what runs, so that no worker waits for this process.
 AHEAD = 1
-# Exit code where the process that asks has gone.
-EXIT_ALONE = 1
 
 
 class Processes:
@@ -135,7 +133,7 @@ def _begin(source: SceneSource) -> None:
 def _end_with_parent() -> None:
     """End at once where the process that asks has gone, in the middle of a scene too."""
     multiprocessing.parent_process().join()
-    os._exit(EXIT_ALONE)
+    os._exit(1)
 
 
 @contextlib.contextmanager
