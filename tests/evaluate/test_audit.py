@@ -11,7 +11,6 @@ from support.command_line import make_run
 from support.planning import SINGLE
 from support.scoring import MissTask, design, make_request, scenes
 
-from lidardesign.errors import PluginError
 from lidardesign.evaluate.report.tables import audit_section, effects_section
 from lidardesign.evaluate.results import Audit, AuditRow, effect_notes, summaries
 from lidardesign.evaluate.score import evaluate
@@ -155,16 +154,6 @@ def test_failed_rows_are_those_beyond_the_tolerance_on_either_side():
     audit = Audit(0.5, "mm", rows, [], [])
     assert audit.failed == rows[2:]
     assert (audit.worst, audit.seconds) == (0.6, (4.0, 8.0))
-
-
-class BrokenTask(MissTask):
-    def score(self, scene, returns):
-        raise ValueError("no such body: -1")
-
-
-def test_a_score_that_cannot_take_noisy_returns_is_named():
-    with pytest.raises(PluginError, match="no such body: -1"):
-        evaluate(make_request(task=BrokenTask(), test=sunny(1), planner=Planner(SINGLE)))
 
 
 @pytest.fixture(scope="module")

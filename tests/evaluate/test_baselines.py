@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from support.rivals import Rivals
+from support.rivals import Rivals, balls
 from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
@@ -17,7 +17,7 @@ from lidardesign.evaluate.baselines.simple import (
     baseline_of,
     is_baseline,
 )
-from lidardesign.scene import Body, Box, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Scene, rigid
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, angles
 
@@ -36,23 +36,6 @@ BUILT = ["uniform", "random", "bounding", "occupancy"]
 def build_baseline(name, space, train, count, seed, judge=None):
     """A baseline at so many rays, for a space without conditions."""
     return Rivals(space, train, seed, judge).positions(name, count)[0]
-
-
-def balls(centre, radius=0.4, jitter=0.05, count=3):
-    generator = np.random.default_rng(8)
-    return [
-        Scene(
-            (
-                Body(
-                    Sphere(radius),
-                    "ball",
-                    "both",
-                    rigid(translation_m=centre + generator.normal(0, jitter, 3)),
-                ),
-            )
-        )
-        for _ in range(count)
-    ]
 
 
 CASES = {

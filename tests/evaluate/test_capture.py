@@ -59,10 +59,17 @@ def ball_design(rays=150):
     return DesignSpec("ball", (Sensor("ball", 1.0, np.zeros(3), np.zeros((3, 3)), *numbers),), rays=rays)
 
 
-def looking(scan_deg, gate=(0.3, 2.0), origin=(0.0, 0.0, 0.0)):
-    count = len(scan_deg)
-    directions = scan_directions(degree_frame(0.0, 0.0), np.array(scan_deg, dtype=float))
+def rays_along(directions, gate=(0.3, 2.0), origin=(0.0, 0.0, 0.0)):
+    count = len(directions)
     return Rays(np.tile(origin, (count, 1)), directions, np.tile(gate, (count, 1)), np.zeros(count), np.zeros(count))
+
+
+def looking(scan_deg, **places):
+    return rays_along(scan_directions(degree_frame(0.0, 0.0), np.array(scan_deg, dtype=float)), **places)
+
+
+def random_looks(generator, count):
+    return scan_directions(degree_frame(0.0, 0.0), generator.uniform(-10, 10, (count, 2)))
 
 
 def settings(capture, **changes):
@@ -75,10 +82,7 @@ def settings(capture, **changes):
 
 def test_a_ray_takes_the_pixel_that_looks_its_way(clean):
     order = np.random.default_rng(0).permutation(len(clean))
-    rays = Rays(
-        np.zeros((len(order), 3)), clean.direction[order], np.tile([0.3, 2.0], (len(order), 1)), 0 * order, 0 * order
-    )
-    found = scan(clean, rays, 1e-6, Estimation())
+    found = scan(clean, rays_along(clean.direction[order]), 1e-6, Estimation())
     np.testing.assert_array_equal(found.pixel, order)
     assert found.away_rad.max() < 1e-7
 
@@ -158,7 +162,7 @@ def test_the_usual_background_is_what_was_put_in(clean, noisy):
 
 def test_background_alone_is_seldom_taken_for_a_return():
     generator = np.random.default_rng(8)
-    looks = scan_directions(degree_frame(0.0, 0.0), generator.uniform(-10, 10, (3000, 2)))
+    looks = random_looks(generator, 3000)
     dark = Capture(generator.poisson(0.5, (3000, 200)), BIN_PS, START_PS, np.zeros(3), looks, pulse_fwhm_ps=60.0)
     for estimation in ESTIMATIONS:
         share = scan_pixels(dark, estimation).returned.mean()
@@ -169,14 +173,13 @@ def test_background_alone_is_seldom_taken_for_a_return():
 @pytest.mark.parametrize("per_bin", [0.003, 0.01, 0.03])
 def test_rare_background_in_a_gate_is_seldom_taken_for_a_return(per_bin):
     generator = np.random.default_rng(9)
-    looks = scan_directions(degree_frame(0.0, 0.0), generator.uniform(-10, 10, (3000, 2)))
+    looks = random_looks(generator, 3000)
     counts = generator.poisson(per_bin, (3000, 800))
     # a surface in every pixel, outside of the gates
     counts[np.arange(3000)[:, None], generator.integers(300, 790, 3000)[:, None] + np.arange(5)] += 20
     dark = Capture(counts, BIN_PS, START_PS, np.zeros(3), looks, pulse_fwhm_ps=60.0)
     assert dark.background_per_bin == pytest.approx(per_bin, rel=0.3)
-    gates = np.tile(dark.start_m[0] + np.array([100, 140]) * dark.bin_m, (3000, 1))
-    rays = Rays(np.zeros((3000, 3)), looks, gates, np.zeros(3000), np.zeros(3000))
+    rays = rays_along(looks, dark.start_m[0] + np.array([100, 140]) * dark.bin_m)
     for estimation in ESTIMATIONS:
         assert scan(dark, rays, default_within_rad(dark), estimation).returned.mean() < 0.02
 
@@ -188,7 +191,7 @@ def test_rays_that_were_not_captured_return_nothing_and_say_why(clean):
     rays = looking([[0, 0], [0, 0], [40, 0], [0, 0]])
     gate, origin = rays.gate_m.copy(), rays.origin_m.copy()
     gate[1], origin[3] = (5.0, 6.0), (0.0, 0.2, 0.0)
-    rays = Rays(origin, rays.direction, gate, rays.sensor, rays.time_s)
+    rays = replace(rays, origin_m=origin, gate_m=gate)
     found = scan(clean, rays, np.radians(1.0), Estimation())
     expected = [Captured.YES, Captured.OUT_OF_WINDOW, Captured.OUT_OF_FIELD, Captured.OTHER_PLACE]
     assert found.captured.tolist() == expected
@@ -281,7 +284,7 @@ def test_medians_of_neighbours_stand_in_for_true_ranges(files, noisy):
 
 def test_what_is_counted_before_the_pulse_left_is_no_range_of_a_pixel():
     generator = np.random.default_rng(10)
-    looks = scan_directions(degree_frame(0.0, 0.0), generator.uniform(-10, 10, (300, 2)))
+    looks = random_looks(generator, 300)
     counts = generator.poisson(0.2, (300, 400))
     counts[:, 30] += 200  # the trigger's own light, 100 bins before the pulse
     counts[:, 300] += 50

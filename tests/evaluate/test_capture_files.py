@@ -51,9 +51,9 @@ def path_of(folder, kind):
 @each_row("kind", FORMATS)
 def test_a_capture_is_the_same_from_every_kind_of_file(tmp_path, kind, images):
     arrays = make_capture(9, images=images)
-    FORMATS[kind](path_of(tmp_path, kind), arrays)
-    found = load_capture(path_of(tmp_path, kind))
+    found = stored(tmp_path, kind, arrays)
     np.testing.assert_array_equal(found.counts, arrays["counts"].reshape(-1, BINS))
+    assert found.counts.dtype == np.uint16, "counts keep their small type"
     np.testing.assert_array_equal(found.true_range_m, arrays["true_range_m"].reshape(-1))
     np.testing.assert_allclose(np.linalg.norm(found.direction, axis=1), 1.0, atol=1e-15)
     assert (found.bin_ps, found.pulse_fwhm_ps) == (20.0, 60.0)
@@ -62,29 +62,29 @@ def test_a_capture_is_the_same_from_every_kind_of_file(tmp_path, kind, images):
     assert np.degrees(found.spacing_rad) == pytest.approx(30 / 8, rel=0.01)
 
 
+def without_angles(arrays):
+    return {name: array for name, array in arrays.items() if not name.endswith("_deg")}
+
+
+def stored(folder, kind, arrays):
+    """What is read of arrays that were written as one kind of file."""
+    FORMATS[kind](path_of(folder, kind), arrays)
+    return load_capture(path_of(folder, kind))
+
+
 @pytest.mark.parametrize("kind", FORMATS)
 def test_directions_and_scan_angles_say_the_same(tmp_path, kind):
-    arrays = make_capture(5)
-    FORMATS[kind](path_of(tmp_path, kind), arrays)
-    by_angles = load_capture(path_of(tmp_path, kind))
-    for name in ("x_deg", "y_deg", "boresight_azimuth_deg", "boresight_elevation_deg"):
-        del arrays[name]
-    arrays["direction"] = by_angles.direction.reshape(5, 5, 3)
-    FORMATS[kind](path_of(tmp_path, kind), arrays)
-    np.testing.assert_allclose(load_capture(path_of(tmp_path, kind)).direction, by_angles.direction, atol=1e-15)
-
-
-@pytest.mark.parametrize("kind", FORMATS)
-def test_counts_keep_their_small_type(tmp_path, kind):
-    FORMATS[kind](path_of(tmp_path, kind), make_capture(4))
-    assert load_capture(path_of(tmp_path, kind)).counts.dtype == np.uint16
+    by_angles = stored(tmp_path, kind, make_capture(5)).direction
+    by_vectors = {**without_angles(make_capture(5)), "direction": by_angles.reshape(5, 5, 3)}
+    np.testing.assert_allclose(stored(tmp_path, kind, by_vectors).direction, by_angles, atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_every_pixel_may_have_a_start_of_its_own(tmp_path, kind):
     starts = 2000.0 + np.arange(25.0).reshape(5, 5)
-    FORMATS[kind](path_of(tmp_path, kind), {**make_capture(5), "start_ps": starts})
-    np.testing.assert_array_equal(load_capture(path_of(tmp_path, kind)).start_ps, starts.ravel())
+    np.testing.assert_array_equal(
+        stored(tmp_path, kind, {**make_capture(5), "start_ps": starts}).start_ps, starts.ravel()
+    )
 
 
 def changed(**values):
@@ -168,26 +168,17 @@ ONLY_NUMPY = {"flat counts"}
 )
 def test_what_cannot_be_is_refused(tmp_path, kind, name):
     change, message = WRONG[name]
-    path = path_of(tmp_path, kind)
-    FORMATS[kind](path, change(make_capture(5)))
     # MATLAB knows no list of three, only a row
     with pytest.raises(DataError, match=message.replace(r"\(2,\)", r"\((1, )?2,?\)")) as caught:
-        load_capture(path)
-    assert str(path) in str(caught.value)
+        stored(tmp_path, kind, change(make_capture(5)))
+    assert str(path_of(tmp_path, kind)) in str(caught.value)
 
 
 def test_directions_that_are_no_unit_vectors_are_refused(tmp_path):
-    arrays = make_capture(3)
-    for name in ("x_deg", "y_deg", "boresight_azimuth_deg", "boresight_elevation_deg"):
-        del arrays[name]
-    for vectors, message in (
-        (np.ones((3, 3, 3)), "length 1.732"),
-        (np.ones((9, 3)), "shape"),
-        (np.zeros((3, 3, 3)), "length 0"),
-    ):
-        save_npz(tmp_path / "s.npz", {**arrays, "direction": vectors})
+    arrays, ones = without_angles(make_capture(3)), np.ones((3, 3, 3))
+    for vectors, message in ((ones, "length 1.732"), (ones.reshape(9, 3), "shape"), (0 * ones, "length 0")):
         with pytest.raises(DataError, match=message):
-            load_capture(tmp_path / "s.npz")
+            stored(tmp_path, "npz", {**arrays, "direction": vectors})
 
 
 # --- files

@@ -10,6 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.rivals import balls
+from support.scoring import HitTask, MissTask
 from support.tables import each_row
 
 from lidardesign.cli.commands.evaluate import search_display
@@ -28,10 +30,9 @@ from lidardesign.evaluate.cma.search import OutOfTimeError, Search, SearchBudget
 from lidardesign.evaluate.cma.starts import starts, tiles
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.score import evaluate
-from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace
-from lidardesign.task import Defaults, Metric, Score, TaskConfig
+from lidardesign.task import TaskConfig
 from lidardesign.workflow.evaluate import ScoreOptions
 
 FIXED = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
@@ -42,15 +43,6 @@ AISLE = DesignSpace(
     (0.0, 0, 0, 0.0, -0.5, 0.05), (1.0, 0, 0, 0.0, 0.5, 4.0), condition=("x_m",), measure="angles"
 )  # fmt: skip
 FAST = SearchBudget(math.inf, evaluations=300)
-
-
-def balls(centre, radius=0.4, jitter=0.05, count=3):
-    generator = np.random.default_rng(8)
-    shifts = generator.normal(0, jitter, (count, 3))
-    return [
-        Scene((Body(Sphere(radius), "ball", "both", rigid(translation_m=centre + shift)),), f"ball {index}")
-        for index, shift in enumerate(shifts)
-    ]
 
 
 AHEAD, BELOW = balls(np.array([3.0, 0, 0])), balls(np.array([0.3, 0.2, 0.0]), 0.3)
@@ -318,31 +310,10 @@ def test_a_search_that_has_converged_begins_anew():
     assert found.value < 1e-9
 
 
-class MissTask:
-    """Percent of rays without a return."""
+class AnyMissTask(MissTask):
+    """Percent of rays without a return, of however few."""
 
-    name = "miss"
-    summary = "rays without a return"
-    api_version = 1
-    Config = TaskConfig
-    metric = Metric("misses", "%", "lower", worst=150.0, tolerance=1.0)
-    defaults = Defaults()
-
-    def score(self, scene, returns):
-        total = sum(len(frame.outcome) for frame in returns)
-        if not total:
-            return Score(self.metric.worst, failed=True)
-        return Score(100.0 * (1 - sum(int(frame.returned.sum()) for frame in returns) / total))
-
-
-class HitTask(MissTask):
-    """Percent of rays with a return: higher is better."""
-
-    metric = Metric("hits", "%", "higher", worst=-50.0, tolerance=1.0)
-
-    def score(self, scene, returns):
-        found = super().score(scene, returns)
-        return Score(100.0 - found.value, failed=found.failed)
+    fewest_returns = 0
 
 
 def sensors(count, space=FIXED):
@@ -373,7 +344,7 @@ FOLLOWED = {
 def request_of(name, task=None, **changes):
     design, space, train = FOLLOWED[name]
     values = {
-        "task": task or MissTask(),
+        "task": task or AnyMissTask(),
         "config": TaskConfig(),
         "space": space,
         "seed": 3,
@@ -406,7 +377,7 @@ def test_every_kind_of_design_is_followed_and_what_is_found_keeps_its_constraint
     json.dumps(evaluation.as_dict()["cma"], allow_nan=False)
 
 
-@pytest.mark.parametrize("task", [MissTask(), HitTask()])
+@pytest.mark.parametrize("task", [AnyMissTask(), HitTask()])
 def test_the_search_gains_in_the_direction_of_the_metric_and_no_less_than_bounding(task):
     evaluation = evaluate(request_of("grid", task, cma=CmaSettings(SearchBudget(math.inf, 1500))))
     value = {row.design: row.value for row in evaluation.rows}
@@ -419,7 +390,7 @@ def test_the_search_gains_in_the_direction_of_the_metric_and_no_less_than_boundi
 def candidate_of(name, settings=None):
     design, space, train = FOLLOWED[name]
     conditions = [{"x_m": 0.25}, {"x_m": 0.75}] if name == "track" else [{}]
-    objective = TrainingObjective(MissTask(), train, Planner(), 0)
+    objective = TrainingObjective(AnyMissTask(), train, Planner(), 0)
     return CmaCandidate(
         design, space, conditions, TrainingViews(space, train), objective, settings or CmaSettings(FAST), 0
     )
@@ -541,7 +512,7 @@ class Bar:
 
 
 def shown_settings(bar):
-    request = SimpleNamespace(cma_seconds=FAST.seconds, run=SimpleNamespace(task=MissTask()))
+    request = SimpleNamespace(cma_seconds=FAST.seconds, run=SimpleNamespace(task=AnyMissTask()))
     return CmaSettings(FAST, search_display(request, Output(), bar))
 
 

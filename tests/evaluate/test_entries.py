@@ -6,19 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.scoring import MissTask, make_request
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Coupling, DesignSpec, Sensor
 from lidardesign.errors import ConfigError, PluginError
-from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.score import entries_of, evaluate
 from lidardesign.geometry.rays import Rays
 from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Capsule, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, angles
-from lidardesign.task import Defaults, Metric, Score, TaskConfig
+from lidardesign.task import Metric, Score
 
 AISLE = DesignSpace(
     (-0.5, 0.0, 0.0, -math.pi / 2, 0.0, 0.1), (4.0, 0.0, 0.0, -math.pi / 2, math.pi / 2, 5.0), condition=("x_m",)
@@ -27,15 +27,10 @@ PLACES = (3.0, 0.25, 1.5)
 CEILING = DesignSpace((-1, -1, 1, 0, -math.pi / 2, 0.1), (1, 1, 1, 2 * math.pi, -0.2, 2.5))
 
 
-class SeenTask:
+class SeenTask(MissTask):
     """Percent of rays that return; remembers the returns that it was given."""
 
-    name = "seen"
-    summary = "rays with a return"
-    api_version = 1
-    Config = TaskConfig
     metric = Metric("seen", "%", "higher", worst=0.0, tolerance=1.0)
-    defaults = Defaults()
 
     def __init__(self, places=None):
         self.given = []
@@ -50,18 +45,16 @@ class SeenTask:
 
 def shelves(count, seed):
     """Boxes along the aisle at y = -1."""
-    generator = np.random.default_rng(seed)
+    heights = np.random.default_rng(seed).uniform(0.2, 1.2, (count, 9))
     return [
         Scene(
             tuple(
-                Body(
-                    Box((0.2, 0.1, 0.15)), f"box {i}", poses=rigid(translation_m=(x, -1.0, generator.uniform(0.2, 1.2)))
-                )
-                for i, x in enumerate(np.linspace(-0.4, 3.9, 9))
+                Body(Box((0.2, 0.1, 0.15)), f"box {i}", poses=rigid(translation_m=(x, -1.0, z)))
+                for i, (x, z) in enumerate(zip(np.linspace(-0.4, 3.9, 9), row, strict=True))
             ),
             f"shelf {index}",
         )
-        for index in range(count)
+        for index, row in enumerate(heights)
     ]
 
 
@@ -84,35 +77,28 @@ def upward(name="up", elevation=0.6, weight=1.0, range_m=1.2):
     return Sensor(name, weight, origin, np.zeros((3, 3)), -math.pi / 2, elevation, 0.0, 1e-3, 0.2, range_m, 0.1)
 
 
+BUILT = ("uniform", "random", "bounding", "occupancy")
+
+
 def aisle_request(task, **changes):
-    values = {
-        "task": task,
-        "config": TaskConfig(),
-        "space": AISLE,
-        "seed": 3,
-        "designs": [DesignSpec("cart", (upward(),))],
-        "rays": (6, 10),
-        "baselines": ("uniform", "random", "bounding", "occupancy"),
-        "train": shelves(4, 1),
-        "test": shelves(3, 2),
-    }
-    return EvaluationRequest(**{**values, **changes})
+    scenes = {"train": shelves(4, 1), "test": shelves(3, 2)}
+    values = {"task": task, "space": AISLE, "rays": (6, 10), "baselines": BUILT, **scenes}
+    return make_request([DesignSpec("cart", (upward(),))], **{**values, **changes})
+
+
+def ceiling_request(designs=None, **changes):
+    values = {"task": SeenTask(), "space": CEILING, "seed": 0, "test": carried(2, 4, 2)}
+    return make_request(designs or [DesignSpec("d", ceiling_sensors())], **{**values, **changes})
 
 
 def test_returns_come_condition_by_condition_and_within_each_frame_by_frame():
-    task = SeenTask(PLACES)
+    task, lifts = SeenTask(PLACES), [rigid(translation_m=(0, 0, dz)) for dz in (0.0, 0.1)]
     moving = [
-        replace(
-            scene,
-            bodies=tuple(
-                replace(body, poses=np.stack([rigid(translation_m=(0, 0, dz)) @ body.poses for dz in (0.0, 0.1)]))
-                for body in scene.bodies
-            ),
-        )
+        replace(scene, bodies=tuple(replace(body, poses=np.stack([lift @ body.poses for lift in lifts]))
+                                    for body in scene.bodies))
         for scene in shelves(2, 2)
-    ]
-    request = aisle_request(task, test=moving, rays=(6,), equal_bandwidth=False)
-    evaluate(request)
+    ]  # fmt: skip
+    evaluate(aisle_request(task, test=moving, rays=(6,), equal_bandwidth=False))
     judged = [(scene, returns) for scene, returns in task.given if any(scene is other for other in moving)]
     assert judged
     for _, returns in judged:
@@ -196,13 +182,8 @@ QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 def ceiling_sensors():
     """One that looks straight down, two about azimuth 0, one that is coupled to where its rays start."""
     flat = np.diag([0.04, 0.02, 0.0])
-    coupling = Coupling(
-        np.array([[0.1, 0.3, 0.0], [-0.2, 0.1, 0.0]]),
-        np.array([0.1, -0.1, 0.0]),
-        np.array([0.1, 0.2]),
-        (0.1, 0.1),
-        0.05,
-    )
+    slopes = np.array([[0.1, 0.3, 0.0], [-0.2, 0.1, 0.0]])
+    coupling = Coupling(slopes, np.array([0.1, -0.1, 0.0]), np.array([0.1, 0.2]), (0.1, 0.1), 0.05)
     places = [(0.1, 0.2, 1.0), (-0.6, 0.0, 1.0), (-0.5, 0.1, 1.0), (0.3, -0.4, 1.0)]
     looks = [(0.4, -math.pi / 2), (math.radians(359), -1.0), (math.radians(1), -1.1), (2.0, -1.2)]
     return tuple(
@@ -253,11 +234,7 @@ def test_turning_sensors_and_world_by_a_quarter_changes_no_score():
     found = []
     for designs, test in (((plain, replace(table, name="table")), scenes), (turned, world)):
         designs = [replace(one, name=name) for one, name in zip(designs, ("plain", "table"), strict=True)]
-        request = EvaluationRequest(
-            task=SeenTask(), config=TaskConfig(), space=CEILING, seed=0, designs=designs, rays=(300,),
-            baselines=(), train=(), test=test,
-        )  # fmt: skip
-        found.append(evaluate(request).rows)
+        found.append(evaluate(ceiling_request(designs, rays=(300,), baselines=(), train=(), test=test)).rows)
     for before, after in zip(*found, strict=True):
         assert 5 < before.value < 95
         assert before.bandwidth_mbps == after.bandwidth_mbps
@@ -266,11 +243,7 @@ def test_turning_sensors_and_world_by_a_quarter_changes_no_score():
 
 
 def test_all_baselines_of_moving_scenes_have_free_origins_inside_the_space():
-    request = EvaluationRequest(
-        task=SeenTask(), config=TaskConfig(), space=CEILING, seed=0, designs=[DesignSpec("d", ceiling_sensors())],
-        rays=(50,), baselines=("uniform", "random", "bounding", "occupancy"), train=carried(3, 6, 1),
-        test=carried(2, 4, 2),
-    )  # fmt: skip
+    request = ceiling_request(rays=(50,), baselines=BUILT, train=carried(3, 6, 1))
     rows = {row.design: row for row in evaluate(request).rows}
     assert rows["bounding"].value > rows["uniform"].value
     assert rows["occupancy"].value > 2 * rows["uniform"].value
@@ -289,11 +262,9 @@ def test_a_twin_stands_for_no_visibility_with_as_many_rays():
         points = np.tile([0.0, 0, 1, 0, -1.2, 1], (3, 1))
         return DesignSpec("no-visibility", ceiling_sensors()[:2]), Samples(points, np.zeros(3), np.zeros(3), CEILING)
 
-    request = EvaluationRequest(
-        task=SeenTask(), config=TaskConfig(), space=CEILING, seed=0, designs=[DesignSpec("d", ceiling_sensors())],
-        rays=(40, 80), baselines=("no-visibility",), train=carried(1, 4, 1), test=carried(2, 4, 2),
-        without_visibility=twin,
-    )  # fmt: skip
+    request = ceiling_request(
+        rays=(40, 80), baselines=("no-visibility",), train=carried(1, 4, 1), without_visibility=twin
+    )
     evaluation = evaluate(request)
     assert [(row.design, row.rays, row.baseline) for row in evaluation.rows] == [
         ("d", 40, False), ("d", 80, False), ("no-visibility", 40, True), ("no-visibility", 80, True)

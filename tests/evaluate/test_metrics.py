@@ -18,8 +18,8 @@ from lidardesign.evaluate.metrics import (
     triangle_distance_m,
     visible_surface,
 )
-from lidardesign.geometry.surface import sample_body, sample_triangles
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.geometry.surface import sample_triangles
+from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, angles
 
 STANDARD_ERRORS = 4  # the tolerance of every sampled mean below
@@ -106,12 +106,8 @@ def test_the_reconstruction_does_not_depend_on_the_order_of_returns():
 
 
 def test_the_triangles_of_returns_tile_what_was_seen():
-    points = np.vstack(
-        [directions_around_x(60), [[1, y, z] for y, z in itertools.product((-0.6, 0.6), repeat=2)]]
-    )
-    points = (
-        points / points[:, :1]
-    )  # all on the plane x = 1, whose outermost returns are the corners of a square
+    points = np.vstack([directions_around_x(60), [[1, y, z] for y, z in itertools.product((-0.6, 0.6), repeat=2)]])
+    points = points / points[:, :1]  # all on the plane x = 1, whose outermost returns are the corners of a square
     vertices, faces = delaunay_surface(points, np.zeros(3))
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
@@ -217,46 +213,6 @@ def test_the_spacing_of_rays_is_that_of_their_grid_and_of_different_directions_a
     assert np.isinf(ray_spacing(directions[:1])).all()
 
 
-def test_points_on_a_mesh_are_uniform_in_area_and_repeatable():
-    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 3], [2, 0, 3]])
-    faces = np.array([[0, 1, 2], [0, 3, 4]])  # areas 0.5 and 3
-    points = sample_triangles(vertices, faces, 7000, generator())[0]
-    np.testing.assert_array_equal(points, sample_triangles(vertices, faces, 7000, generator())[0])
-    on_second = points[points[:, 2] > 0]
-    assert len(on_second) == pytest.approx(6000, abs=2)  # places along the area are stratified
-    spread = STANDARD_ERRORS * on_second.std(axis=0) / math.sqrt(len(on_second))
-    np.testing.assert_array_less(np.abs(on_second.mean(axis=0) - [2 / 3, 0, 2]), spread + 1e-9)
-
-
-SHAPES = {
-    "sphere": (Sphere(0.5), lambda p: np.linalg.norm(p, axis=1) - 0.5),
-    "box": (Box((0.1, 0.2, 0.3)), lambda p: (np.abs(p) / [0.1, 0.2, 0.3]).max(axis=1) - 1),
-    "capsule": (
-        Capsule(0.2, 0.4),
-        lambda p: np.linalg.norm(p - np.clip(p * [0, 0, 1], -0.4, 0.4), axis=1) - 0.2,
-    ),
-    "plane": (Plane(), lambda p: p[:, 2]),
-}
-
-
-@pytest.mark.parametrize("name", SHAPES)
-def test_points_on_primitives_lie_on_them(name):
-    shape, distance = SHAPES[name]
-    points = sample_body([Body(shape)], looking_along_minus_x(), 500, generator()).points
-    np.testing.assert_allclose(distance(points), 0, atol=1e-12)
-
-
-def test_the_shares_of_a_capsule_and_a_box_follow_their_areas():
-    count = 20_000
-    capsule = sample_body([Body(Capsule(0.2, 0.4))], looking_along_minus_x(), count, generator()).points
-    box = sample_body([Body(Box((0.1, 0.2, 0.3)))], looking_along_minus_x(), count, generator()).points
-    for share, expected in (
-        ((np.abs(capsule[:, 2]) < 0.4).mean(), 0.4 / 0.6),
-        ((np.abs(np.abs(box[:, 0]) - 0.1) < 1e-12).mean(), 0.06 / 0.11),
-    ):
-        assert abs(share - expected) < STANDARD_ERRORS * math.sqrt(expected * (1 - expected) / count)
-
-
 def test_the_visible_part_of_a_sphere_is_the_cap_that_faces_the_sensor():
     scene = Scene((Body(Sphere(0.5)),))
     points = visible_surface_points(scene, looking_along_minus_x(), 2000, generator())
@@ -286,9 +242,7 @@ def test_angles_and_range_of_the_space_bound_what_counts_as_visible():
 
 def test_what_an_occluder_hides_is_not_visible():
     plate = Body(Box((0.01, 0.5, 1.0)), "plate", "occluder", rigid(translation_m=(1.0, 0.5, 0.0)))
-    points = visible_surface_points(
-        Scene((Body(Sphere(0.5)), plate)), looking_along_minus_x(), 500, generator()
-    )
+    points = visible_surface_points(Scene((Body(Sphere(0.5)), plate)), looking_along_minus_x(), 500, generator())
     assert points[:, 1].max() < 0.01
     hidden = Body(Box((0.01, 2.0, 2.0)), "wall", "occluder", rigid(translation_m=(1.0, 0.0, 0.0)))
     with pytest.raises(DataError, match="no admissible ray sees"):

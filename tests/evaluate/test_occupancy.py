@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidardesign.evaluate.baselines.candidates import RAY_AXES, Spot
-from lidardesign.evaluate.baselines.occupancy import AimedPoints, OccupancyGrid, occupancy, occupancy_grid
+from lidardesign.evaluate.baselines.occupancy import AimedPoints, occupancy, occupancy_grid
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, direction, observed_point
 
@@ -121,13 +121,3 @@ def test_targets_out_of_reach_and_no_scenes_leave_nothing_to_aim_at():
     behind = [Scene((Body(Sphere(0.1), poses=rigid(translation_m=(-3.0, 0, 0))),))]
     assert occupancy(MEASURED, behind, seed=0) is None
     assert occupancy(MEASURED, [], seed=0) is None
-
-
-def test_points_are_drawn_from_cells_in_proportion_to_their_probability():
-    probability = np.zeros((2, 2, 1))
-    probability[0, 0, 0], probability[1, 1, 0] = 0.25, 0.75
-    grid = OccupancyGrid(np.array([1.0, 2.0, 3.0]), 0.5, probability)
-    points = grid.draw(4000, np.random.default_rng(0))
-    assert (grid.at(points) > 0).all()
-    # four standard errors of a share of 4000
-    assert (points[:, 0] > 1.5).mean() == pytest.approx(0.75, abs=4 * math.sqrt(0.75 * 0.25 / 4000))

@@ -101,12 +101,8 @@ def test_only_gates_change(kind):
     before, after = lay_out(design), lay_out(other)
     np.testing.assert_allclose(after.direction, before.direction, atol=1e-12)
     np.testing.assert_array_equal(after.origin_m, before.origin_m)
-    assert (other.name, other.layout, other.rays, len(other.sensors)) == (
-        design.name,
-        design.layout,
-        15,
-        len(design.sensors),
-    )
+    kept = [(one.name, one.layout, one.rays, len(one.sensors)) for one in (design, other)]
+    assert kept[0] == kept[1]
     assert not np.allclose(after.gate_m, before.gate_m)
 
 

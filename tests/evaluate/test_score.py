@@ -3,9 +3,8 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
-from support.scoring import RAYS, MissTask, design, make_request, rows_by_key, scenes
+from support.scoring import RAYS, HitTask, MissTask, design, make_request, rows_by_key, scenes
 from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
@@ -13,16 +12,7 @@ from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.evaluate.results import worse_than_threshold
 from lidardesign.evaluate.score import evaluate
 from lidardesign.space import DesignSpace
-from lidardesign.task import Metric, Score
-
-
-class HitTask(MissTask):
-    """Percent of rays with a return: higher is better."""
-
-    metric = Metric("hits", "%", "higher", worst=0.0, tolerance=1.0)
-
-    def score(self, scene, returns):
-        return Score(100.0 * float(np.mean(returns[0].returned)) if len(returns[0].outcome) else 0.0)
+from lidardesign.task import Score
 
 
 def test_rows_are_designs_then_baselines_at_every_number_of_rays():
@@ -73,9 +63,7 @@ def test_baselines_at_equal_bandwidth_never_exceed_the_design_and_one_more_ray_w
         if row.rays and row.design in ("uniform", "random"):
             assert row.bandwidth_mbps * (row.rays + 1) / row.rays > own.bandwidth_mbps
     keys = {(pair.a, pair.rays, pair.b, pair.rays_b) for pair in evaluation.paired_bandwidth}
-    assert keys == {
-        (row.matched_to, row.matched_rays, row.design, row.rays) for row in evaluation.equal_bandwidth
-    }
+    assert keys == {(row.matched_to, row.matched_rays, row.design, row.rays) for row in evaluation.equal_bandwidth}
     without = evaluate(make_request(equal_bandwidth=False))
     assert not without.equal_bandwidth
     assert not without.paired_bandwidth

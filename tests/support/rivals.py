@@ -1,8 +1,20 @@
-"""Baselines, each at the number of rays or in the bandwidth that a test asks for."""
+"""Baselines, each at the number of rays or in the bandwidth that a test asks for, and scenes for them."""
 
 from __future__ import annotations
 
+import numpy as np
+
 from lidardesign.evaluate.baselines.simple import Baselines
+from lidardesign.scene import Body, Scene, Sphere, rigid
+
+
+def balls(centre, radius=0.4, jitter=0.05, count=3, seed=8):
+    """Scenes of a ball each, about a place."""
+    shifts = np.random.default_rng(seed).normal(0, jitter, (count, 3))
+    return [
+        Scene((Body(Sphere(radius), "ball", "both", rigid(translation_m=centre + shift)),), f"ball {index}")
+        for index, shift in enumerate(shifts)
+    ]
 
 
 class Rivals(Baselines):

@@ -6,9 +6,9 @@ import numpy as np
 
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.evaluate.request import EvaluationRequest
-from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
+from support.rivals import balls
 
 SPACE = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
 
@@ -16,7 +16,7 @@ RAYS = (9, 25)
 
 
 class MissTask:
-    """Percent of rays without a return; fewer than three returns are a failure."""
+    """Percent of rays without a return; too few returns are a failure."""
 
     name = "miss"
     summary = "rays without a return"
@@ -24,6 +24,7 @@ class MissTask:
     Config = TaskConfig
     metric = Metric("misses", "%", "lower", worst=150.0, tolerance=1.0)
     defaults = Defaults()
+    fewest_returns = 3
 
     def space(self, config):
         return SPACE
@@ -33,33 +34,27 @@ class MissTask:
 
     def score(self, scene, returns):
         hit = sum(int(frame.returned.sum()) for frame in returns)
-        if hit < 3:
+        fired = sum(len(frame.outcome) for frame in returns)
+        if hit < self.fewest_returns or not fired:
             return Score(self.metric.worst, failed=True)
-        return Score(100.0 * (1 - hit / sum(len(frame.outcome) for frame in returns)))
+        return Score(100.0 * (1 - hit / fired))
+
+
+class HitTask(MissTask):
+    """Percent of rays with a return: higher is better."""
+
+    metric = Metric("hits", "%", "higher", worst=0.0, tolerance=1.0)
+
+    def score(self, scene, returns):
+        return Score(100.0 * float(np.mean(returns[0].returned)) if len(returns[0].outcome) else 0.0)
 
 
 def scenes(seed, count=6, side=0.0):
-    generator = np.random.default_rng(seed)
-    return [
-        Scene(
-            (
-                Body(
-                    Sphere(0.4),
-                    "ball",
-                    "both",
-                    rigid(translation_m=np.array([3, side, 0]) + generator.normal(0, 0.05, 3)),
-                ),
-            ),
-            f"ball {index}",
-        )
-        for index in range(count)
-    ]
+    return balls(np.array([3, side, 0]), count=count, seed=seed)
 
 
 def design(name="aimed", azimuth=0.0, spread=0.03, range_m=2.65, weight=1.0):
-    sensor = Sensor(
-        "s0", weight, np.zeros(3), np.zeros((3, 3)), azimuth, 0.0, 0.0, spread, spread, range_m, 0.05
-    )
+    sensor = Sensor("s0", weight, np.zeros(3), np.zeros((3, 3)), azimuth, 0.0, 0.0, spread, spread, range_m, 0.05)
     return DesignSpec(name, (sensor,))
 
 
