@@ -17,6 +17,7 @@ import numpy as np
 from common import face_scenes, interleaved, model_option, parser, report
 
 from lidardesign.config import DensitySettings
+from lidardesign.density.target.visibility import NoVisibility
 from lidardesign.evaluate.accuracy.visibility import POINTS, REFERENCE_POINTS, VisibilityCase
 from lidardesign.scene import Body, Box, Scene, rigid
 from lidardesign.space import DesignSpace
@@ -40,7 +41,7 @@ def plate_scenes(count: int) -> tuple[list[Scene], DesignSpace]:
 
 def measure(name: str, case: VisibilityCase, points: tuple[int, ...], rounds: int) -> list[list[object]]:
     """One row per way: its error with the standard error, and milliseconds."""
-    ways = {"off": case.off, "raycast": case.cast}
+    ways = {"off": case.cast.with_visibility(NoVisibility()), "raycast": case.cast}
     ways |= {f"quadrature {count}": case.quadrature(count) for count in points}
     batch = case.probes.points[: case.batch]
     timings = interleaved(

@@ -72,7 +72,7 @@ def make_rays(count=25):
 
 def make_shown(names=("first",)):
     designs = [DesignSpec(name, (make_sensor(),)) for name in names]
-    return scene_figure(BALL, designs, [{}], lambda design, at: design, lambda design, at: make_rays())
+    return scene_figure(BALL, designs, [{}], lambda design, at: make_rays())
 
 
 def make_pictured(names=("first",)):
@@ -234,7 +234,7 @@ def test_planes_are_seen_from_their_front_only():
 def test_a_room_is_cut_open_where_its_walls_hide_the_sensors():
     room = Scene((Body(Box((6.0, 6.0, 6.0)), "room", "both"),), "room")
     design = DesignSpec("inside", (make_sensor(),))
-    shown = scene_figure(room, [design], [{}], lambda design, at: design, lambda design, at: make_rays())
+    shown = scene_figure(room, [design], [{}], lambda design, at: make_rays())
     view = view_of(shown.directions, framed_points(shown, 0, 0))
     image, cut = opened(shown, 0, 0, view, 60)
     assert cut

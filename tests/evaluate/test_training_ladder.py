@@ -23,7 +23,7 @@ from lidardesign.design.fit import fit
 from lidardesign.errors import DataError, NumericalError
 from lidardesign.evaluate.accuracy import sweeps as accuracy
 from lidardesign.evaluate.accuracy import training
-from lidardesign.evaluate.accuracy.probes import AccuracyRequest, run_target
+from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Accuracy
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
@@ -105,7 +105,7 @@ def test_runs_of_other_presets_are_measurements_and_runs_of_other_densities_are_
 
 def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs, sweeps):
     request = request_for(runs)
-    config, target = request.config, run_target(request)
+    config, target = request.config, request.target
     probes = draw_probes(target, 8192, random_generator(99, "others"))
     again = remeasured(runs, config, target, probes, count=8192, seed=99)
     for measurement, reached in zip(sweeps[0].measurements, again, strict=True):
@@ -115,11 +115,11 @@ def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs
 
 def test_a_snapshot_is_measured_as_the_flow_that_was_learned(runs):
     request = request_for(runs)
-    flow = load_flow(runs, "flow.safetensors", request.config, run_target(request), 0)
+    flow = load_flow(runs, "flow.safetensors", request.config, request.target, 0)
     assert next(flow.flow.parameters()).dtype.is_floating_point
     wide = replace(request.config, learning=request.config.learning.model_copy(update={"hidden": 32}))
     with pytest.raises(DataError, match="another flow"):
-        load_flow(runs, "flow.safetensors", wide, run_target(request), 0)
+        load_flow(runs, "flow.safetensors", wide, request.target, 0)
 
 
 def test_seconds_between_rows_of_the_progress_are_interpolated(runs):

@@ -8,7 +8,6 @@ import numpy as np
 
 from lidardesign.design.constraints.check import ConstraintCheck
 from lidardesign.design.constraints.slack import constraint_slack
-from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.evaluate.figures.density_views import density_view
 from lidardesign.evaluate.figures.scene_figure import scene_figure
@@ -91,7 +90,7 @@ def make_shown(name="plain", designs=2, places=PLACES, rays=25, scene=None, **fu
     def laid_out(design, at):
         return moved_to(make_rays(rays, 2, lift=0.05), at)
 
-    return scene_figure(scene or make_scene(name), made, places, placed, laid_out, **further)
+    return scene_figure(scene or make_scene(name), made, places, laid_out, **further)
 
 
 def make_samples(count=4000):

@@ -41,7 +41,6 @@ from lidardesign.evaluate.accuracy.probes import (
     Probes,
     draw_probes,
     few_columns,
-    run_visibility,
 )
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
 from lidardesign.numerics import logsumexp
@@ -67,7 +66,6 @@ class ExactField:
             for body in filter(chosen, scenes[index].bodies)
         ]
         self.columns = len(scene_columns(scenes))
-        self.shell_m = np.zeros(self.columns)
         self._meshes = [entry for entry in entries if isinstance(entry[1].shape, Mesh)]
         others = [entry for entry in entries if not isinstance(entry[1].shape, Mesh)]
         self._others = BodyField(place_bodies(others, self.columns, _no_grid)) if others else None
@@ -116,22 +114,6 @@ def fresh_table(scenes: Sequence[Scene], around: Sequence[Scene], resolution: in
     return TableField(np.stack(columns, axis=1), grid, np.where(unsigned, grid.step, 0.0))
 
 
-def fresh_bodies(scenes: Sequence[Scene], resolution: int, padding_m: float) -> BodyField:
-    """The targets of moving scenes with a grid for each of their meshes, built anew whatever is cached."""
-
-    def build(mesh: Mesh) -> tuple:
-        grid = grid_around(mesh.bounds_m, resolution, padding_m)
-        return grid, distance_grid(mesh, grid)
-
-    entries = [
-        (column, body, frame)
-        for column, (index, frame) in enumerate(scene_columns(scenes))
-        for body in scenes[index].bodies
-        if body.is_target
-    ]
-    return BodyField(place_bodies(entries, len(scene_columns(scenes)), build))
-
-
 def target_meshes(scene: Scene) -> list[Mesh]:
     """The target meshes of a scene at rest, in the world."""
     return [b.shape.transformed(b.pose()) for b in scene.bodies if b.is_target and isinstance(b.shape, Mesh)]
@@ -154,24 +136,13 @@ class InterpolatedField:
         """The same distances, with the coefficients that splines of an order need."""
         from scipy.ndimage import spline_filter
 
-        counts = tuple(table.grid.counts)
         if order < 2:
             return cls(table, order)
         columns = [
-            spline_filter(column.reshape(counts), order, output=np.float32, mode="nearest").ravel()
+            spline_filter(column.reshape(table.grid.counts), order, output=np.float32, mode="nearest").ravel()
             for column in table.table.T
         ]
         return cls(TableField(np.stack(columns, axis=1), table.grid, table.shell_m), order)
-
-    @property
-    def columns(self) -> int:
-        """The number of columns."""
-        return self.table.columns
-
-    @property
-    def shell_m(self) -> np.ndarray:
-        """See `Field`."""
-        return self.table.shell_m
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """See `Field`; a lower bound outside the grid, as that of learning is."""
@@ -242,8 +213,9 @@ class FieldCase:
         field = fresh(few, scenes, settings.field_resolution, settings)
         surfaces = SceneTable(field, -np.log(frames), build_log_weights(few, field))
         way = NoVisibility() if visibility == "off" else surfaces.raycast(few)
-        target = Target(tuple(few), surfaces, way, Optics.of(settings), space, settings.surface_tolerance_nats)
-        target = target.with_visibility(way)
+        target = Target(
+            tuple(few), surfaces, way, Optics.of(settings), space, settings.surface_tolerance_nats
+        ).with_visibility(way)
         probes = draw_probes(target, PROBES, seed, "fields", widening=WIDENING)
         if not len(probes.points):
             return None
@@ -255,8 +227,8 @@ class FieldCase:
 
     def log_density(self, distances: np.ndarray) -> np.ndarray:
         """log p* at the probes from their distances (N, columns)."""
-        surface = self.target.surfaces.terms(self.observed, distances, self.target.optics.sigma_m)
-        return logsumexp(surface + self.log_transmittance, axis=1)
+        terms = self.target.surfaces.terms(self.observed, distances, self.target.optics.sigma_m)
+        return logsumexp(terms + self.log_transmittance, axis=1)
 
     def errors(self, field: Field) -> tuple[float, float, dict[str, float]]:
         """The share of mass in the wrong place, its standard error, and the error of distances near surfaces."""
@@ -274,17 +246,25 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     scenes, config = list(request.request.train), request.config
     if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
         return []
-    visibility = run_visibility(request) or config.density.visibility
+    visibility = request.decided_visibility or config.density.visibility
     case = FieldCase.of(scenes, config.space, config.density, config.seed, visibility)
     if case is None:
         return []
-    found = [resolution_sweep(case)]
-    return [*found, interpolation_sweep(case)] if isinstance(case.target.surfaces.field, TableField) else found
+    ways = [interpolation_sweep] if isinstance(case.target.surfaces.field, TableField) else []
+    return [sweep(case) for sweep in (resolution_sweep, *ways)]
 
 
 def resolution_sweep(case: FieldCase) -> Sweep:
     """Grid points along the longest side of a field, against exact distances."""
-    measurements, left_out = _resolution_measurements(case)
+    own, measurements, left_out = case.settings.field_resolution, [], ""
+    for count in sorted({*RESOLUTIONS, own}):
+        # the time grows like the volume
+        if count > own:
+            last = measurements[-1]
+            if last.seconds * (count / int(last.setting)) ** 3 * len(case.few) > LONGEST_SECONDS:
+                left_out = f"; {count} and more points would take long to measure"
+                break
+        measurements.append(_resolution_measure(case, count))
     return Sweep(
         knob="density.field_resolution",
         error_of=ERROR_OF,
@@ -298,28 +278,13 @@ def resolution_sweep(case: FieldCase) -> Sweep:
     )
 
 
-def _resolution_measurements(case: FieldCase) -> tuple[list[Measurement], str]:
-    """The measurements that do not take too long beyond the run's own, and what the first one that would is called."""
-    measurements: list[Measurement] = []
-    for count in sorted({*RESOLUTIONS, case.settings.field_resolution}):
-        if count > case.settings.field_resolution and _predicted_s(case, measurements[-1], count) > LONGEST_SECONDS:
-            return measurements, f"; {count} and more points would take long to measure"
-        measurements.append(_resolution_measure(case, count))
-    return measurements, ""
-
-
-def _predicted_s(case: FieldCase, last: Measurement, resolution: int) -> float:
-    """What building the fields at a resolution will take, growing like their volume [s]."""
-    return last.seconds * (resolution / int(last.setting)) ** 3 * len(case.few)
-
-
 def _resolution_measure(case: FieldCase, resolution: int) -> Measurement:
     started = time.perf_counter()
     field = fresh(case.few, case.scenes, resolution, case.settings)
     seconds = (time.perf_counter() - started) / len(case.few)
     error, uncertainty, values = case.errors(field)
-    default = resolution == case.settings.field_resolution
-    return Measurement(str(resolution), error, uncertainty, seconds, _bytes(field, case), default, values=values)
+    own = resolution == case.settings.field_resolution
+    return Measurement(str(resolution), error, uncertainty, seconds, _bytes(field, case), own, values=values)
 
 
 def _bytes(field: Field, case: FieldCase) -> int:
@@ -331,8 +296,8 @@ def _bytes(field: Field, case: FieldCase) -> int:
 
 def _meshes(scenes: list[Scene]) -> int:
     """How many different target meshes scenes have."""
-    shapes = (body.shape for scene in scenes for body in scene.bodies if body.is_target)
-    return len({shape.content_hash for shape in shapes if isinstance(shape, Mesh)})
+    bodies = [body for scene in scenes for body in scene.bodies if body.is_target]
+    return len({body.shape.content_hash for body in bodies if isinstance(body.shape, Mesh)})
 
 
 def interpolation_sweep(case: FieldCase) -> Sweep:
@@ -371,7 +336,19 @@ def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: Dens
     bodies = [(scene, body) for scene in scenes for body in scene.bodies if body.is_target]
     if all(isinstance(body.shape, Mesh) and scene.frames == 1 for scene, body in bodies):
         return fresh_table(few, scenes, resolution, padding_m)
-    return fresh_bodies(few, resolution, padding_m)
+
+    def build(mesh: Mesh) -> tuple:
+        grid = grid_around(mesh.bounds_m, resolution, padding_m)
+        return grid, distance_grid(mesh, grid)
+
+    columns = scene_columns(few)
+    entries = [
+        (column, body, frame)
+        for column, (index, frame) in enumerate(columns)
+        for body in few[index].bodies
+        if body.is_target
+    ]
+    return BodyField(place_bodies(entries, len(columns), build))
 
 
 def _part(case: FieldCase, note: str) -> str:
@@ -410,8 +387,7 @@ def fields_within(scenes: list[Scene], config: RunConfig, tolerance: float, *, f
     density = config.density
     if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
         return FieldChoice(density, 0.0)
-    visibility = "off" if density.visibility == "off" else "raycast"
-    case = FieldCase.of(scenes, config.space, density, config.seed, visibility)
+    case = FieldCase.of(scenes, config.space, density, config.seed, density.visibility)
     if case is None:
         return FieldChoice(density, 0.0)
     misplaced = 0.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
-from lidardesign.evaluate.results import Evaluation, Row
+from lidardesign.evaluate.results import Row
 from lidardesign.evaluate.statistics import bootstrap_interval
 from lidardesign.task import random_generator
 
@@ -22,23 +22,22 @@ DRAWS = 32
 
 def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """One sweep: the first design at its largest number of rays against `bounding`; none with fewer than 2 scenes."""
-    pair = _pair(request.evaluation)
-    if pair is None or len(pair[0].per_scene) < 2:
+    rows = request.evaluation.rows
+    first = next((row.design for row in rows if not row.baseline), None)
+    pairs = [
+        (row, rival)
+        for row in rows
+        for rival in rows
+        if row.design == first and rival.design == RIVAL and rival.rays == row.rays
+    ]
+    if not pairs:
         return []
-    design, rival = pair
+    # where designs are closest
+    design, rival = max(pairs, key=lambda pair: pair[0].rays)
+    if len(design.per_scene) < 2:
+        return []
     differences = np.asarray(design.per_scene, dtype=np.float64) - np.asarray(rival.per_scene, dtype=np.float64)
     return [_sweep(differences, design, request)]
-
-
-def _pair(evaluation: Evaluation) -> tuple[Row, Row] | None:
-    """The first design's row at its largest number of rays, where designs are closest, and its rival's."""
-    names = [row.design for row in evaluation.rows if not row.baseline]
-    rows = [row for row in evaluation.rows if names and row.design == names[0]]
-    for row in sorted(rows, key=lambda row: -row.rays):
-        for rival in evaluation.rows:
-            if rival.design == RIVAL and rival.rays == row.rays:
-                return row, rival
-    return None
 
 
 def _sweep(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Sweep:
@@ -46,18 +45,24 @@ def _sweep(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Sw
     # of all rows in all scenes [s]; rows that fire the same rays have one time, to the last bit
     row_seconds = {row.seconds for row in (*request.evaluation.rows, *request.evaluation.equal_bandwidth)}
     seconds = (request.evaluation.planning_seconds + sum(row_seconds)) / total
-    counts = [count for count in COUNTS if count < total]
-    measurements = [_measure(differences, count, seconds, request.request.seed) for count in (*counts, total)]
+    counts = [*(count for count in COUNTS if count < total), total]
+    measurements = [_measure(differences, count, seconds, request.request.seed) for count in counts]
+    # half-widths fall with the root of the number of scenes
+    half_width, tolerance = measurements[-1].error, metric.tolerance
+    note = ""
+    if half_width > tolerance > 0:
+        needed = math.ceil(total * (half_width / tolerance) ** 2)
+        note = f"{needed:,} scenes would tell differences of {tolerance:g} {metric.unit} apart"
     return Sweep(
         knob="held-out scenes",
         error_of=f"half-width of the 95 % interval of {design.design} minus {RIVAL} at {design.rays} rays",
         unit=metric.unit,
         against="all scenes that there could be",
-        tolerance=metric.tolerance,
+        tolerance=tolerance,
         because="the task's own tolerance: smaller differences do not matter to it",
         work="simulating and scoring all rows in so many scenes",
         measurements=measurements,
-        note=_note(measurements[-1].error, metric.tolerance, metric.unit, total),
+        note=note,
     )
 
 
@@ -92,11 +97,3 @@ def relative_error_of_spread(values: np.ndarray) -> float:
     if second == 0:
         return 0.0
     return math.sqrt(max(float(np.mean(centred**4)) / second**2 - 1, 0.0) / (4 * len(values)))
-
-
-def _note(half_width: float, tolerance: float, unit: str, total: int) -> str:
-    """How many scenes the tolerance would take: half-widths fall with the root of their number."""
-    if half_width <= tolerance or tolerance <= 0:
-        return ""
-    needed = math.ceil(total * (half_width / tolerance) ** 2)
-    return f"{needed:,} scenes would tell differences of {tolerance:g} {unit} apart"

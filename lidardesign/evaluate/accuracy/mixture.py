@@ -125,9 +125,8 @@ def _samples(request: AccuracyRequest, design: DesignSpec) -> Samples | None:
     if samples is None or not samples.space.conditioned:
         return samples
     from lidardesign.density.target.prepare import prepare_target
-    from lidardesign.run.manifest import read_manifest
 
-    decided = read_manifest(request.run).get("visibility")
+    decided = request.decided_visibility
     target = prepare_target(request.request.train, request.config, visibility=decided, compiled=False)[0]
     generator = random_generator(request.request.seed, "mixture ladder")
     return at_condition(samples, design.at, target.log_density, MOVED_SAMPLES, generator)

@@ -15,6 +15,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed, with_memory
 from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.geometry.frames import path_windows
 from lidardesign.geometry.raycast import SceneCaster
@@ -51,7 +52,7 @@ class Bench:
         scenes: The scenes.
     """
 
-    request: AccuracyRequest
+    request: EvaluationRequest
     planner: Planner
     positions: Positions
     scenes: Sequence[Scene]
@@ -69,69 +70,52 @@ class Bench:
     @cached_property
     def plans(self) -> list[EffectPlan]:
         """Of every scene."""
-        pairs = zip(self.scenes, self.casters, strict=True)
-        return [self.planner.plan(scene, list(self.positions), casters) for scene, casters in pairs]
+        return [
+            self.planner.plan(scene, list(self.positions), casters)
+            for scene, casters in zip(self.scenes, self.casters, strict=True)
+        ]
 
     def score(self, number: int, effects: frozenset[str], detector: Detector) -> float:
         """The score in a scene under some effects; random numbers are the same whatever the effects."""
-        physics = Physics(detector, effects, self.request.request.seed) if effects else None
-        task, scene = self.request.request.task, self.scenes[number]
-        ((score, _),) = score_lists(task, scene, [self.positions], self.casters[number], physics)
+        physics = Physics(detector, effects, self.request.seed) if effects else None
+        scene, casters = self.scenes[number], self.casters[number]
+        ((score, _),) = score_lists(self.request.task, scene, [self.positions], casters, physics)
         return score.value
 
-    def scores(self, effects: frozenset[str], detector: Detector | None = None) -> np.ndarray:
+    def scores(self, effects: frozenset[str], detector: Detector) -> np.ndarray:
         """The scores in all scenes, shape (S,)."""
-        measuring = detector or self.planner.detector
-        return np.array([self.score(number, effects, measuring) for number in range(len(self.scenes))])
+        return np.array([self.score(number, effects, detector) for number in range(len(self.scenes))])
 
 
 def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """The footprint's sweep where beams have a width, and that of the effects that the scenes have."""
-    if not request.request.designs:
+    asked = request.request
+    if not asked.designs:
         return []
-    design, own = request.request.designs[0], request.request.planner.detector
-    planner = request.request.planner
-    if asks_nothing(own):
+    design, planner, own = asked.designs[0], asked.planner, asked.planner.detector
+    first_hits = own.photons is None and own.bin_s is None and own.divergence_rad == 0 and own.timing_sigma_s == 0
+    if first_hits:
         planner = Planner(load_detector(STAND_IN))
-        planner = replace(planner, tolerance=planner.tolerated.within(request.request.task.metric))
-    count, positions = _rays(request, design)
-    frames = request.request.test[0].frames
-    most = max(RAYS // max(sum(len(rays) for rays in positions) * frames, 1), 1)
-    bench = Bench(request, planner, positions, request.request.test[: min(most, MOST_SCENES)])
+        planner = replace(planner, tolerance=planner.tolerated.within(asked.task.metric))
+    count, positions = _rays(asked, design)
+    most = max(RAYS // max(sum(len(rays) for rays in positions) * asked.test[0].frames, 1), 1)
+    bench = Bench(asked, planner, positions, asked.test[: min(most, MOST_SCENES)])
     several = len(bench.scenes) > 1
     note = f"{design.name} with {count} rays in {len(bench.scenes)} scene{'s' if several else ''}"
     note += "" if several else ", so that differences between scenes are not known"
-    if planner.detector is not own:
+    if first_hits:
         note += f", measured by {STAND_IN}: the detector of this evaluation, {own.name}, asks for nothing"
-        if not _covers_gates(positions, request.request.test[0], planner.detector):
+        try:
+            for rays in positions:
+                check_windows(path_windows(rays, asked.test[0].receiver), planner.detector)
+        except ConfigError:
             return []
-    found = [_footprint(bench, note, own)] if planner.detector.divergence_rad > 0 else []
-    return [*found, *_effects(bench, note, own)]
+    footprint = [_footprint(bench, note, own)] if planner.detector.divergence_rad > 0 else []
+    return [*footprint, *_effects(bench, note, own)]
 
 
-def _covers_gates(positions: Positions, scene: Scene, detector: Detector) -> bool:
-    """Whether a detector's histogram covers the gates of all rays."""
-    try:
-        for rays in positions:
-            check_windows(path_windows(rays, scene.receiver), detector)
-    except ConfigError:
-        return False
-    return True
-
-
-def asks_nothing(detector: Detector) -> bool:
-    """Whether a detector measures exact first hits."""
-    return (
-        detector.photons is None
-        and detector.bin_s is None
-        and detector.divergence_rad == 0
-        and detector.timing_sigma_s == 0
-    )
-
-
-def _rays(request: AccuracyRequest, design: DesignSpec) -> tuple[int, Positions]:
+def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, Positions]:
     """The number of rays that is simulated, and the design's rays."""
-    asked = request.request
     counts = sorted(set(asked.rays))
     with plugin_guard(asked.task.name):
         conditions = conditions_of(asked.task, asked.config, asked.space)
@@ -154,31 +138,20 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
 
 
 def _footprint(bench: Bench, note: str, own: Detector) -> Sweep:
-    detector, metric = bench.planner.detector, bench.request.request.task.metric
+    detector, metric = bench.planner.detector, bench.request.task.metric
     most = MOST_THIN_RAYS // max(bench.rays * len(bench.scenes), 1)
     counts = sorted({count for count in FOOTPRINT_RAYS if count <= max(most, 1)} | {detector.footprint_rays})
-    alone = {
-        count: bench.scores(frozenset({"footprint"}), replace(detector, footprint_rays=count)) for count in counts
-    }
+    changed = {count: replace(detector, footprint_rays=count) for count in counts}
+    alone = {count: bench.scores(frozenset({"footprint"}), other) for count, other in changed.items()}
     planned = bench.plans[0].effects - {"multipath"} | {"footprint"}
     # what is compiled when it is first called is no part of any setting's time
     bench.score(0, planned, detector)
     measurements = []
-    for count in counts:
-        error, uncertainty = _mean(np.abs(alone[count] - alone[counts[-1]]))
-        changed = replace(detector, footprint_rays=count)
-        _, seconds, memory = timed(lambda changed=changed: bench.score(0, planned, changed))
-        measurements.append(
-            Measurement(
-                str(count),
-                error,
-                uncertainty,
-                seconds,
-                memory,
-                default=detector is own and count == detector.footprint_rays,
-                reference=count == counts[-1],
-            )
-        )
+    for count, other in changed.items():
+        errors = _mean(np.abs(alone[count] - alone[counts[-1]]))
+        _, seconds, memory = timed(partial(bench.score, 0, planned, other))
+        default, reference = detector is own and count == detector.footprint_rays, count == counts[-1]
+        measurements.append(Measurement(str(count), *errors, seconds, memory, default, reference))
     return Sweep(
         knob="footprint_rays",
         error_of=f"change of a scene's {metric.name}, of the beams' width alone, mean over scenes",
@@ -202,7 +175,7 @@ def _effects(bench: Bench, note: str, own: Detector) -> list[Sweep]:
         return []
     if dear:
         note += f"; without {', '.join(sorted(dear))}, which take{'s' if len(dear) == 1 else ''} too long here"
-    metric = bench.request.request.task.metric
+    metric = bench.request.task.metric
     return [
         Sweep(
             knob="effects",
@@ -232,19 +205,18 @@ def _passes(bench: Bench, choices: Mapping[str, Sequence[frozenset[str]]]) -> di
 
     One scene after the other under all choices, so that whatever else the machine does slows all alike.
     """
-    found: dict[str, list[tuple[float, float, int | None]]] = {name: [] for name in choices}
+    measured: dict[str, list[tuple[float, float, int | None]]] = {name: [] for name in choices}
     for number in range(len(bench.scenes)):
         for name, choice in choices.items():
             started = time.perf_counter()
             value, memory = with_memory(partial(bench.score, number, choice[number], bench.planner.detector))
-            found[name].append((value, time.perf_counter() - started, memory))
-    return {name: _summed(rows) for name, rows in found.items()}
-
-
-def _summed(rows: Sequence[tuple[float, float, int | None]]) -> _Pass:
-    values, seconds, memory = zip(*rows, strict=True)
-    known = [size for size in memory if size is not None]
-    return _Pass(np.array(values), float(np.median(seconds)), max(known, default=None))
+            measured[name].append((value, time.perf_counter() - started, memory))
+    passes = {}
+    for name, rows in measured.items():
+        values, seconds, memories = zip(*rows, strict=True)
+        most = max((size for size in memories if size is not None), default=None)
+        passes[name] = _Pass(np.array(values), float(np.median(seconds)), most)
+    return passes
 
 
 def _effect_measurements(bench: Bench, there: Sequence[str], *, marks: bool) -> list[Measurement]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -30,6 +30,7 @@ FRAMES_OF_FEW = 4
 # Few draws at a time: each call chooses from candidates of its own, which many draws would exhaust.
 DRAWN_AT_ONCE = 4096
 
+
 @dataclass(frozen=True, eq=False)
 class AccuracyRequest:
     """What sweeps are measured on.
@@ -46,8 +47,15 @@ class AccuracyRequest:
     request: EvaluationRequest
     evaluation: Evaluation
 
+    @cached_property
+    def target(self) -> Target:
+        """The target of all training scenes as the run learned it."""
+        return prepare_target(list(self.request.train), self.config, visibility=self.decided_visibility)[0]
 
-_TARGETS: WeakKeyDictionary[AccuracyRequest, Target] = WeakKeyDictionary()
+    @property
+    def decided_visibility(self) -> str | None:
+        """What the run's own probe decided; None where it left no word of it."""
+        return read_manifest(self.run).get("visibility")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,20 +103,6 @@ def draw_probes(target: Target, count: int, seed: int, label: str, *, widening: 
     order = np.argsort(first)
     first, times = first[order], times[order]
     return Probes(points[first], log_proposal[first] - np.log(times))
-
-
-def run_target(request: AccuracyRequest) -> Target:
-    """The target of all training scenes as the run learned it, built once per request."""
-    if request not in _TARGETS:
-        _TARGETS[request] = prepare_target(
-            list(request.request.train), request.config, visibility=run_visibility(request)
-        )[0]
-    return _TARGETS[request]
-
-
-def run_visibility(request: AccuracyRequest) -> str | None:
-    """What the run's own probe decided; None where it left no word of it."""
-    return read_manifest(request.run).get("visibility")
 
 
 def few_columns(scenes: Sequence[Scene], most: int) -> list[Scene]:

@@ -88,19 +88,20 @@ class Sweep:
         What the run does already stays where it is inside the tolerance and nothing there is cheaper by more than can
         be told. Where no measurement is inside the tolerance, the most accurate one.
         """
-        inside = [
-            measurement
-            for measurement in self.measurements
-            if measurement.error + measurement.uncertainty <= self.tolerance
-        ]
+        inside = [one for one in self.measurements if one.error + one.uncertainty <= self.tolerance]
         if not inside:
-            return min(self.measurements, key=lambda measurement: (measurement.error, measurement.seconds))
-        least = min(measurement.seconds for measurement in inside)
-        cheap = [measurement for measurement in inside if measurement.seconds <= SAME_COST * least]
-        found = min(cheap, key=lambda measurement: (not measurement.default, measurement.error, measurement.seconds))
-        return next(
-            (measurement for measurement in inside if measurement.default and _no_worse(measurement, found)), found
+            return min(self.measurements, key=lambda one: (one.error, one.seconds))
+        least = min(one.seconds for one in inside)
+        cheap = [one for one in inside if one.seconds <= SAME_COST * least]
+        best = min(cheap, key=lambda one: (not one.default, one.error, one.seconds))
+        no_worse = (
+            one
+            for one in inside
+            if one.default
+            and one.seconds <= SAME_COST * best.seconds
+            and one.error - best.error <= _sure_difference(one, best)
         )
+        return next(no_worse, best)
 
     @property
     def default(self) -> Measurement | None:
@@ -116,8 +117,7 @@ class Sweep:
     @property
     def verdict(self) -> str:
         """How the chosen setting compares with the run's own, in one line; whether chance had a part in it."""
-        chance = "" if self.falls else "; but errors do not fall here: by chance, perhaps"
-        return self._comparison + chance
+        return self._comparison + ("" if self.falls else "; but errors do not fall here: by chance, perhaps")
 
     @property
     def _comparison(self) -> str:
@@ -128,10 +128,10 @@ class Sweep:
             return f"{chosen.setting} suffices"
         if chosen is default:
             return f"{chosen.setting}, the setting of this run, is the one to choose"
-        ratio = default.seconds / max(chosen.seconds, TINY)
         if default.error + default.uncertainty > self.tolerance:
             verdict = "is needed" if chosen.seconds > default.seconds else "is good enough"
             return f"{chosen.setting} {verdict}: {default.setting}, as this run has it, may be outside the tolerance"
+        ratio = default.seconds / max(chosen.seconds, TINY)
         if ratio <= SAME_COST:
             return f"{chosen.setting} costs the same as {default.setting}, the setting of this run, and errs less"
         return f"{chosen.setting} suffices, {ratio:.2g} times cheaper than {default.setting}, the setting of this run"
@@ -170,13 +170,6 @@ class Accuracy:
         return [row for sweep in self.sweeps for row in sweep.as_rows()]
 
 
-def _no_worse(measurement: Measurement, other: Measurement) -> bool:
-    """Whether a measurement costs the same as another one, or less, and errs no more, as far as can be told."""
-    return measurement.seconds <= SAME_COST * other.seconds and measurement.error - other.error <= _sure_difference(
-        measurement, other
-    )
-
-
 def _sure_difference(first: Measurement, second: Measurement) -> float:
     """Errors of two measurements that differ by less than this do not differ."""
     return STANDARD_ERRORS * math.hypot(first.uncertainty, second.uncertainty)
@@ -205,17 +198,13 @@ def with_memory(call: Callable[[], Value]) -> tuple[Value, int | None]:
 
     None where the system does not tell (it does on Linux).
     """
-    before = _resident("VmRSS") if _peak_was_reset() else None
-    value = call()
-    peak = None if before is None else _resident("VmHWM")
-    return value, None if before is None or peak is None else max(peak - before, 0)
-
-
-def _peak_was_reset() -> bool:
+    before = None
     with contextlib.suppress(OSError):
         _CLEAR.write_text("5", encoding="ascii")
-        return True
-    return False
+        before = _resident("VmRSS")
+    value = call()
+    peak = None if before is None else _resident("VmHWM")
+    return value, None if peak is None else max(peak - before, 0)
 
 
 def _resident(name: str) -> int | None:

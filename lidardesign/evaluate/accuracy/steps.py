@@ -22,7 +22,7 @@ from lidardesign.density.learned import (
 )
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
-from lidardesign.evaluate.accuracy.probes import AccuracyRequest, draw_probes, run_target
+from lidardesign.evaluate.accuracy.probes import AccuracyRequest, draw_probes
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
 from lidardesign.task import random_generator
 
@@ -44,21 +44,17 @@ def dtype_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
 
 
 def run_steps(request: AccuracyRequest) -> LearningSteps | None:
-    """The steps of a run's learning, at the flow that it learned; None where no probe reaches a surface."""
-    if request not in _STEPS:
-        _STEPS[request] = _steps(request)
-    return _STEPS[request]
-
-
-def _steps(request: AccuracyRequest) -> LearningSteps | None:
-    target, config = run_target(request), request.config
+    """The steps of a run's learning at the flow that it learned, made once; None where no probe reaches a surface."""
+    if request in _STEPS:
+        return _STEPS[request]
+    target, config, steps = request.target, request.config, None
     probes = draw_probes(target, POOL, config.seed, "steps")
-    if not len(probes.points):
-        return None
-    unit = config.space.to_unit(probes.points)
-    pool = Pool.of(unit, target.log_density(probes.points), probes.log_proposal)
-    flow = load_flow(request.run, FLOW, config, target, config.seed).flow
-    return LearningSteps(flow, target, config.learning, pool)
+    if len(probes.points):
+        unit = config.space.to_unit(probes.points)
+        pool = Pool.of(unit, target.log_density(probes.points), probes.log_proposal)
+        flow = load_flow(request.run, FLOW, config, target, config.seed).flow
+        steps = LearningSteps(flow, target, config.learning, pool)
+    return _STEPS.setdefault(request, steps)
 
 
 def dtype_sweep(steps: LearningSteps, seed: int) -> Sweep:
@@ -88,7 +84,11 @@ def _gradients(dtype: str, steps: LearningSteps, loss: Loss, seed: int) -> list[
 
 
 def _dtype_measure(
-    dtype: str, steps: LearningSteps, kinds: dict[str, Loss], exact: dict[str, list[np.ndarray]], drawn: FlowSamples,
+    dtype: str,
+    steps: LearningSteps,
+    kinds: dict[str, Loss],
+    exact: dict[str, list[np.ndarray]],
+    drawn: FlowSamples,
     seed: int,
 ) -> Measurement:
     flow, alone = in_arithmetic(steps.flow, dtype), steps.without_target()
@@ -98,21 +98,15 @@ def _dtype_measure(
     if dtype == "float64":
         return Measurement(dtype, 0.0, 0.0, seconds, memory, default, reference=True, values=values)
     found = {name: noise_shares(_gradients(dtype, steps, loss, seed), exact[name]) for name, loss in kinds.items()}
+    medians = []
     for name, shares in found.items():
+        middle = float(np.median(shares))
         # a leaked sample near a silhouette has a gradient without bounds, which any rounding may turn over
-        values |= {
-            f"{name}_error": float(np.median(shares)),
-            f"{name}_beyond": float((shares > DTYPE_TOLERANCE).mean()),
-        }
-    error, uncertainty = max(_median(shares) for shares in found.values())
-    return Measurement(dtype, error, uncertainty, seconds, memory, default, values=values)
-
-
-def _median(values: np.ndarray) -> tuple[float, float]:
-    """The median, and its standard error from the median deviation as for normal values."""
-    middle = float(np.median(values))
-    deviation = MEDIAN_DEVIATION * float(np.median(np.abs(values - middle)))
-    return middle, MEDIAN_ERROR * deviation / math.sqrt(len(values))
+        values |= {f"{name}_error": middle, f"{name}_beyond": float((shares > DTYPE_TOLERANCE).mean())}
+        # the standard error from the median deviation, as for normal values
+        deviation = MEDIAN_DEVIATION * float(np.median(np.abs(shares - middle)))
+        medians.append((middle, MEDIAN_ERROR * deviation / math.sqrt(len(shares))))
+    return Measurement(dtype, *max(medians), seconds, memory, default, values=values)
 
 
 def _densities(dtype: str, steps: LearningSteps, drawn: FlowSamples) -> dict[str, float]:
@@ -146,13 +140,9 @@ def frames_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
 
 def frames_sweep(steps: LearningSteps, seed: int) -> Sweep:
     """The error of a path-wise step's gradient when a few scenes and frames, drawn anew each time, stand for all."""
-    steps_flow = in_arithmetic(steps.flow, steps.settings.dtype)
-    seeds = range(seed, seed + FRAMES_BATCHES)
-    exact = [gradient(steps_flow, steps.pathwise(), number, steps.settings.clip_norm) for number in seeds]
-    default = min(steps.settings.frames, steps.target.columns)
-    measurements = [
-        _frames_measure(count, steps, exact, seeds, default) for count in counts(steps.target.columns, default)
-    ]
+    flow, columns = in_arithmetic(steps.flow, steps.settings.dtype), steps.target.columns
+    seeds, default = range(seed, seed + FRAMES_BATCHES), min(steps.settings.frames, columns)
+    exact = [gradient(flow, steps.pathwise(), number, steps.settings.clip_norm) for number in seeds]
     return Sweep(
         knob="learning.frames",
         error_of="error of a step's gradient beside the noise of its batch",
@@ -161,7 +151,7 @@ def frames_sweep(steps: LearningSteps, seed: int) -> Sweep:
         tolerance=FRAMES_TOLERANCE,
         because="it adds a quarter to the variance that gradients have anyway, as a batch a fifth smaller would",
         work=f"the gradient of a path-wise step of {steps.settings.batch} design points",
-        measurements=measurements,
+        measurements=[_frames_measure(count, steps, exact, seeds, default) for count in counts(columns, default)],
         note=f"at sigma {steps.sigma_m:.3g} m, the middle of the annealing",
     )
 
@@ -186,5 +176,4 @@ def _frames_measure(
     if count == columns:
         return Measurement(str(count), 0.0, 0.0, seconds, memory, default == count, reference=True)
     found = [np.stack([drawn(number) for _ in range(DRAWS)]) for number in seeds]
-    error, uncertainty = noise_share(found, exact)
-    return Measurement(str(count), error, uncertainty, seconds, memory, default == count)
+    return Measurement(str(count), *noise_share(found, exact), seconds, memory, default == count)

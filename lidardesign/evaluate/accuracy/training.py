@@ -20,15 +20,13 @@ from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import LidardesignError
 from lidardesign.estimates import Estimate
-from lidardesign.evaluate.accuracy.probes import ERROR_OF, AccuracyRequest, run_target
+from lidardesign.evaluate.accuracy.probes import ERROR_OF, AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
 from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.evaluate.scene_scores import score_lists
-from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.registry import plugin_guard
 from lidardesign.run.manifest import read_manifest, verify
 from lidardesign.samples import Samples
-from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import conditions_of, random_generator
 
@@ -42,35 +40,28 @@ BECAUSE = (
 # A quick fit shows what a density's errors are worth in the metric; a careful one would take the sweep's time.
 SCORED_SCENES = 8
 RESTARTS = 2
-STEPS_NOTE = (
-    "fewer steps are what this run had reached then, on its way; a run that is planned for as many does better"
-)
+STEPS_NOTE = "fewer steps are what this run had reached then, on its way; a run that is planned for as many does better"
 
 
 def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """The run's own snapshots; the stages of a tolerance, and runs of other presets beside it, where there are any."""
-    seed, target = request.config.seed, run_target(request)
-    generator = random_generator(seed, "accuracy", "training")
-    probes = draw_probes(target, PROBES, generator)
+    seed, target = request.config.seed, request.target
+    probes = draw_probes(target, PROBES, random_generator(seed, "accuracy", "training"))
     reached = remeasured(request.run, request.config, target, probes, count=SAMPLES, seed=seed)
-    found = [_steps_sweep(request, reached), *_stages_sweep(request)]
-    return [*found, *_preset_sweep(request, reached[-1], target, probes)]
+    by_steps = _steps_sweep(request, reached)
+    return [by_steps, *_stages_sweep(request), *_preset_sweep(request, reached[-1], target, probes)]
 
 
 def _steps_sweep(request: AccuracyRequest, reached: Sequence[SnapshotQuality]) -> Sweep:
     judge = _Judge(request, reached[-1].samples)
     scores = [judge.scores(one.samples) for one in reached]
-    measurements = [
-        _measure(str(one.step), _around(one), one.seconds, judge.values(own, scores[-1]), default=one is reached[-1])
-        for one, own in zip(reached, scores, strict=True)
-    ]
-    notes = [STEPS_NOTE] if len(measurements) > 1 else ["this run kept no snapshots; learned again, it keeps some"]
-    return _sweep("learning.steps", "learning up to there", measurements, "; ".join([*notes, *judge.notes]))
-
-
-def _around(reached: SnapshotQuality) -> dict[str, Estimate]:
-    """The figures of a measurement, its error with the jitter from step to step."""
-    return {**reached.estimates, "misplaced": reached.misplaced}
+    measurements = []
+    for one, own in zip(reached, scores, strict=True):
+        # the error with the jitter from step to step
+        figures, further = {**one.estimates, "misplaced": one.misplaced}, judge.values(own, scores[-1])
+        measurements.append(_measure(str(one.step), figures, one.seconds, further, default=one is reached[-1]))
+    note = STEPS_NOTE if len(measurements) > 1 else "this run kept no snapshots; learned again, it keeps some"
+    return _sweep("learning.steps", "learning up to there", measurements, note + judge.note)
 
 
 def _stages_sweep(request: AccuracyRequest) -> Sequence[Sweep]:
@@ -97,9 +88,8 @@ def _preset_sweep(
         return []
     measurements.append(_measure(config.preset, own.estimates, seconds, {}, default=True))
     measurements.sort(key=lambda measurement: PRESETS.index(measurement.setting))
-    return [
-        _sweep("preset", "the whole of learn", measurements, "runs of the same task, space and density beside this one")
-    ]
+    note = "runs of the same task, space and density beside this one"
+    return [_sweep("preset", "the whole of learn", measurements, note)]
 
 
 def _measurement_beside(
@@ -142,8 +132,8 @@ def _config_of(folder: Path) -> RunConfig | None:
 
 def _seconds(run: Path) -> float | None:
     """What the whole of learn took [s]; None where the manifest has no word of it."""
-    found = (read_manifest(run).get("learn") or {}).get("seconds")
-    return float(found) if isinstance(found, float | int) else None
+    seconds = (read_manifest(run).get("learn") or {}).get("seconds")
+    return float(seconds) if isinstance(seconds, float | int) else None
 
 
 def _measure(
@@ -176,7 +166,7 @@ class _Judge:
 
     def __init__(self, request: AccuracyRequest, samples: Samples) -> None:
         asked = self._asked = request.request
-        self._retarget = run_target(request).log_density
+        self._retarget = request.target.log_density
         self._rays = sorted(asked.rays)[len(asked.rays) // 2]
         with plugin_guard(asked.task.name):
             self._conditions = conditions_of(asked.task, asked.config, asked.space)
@@ -185,19 +175,23 @@ class _Judge:
         self._scenes = [(scene, build_casters(scene)) for scene in asked.test[:SCORED_SCENES]] if self._design else []
 
     @property
-    def notes(self) -> list[str]:
-        """What the scores are of."""
+    def note(self) -> str:
+        """What the scores are of, to follow another note."""
         if self._design is None:
-            return []
-        scored = f"scores of quick fits like {self._design.name} with {self._rays} rays on {len(self._scenes)} scenes"
-        return [scored]
+            return ""
+        return f"; scores of quick fits like {self._design.name} with {self._rays} rays on {len(self._scenes)} scenes"
 
     def scores(self, samples: Samples) -> np.ndarray | None:
         """Per scene; None where the samples carry no such design."""
         positions = self._laid_out(self._design, samples) if self._design else None
         if positions is None:
             return None
-        return np.array([self._score(scene, casters, positions) for scene, casters in self._scenes])
+        planner, scores = self._asked.planner, []
+        for scene, casters in self._scenes:
+            physics = planner.physics(planner.plan(scene, list(positions), casters), self._asked.seed)
+            ((score, _),) = score_lists(self._asked.task, scene, [positions], casters, physics)
+            scores.append(score.value)
+        return np.array(scores)
 
     def values(self, scores: np.ndarray | None, last: np.ndarray | None) -> dict[str, float]:
         """The mean score, and its standard error beside the last measurement's, on the same scenes."""
@@ -212,25 +206,16 @@ class _Judge:
     def _laid_out(self, design: DesignSpec, samples: Samples) -> Positions | None:
         """The rays of a quick fit; None where its constraints fix other rays, or the samples are too few for it."""
         try:
-            found = self._fitted(design, samples)
-            return tuple(self._asked.lay_out(found, self._rays, samples, at=place) for place in self._conditions)
+            is_open = design.ray_table is None and layout_of(design).leaves_rays_open(design.gates)
+            fitted = fit_like(
+                design,
+                samples,
+                rays=None if is_open else self._rays,
+                seed=self._asked.seed,
+                restarts=RESTARTS,
+                em_samples=4000,
+                retarget=self._retarget,
+            )
+            return tuple(self._asked.lay_out(fitted, self._rays, samples, at=place) for place in self._conditions)
         except LidardesignError:
             return None
-
-    def _fitted(self, design: DesignSpec, samples: Samples) -> DesignSpec:
-        is_open = design.ray_table is None and layout_of(design).leaves_rays_open(design.gates)
-        return fit_like(
-            design,
-            samples,
-            rays=None if is_open else self._rays,
-            seed=self._asked.seed,
-            restarts=RESTARTS,
-            em_samples=4000,
-            retarget=self._retarget,
-        )
-
-    def _score(self, scene: Scene, casters: Sequence[SceneCaster], positions: Positions) -> float:
-        planner = self._asked.planner
-        physics = planner.physics(planner.plan(scene, list(positions), casters), self._asked.seed)
-        ((score, _),) = score_lists(self._asked.task, scene, [positions], casters, physics)
-        return score.value

@@ -34,8 +34,6 @@ from lidardesign.evaluate.accuracy.probes import (
     Probes,
     draw_probes,
     few_columns,
-    run_target,
-    run_visibility,
 )
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
 from lidardesign.scene import Mesh, Scene
@@ -95,16 +93,12 @@ class VisibilityCase:
     """Scenes and what visibility is measured on there.
 
     Arguments:
-        scenes: What p* is the density of.
-        off, cast: The target without visibility and with ray casting.
-        integrated: The target with quadrature.
+        cast, integrated: The target with ray casting and with quadrature.
         probes: Points that know nothing of the flow.
         few: How many of these a quadrature is evaluated at.
         batch: How many of them are timed.
     """
 
-    scenes: list[Scene]
-    off: Target
     cast: Target
     integrated: Target
     probes: Probes
@@ -122,14 +116,13 @@ class VisibilityCase:
             space: The design space.
             settings: Of the density.
             seed: The root of the probes.
-                batch: The number of points that is timed, fewer where bodies are evaluated one by one.
+            batch: The number of points that is timed, fewer where bodies are evaluated one by one.
         """
         cast = build_target(scenes, space, settings, "raycast")
-        off = cast.with_visibility(NoVisibility())
         integrated = build_target(scenes, space, settings, "quadrature")
         shared = isinstance(integrated.visibility.one_way.field, TableField)
         few, batch = (TABLE_PROBES, batch) if shared else (BODY_PROBES, min(BODY_BATCH, batch))
-        return cls(scenes, off, cast, integrated, draw_probes(cast, PROBES, seed, "visibility"), few, batch)
+        return cls(cast, integrated, draw_probes(cast, PROBES, seed, "visibility"), few, batch)
 
     @cached_property
     def exact(self) -> np.ndarray:
@@ -150,8 +143,8 @@ class VisibilityCase:
         probes, batch = self.probes.first(len(exact)), self.probes.points[: self.batch]
         target.log_density_and_gradient(batch[:WARM_UP_PROBES])
         _, seconds, memory = timed(lambda: target.log_density_and_gradient(batch))
-        error, uncertainty = probes.misplaced(target.log_density(probes.points), exact)
-        return Measurement(setting, error, uncertainty, seconds, memory, default=default)
+        errors = probes.misplaced(target.log_density(probes.points), exact)
+        return Measurement(setting, *errors, seconds, memory, default=default)
 
     @property
     def work(self) -> str:
@@ -168,11 +161,11 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
         return []
     default, points = _own_setting(request)
     part = _part(few, scenes)
-    unused = "" if default == "quadrature" else f"this run's visibility is {default}"
-    return [
-        replace(visibility_sweep(case, points, default), note=part),
-        replace(points_sweep(case, points if default == "quadrature" else None), note=_joined(unused, part)),
-    ]
+    by_ways = replace(visibility_sweep(case, points, default), note=part)
+    if default == "quadrature":
+        return [by_ways, replace(points_sweep(case, points), note=part)]
+    note = f"this run's visibility is {default}" + (f"; {part}" if part else "")
+    return [by_ways, replace(points_sweep(case, None), note=note)]
 
 
 def visibility_sweep(case: VisibilityCase, points: int, default: str) -> Sweep:
@@ -183,28 +176,27 @@ def visibility_sweep(case: VisibilityCase, points: int, default: str) -> Sweep:
         points: Of the quadrature.
         default: off, quadrature or raycast: what the run uses.
     """
-    exact, quadrature = case.exact, case.quadrature(points)
-    measurements = [
-        case.measure("off", case.off, exact, default=default == "off"),
-        case.measure("quadrature", quadrature, exact[: case.few], default=default == "quadrature"),
-        case.measure("raycast", case.cast, exact, default=default == "raycast"),
-    ]
+    exact = case.exact
+    ways = {
+        "off": (case.cast.with_visibility(NoVisibility()), exact),
+        "quadrature": (case.quadrature(points), exact[: case.few]),
+        "raycast": (case.cast, exact),
+    }
     return Sweep(
-        "density.visibility",
-        ERROR_OF,
-        "",
-        "opaque geometry, by exact first hits",
-        TOLERANCE,
-        BECAUSE,
-        case.work,
-        measurements,
+        knob="density.visibility",
+        error_of=ERROR_OF,
+        unit="",
+        against="opaque geometry, by exact first hits",
+        tolerance=TOLERANCE,
+        because=BECAUSE,
+        work=case.work,
+        measurements=[case.measure(name, *way, default=name == default) for name, way in ways.items()],
     )
 
 
 def points_sweep(case: VisibilityCase, default: int | None) -> Sweep:
     """Midpoints of the quadrature against many of them; `default` is what the run uses, None without quadrature."""
-    probes = case.probes.first(case.few).points
-    exact = case.quadrature(REFERENCE_POINTS).log_density(probes)
+    exact = case.quadrature(REFERENCE_POINTS).log_density(case.probes.first(case.few).points)
     measurements = [
         case.measure(str(count), case.quadrature(count), exact, default=count == default)
         for count in sorted({*POINTS, *([default] if default else [])})
@@ -229,22 +221,17 @@ def _part(few: list[Scene], scenes: list[Scene]) -> str:
     return f"measured on {len(few)} of {len(scenes)} training scenes{frames}"
 
 
-def _joined(*notes: str) -> str:
-    return "; ".join(note for note in notes if note)
-
-
 def affordable_scenes(scenes: list[Scene]) -> list[Scene]:
     """All scenes where their occluders share a table, else as many as a fine quadrature can evaluate."""
-    occluders = [body for scene in scenes for body in scene.bodies if body.is_occluder]
-    if all(isinstance(body.shape, Mesh) and body.poses.ndim == 2 for body in occluders):
+    occluders = [[body for body in scene.bodies if body.is_occluder] for scene in scenes]
+    if all(isinstance(body.shape, Mesh) and body.poses.ndim == 2 for bodies in occluders for body in bodies):
         return scenes
-    per_column = max(sum(body.is_occluder for body in scene.bodies) for scene in scenes)
+    per_column = max(map(len, occluders))
     return few_columns(scenes, max(MOST_BODIES // max(per_column, 1), 1))
 
 
 def _own_setting(request: AccuracyRequest) -> tuple[str, int]:
     """What the run's probe decided, and the points of its quadrature, refined as they were."""
-    name = run_visibility(request) or request.config.density.visibility
-    if name != "quadrature":
-        return name, request.config.density.quadrature_points
-    return name, run_target(request).visibility.one_way.points
+    density = request.config.density
+    name = request.decided_visibility or density.visibility
+    return name, request.target.visibility.one_way.points if name == "quadrature" else density.quadrature_points

@@ -109,25 +109,17 @@ def plain_axes(axes: Axes, *, grid: str | None = "both") -> None:
         axes.grid(True, axis=grid, which="major", color=GRID, linewidth=0.6)
 
 
-def label_ticks(axis: Any, at: Sequence[float] | None) -> None:
-    """Plain numbers instead of powers of ten; at the given places where there are any."""
+def label_ticks(axis: Any, at: Sequence[float] | None = None, *, fine: bool = False) -> None:
+    """Plain numbers at powers of ten; at the given places where there are any, at 1, 2 and 5 where `fine`."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
     if at is not None:
         axis.set_major_locator(FixedLocator(at))
         axis.set_minor_locator(NullLocator())
-    else:
+    elif fine:
         axis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0)))
-        axis.set_minor_formatter(NullFormatter())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-
-
-def label_powers(axis: Any) -> None:
-    """Plain numbers at powers of ten alone."""
-    from matplotlib.ticker import FuncFormatter, NullFormatter
-
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def plain_label(text: str, longest: int = 28) -> str:
@@ -172,22 +164,16 @@ class Series:
 
 def series(evaluation: Evaluation) -> list[Series]:
     """One series per name, in the order of the rows."""
-    found: list[Series] = []
+    curves: list[Series] = []
     for name in dict.fromkeys(row.design for row in evaluation.rows):
         rows = tuple(sorted((row for row in evaluation.rows if row.design == name), key=lambda row: row.rays))
-        kind = sum(other.baseline == rows[0].baseline for other in found)
-        found.append(_styled(name, rows, kind))
-    return found
-
-
-def _styled(name: str, rows: tuple[Row, ...], index: int) -> Series:
-    if rows[0].baseline:
-        grey, marker = GREYS[index % len(GREYS)], BASELINE_MARKERS[index % len(BASELINE_MARKERS)]
-        return Series(name, rows, grey, marker, DASHES[1 + index % (len(DASHES) - 1)], baseline=True)
-    dash = DASHES[index // len(COLOURS) % len(DASHES)]
-    return Series(
-        name, rows, COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)], dash, baseline=False
-    )
+        baseline = rows[0].baseline
+        index = sum(other.baseline == baseline for other in curves)
+        colours, markers = (GREYS, BASELINE_MARKERS) if baseline else (COLOURS, MARKERS)
+        turn = 1 + index % (len(DASHES) - 1) if baseline else index // len(COLOURS) % len(DASHES)
+        colour, marker = colours[index % len(colours)], markers[index % len(markers)]
+        curves.append(Series(name, rows, colour, marker, DASHES[turn], baseline))
+    return curves
 
 
 def position(row: Row, against: Against) -> float:
@@ -213,5 +199,5 @@ def log_ticks(values: Sequence[float]) -> list[float]:
 def axis_titles(evaluation: Evaluation, against: Against) -> tuple[str, str]:
     """Titles of the horizontal and the vertical axis, with their units."""
     metric = evaluation.metric
-    across = "rays" if against == "rays" else "bandwidth [Mbit/s]"
-    return across, f"{metric.name} [{metric.unit}], {metric.better} is better"
+    up = f"{metric.name} [{metric.unit}], {metric.better} is better"
+    return ("rays" if against == "rays" else "bandwidth [Mbit/s]"), up

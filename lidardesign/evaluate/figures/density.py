@@ -22,7 +22,6 @@ from lidardesign.evaluate.figures.density_views import DensityView, Marginal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
 COLUMNS = 3
@@ -74,45 +73,45 @@ def _draw_marginal(axes: Axes, marginal: Marginal) -> None:
             baseline=None,
             label=plain_label(name),
         )
-    axes.set_xlim(marginal.edges[0], marginal.edges[-1])
-    axes.set_ylim(0.0, marginal.top)
-    axes.set_xlabel(marginal.label)
-    axes.set_ylabel(marginal.unit)
+    axes.set(xlim=(marginal.edges[0], marginal.edges[-1]), ylim=(0.0, marginal.top))
+    axes.set(xlabel=marginal.label, ylabel=marginal.unit)
     plain_axes(axes, grid=None)
 
 
 def field_picture(view: DensityView) -> Figure:
     """Where in space the density looks, over what the scene covers, a page wide; one panel per plane."""
+    from matplotlib.colors import LinearSegmentedColormap, to_rgb
+
     # width over height
     places, height = panel_places([float(np.ptp(plane.edges[0]) / np.ptp(plane.edges[1])) for plane in view.planes])
     figure = new_figure(PAGE_INCHES, height)
     # panels keep their shape: where they are is known, and nothing is left to lay out
     figure.set_layout_engine("none")
     for plane, (left, bottom, width, tall) in zip(view.planes, places, strict=True):
-        size = (left / PAGE_INCHES, bottom / height, width / PAGE_INCHES, tall / height)
-        axes = figure.add_axes(size)
+        axes = figure.add_axes((left / PAGE_INCHES, bottom / height, width / PAGE_INCHES, tall / height))
         across, up = plane.edges
         extent = (across[0], across[-1], up[0], up[-1])
         # cells coloured by what covers them
-        from matplotlib.colors import to_rgb
-
         colours = np.ones((*plane.targets.shape, 3))
         colours[plane.others] = to_rgb(OTHER)
         colours[plane.targets] = to_rgb(TARGET)
-        axes.imshow(colours, extent=extent, origin="lower", interpolation="nearest")
-        most = most_shown(plane.heights)
+        image = {"extent": extent, "origin": "lower", "interpolation": "nearest"}
+        axes.imshow(colours, **image)
+        # the colours end before a few cells that, where a heavy sample lies, would leave all others pale
+        held = plane.heights[plane.heights > 0]
+        most = float(np.quantile(held, MOST_SHARE)) if len(held) else 1.0
         shown = np.ma.masked_less(plane.heights, 0.02 * most)
-        drawn = axes.imshow(
-            shown, extent=extent, origin="lower", interpolation="nearest", cmap=field_colours(), vmin=0.0, vmax=most
-        )
+        colour_map = LinearSegmentedColormap.from_list("field", FIELD_COLOURS)
+        drawn = axes.imshow(shown, **image, cmap=colour_map, vmin=0.0, vmax=most)
         axes.set_aspect("equal")
-        axes.set_xlabel(plane.labels[0])
-        axes.set_ylabel(plane.labels[1])
+        axes.set(xlabel=plane.labels[0], ylabel=plane.labels[1])
         for mask, colour in ((plane.others, SOFT), (plane.targets, INK)):
             if mask.any() and not mask.all():
                 axes.contour(mask, (0.5,), extent=extent, colors=[colour], linewidths=0.5, alpha=0.7)
-        beyond = "max" if plane.heights.max() > most else "neither"
-        bar = axes.figure.colorbar(drawn, extend=beyond, cax=_bar_axes(axes, width))
+        # the colours beside the panel, as high as it is
+        thin = 0.1 / width
+        place = axes.inset_axes((1.0 + 0.8 * thin, 0.0, thin, 1.0))
+        bar = figure.colorbar(drawn, extend="max" if plane.heights.max() > most else "neither", cax=place)
         bar.set_label(plane.unit.replace("2", "²"))
         bar.outline.set_visible(False)
         axes.spines[["top", "right"]].set_visible(False)
@@ -143,21 +142,3 @@ def panel_places(ratios: list[float]) -> tuple[list[tuple[float, float, float, f
         places.append((LEFT_INCHES + (usable - width) / 2, top - tall, width, tall))
         top -= tall + BELOW_INCHES
     return places, height
-
-
-def most_shown(heights: np.ndarray) -> float:
-    """Where the colours end: a few cells beyond, where a heavy sample lies, would leave all others pale."""
-    return float(np.quantile(heights[heights > 0], MOST_SHARE)) if (heights > 0).any() else 1.0
-
-
-def _bar_axes(axes: Axes, width_inches: float) -> Axes:
-    """Axes for the colours beside a panel of so many inches, as high as it is."""
-    width = 0.1 / width_inches
-    return axes.inset_axes((1.0 + 0.8 * width, 0.0, width, 1.0))
-
-
-def field_colours() -> Colormap:
-    """Colours of the field, from little to much."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("field", FIELD_COLOURS)

@@ -36,7 +36,10 @@ def mixture_points(design: DesignSpec) -> tuple[np.ndarray, np.ndarray]:
 
     A track counts at evenly spread knots, equally.
     """
-    moments = _along_track(design)
+    moments, track = [design], design.track
+    if track is not None:
+        knots = np.unique(np.linspace(0, len(track.knots) - 1, PLACES).round().astype(int))
+        moments = [placed(design, {track.dimension: float(track.knots[index])}) for index in knots]
     sensors = [sensor for moment in moments for sensor in moment.sensors]
     weights = np.concatenate([moment.weights for moment in moments]) / len(moments)
     count = max(POINTS // len(sensors), FEWEST)
@@ -53,23 +56,14 @@ def sensor_points(sensor: Sensor, normal: np.ndarray) -> np.ndarray:
     # a with A A' = covariance, also where that is singular: origins are often fixed along an axis
     values, vectors = np.linalg.eigh(np.asarray(sensor.origin_covariance_m2, dtype=np.float64))
     origin = normal[:, :3] @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-    spread = np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad])
+    spread, follow = np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad]), sensor.coupling
     tangent, range_m = normal[:, 3:5] * spread, sensor.range_m + sensor.spread_range_m * normal[:, 5]
-    follow = sensor.coupling
     if follow is not None:
         tangent = origin @ follow.direction_per_m.T + normal[:, 3:5] * follow.spread_rad
         range_m = sensor.range_m + origin @ follow.range_per_m + tangent @ follow.range_per_rad
         range_m = range_m + follow.spread_m * normal[:, 5]
     azimuth, elevation = angles(tangent_directions(sensor.frame, tangent))
     return np.column_stack([origin + sensor.origin_m, azimuth, elevation, np.maximum(range_m, 0.0)])
-
-
-def _along_track(design: DesignSpec) -> list[DesignSpec]:
-    track = design.track
-    if track is None:
-        return [design]
-    chosen = np.unique(np.linspace(0, len(track.knots) - 1, PLACES).round().astype(int))
-    return [placed(design, {track.dimension: float(track.knots[index])}) for index in chosen]
 
 
 MOST_STEPS = 512  # along a triangle's side: beyond, it is far larger than any picture
@@ -87,16 +81,13 @@ def silhouette(
         targets: Whether targets count, or everything else.
     """
     covered = np.zeros((len(edges[1]) - 1, len(edges[0]) - 1), dtype=bool)
-    share = drawn_share(scene)
+    share, upper = drawn_share(scene), np.array(covered.shape[::-1])
+    low, cell = np.array([edge[0] for edge in edges]), np.array([edge[1] - edge[0] for edge in edges])
     for body in scene.bodies:
         if body.is_target == targets and not isinstance(body.shape, Plane):
             vertices, faces = body_triangles(body, frame, np.zeros((2, 3)), share)
             # mark the cells that hold a point of a lattice, no wider than a cell, on triangles (F, 3, 2)
-            corners = vertices[:, list(axes)][faces].astype(np.float64)
-            low = np.array([edge[0] for edge in edges])
-            cell = np.array([edge[1] - edge[0] for edge in edges])
-            places = (corners - low) / cell
-            upper = np.array(covered.shape[::-1])
+            places = (vertices[:, list(axes)][faces].astype(np.float64) - low) / cell
             near = (places.max(axis=1) >= 0).all(axis=1) & (places.min(axis=1) < upper).all(axis=1)
             places = places[near]
             sides = np.abs(places - np.roll(places, 1, axis=1)).max(axis=(1, 2))
@@ -215,15 +206,8 @@ def density_view(
         frame: Of the scene; the one in the middle by default.
     """
     moment = scene.frames // 2 if frame is None else frame
-    effective = effective_count(samples.weights)
-    return DensityView(
-        marginals(samples, designs),
-        plane_densities(samples, scene, moment),
-        len(samples),
-        effective,
-        scene.name,
-        moment,
-    )
+    planes, effective = plane_densities(samples, scene, moment), effective_count(samples.weights)
+    return DensityView(marginals(samples, designs), planes, len(samples), effective, scene.name, moment)
 
 
 def marginals(samples: Samples, designs: Sequence[DesignSpec] = ()) -> tuple[Marginal, ...]:
@@ -231,10 +215,8 @@ def marginals(samples: Samples, designs: Sequence[DesignSpec] = ()) -> tuple[Mar
     space, weights = samples.space, samples.weights
     start = turn_start(samples.points[:, AZIMUTH], weights, space)
     points = _degrees_points(samples.points, start)
-    beside = {}
-    for design in designs:
-        own, share = mixture_points(design)
-        beside[design.name] = _degrees_points(own, start), share
+    mixtures = {design.name: mixture_points(design) for design in designs}
+    beside = {name: (_degrees_points(own, start), share) for name, (own, share) in mixtures.items()}
     bins = int(np.clip(2 * effective_count(weights) ** (1 / 3), LEAST_BINS, MOST_BINS))
     learned = [axis for axis in space.free if axis not in space.conditioned]
     bounds = _degrees_points(np.array([space.low, space.high]), None)
@@ -260,9 +242,8 @@ def _marginal(
     angle = axis in (AZIMUTH, ELEVATION)
     name, per = ("deg", 1.0) if angle else METRES if high - low > LONG_M else CENTIMETRES
 
-    def heights(found: np.ndarray, shares: np.ndarray) -> np.ndarray:
-        counted, _ = np.histogram(found, edges, weights=shares)
-        return PERCENT * counted / (np.diff(edges) * per)
+    def heights(places: np.ndarray, shares: np.ndarray) -> np.ndarray:
+        return PERCENT * np.histogram(places, edges, weights=shares)[0] / (np.diff(edges) * per)
 
     designs = {design: heights(points[:, axis], share) for design, (points, share) in beside.items()}
     label = f"{NAMES[axis]} [{'deg' if angle else 'm'}]"
@@ -299,8 +280,8 @@ def plane_densities(samples: Samples, scene: Scene, frame: int) -> tuple[PlaneDe
     points, weights = observed_point(samples.points), samples.weights
     ends = [_central(values, weights, TAIL) for values in points.T]
     spans = np.array([high - low for low, high in ends])
-    pairs = [(0, 1), (0, 2), (1, 2)]
-    wide = [pair for pair in pairs if spans[list(pair)].min() > THINNEST * spans.max() and spans.max() > 0]
+    least, pairs = THINNEST * spans.max(), [(0, 1), (0, 2), (1, 2)]
+    wide = [pair for pair in pairs if spans[list(pair)].min() > least and spans.max() > 0]
     ranked = sorted(wide, key=lambda pair: -float(spans[pair[0]] * spans[pair[1]]))
     # along a condition the density is even: a second picture without it shows more
     beside = sorted(ranked[1:], key=lambda pair: bool(set(pair) & set(samples.space.conditioned)))
@@ -318,8 +299,7 @@ def _plane(
 ) -> PlaneDensity:
     ends = [_widened(*end) for end in ends]
     spans = [high - low for low, high in ends]
-    most = np.clip(np.sqrt(effective_count(weights) / 5.0), LEAST_CELLS, MOST_CELLS)
-    cell = max(spans) / most
+    cell = max(spans) / np.clip(np.sqrt(effective_count(weights) / 5.0), LEAST_CELLS, MOST_CELLS)
     counts = [max(int(np.ceil(span / cell)), 1) for span in spans]
     edges = tuple(np.linspace(low, high, count + 1) for (low, high), count in zip(ends, counts, strict=True))
     held, _, _ = np.histogram2d(points[:, axes[1]], points[:, axes[0]], bins=edges[::-1], weights=weights)

@@ -26,9 +26,7 @@ def drawn_share(scene: Scene) -> float:
     return min(1.0, MOST_FACES / max(faces, 1))
 
 
-def body_triangles(
-    body: Body, frame: int, bounds_m: np.ndarray, share: float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
+def body_triangles(body: Body, frame: int, bounds_m: np.ndarray, share: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """World vertices (V, 3) float32 [m] and faces (F, 3) int32 of a body; planes are cut at bounds (2, 3).
 
     Of a mesh about a share of its triangles is drawn.
@@ -66,7 +64,7 @@ def round_steps(scene: Scene) -> int:
     count = sum(isinstance(body.shape, Sphere | Capsule) for body in scene.bodies)
     # a ball of n steps has about n (n + 2) triangles
     most = math.sqrt(MOST_FACES / max(count, 1)) - 1
-    return int(min(STEPS, max(FEWEST_STEPS, 4 * (most // 4))))
+    return int(np.clip(4 * (most // 4), FEWEST_STEPS, STEPS))
 
 
 def thinned(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
@@ -88,10 +86,8 @@ def thinned(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndar
 
 def scene_bounds(scene: Scene, frame: int, rays: list[Rays]) -> np.ndarray:
     """Bounds of everything finite in a scene and of the rays' origins, with a margin, shape (2, 3) [m]."""
-    points = [ray.origin_m for ray in rays]
-    for body in scene.bodies:
-        if not isinstance(body.shape, Plane):
-            points.append(body_triangles(body, frame, np.zeros((2, 3)))[0])
+    finite = [body for body in scene.bodies if not isinstance(body.shape, Plane)]
+    points = [ray.origin_m for ray in rays] + [body_triangles(body, frame, np.zeros((2, 3)))[0] for body in finite]
     everything = np.concatenate([*points, np.zeros((0, 3))])
     if not len(everything):
         return np.array([[-1.0] * 3, [1.0] * 3])
@@ -104,14 +100,10 @@ def frustum_lines(sensor: Sensor) -> np.ndarray:
     """A field of view up to its gate's end and the gate's outlines, NaN between lines, (K, 3) float32 [m]."""
     start, end = sensor.gate_m
     corners = _patch(sensor, np.array([-1.0, 1.0]), np.array([-1.0, 1.0]))
-    pieces = [
-        np.stack([sensor.origin_m, sensor.origin_m + end * corner]) for corner in corners.reshape(-1, 3)
-    ]
-    side = np.linspace(-1.0, 1.0, SHELL_STEPS + 1)
-    one = np.ones(1)
-    edges = [_patch(sensor, side, -one), _patch(sensor, one, side), _patch(sensor, side[::-1], one)]
-    edges.append(_patch(sensor, -one, side[::-1]))
-    outline = np.concatenate([edge.reshape(-1, 3) for edge in edges])
+    pieces = [np.stack([sensor.origin_m, sensor.origin_m + end * corner]) for corner in corners.reshape(-1, 3)]
+    side, one = np.linspace(-1.0, 1.0, SHELL_STEPS + 1), np.ones(1)
+    edges = ((side, -one), (one, side), (side[::-1], one), (-one, side[::-1]))
+    outline = np.concatenate([_patch(sensor, *edge).reshape(-1, 3) for edge in edges])
     pieces += [sensor.origin_m + radius * outline for radius in (start, end)]
     return separated(pieces)
 

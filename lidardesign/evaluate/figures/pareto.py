@@ -17,7 +17,6 @@ from lidardesign.evaluate.figures.canvas import (
     LETTERS_POINTS,
     PAGE_INCHES,
     SMALL_POINTS,
-    label_powers,
     label_ticks,
     new_figure,
     plain_label,
@@ -107,41 +106,20 @@ def panels(sweeps: Sequence[Sweep]) -> list[Panel]:
 
 def _panel(sweep: Sweep) -> Panel:
     seconds = [measurement.seconds for measurement in sweep.measurements if measurement.seconds > 0] or [1.0]
-    known = [
-        measurement.error
-        for measurement in sweep.measurements
-        if measurement.error > 0 and math.isfinite(measurement.error)
-    ]
-    tolerance = [sweep.tolerance] if sweep.tolerance > 0 and math.isfinite(sweep.tolerance) else []
-    largest = max([*known, *tolerance], default=1.0)
-    shown = [error for error in [*known, *tolerance] if error >= SHOWN_SHARE * largest]
-    low, high = _spanned(min(shown, default=1.0), largest)
+    places = [*(measurement.error for measurement in sweep.measurements), sweep.tolerance]
+    known = [place for place in places if place > 0 and math.isfinite(place)]
+    largest = max(known, default=1.0)
+    low, high = _spanned(min((place for place in known if place >= SHOWN_SHARE * largest), default=1.0), largest)
     # room for what stands on the edge
     errors = (low / BEYOND, high)
-    chosen = sweep.chosen
-    marks = tuple(
-        _mark(measurement, min(seconds), errors, measurement is chosen, _beaten(measurement, sweep))
-        for measurement in sweep.measurements
-    )
+    marks = tuple(_mark(measurement, min(seconds), errors, sweep) for measurement in sweep.measurements)
     return Panel(sweep, marks, _spanned(min(seconds), max(seconds)), errors)
 
 
 def _spanned(low: float, high: float) -> tuple[float, float]:
     """Ends of a logarithmic axis that holds both values and is not too short."""
-    missing = max(LEAST_SPAN / (high / low), 1.0)
-    factor = BEYOND * math.sqrt(missing)
+    factor = BEYOND * math.sqrt(max(LEAST_SPAN / (high / low), 1.0))
     return low / factor, high * factor
-
-
-def _beaten(measurement: Measurement, sweep: Sweep) -> bool:
-    """Whether another measurement is at least as good in seconds and in error, and better in one of them."""
-    return any(
-        other.seconds <= measurement.seconds
-        and other.error <= measurement.error
-        and (other.seconds, other.error) != own
-        for own in [(measurement.seconds, measurement.error)]
-        for other in sweep.measurements
-    )
 
 
 def has_fine_ticks(ends: tuple[float, float]) -> bool:
@@ -151,24 +129,27 @@ def has_fine_ticks(ends: tuple[float, float]) -> bool:
     return high < FINE_TICKS_SPAN * low or powers < 2
 
 
-def _mark(
-    measurement: Measurement, least_seconds: float, errors: tuple[float, float], chosen: bool, beaten: bool
-) -> Mark:
+def _mark(measurement: Measurement, least_seconds: float, errors: tuple[float, float], sweep: Sweep) -> Mark:
     low, high = errors
     on_edge = measurement.error <= low
     # what has no finite error stands on the upper edge
     y = low if on_edge else measurement.error if math.isfinite(measurement.error) else high
     uncertainty = measurement.uncertainty if math.isfinite(measurement.uncertainty) else 0.0
-    ends = max(y - uncertainty, low), min(y + uncertainty, high)
+    beaten = any(
+        other.seconds <= measurement.seconds
+        and other.error <= measurement.error
+        and (other.seconds, other.error) != (measurement.seconds, measurement.error)
+        for other in sweep.measurements
+    )
     return Mark(
         measurement,
-        max(measurement.seconds, least_seconds),
-        y,
-        min(ends[0], y),
-        max(ends[1], y),
-        on_edge,
-        chosen,
-        beaten,
+        x=max(measurement.seconds, least_seconds),
+        y=y,
+        low=min(max(y - uncertainty, low), y),
+        high=max(min(y + uncertainty, high), y),
+        on_edge=on_edge,
+        chosen=measurement is sweep.chosen,
+        beaten=beaten,
     )
 
 
@@ -182,38 +163,27 @@ def pareto_picture(sweeps: Sequence[Sweep]) -> Figure | None:
     figure = new_figure(columns * PANEL_INCHES[0], rows * PANEL_INCHES[1] + 0.5)
     for number, panel in enumerate(shown):
         axes = figure.add_subplot(rows, columns, number + 1)
-        front = panel.front
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlim(*panel.seconds)
-        axes.set_ylim(*panel.errors)
-        for axis, ends in ((axes.xaxis, panel.seconds), (axes.yaxis, panel.errors)):
-            if has_fine_ticks(ends):
-                label_ticks(axis, None)
-            else:
-                # on axes of one or two powers of ten there would be names at all ticks, which do not fit
-                label_powers(axis)
+        axes.set(xscale="log", yscale="log", xlim=panel.seconds, ylim=panel.errors)
+        # on axes of one or two powers of ten there would be names at all ticks, which do not fit
+        label_ticks(axes.xaxis, fine=has_fine_ticks(panel.seconds))
+        label_ticks(axes.yaxis, fine=has_fine_ticks(panel.errors))
         axes.set_title(plain_label(panel.sweep.knob, 48), fontsize=LETTERS_POINTS, loc="left", color="#222222")
-        axes.set_xlabel("seconds")
-        axes.set_ylabel(plain_label(panel.error_title, 40))
+        axes.set(xlabel="seconds", ylabel=plain_label(panel.error_title, 40))
         axes.tick_params(labelsize=SMALL_POINTS)
         axes.set_axisbelow(True)
         axes.grid(True, which="major", color="#e2e2e2", linewidth=0.7, zorder=0.5)
         axes.spines[["top", "right"]].set_visible(False)
         if panel.shows_tolerance:
             axes.axhline(panel.sweep.tolerance, color=TOLERANCE, linestyle="dashed", linewidth=1.1, zorder=1.5)
-        axes.plot(
-            [mark.x for mark in front], [mark.y for mark in front], color=LINE, alpha=PALE, linewidth=1.3, zorder=2
-        )
+        fastest_first = ([mark.x for mark in panel.front], [mark.y for mark in panel.front])
+        axes.plot(*fastest_first, color=LINE, alpha=PALE, linewidth=1.3, zorder=2)
         for mark in panel.marks:
             colour, alpha = (CHOSEN, 1.0) if mark.chosen else (LINE, PALE if mark.beaten else 1.0)
             if mark.high > mark.y or mark.low < mark.y:
                 axes.plot([mark.x, mark.x], [mark.low, mark.high], color=colour, linewidth=1.0, alpha=alpha, zorder=3)
             look = {"linestyle": "none", "clip_on": False, "zorder": 4}
-            shape = "v" if mark.on_edge else "o"
-            axes.plot(
-                mark.x, mark.y, marker=shape, markersize=4.5, color=colour, alpha=alpha, markeredgewidth=0, **look
-            )
+            filled = {"marker": "v" if mark.on_edge else "o", "markersize": 4.5, "markeredgewidth": 0, **look}
+            axes.plot(mark.x, mark.y, color=colour, alpha=alpha, **filled)
             if mark.measurement.default:
                 axes.plot(mark.x, mark.y, marker="o", markersize=8.5, color="none", markeredgecolor="#222222", **look)
         places = label_places(panel, POINTS * (PANEL_INCHES[1] - MARGIN_INCHES), LINE_POINTS)
@@ -252,11 +222,8 @@ def label_places(panel: Panel, height: float, line: float) -> list[tuple[float, 
         near = [up for other, up in placed.items() if abs(across[other] - across[index]) < TEXT_SHARE]
         up = max(wanted[index], line * 0.6)
         placed[index] = max([up, *(other + line for other in near if other + line > up)])
-    left = [share > 0.66 for share in across]
-    return [
-        (-line if left[index] else line, placed[index] - wanted[index], "right" if left[index] else "left")
-        for index in range(len(wanted))
-    ]
+    sides = [(-line, "right") if share > 0.66 else (line, "left") for share in across]
+    return [(aside, placed[index] - wanted[index], side) for index, (aside, side) in enumerate(sides)]
 
 
 def _share(value: float, ends: tuple[float, float]) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from lidardesign.evaluate.figures.scene_figure import DrawnDesign, SceneFigure
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome
 from lidardesign.numerics import EPSILON_FLOAT32, HALF_DIGITS
-from lidardesign.scene import Body, Plane, Scene
+from lidardesign.scene import Plane, Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,10 +88,9 @@ def view_of(directions: np.ndarray, points_m: np.ndarray, margin: float = 0.04) 
     # no picture is thinner than a third of its length
     least = max(float((high - low).max()), HALF_DIGITS) / 3
     pad = np.maximum((least - (high - low)) / 2, 0.0) + margin * 3 * least
-    (left, bottom), (right, top) = low - pad, high + pad
+    (left, right), (bottom, top) = zip((low - pad).tolist(), (high + pad).tolist(), strict=True)
     depth = view.depth(points_m)
-    near = float(depth.min() - 3 * np.ptp(depth) - 3 * least)
-    return replace(view, window=(float(left), float(right), float(bottom), float(top)), near_m=near)
+    return replace(view, window=(left, right, bottom, top), near_m=float(depth.min() - 3 * np.ptp(depth) - 3 * least))
 
 
 def _from(directions: np.ndarray) -> np.ndarray:
@@ -151,21 +150,22 @@ def shaded(scene: Scene, frame: int, view: View, width: int) -> Shaded:
     colour, depth = np.zeros((len(starts), 4)), np.full(len(starts), np.inf)
     if seen.bodies:
         caster = SceneCaster(seen, frame)
-        kinds = np.array([_colour(body) for body in seen.bodies])
+        lamp = -view.forward - 0.8 * view.right + 0.9 * view.up
+        lamp /= np.linalg.norm(lamp)
+        kinds = np.array(
+            [GROUND if isinstance(body.shape, Plane) else TARGET if body.is_target else OTHER for body in seen.bodies]
+        )
         for block in np.array_split(np.arange(len(starts)), max(1, len(starts) // BLOCK)):
             hits = caster.first_hit(starts[block], np.broadcast_to(view.forward, (len(block), 3)))
             met = np.isfinite(hits.range_m)
             depth[block] = view.near_m + hits.range_m
             # brightness of surfaces: from the front, and from the upper left
             normal = hits.normal[met]
-            lamp = -view.forward - 0.8 * view.right + 0.9 * view.up
-            lamp /= np.linalg.norm(lamp)
             front, sideways = np.abs(normal @ view.forward), np.clip(normal @ lamp, 0.0, 1.0)
             lit = kinds[hits.body[met]] * (AMBIENT + FRONT * front + LAMP * sideways)[:, None]
             colour[block[met], :3] = np.minimum(lit, 1.0)
             colour[block[met], 3] = 1.0
-    depth = depth.reshape(height, width)
-    colour = colour.reshape(height, width, 4)
+    depth, colour = depth.reshape(height, width), colour.reshape(height, width, 4)
     # darken pixels where the depth jumps: outlines tell things apart that are lit alike
     step_m = EDGE_DEPTH * (right - left)
     from matplotlib.colors import to_rgb
@@ -177,12 +177,6 @@ def shaded(scene: Scene, frame: int, view: View, width: int) -> Shaded:
     edge &= np.isfinite(depth)
     colour[edge, :3] = 0.55 * colour[edge, :3] + 0.45 * np.array(to_rgb(INK))
     return Shaded(colour, depth)
-
-
-def _colour(body: Body) -> tuple[float, float, float]:
-    if isinstance(body.shape, Plane):
-        return GROUND
-    return TARGET if body.is_target else OTHER
 
 
 MOST_DESIGNS = 6
@@ -221,42 +215,37 @@ def scene_picture(shown: SceneFigure) -> Figure:
     place, step = len(shown.places) // 2, len(shown.frames) // 2
     view = view_of(shown.directions, framed_points(shown, place, step))
     columns = min(COLUMNS, len(designs)) or 1
-    rows = math.ceil(len(designs) / columns)
-    width = PAGE_INCHES / columns
+    rows, width = math.ceil(len(designs) / columns), PAGE_INCHES / columns
     height = min(width / view.ratio, 4.6)
     figure = new_figure(PAGE_INCHES, rows * (height + HEAD_INCHES) + LEGEND_INCHES)
     receiver = shown.scene.receiver
-    pixels = int(160 * min(width, height * view.ratio))
-    image, cut = opened(shown, place, step, view, pixels)
+    image, cut = opened(shown, place, step, view, int(160 * min(width, height * view.ratio)))
     for number, design in enumerate(designs):
         axes = figure.add_subplot(rows, columns, number + 1)
         axes.imshow(image.colour, extent=view.window, origin="lower", interpolation="antialiased", zorder=0)
-        axes.set_xlim(view.window[0], view.window[1])
-        axes.set_ylim(view.window[2], view.window[3])
-        axes.set_aspect("equal")
+        axes.set(xlim=view.window[:2], ylim=view.window[2:], aspect="equal")
         axes.set_axis_off()
         _scale_bar(axes, view)
         _draw_design(axes, design, place, step, image, view)
         if receiver is not None:
             axes.plot(*view.project(np.array(receiver.origin_m)), **RECEIVER_LOOK)
-    kinds = [int(kind) for one in designs for kind in np.unique(one.outcome[place, step])]
-    _legend(figure, kinds, receiver=receiver is not None)
-    figure.suptitle(
-        _caption(shown, place, step) + "; cut open before the sensors" * cut, fontsize=SMALL_POINTS, color=SOFT
-    )
+    kinds = {int(kind) for one in designs for kind in np.unique(one.outcome[place, step])}
+    _legend(figure, [kind for kind in Outcome if int(kind) in kinds], receiver=receiver is not None)
+    caption = _caption(shown, place, step) + "; cut open before the sensors" * cut
+    figure.suptitle(caption, fontsize=SMALL_POINTS, color=SOFT)
     return figure
 
 
 def opened(shown: SceneFigure, place: int, step: int, view: View, pixels: int) -> tuple[Shaded, bool]:
     """The scene as it is seen, and whether what stands before the sensors is cut away, as walls that hide them."""
-    frame = shown.frames[step]
-    image = shaded(shown.scene, frame, view, pixels)
+    scene, frame = shown.scene, shown.frames[step]
+    image = shaded(scene, frame, view, pixels)
     origins = np.concatenate([np.zeros((0, 3)), *(one.rays[place].origin_m for one in shown.designs)])
     slack = SLACK_SHARE * (view.window[1] - view.window[0])
     if not len(origins) or image.hides(view, origins, slack).mean() <= MOST_HIDDEN:
         return image, False
     nearer = replace(view, near_m=float(view.depth(origins).min()) - slack)
-    return shaded(shown.scene, frame, nearer, pixels), True
+    return shaded(scene, frame, nearer, pixels), True
 
 
 def framed_points(shown: SceneFigure, place: int, step: int) -> np.ndarray:
@@ -271,13 +260,12 @@ def framed_points(shown: SceneFigure, place: int, step: int) -> np.ndarray:
     points = np.concatenate(ends)
     around = [frustum_lines(sensor) for one in shown.designs for sensor in _drawn_sensors(one.placed[place].sensors)]
     # ends of all finite targets along the axes
-    frame = shown.frames[step]
-    found = [np.zeros((0, 3))]
+    boxes = [np.zeros((0, 3))]
     for body in shown.scene.bodies:
         if body.is_target and not isinstance(body.shape, Plane):
-            vertices, _ = body_triangles(body, frame, np.zeros((2, 3)))
-            found.append(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
-    bodies = np.concatenate([np.concatenate(found), *around])
+            vertices, _ = body_triangles(body, shown.frames[step], np.zeros((2, 3)))
+            boxes.append(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
+    bodies = np.concatenate([*boxes, *around])
     bodies = bodies[np.isfinite(bodies).all(axis=1)]
     if not len(points):
         return bodies if len(bodies) else np.zeros((1, 3))
@@ -307,31 +295,20 @@ def _draw_design(axes: Axes, one: DrawnDesign, place: int, step: int, image: Sha
         some = keep[outcome[keep] == kind]
         if not len(some):
             continue
-        starts = rays.origin_m[some]
-        _draw_lines(axes, starts, ends[some], image, view, slack, color=colour, linestyle=dash, width=width * share)
+        look = {"colors": colour, "linestyles": dash, "linewidths": width * share}
+        _draw_lines(axes, rays.origin_m[some], ends[some], image, view, slack, look)
         if kind == Outcome.RETURN:
             seen = ends[some][~image.hides(view, ends[some], 2 * slack)]
             axes.plot(*view.project(seen).T, "o", color=colour, markersize=2.2 * share + 0.3, zorder=4)
     _draw_sensors(axes, one.placed[place].sensors, rays.origin_m[keep], view)
-    returned = int((outcome == Outcome.RETURN).sum())
-    drawn = "" if len(outcome) == one.fired else f" of {len(outcome)} of {one.fired} rays drawn"
-    share = drawn or f" of {one.fired} rays"
-    axes.set_title(
-        f"{plain_label(one.design.name)}: {returned}{share} return", fontsize=SMALL_POINTS, color=INK, pad=2
-    )
+    drawn = "" if len(outcome) == one.fired else f"{len(outcome)} of "
+    title = f"{plain_label(one.design.name)}: {(outcome == Outcome.RETURN).sum()} of {drawn}{one.fired} rays"
+    title += " drawn return" if drawn else " return"
+    axes.set_title(title, fontsize=SMALL_POINTS, color=INK, pad=2)
 
 
 def _draw_lines(
-    axes: Axes,
-    starts: np.ndarray,
-    ends: np.ndarray,
-    image: Shaded,
-    view: View,
-    slack_m: float,
-    *,
-    color: str,
-    linestyle: object,
-    width: float,
+    axes: Axes, starts: np.ndarray, ends: np.ndarray, image: Shaded, view: View, slack_m: float, look: dict[str, Any]
 ) -> None:
     """Lines from starts to ends, (N, 3) each; where something is before them they are faint."""
     from matplotlib.collections import LineCollection
@@ -344,9 +321,7 @@ def _draw_lines(
     for covered, opacity in ((False, SEEN), (True, HIDDEN)):
         pieces = [piece for line, mask in zip(flat, hidden == covered, strict=True) for piece in _runs(line, mask)]
         if pieces:
-            axes.add_collection(
-                LineCollection(pieces, colors=color, linestyles=linestyle, linewidths=width, alpha=opacity, zorder=2)
-            )
+            axes.add_collection(LineCollection(pieces, **look, alpha=opacity, zorder=2))
 
 
 def _runs(line: np.ndarray, mask: np.ndarray) -> list[np.ndarray]:
@@ -367,22 +342,20 @@ def _drawn_sensors(sensors: Sequence[Sensor]) -> Sequence[Sensor]:
     return sensors if len(sensors) <= MOST_SENSORS else ()
 
 
-def _legend(figure: Figure, kinds: Sequence[int], *, receiver: bool) -> None:
+def _legend(figure: Figure, kinds: Sequence[Outcome], *, receiver: bool) -> None:
     from matplotlib.lines import Line2D
 
-    shown = [kind for kind in Outcome if int(kind) in kinds]
-    looks = {kind: OUTCOME_LOOKS[kind] for kind in shown}
     handles = [Line2D([], [], color=SENSOR, marker="D", markersize=3.2, linewidth=0.6)]
-    handles += [
-        Line2D([], [], color=colour, linestyle=dash, linewidth=1.2, marker="o" if kind == Outcome.RETURN else "")
-        for kind, (colour, dash, _) in looks.items()
-    ]
-    names = ["sensor, field of view and gate", *(kind.name.lower().replace("_", " ") for kind in shown)]
+    for kind in kinds:
+        colour, dash, _ = OUTCOME_LOOKS[kind]
+        mark = "o" if kind == Outcome.RETURN else ""
+        handles.append(Line2D([], [], color=colour, linestyle=dash, linewidth=1.2, marker=mark))
+    names = ["sensor, field of view and gate", *(kind.name.lower().replace("_", " ") for kind in kinds)]
     if receiver:
         handles.append(Line2D([], [], **RECEIVER_LOOK))
         names.append("detector")
-    look = {"ncols": 6, "frameon": False, "handlelength": 2.4, "columnspacing": 1.2}
-    figure.legend(handles, names, loc="outside lower center", **look)
+    place = "outside lower center"
+    figure.legend(handles, names, loc=place, ncols=6, frameon=False, handlelength=2.4, columnspacing=1.2)
 
 
 def _caption(shown: SceneFigure, place: int, step: int) -> str:

@@ -99,7 +99,6 @@ def scene_figure(
     scene: Scene,
     designs: Sequence[DesignSpec],
     places: Sequence[Conditions],
-    placed: Callable[[DesignSpec, Conditions], DesignSpec],
     laid_out: Callable[[DesignSpec, Conditions], Rays],
     *,
     planner: Planner | None = None,
@@ -111,23 +110,24 @@ def scene_figure(
         scene: The scene.
         designs: The designs.
         places: The condition values that they are evaluated at, ascending.
-        placed: A design as it is at a condition value.
-        laid_out: Its rays there; at every condition value as many.
+        laid_out: A design's rays at a condition value; at every one as many.
         planner: How effects are chosen; None: geometry alone.
         seed: Of the effects' random numbers.
     """
     chosen = tuple(places[index] for index in _spread(len(places), MOST_STEPS))
     every = [[laid_out(design, at) for at in chosen] for design in designs]
-    frames = _spread(scene.frames, _frame_count(len(designs) * len(chosen)))
+    # as many frames, and as many rays of each placed design, as can be drawn
+    count = max(len(designs) * len(chosen), 1)
+    frames = _spread(scene.frames, min(MOST_STEPS, max(5, MOST_RAY_STEPS // (count * FEWEST_RAYS))))
+    share = min(MOST_PLACED_RAYS / count, MOST_RAY_STEPS / (count * len(frames)))
+    budget = max(min(MOST_RAYS, math.floor(share)), 1)
     outcomes = _outcomes(scene, every, frames, planner, seed)
-    budget = _ray_budget(len(designs) * len(chosen), len(frames))
-    found = []
+    drawn = []
     for design, rays, (length_m, outcome) in zip(designs, every, outcomes, strict=True):
         keep = np.array(_spread(len(rays[0]), budget), dtype=np.int64)
-        at = tuple(placed(design, where) for where in chosen)
-        drawn = tuple(one.subset(keep) for one in rays)
-        found.append(DrawnDesign(design, at, drawn, length_m[..., keep], outcome[..., keep], len(rays[0])))
-    return SceneFigure(scene, frames, chosen, tuple(found), planner is not None, len(places))
+        at, some = tuple(placed(design, where) for where in chosen), tuple(one.subset(keep) for one in rays)
+        drawn.append(DrawnDesign(design, at, some, length_m[..., keep], outcome[..., keep], len(rays[0])))
+    return SceneFigure(scene, frames, chosen, tuple(drawn), planner is not None, len(places))
 
 
 def _spread(count: int, most: int) -> tuple[int, ...]:
@@ -135,25 +135,13 @@ def _spread(count: int, most: int) -> tuple[int, ...]:
     return tuple(np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()) if count else ()
 
 
-def _frame_count(placed: int) -> int:
-    """How many frames leave enough rays to each of so many placed designs."""
-    return min(MOST_STEPS, max(5, MOST_RAY_STEPS // (max(placed, 1) * FEWEST_RAYS)))
-
-
-def _ray_budget(placed: int, frames: int) -> int:
-    """How many rays of each of so many placed designs can be drawn."""
-    share = min(MOST_PLACED_RAYS / max(placed, 1), MOST_RAY_STEPS / max(placed * frames, 1))
-    return max(min(MOST_RAYS, math.floor(share)), 1)
-
-
 def _outcomes(
     scene: Scene, every: Sequence[Sequence[Rays]], frames: Sequence[int], planner: Planner | None, seed: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Drawn lengths and outcomes of each design's rays, shape (P, T, N) each."""
-    casters = build_casters(scene) if planner is not None else None
-    drawn = [casters[frame] if casters else SceneCaster(scene, frame) for frame in frames]
-    found = [_first_hits(rays, drawn) for rays in every]
-    if planner is None or casters is None:
+    casters = build_casters(scene) if planner is not None else {frame: SceneCaster(scene, frame) for frame in frames}
+    found = [_first_hits(rays, [casters[frame] for frame in frames]) for rays in every]
+    if planner is None:
         return found
     lists = [rays for one in every for rays in one]
     physics = planner.physics(planner.plan(scene, lists, casters), seed)
@@ -225,7 +213,6 @@ def scene_figure_of(request: EvaluationRequest, *, physics: bool) -> SceneFigure
         request.test[0],
         request.designs,
         ordered_conditions(request),
-        placed,
         laid_out,
         planner=request.planner if physics else None,
         seed=request.seed,

@@ -19,7 +19,6 @@ from lidardesign.evaluate.figures.canvas import (
     Against,
     Series,
     axis_titles,
-    label_powers,
     label_ticks,
     log_ticks,
     logarithmic,
@@ -29,7 +28,7 @@ from lidardesign.evaluate.figures.canvas import (
     position,
     series,
 )
-from lidardesign.evaluate.results import MILLIMETRES, EffectSummary, Evaluation, Paired, Row, verdict
+from lidardesign.evaluate.results import MILLIMETRES, EffectSummary, Evaluation, Paired, verdict
 from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
@@ -56,8 +55,7 @@ VERDICT_WORDS = {"better": "a is better", "worse": "a is worse", "open": "not cl
 def curve_picture(evaluation: Evaluation, against: Against) -> Figure:
     """Score against rays or bandwidth, a column wide: a line and an interval band per design and baseline."""
     curves = series(evaluation)
-    lines = -(-len(curves) // LEGEND_COLUMNS)
-    figure = new_figure(COLUMN_INCHES, CURVE_HEIGHT + lines * LEGEND_LINE)
+    figure = new_figure(COLUMN_INCHES, CURVE_HEIGHT + math.ceil(len(curves) / LEGEND_COLUMNS) * LEGEND_LINE)
     axes = figure.add_subplot()
     for curve in curves:
         across = [position(row, against) for row in curve.rows]
@@ -73,37 +71,41 @@ def curve_picture(evaluation: Evaluation, against: Against) -> Figure:
             label=plain_label(curve.name),
         )
         if len(curve.rows) == 1:  # there is no band of a single point
-            axes.errorbar(across, [curve.rows[0].value], _lengths(curve.rows[0]), color=curve.colour, capsize=2.0)
+            (row,) = curve.rows
+            # an interval of a bootstrap may leave its mean out
+            lengths = [[max(row.value - row.ci_low, 0.0)], [max(row.ci_high - row.value, 0.0)]]
+            axes.errorbar(across, [row.value], lengths, color=curve.colour, capsize=2.0)
     _dress_curves(axes, evaluation, curves, against)
     figure.legend(loc="outside lower center", ncols=LEGEND_COLUMNS, frameon=False, handlelength=2.6, borderaxespad=0.2)
     return figure
 
 
-def _lengths(row: Row) -> list[list[float]]:
-    """Both lengths of an error bar; an interval of a bootstrap may leave its mean out."""
-    low, high = row.value - row.ci_low, row.ci_high - row.value
-    return [[max(low, 0.0)], [max(high, 0.0)]]
-
-
 def _dress_curves(axes: Axes, evaluation: Evaluation, curves: list[Series], against: Against) -> None:
-    across, _ = axis_titles(evaluation, against)
-    up = f"{evaluation.metric.name} [{evaluation.metric.unit}]"
-    rows = [row for curve in curves for row in curve.rows]
+    metric, rows = evaluation.metric, [row for curve in curves for row in curve.rows]
+    up = plain_label(f"{metric.name} [{metric.unit}]", longest=40)
+    axes.set(xlabel=axis_titles(evaluation, against)[0], ylabel=up)
     scenes = f"{evaluation.scenes} held-out scene{'s' if evaluation.scenes != 1 else ''}"
-    axes.set_xlabel(across)
-    axes.set_ylabel(plain_label(up, longest=40))
-    title = f"{evaluation.metric.better} is better; {scenes}, 95 % intervals"
-    axes.set_title(title, fontsize=SMALL_POINTS, loc="left", color=SOFT)
-    places = [position(row, against) for row in rows]
+    _soft_title(axes, f"{metric.better} is better; {scenes}, 95 % intervals")
+    places, values = [position(row, against) for row in rows], [row.value for row in rows]
     if logarithmic(places):
         axes.set_xscale("log")
         counts = sorted({row.rays for row in rows})
         at_counts = against == "rays" and len(counts) <= MOST_RAY_TICKS
         label_ticks(axes.xaxis, counts if at_counts else log_ticks(places))
-    if logarithmic([row.value for row in rows]):
+    if logarithmic(values):
         axes.set_yscale("log")
-        label_ticks(axes.yaxis, log_ticks([row.value for row in rows]))
+        label_ticks(axes.yaxis, log_ticks(values))
     plain_axes(axes)
+
+
+def _soft_title(axes: Axes, title: str) -> None:
+    axes.set_title(title, fontsize=SMALL_POINTS, loc="left", color=SOFT)
+
+
+def _list_rows(axes: Axes, labels: Sequence[str]) -> None:
+    """A row per label, the first on top."""
+    axes.set_yticks(range(len(labels)), labels)
+    axes.set_ylim(max(len(labels), 1) - 0.4, -0.6)
 
 
 def differences_picture(evaluation: Evaluation) -> Figure:
@@ -119,12 +121,11 @@ def differences_picture(evaluation: Evaluation) -> Figure:
         if place and pair.a != pairs[place - 1].a:
             axes.axhline(place - 0.5, color=SOFT, linewidth=0.5)
     axes.axvline(0.0, color=INK, linewidth=0.8, zorder=1)
-    axes.set_yticks(range(len(pairs)), [_pair_label(pair) for pair in pairs])
-    axes.set_ylim(max(len(pairs), 1) - 0.4, -0.6)
+    _list_rows(axes, [f"{plain_label(pair.a)} - {plain_label(pair.b)}, {pair.rays} rays" for pair in pairs])
     metric = evaluation.metric
     axes.set_xlabel(plain_label(f"a - b: {metric.name} [{metric.unit}], {metric.better} is better", longest=90))
     plain_axes(axes, grid="x")
-    axes.set_title(title, fontsize=SMALL_POINTS, loc="left", color=SOFT)
+    _soft_title(axes, title)
     from matplotlib.lines import Line2D
 
     handles = [
@@ -152,10 +153,6 @@ def drawn_pairs(evaluation: Evaluation) -> tuple[list[Paired], str]:
     return pairs[:MOST_ROWS], f"{title}, against baselines" + (f"; the first {MOST_ROWS}" * (len(pairs) > MOST_ROWS))
 
 
-def _pair_label(pair: Paired) -> str:
-    return f"{plain_label(pair.a)} - {plain_label(pair.b)}, {pair.rays} rays"
-
-
 PHASE_ROW_INCHES, PANEL_MARGIN_INCHES = 0.17, 0.62
 PERCENT = 100.0
 # Phases of a smaller share of their command are in `other`.
@@ -178,15 +175,12 @@ def times_picture(times: Mapping[str, Mapping[str, float]]) -> Figure | None:
     panels = figure.subplots(len(shown), 1, squeeze=False, gridspec_kw={"height_ratios": [n + 1 for n in counts]})
     for axes, (command, rows) in zip(panels[:, 0], shown.items(), strict=True):
         total = sum(seconds for _, seconds, inside in rows if not inside)
-        most = max(seconds for _, seconds, _ in rows)
         for place, (_, seconds, inside) in enumerate(rows):
             axes.barh(place, seconds, height=0.62 if inside else 0.78, color=INNER if inside else WHOLE, linewidth=0)
             text = f" {seconds:.3g} s, {PERCENT * seconds / total:.0f} %"
             axes.text(seconds, place, text, va="center", fontsize=SMALL_POINTS, color=INK)
-        axes.set_yticks(range(len(rows)), [f"{'in it: ' * inside}{plain_label(name)}" for name, _, inside in rows])
-        axes.set_ylim(len(rows) - 0.4, -0.6)
-        axes.set_xlim(0.0, 1.22 * most)
-        axes.set_xlabel("seconds")
+        _list_rows(axes, [f"{'in it: ' * inside}{plain_label(name)}" for name, _, inside in rows])
+        axes.set(xlim=(0.0, 1.22 * max(seconds for _, seconds, _ in rows)), xlabel="seconds")
         axes.set_title(f"{plain_label(command)}: {total:.3g} s", loc="left", color=INK)
         axes.tick_params(axis="y", length=0)
         plain_axes(axes, grid="x")
@@ -217,7 +211,7 @@ def phase_rows(timings: Mapping[str, float]) -> list[tuple[str, float, bool]]:
 
 BOUND_ROW_INCHES, BOUND_MARGIN_INCHES = 0.19, 0.95
 DESIGN_INCHES = 0.085  # of a row, for each design in it
-MOST_DESIGNS = 6
+MOST_DESIGNS = min(len(COLOURS), len(MARKERS))
 # Room is shown on an axis between these; what is further is drawn on the edge.
 LEAST_ROOM, MOST_ROOM = -25.0, 105.0
 BROKEN = "#D55E00"
@@ -233,7 +227,9 @@ def constraints_picture(tightness: Mapping[str, Sequence[ConstraintSlack]]) -> F
         tightness: How tight each bound is, by the design's name.
     """
     # what holds for every design of the space is no constraint of anybody's
-    designs = {name: rows for name, rows in tightness.items() if any(not _of_space(row) for row in rows)}
+    designs = {
+        name: rows for name, rows in tightness.items() if not all(row.name.startswith(SPACE_MARK) for row in rows)
+    }
     if not designs:
         return None
     shown = dict(list(designs.items())[:MOST_DESIGNS])
@@ -250,18 +246,12 @@ def constraints_picture(tightness: Mapping[str, Sequence[ConstraintSlack]]) -> F
     for number, (name, rows) in enumerate(shown.items()):
         _draw_room(axes, rows, labels, number, len(shown), name)
     axes.axvline(0.0, color=INK, linewidth=0.8, zorder=1)
-    axes.set_yticks(range(len(labels)), labels)
-    axes.set_ylim(max(len(labels), 1) - 0.4, -0.6)
-    axes.set_xlim(LEAST_ROOM, MOST_ROOM)
-    axes.set_xlabel("room left [% of the bound]; negative: broken")
-    plain_axes(axes, grid="both")
-    axes.set_title(title, fontsize=SMALL_POINTS, loc="left", color=SOFT)
+    _list_rows(axes, labels)
+    axes.set(xlim=(LEAST_ROOM, MOST_ROOM), xlabel="room left [% of the bound]; negative: broken")
+    plain_axes(axes)
+    _soft_title(axes, title)
     figure.legend(*_room_legend(list(shown)), loc="outside lower center", ncols=4, frameon=False)
     return figure
-
-
-def _of_space(row: ConstraintSlack) -> bool:
-    return row.name.startswith(SPACE_MARK)
 
 
 def bound_label(row: ConstraintSlack) -> str:
@@ -273,25 +263,21 @@ def short_value(value: Any) -> str:
     """A bound or value in few letters: numbers with four digits, lists in brackets."""
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "none"}[value]
-    if isinstance(value, int | float):
-        return f"{value:.4g}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(short_value(one) for one in value)}]"
-    return str(value)
+    return f"{value:.4g}" if isinstance(value, int | float) else str(value)
 
 
 def _draw_room(
     axes: Axes, rows: Sequence[ConstraintSlack], labels: Sequence[str], number: int, count: int, name: str
 ) -> None:
     offset = (number - (count - 1) / 2) * 0.7 / count
-    colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
+    colour, marker = COLOURS[number], MARKERS[number]
     for row in rows:
         label = bound_label(row)
         if label not in labels:
             continue
-        place = labels.index(label) + offset
-        across = _place_of(row)
-        broken = row.broken > 0
+        place, across, broken = labels.index(label) + offset, _place_of(row), row.broken > 0
         if across > 0 and row.share is not None:
             axes.plot([0.0, min(across, MOST_ROOM)], [place, place], color=colour, linewidth=0.8, alpha=0.5, zorder=2)
         axes.plot(
@@ -320,10 +306,7 @@ def _room_legend(names: Sequence[str]) -> tuple[list[Any], list[str]]:
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], color=COLOURS[i % len(COLOURS)], marker=MARKERS[i % len(MARKERS)], linewidth=0.8)
-        for i in range(len(names))
-    ]
-    handles += [
+        *(Line2D([], [], color=COLOURS[i], marker=MARKERS[i], linewidth=0.8) for i in range(len(names))),
         Line2D([], [], color=SOFT, marker="o", markerfacecolor="white", linestyle="none"),
         Line2D([], [], color=BROKEN, marker="X", markersize=5.5, linestyle="none"),
     ]
@@ -337,8 +320,7 @@ def effects_picture(effects: Sequence[EffectSummary]) -> Figure | None:
     figure = new_figure(PAGE_INCHES, BOUND_MARGIN_INCHES + len(effects) * BOUND_ROW_INCHES)
     axes = figure.add_subplot()
     tolerance = effects[0].tolerance
-    shares = [share for effect in effects for share in _shares(effect)]
-    most = 10.0 ** math.ceil(math.log10(max([*shares, 10.0])))
+    most = max([10.0, *(share for effect in effects for share in _shares(effect))])
     for place, effect in enumerate(effects):
         _draw_effect(axes, effect, place)
         axes.annotate(
@@ -350,49 +332,33 @@ def effects_picture(effects: Sequence[EffectSummary]) -> Figure | None:
             color=INK if effect.on else SOFT,
         )
     axes.axvline(1.0, color=INK, linewidth=0.9, linestyle="dashed", zorder=1)
-    axes.set_xscale("log")
-    axes.set_xlim(LEAST_TOLERANCE_SHARE, most)
-    label_powers(axes.xaxis)
-    axes.set_yticks(range(len(effects)), [effect.name.replace("_", " ") for effect in effects])
-    axes.set_ylim(len(effects) - 0.4, -0.6)
+    axes.set(xscale="log", xlim=(LEAST_TOLERANCE_SHARE, 10.0 ** math.ceil(math.log10(most))))
+    label_ticks(axes.xaxis)
+    _list_rows(axes, [effect.name.replace("_", " ") for effect in effects])
     axes.set_xlabel("most that it could change / tolerated together")
-    plain_axes(axes, grid="both")
-    title = (
-        f"tolerated together (dashed): {MILLIMETRES * tolerance.range_m:.3g} mm, {tolerance.lost:.2g} of the returns"
-    )
-    axes.set_title(title, fontsize=SMALL_POINTS, loc="left", color=SOFT)
+    plain_axes(axes)
+    together = f"{MILLIMETRES * tolerance.range_m:.3g} mm, {tolerance.lost:.2g} of the returns"
+    _soft_title(axes, f"tolerated together (dashed): {together}")
     figure.legend(*_effect_legend(), loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
 def _shares(effect: EffectSummary) -> tuple[float, float]:
-    """Bounds on ranges and returns as shares of what is tolerated; 0 where nothing is bounded by nothing."""
-    tolerance = effect.tolerance
-    return _over(effect.range_m, tolerance.range_m), _over(effect.lost, tolerance.lost)
+    """Bounds on ranges and returns as shares of what is tolerated."""
+    tolerance, most = effect.tolerance, 1 / LEAST_TOLERANCE_SHARE**2
+    return min(effect.range_m / tolerance.range_m, most), min(effect.lost / tolerance.lost, most)
 
 
-def _over(bound: float, tolerated: float) -> float:
-    if not bound > 0:
-        return 0.0
-    share = bound / tolerated if tolerated > 0 else math.inf
-    return min(share, 1 / LEAST_TOLERANCE_SHARE**2)
+def _effect_look(marker: str, *, filled: bool) -> dict[str, Any]:
+    colour = ON if filled else OFF
+    return {"color": colour, "marker": marker, "markerfacecolor": colour if filled else "white", "linestyle": "none"}
 
 
 def _draw_effect(axes: Axes, effect: EffectSummary, place: int) -> None:
-    colour = ON if effect.on else OFF
     for share, marker, shift in zip(_shares(effect), ("o", "s"), (-0.14, 0.14), strict=True):
-        if share <= 0:
-            continue
-        axes.plot(
-            max(share, LEAST_TOLERANCE_SHARE),
-            place + shift,
-            marker=marker,
-            color=colour,
-            markerfacecolor=colour if effect.on else "white",
-            linestyle="none",
-            clip_on=False,
-            zorder=3,
-        )
+        if share > 0:
+            look = {**_effect_look(marker, filled=effect.on), "clip_on": False, "zorder": 3}
+            axes.plot(max(share, LEAST_TOLERANCE_SHARE), place + shift, **look)
 
 
 def _effect_words(effect: EffectSummary) -> str:
@@ -406,9 +372,5 @@ def _effect_words(effect: EffectSummary) -> str:
 def _effect_legend() -> tuple[list[Any], list[str]]:
     from matplotlib.lines import Line2D
 
-    def mark(marker: str, *, filled: bool) -> Line2D:
-        colour = ON if filled else OFF
-        return Line2D([], [], color=colour, marker=marker, markerfacecolor=colour if filled else "white", linestyle="")
-
-    names = ["range", "returns", "skipped (hollow)"]
-    return [mark("o", filled=True), mark("s", filled=True), mark("o", filled=False)], names
+    names = {"range": ("o", True), "returns": ("s", True), "skipped (hollow)": ("o", False)}
+    return [Line2D([], [], **_effect_look(marker, filled=on)) for marker, on in names.values()], list(names)

@@ -64,16 +64,14 @@ def curve_figure(evaluation: Evaluation, against: Against) -> dict[str, Any]:
     across, up = axis_titles(evaluation, against)
     rows = [row for curve in curves for row in curve.rows]
     places = [position(row, against) for row in rows]
-    ticks = (
-        {"tickvals": sorted(set(places)), "tickformat": "~g"} if against == "rays" else {"tickformat": "~g"}
-    )
+    ticks = {"tickvals": sorted(set(places))} if against == "rays" else {}
     axis = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside"}
     layout = {
         "font": FONT,
         "paper_bgcolor": "#ffffff",
         "plot_bgcolor": "#ffffff",
         "margin": {"l": 74, "r": 16, "t": 12, "b": 56},
-        "xaxis": {**axis, **_scale(places), **ticks, "title": {"text": across}},
+        "xaxis": {**axis, **_scale(places), **ticks, "tickformat": "~g", "title": {"text": across}},
         "yaxis": {
             **axis,
             **_scale([row.value for row in rows]),
@@ -124,9 +122,7 @@ def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
             "color": curve.colour,
             "line": {"color": curve.colour, "width": 1.5},
         },
-        "text": [
-            f"{row.rays} rays, {row.bandwidth_mbps:.3g} Mbit/s, {row.failures} failures" for row in curve.rows
-        ],
+        "text": [f"{row.rays} rays, {row.bandwidth_mbps:.3g} Mbit/s, {row.failures} failures" for row in curve.rows],
         "hovertemplate": "%{y:.4g}<br>%{text}<extra>%{fullData.name}</extra>",
     }
     return [band, line]
@@ -137,6 +133,13 @@ SCALE = [[0.0, "#ffffff"], [0.2, "#d6e6f4"], [0.45, "#6baed6"], [0.7, "#2171b5"]
 FILL, INK, QUIET = "#b8c1cb", "#1f2933", "#7b8794"
 MOST_DESIGNS = 6  # drawn beside a marginal
 AXIS = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside", "tickformat": "~g"}
+LAYOUT = {
+    "font": {**FONT, "size": 12},
+    "paper_bgcolor": "#ffffff",
+    "plot_bgcolor": "#ffffff",
+    "margin": {"l": 58, "r": 12, "t": 10, "b": 46},
+    "showlegend": False,
+}
 
 
 def marginal_figure(marginal: Marginal, looks: Mapping[str, Series]) -> dict[str, Any]:
@@ -159,7 +162,7 @@ def marginal_figure(marginal: Marginal, looks: Mapping[str, Series]) -> dict[str
         if name in looks
     ]
     layout = {
-        **_figure_layout(),
+        **LAYOUT,
         "xaxis": {**AXIS, "title": {"text": marginal.label}, "range": [marginal.edges[0], marginal.edges[-1]]},
         "yaxis": {**AXIS, "title": {"text": marginal.unit}, "range": [0, marginal.top]},
         "hovermode": "closest",
@@ -186,11 +189,12 @@ def plane_figure(plane: PlaneDensity) -> dict[str, Any]:
         if covered.any() and not covered.all()
     ]
     layout = {
-        **_figure_layout(),
+        **LAYOUT,
         "xaxis": {**AXIS, "title": {"text": plane.labels[0]}, "constrain": "domain", "showgrid": False},
-        "yaxis": {**AXIS, "title": {"text": plane.labels[1]}, "constrain": "domain", "showgrid": False},
-    }
-    layout["yaxis"]["scaleanchor"] = "x"
+        "yaxis": {
+            **AXIS, "title": {"text": plane.labels[1]}, "constrain": "domain", "showgrid": False, "scaleanchor": "x"
+        },
+    }  # fmt: skip
     return {"data": [heat, *outlines], "layout": layout}
 
 
@@ -223,16 +227,6 @@ def _steps(edges: np.ndarray, heights: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _figure_layout() -> dict[str, Any]:
-    return {
-        "font": {**FONT, "size": 12},
-        "paper_bgcolor": "#ffffff",
-        "plot_bgcolor": "#ffffff",
-        "margin": {"l": 58, "r": 12, "t": 10, "b": 46},
-        "showlegend": False,
-    }
-
-
 COLUMNS = 2
 ROW_PX = 300
 # The share of the figure's width between panels; pixels above panels for titles, below for axes, and per line of text.
@@ -250,11 +244,8 @@ def pareto_figure(sweeps: Sequence[Sweep]) -> dict[str, Any]:
     shown = panels(sweeps)
     rows = math.ceil(len(shown) / COLUMNS)
     layout: dict[str, Any] = {
-        "font": {**FONT, "size": 12},
-        "paper_bgcolor": "#ffffff",
-        "plot_bgcolor": "#ffffff",
+        **LAYOUT,
         "margin": {"l": 62, "r": 12, "t": 4, "b": 4},
-        "showlegend": False,
         "hovermode": "closest",
         "annotations": [],
     }
@@ -262,43 +253,32 @@ def pareto_figure(sweeps: Sequence[Sweep]) -> dict[str, Any]:
     for index, panel in enumerate(shown):
         name = "" if index == 0 else str(index + 1)
         where = {"xaxis": f"x{name}", "yaxis": f"y{name}", "type": "scatter"}
-        front = panel.front
         line = {
             **where,
-            "x": [mark.x for mark in front],
-            "y": [mark.y for mark in front],
+            "x": [mark.x for mark in panel.front],
+            "y": [mark.y for mark in panel.front],
             "mode": "lines",
             "line": {"color": LINE, "width": 1.5},
             "opacity": PALE,
             "hoverinfo": "skip",
         }
-        tolerance = [{**where, **_tolerance(panel)}] if panel.shows_tolerance else []
-        traces += [*tolerance, line, {**where, **_marks(panel)}]
+        if panel.shows_tolerance:
+            traces.append({**where, **_tolerance(panel)})
+        traces += [line, {**where, **_marks(panel)}]
         # both axes of a panel in its place: across, then down
         row, column = divmod(index, COLUMNS)
         width = (1 - BETWEEN) / COLUMNS
         left = column * (width + BETWEEN)
-        top = 1 - (row + ABOVE_PX / ROW_PX) / rows
-        bottom = 1 - (row + 1 - BELOW_PX / ROW_PX) / rows
-        look = {
-            "type": "log",
-            "gridcolor": "#e4e7eb",
-            "linecolor": "#9aa5b1",
-            "ticks": "outside",
-            "zeroline": False,
-        }
-        seconds = {**look, **_ticks(panel.seconds), "domain": [left, left + width], "anchor": f"y{name}"}
-        errors = {**look, **_ticks(panel.errors), "domain": [bottom, top], "anchor": f"x{name}"}
-        seconds |= {"title": {"text": "seconds", "standoff": 4, "font": {"size": 11}}}
-        errors |= {"title": {"text": html.escape(panel.error_title), "standoff": 4, "font": {"size": 11}}}
-        layout |= {f"xaxis{name}": seconds, f"yaxis{name}": errors}
+        across = [left, left + width]
+        up = [1 - (row + 1 - BELOW_PX / ROW_PX) / rows, 1 - (row + ABOVE_PX / ROW_PX) / rows]
+        layout[f"xaxis{name}"] = _pareto_axis(panel.seconds, across, f"y{name}", "seconds")
+        layout[f"yaxis{name}"] = _pareto_axis(panel.errors, up, f"x{name}", html.escape(panel.error_title))
         layout["annotations"] += [_title(panel, name), *_settings(panel, name)]
     return {"data": traces, "layout": layout}
 
 
 def _marks(panel: Panel) -> dict[str, Any]:
     marks = panel.marks
-    colours = [CHOSEN if mark.chosen else LINE for mark in marks]
     return {
         "x": [mark.x for mark in marks],
         "y": [mark.y for mark in marks],
@@ -307,7 +287,7 @@ def _marks(panel: Panel) -> dict[str, Any]:
         "marker": {
             "symbol": ["triangle-down" if mark.on_edge else "circle" for mark in marks],
             "size": [13 if mark.measurement.default else 9 for mark in marks],
-            "color": colours,
+            "color": [CHOSEN if mark.chosen else LINE for mark in marks],
             "opacity": [
                 PALE if mark.beaten and not (mark.chosen or mark.measurement.default) else 1.0 for mark in marks
             ],
@@ -351,13 +331,10 @@ def _settings(panel: Panel, name: str) -> list[dict[str, Any]]:
 
 
 def _hover_text(mark: Mark, sweep: Sweep) -> str:
-    measurement, unit = mark.measurement, html.escape(sweep.unit)
-    error = (
-        "the reference"
-        if measurement.reference
-        else f"error {measurement.error:.3g} &#177; {measurement.uncertainty:.1g} {unit}"
-    )
-    lines = [f"<b>{html.escape(measurement.setting)}</b>", error, f"{measurement.seconds:.3g} s"]
+    measurement = mark.measurement
+    error = f"error {measurement.error:.3g} &#177; {measurement.uncertainty:.1g} {html.escape(sweep.unit)}"
+    lines = [f"<b>{html.escape(measurement.setting)}</b>", "the reference" if measurement.reference else error]
+    lines.append(f"{measurement.seconds:.3g} s")
     if measurement.memory_bytes is not None:
         lines.append(f"{measurement.memory_bytes / BYTES_PER_MB:.3g} MB")
     lines += ["the one to choose"] if mark.chosen else []
@@ -365,10 +342,21 @@ def _hover_text(mark: Mark, sweep: Sweep) -> str:
     return "<br>".join(line.strip() for line in lines)
 
 
-def _ticks(ends: tuple[float, float]) -> dict[str, Any]:
-    low, high = ends
-    spacing = {"dtick": "D2"} if has_fine_ticks(ends) else {"dtick": 1}
-    return {**spacing, "range": [math.log10(low), math.log10(high)], "tickformat": "~g", "tickfont": {"size": 10}}
+def _pareto_axis(ends: tuple[float, float], domain: list[float], anchor: str, title: str) -> dict[str, Any]:
+    return {
+        "type": "log",
+        "gridcolor": "#e4e7eb",
+        "linecolor": "#9aa5b1",
+        "ticks": "outside",
+        "zeroline": False,
+        "dtick": "D2" if has_fine_ticks(ends) else 1,
+        "range": [math.log10(end) for end in ends],
+        "tickformat": "~g",
+        "tickfont": {"size": 10},
+        "domain": domain,
+        "anchor": anchor,
+        "title": {"text": title, "standoff": 4, "font": {"size": 11}},
+    }
 
 
 def _title(panel: Panel, name: str) -> dict[str, Any]:
@@ -388,10 +376,9 @@ def _title(panel: Panel, name: str) -> dict[str, Any]:
 
 def _tolerance(panel: Panel) -> dict[str, Any]:
     """A dashed line across the panel; a trace, because shapes vanish behind grid lines in the same place."""
-    limit = panel.sweep.tolerance
     return {
         "x": list(panel.seconds),
-        "y": [limit, limit],
+        "y": [panel.sweep.tolerance] * 2,
         "mode": "lines",
         "line": {"color": TOLERANCE, "width": 1.2, "dash": "dash"},
         "hoverinfo": "skip",
@@ -412,10 +399,7 @@ def _table(sweep: Sweep) -> str:
     )
     headings = ("setting", f"error{unit}", "standard error", "seconds", "MB", "verdict")
     chosen = sweep.chosen
-    lines = [
-        (_cells(measurement), "better" if measurement is chosen else "open", False)
-        for measurement in sweep.measurements
-    ]
+    lines = [(_cells(one), "better" if one is chosen else "open", False) for one in sweep.measurements]
     words = {"better": "to choose", "open": ""}
     return f"<h3>{html.escape(sweep.knob)}: {html.escape(sweep.verdict)}</h3><p>{html.escape(about)}</p>" + table(
         headings, lines, text_columns=1, words=words, caption=f"Settings of {sweep.knob}."
@@ -424,15 +408,12 @@ def _table(sweep: Sweep) -> str:
 
 def _cells(measurement: Measurement) -> list[str]:
     """The setting, its error and uncertainty, seconds and memory; the last cell is for the verdict."""
-    memory = (
-        "" if measurement.memory_bytes is None else plain_number(measurement.memory_bytes / BYTES_PER_MB, 3, tiny=1.0)
-    )
-    error = (
-        ("reference", "") if measurement.reference else (f"{measurement.error:.3g}", f"{measurement.uncertainty:.2g}")
-    )
+    size = measurement.memory_bytes
+    memory = "" if size is None else plain_number(size / BYTES_PER_MB, 3, tiny=1.0)
+    error = (f"{measurement.error:.3g}", f"{measurement.uncertainty:.2g}")
     return [
         measurement.setting + (" (run)" if measurement.default else ""),
-        *error,
+        *(("reference", "") if measurement.reference else error),
         f"{measurement.seconds:.3g}",
         memory,
         "",

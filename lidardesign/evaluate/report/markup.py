@@ -95,8 +95,7 @@ def script_safe(text: str) -> str:
 
 def swatch(colour: str, dash: str | None, mark: str | None = None) -> str:
     """A piece of a line as it is drawn, with its mark; without a dash a filled box."""
-    width, height = (34, 12)
-    middle = f"translate({width / 2} {height / 2})"
+    width, height, middle = 34, 12, "translate(17.0 6.0)"
     if dash is None:
         drawn = f'<rect x="8" width="18" height="{height}" fill="{colour}"/>'
     else:
@@ -112,10 +111,9 @@ def swatch(colour: str, dash: str | None, mark: str | None = None) -> str:
 def switch(label: str, *, picture: str = "", count: str = "", checked: bool = True, **data: str) -> str:
     """A box to tick with its label, the look of what it switches, and a place for a count."""
     marks = "".join(f' data-{name}="{html.escape(value)}"' for name, value in data.items())
-    ticked = " checked" if checked else ""
     output = f'<output data-count="{html.escape(count)}"></output>' if count else ""
     return (
-        f'<label class="switch"><input type="checkbox"{marks}{ticked}>{picture}'
+        f'<label class="switch"><input type="checkbox"{marks}{" checked" if checked else ""}>{picture}'
         f"<span>{html.escape(label)}</span>{output}</label>"
     )
 

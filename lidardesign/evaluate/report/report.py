@@ -93,39 +93,43 @@ def write_report(report: Report, path: Path) -> None:
 
 def report_html(report: Report) -> str:
     """The page as text."""
-    evaluation = report.evaluation
-    metric = evaluation.metric
+    metric = report.evaluation.metric
     parts = [part for part in _parts(report) if part[2]]
     body = "\n".join(section(heading, content, identifier) for identifier, heading, content in parts)
     lead = f"{metric.name} in {metric.unit}, {metric.better} is better."
-    links = [(identifier, heading) for identifier, heading, _ in parts]
     from plotly.offline import get_plotlyjs
 
+    links = [part[:2] for part in parts]
     return page(report.title, lead, embedded(FONT, id="page-font") + body, get_plotlyjs(), links)
 
 
 def _parts(report: Report) -> list[tuple[str, str, str]]:
     """Identifier, heading and content of every section; empty content where there is nothing to tell."""
     evaluation = report.evaluation
+    designs = [one.design for one in report.shown.designs]
     # lines without marks are told apart by their dashes
     looks = {curve.name: curve for curve in series(evaluation)}
     looks = {name: replace(look, dash=DASHES[index % len(DASHES)]) for index, (name, look) in enumerate(looks.items())}
-    shown = [looks[one.design.name] for one in report.shown.designs]
-    sweeps = evaluation.accuracy.sweeps if evaluation.accuracy else ()
+    shown = [looks[one.name] for one in designs]
     result = paragraphs(summary_sentences(evaluation)) + paragraphs(evaluation.notes, "note")
+    rivals = folded(paired_table(evaluation), len(evaluation.paired), "All paired differences")
+    matched = len(evaluation.equal_bandwidth)
+    bandwidth = folded(bandwidth_table(evaluation), matched, "All rows at equal bandwidth") if matched else ""
+    constraints = [constraints_table(name, bounds) for name, bounds in report.constraints.items()]
+    sensors = [folded(sensors_table(one), len(one.sensors), f"Sensors of {one.name}") for one in designs]
     return [
         ("result", "Result", result),
         ("scene", "Designs in a scene", view_section(report.shown, shown, report.density_m)),
         ("curves", "Score against rays and bandwidth", _curves(evaluation)),
         ("scores", "All scores", rows_table(evaluation)),
-        ("rivals", "Against the rivals at equal rays", _rivals(evaluation)),
-        ("bandwidth", "Against the rivals at equal bandwidth", _at_equal_bandwidth(evaluation)),
+        ("rivals", "Against the rivals at equal rays", rivals),
+        ("bandwidth", "Against the rivals at equal bandwidth", bandwidth),
         ("density", "The learned density", _density(report.density, looks) if report.density else ""),
-        ("constraints", "Constraints and how tight each is", _constraints(report.constraints)),
+        ("constraints", "Constraints and how tight each is", "".join(constraints)),
         ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
         ("audit", "Audit of the physics", audit_section(evaluation, evaluation.audit) if evaluation.audit else ""),
-        ("accuracy", "What accuracy costs", _accuracy(sweeps)),
-        ("sensors", "Sensors", _sensors(report.shown)),
+        ("accuracy", "What accuracy costs", _accuracy(evaluation.accuracy.sweeps if evaluation.accuracy else ())),
+        ("sensors", "Sensors", "".join(sensors)),
         ("time", "Where the time went", times_tables(report.times)),
         ("reproduce", "How to reproduce this", reproduction(report.reproduce)),
     ]
@@ -145,16 +149,6 @@ def _curves(evaluation: Evaluation) -> str:
         + figure(curve_figure(evaluation, "bandwidth"), BANDWIDTH_ID, CURVE_PX, "The same scores against the bandwidth "
                  "that it takes to read the gates out.", "curves")
     )  # fmt: skip
-
-
-def _rivals(evaluation: Evaluation) -> str:
-    return folded(paired_table(evaluation), len(evaluation.paired), "All paired differences")
-
-
-def _at_equal_bandwidth(evaluation: Evaluation) -> str:
-    if not evaluation.equal_bandwidth:
-        return ""
-    return folded(bandwidth_table(evaluation), len(evaluation.equal_bandwidth), "All rows at equal bandwidth")
 
 
 def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
@@ -185,17 +179,6 @@ def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
         f'<p>{html.escape(about)}</p><div class="curves-shown">{legend}</div>{further}'
         f'<div class="tiles">{marginals}</div><div class="tiles wide">{planes}</div>'
     )
-
-
-def _constraints(found: Mapping[str, Sequence[ConstraintSlack]]) -> str:
-    return "".join(constraints_table(name, bounds) for name, bounds in found.items())
-
-
-def _sensors(shown: SceneFigure) -> str:
-    parts = []
-    for one in shown.designs:
-        parts.append(folded(sensors_table(one.design), len(one.design.sensors), f"Sensors of {one.design.name}"))
-    return "".join(parts)
 
 
 def _accuracy(sweeps: Sequence[Sweep]) -> str:
@@ -243,10 +226,9 @@ def evaluation_report(
     points = None
     if density is not None:
         points = observed_point(density.samples.resample(DENSITY_POINTS, random_generator(config.seed, STREAM)))
-    commands = [("The scores and this page", _line(command))]
     learned = manifest.get("command")
-    if isinstance(learned, list) and learned:
-        commands.insert(0, ("The run that was learned", _line(learned)))
+    commands = [("The run that was learned", _line(learned))] if isinstance(learned, list) and learned else []
+    commands.append(("The scores and this page", _line(command)))
     facts = [
         ("task", config.task_name),
         ("seed of the scenes", str(request.seed)),
@@ -261,9 +243,8 @@ def evaluation_report(
         memory = entry.get("peak_memory_bytes")
         title = f"lidardesign {name}" + (", up to this report" if name == COMMAND else "")
         seconds = {phase: float(value) for phase, value in phases.items()}
-        times.append(
-            CommandTimes(title, str(entry.get("when", "")), seconds, memory if isinstance(memory, int) else None)
-        )
+        memory = memory if isinstance(memory, int) else None
+        times.append(CommandTimes(title, str(entry.get("when", "")), seconds, memory))
     settings = folder / FILE_NAME
     return Report(
         evaluation,

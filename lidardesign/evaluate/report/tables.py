@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +12,7 @@ from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.report.markup import definitions
 from lidardesign.evaluate.results import (
+    MILLIMETRES,
     Audit,
     AuditRow,
     EffectSummary,
@@ -68,19 +69,17 @@ def summary_sentences(evaluation: Evaluation) -> list[str]:
 
 def rows_table(evaluation: Evaluation) -> str:
     """All rows at equal rays."""
-    unit = evaluation.metric.unit
-    headings = ["design", "rays", f"{evaluation.metric.name} [{unit}]", "95 % interval", "failures"]
-    detail = leading_detail(evaluation.rows)
-    headings += [] if detail is None else [_words(detail)]
-    caption = f"Means over {held_out_scenes(evaluation.scenes)}; seconds are those of simulating and scoring all."
-    headings += ["Mbit/s", "seconds"]
+    metric, detail = evaluation.metric, leading_detail(evaluation.rows)
+    details = [] if detail is None else [detail]
+    headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "failures"]
+    headings += [*map(_words, details), "Mbit/s", "seconds"]
     lines = []
     for index, row in enumerate(evaluation.rows):
         cells = [row.design, str(row.rays), four_digits(row.value), _interval(row), str(row.failures)]
-        if detail is not None:
-            cells.append(four_digits(row.details[detail]) if detail in row.details else "-")
+        cells += [four_digits(row.details[name]) if name in row.details else "-" for name in details]
         cells += [four_digits(row.bandwidth_mbps), f"{row.seconds:.2f}"]
         lines.append((cells, "", bool(index and row.design != evaluation.rows[index - 1].design)))
+    caption = f"Means over {held_out_scenes(evaluation.scenes)}; seconds are those of simulating and scoring all."
     return table(headings, lines, text_columns=1, caption=caption)
 
 
@@ -105,41 +104,23 @@ def bandwidth_table(evaluation: Evaluation) -> str:
     """Each design against baselines that were given as many rays as fit in its bandwidth."""
     unit = evaluation.metric.unit
     headings = ["design", "baseline", "rays", "its rays", "Mbit/s", f"design [{unit}]", f"baseline [{unit}]"]
-    own = {(row.design, row.rays): row for row in evaluation.rows if not row.baseline}
-    lines = []
-    for index, (row, pair) in enumerate(
-        zip(evaluation.equal_bandwidth, evaluation.paired_bandwidth, strict=True)
-    ):
-        mine = own[pair.a, pair.rays]
-        cells = [pair.a, pair.b, str(pair.rays), str(row.rays), four_digits(mine.bandwidth_mbps)]
-        cells += [
-            four_digits(mine.value),
-            four_digits(row.value),
-            f"{four_digits(pair.difference)} ({_interval(pair)})",
-            "",
-        ]
-        lines.append(
-            (
-                cells,
-                verdict(evaluation, pair),
-                bool(index and row.design == evaluation.equal_bandwidth[0].design),
-            )
-        )
-    caption = "Each design against baselines with as many rays (their rays) as fit in its bandwidth."
     headings += ["difference (95 % interval)", "design is"]
+    own = {(row.design, row.rays): row for row in evaluation.rows if not row.baseline}
+    pairs = zip(evaluation.equal_bandwidth, evaluation.paired_bandwidth, strict=True)
+    lines = []
+    for index, (row, pair) in enumerate(pairs):
+        mine = own[pair.a, pair.rays]
+        cells = [pair.a, pair.b, str(pair.rays), str(row.rays), *map(four_digits, (mine.bandwidth_mbps, mine.value))]
+        cells += [four_digits(row.value), f"{four_digits(pair.difference)} ({_interval(pair)})", ""]
+        begins = bool(index and row.design == evaluation.equal_bandwidth[0].design)
+        lines.append((cells, verdict(evaluation, pair), begins))
+    caption = "Each design against baselines with as many rays (their rays) as fit in its bandwidth."
     return table(headings, lines, text_columns=2, caption=caption)
 
 
 def sensors_table(design: DesignSpec) -> str:
     """A design's sensors in degrees and metres."""
-    headings = [
-        "sensor",
-        "share",
-        "origin [m]",
-        "azimuth, elevation [deg]",
-        "field of view [deg]",
-        "gate [m]",
-    ]
+    headings = ["sensor", "share", "origin [m]", "azimuth, elevation [deg]", "field of view [deg]", "gate [m]"]
     lines = []
     for sensor, weight in zip(design.sensors[:MOST_SENSORS], design.weights, strict=False):
         horizontal, vertical = (math.degrees(angle) for angle in sensor.field_of_view_rad)
@@ -157,8 +138,8 @@ def sensors_table(design: DesignSpec) -> str:
         lines.append((cells, "", False))
     rest = len(design.sensors) - MOST_SENSORS
     caption = f"Sensors of {design.name}: shares of the rays, and intervals that hold {100 * design.level:g} % of each."
-    listed = table(headings, lines, text_columns=1, caption=caption)
-    return listed + (f"<p>and {rest} more.</p>" if rest > 0 else "")
+    more = f"<p>and {rest} more.</p>" if rest > 0 else ""
+    return table(headings, lines, text_columns=1, caption=caption) + more
 
 
 def _comparison(evaluation: Evaluation, pair: Paired, other: float) -> str:
@@ -190,7 +171,14 @@ def table(
         f'<th{" class=text" if column < text_columns else ""} scope="col">{html.escape(heading)}</th>'
         for column, heading in enumerate(headings)
     )
-    body = "".join(_line(cells, word, words, first, text_columns) for cells, word, first in lines)
+    body = ""
+    for (name, *cells), word, first in lines:
+        shown = [f'<th scope="row" class="name">{html.escape(name)}</th>']
+        for column, cell in enumerate(cells, start=1):
+            shown.append(f"<td{' class=name' if column < text_columns else ''}>{html.escape(cell)}</td>")
+        if word:
+            shown[-1] = f'<td class="{word}">{words[word]}</td>'
+        body += f"<tr{' class=first' if first else ''}>{''.join(shown)}</tr>"
     title = html.escape(caption)
     named = f' role="region" aria-label="{title}"' if title else ""
     heading = f"<caption><span>{title}</span></caption>" if title else ""
@@ -198,17 +186,6 @@ def table(
         f'<div class="scroll" tabindex="0"{named}><table>{heading}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>'
         "</table></div>"
     )
-
-
-def _line(cells: list[str], word: str, words: Mapping[str, str], first: bool, text_columns: int) -> str:
-    shown = [
-        f"<td{' class=name' if column < text_columns else ''}>{html.escape(cell)}</td>"
-        for column, cell in enumerate(cells)
-    ]
-    shown[0] = f'<th scope="row" class="name">{html.escape(cells[0])}</th>'
-    if word:
-        shown[-1] = f'<td class="{word}">{words[word]}</td>'
-    return f"<tr{' class=first' if first else ''}>{''.join(shown)}</tr>"
 
 
 # Phases of a smaller share of their command are left out; `other` has what they took.
@@ -260,24 +237,22 @@ def constraints_table(name: str, found: Sequence[ConstraintSlack]) -> str:
     if not found:
         return f"<p>{html.escape(name)} has no constraints.</p>"
     headings = ("constraint", "bound", "closest", "room", "used", "verdict")
-    head = _head(headings, text=(0, 4))
-    rows = "".join(_constraint_row(one) for one in found)
     caption = f"Constraints of {name}. Closest: the sensor with the least room. Used: the share of the bound."
-    return _scrolled(head, rows, caption)
+    return _scrolled(headings, (0, 4), map(_constraint_row, found), caption)
 
 
 def _constraint_row(one: ConstraintSlack) -> str:
     owner = f"{html.escape(one.sensor)}: " if one.sensor else ""
     how = {"broken": "worse", "at the bound": "open", "kept": "better"}[one.word]
-    verdict = one.word
-    if one.sensors > 1 and (one.broken or one.tight):
-        verdict += f" ({one.broken or one.tight} of {one.sensors})"
+    several = one.sensors > 1 and (one.broken or one.tight)
+    count = f" ({one.broken or one.tight} of {one.sensors})" if several else ""
     room = "-" if one.room is None else _room(one.room, one.bound)
-    bound, value = html.escape(number(one.bound)), html.escape(number(one.value))
-    cells = f'<td class="wraps">{bound}</td><td class="wraps">{owner}{value}</td><td>{room}</td>'
-    used = f'<td class="bars">{_used(one)}</td>'
-    name = f'<th scope="row" class="name">{html.escape(one.name)}</th>'
-    return f'<tr>{name}{cells}{used}<td class="{how}">{verdict}</td></tr>'
+    return (
+        f'<tr><th scope="row" class="name">{html.escape(one.name)}</th>'
+        f'<td class="wraps">{html.escape(number(one.bound))}</td>'
+        f'<td class="wraps">{owner}{html.escape(number(one.value))}</td><td>{room}</td>'
+        f'<td class="bars">{_used(one)}</td><td class="{how}">{one.word}{count}</td></tr>'
+    )
 
 
 def _room(room: float, bound: Any) -> str:
@@ -290,21 +265,19 @@ def _used(one: ConstraintSlack) -> str:
     """A bar that is full where a design is at its bound; in words for who cannot see it."""
     if one.share is None:
         return "-"
-    used = min(max(1.0 - one.share, 0.0), 1.0)
+    used = PERCENT * min(max(1.0 - one.share, 0.0), 1.0)
     kind = " broken" if one.broken else " full" if one.tight else ""
-    label = f"{PERCENT * used:.0f} % used"
-    width = f"{PERCENT * used:.1f}%"
-    return f'<span class="room{kind}" role="img" aria-label="{label}"><i style="width:{width}"></i></span>'
+    bar = f'<i style="width:{used:.1f}%"></i>'
+    return f'<span class="room{kind}" role="img" aria-label="{used:.0f} % used">{bar}</span>'
 
 
 def number(value: Any) -> str:
     """A figure, a text, or a list or mapping of them, for people; of a list of places how many there are."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {number(item)}" for name, item in value.items())
-    if isinstance(value, list | tuple) and value and isinstance(value[0], list | tuple):
-        return f"{len(value)} places"
     if isinstance(value, list | tuple):
-        return ", ".join(number(item) for item in value)
+        places = bool(value) and isinstance(value[0], list | tuple)
+        return f"{len(value)} places" if places else ", ".join(number(item) for item in value)
     if value is None:
         return "-"
     # adding zero takes the sign from a -0
@@ -317,23 +290,19 @@ def times_tables(commands: Sequence[CommandTimes]) -> str:
 
 
 def _times_table(one: CommandTimes) -> str:
-    head = _head(("phase", "seconds", "share", "bar"), text=(0, 3))
     memory = "" if one.memory_bytes is None else f", at most {one.memory_bytes / MEBIBYTE:,.0f} MiB of memory"
     when = f" ({one.when})" if one.when else ""
     caption = f"{one.command}: {one.seconds:.2f} s{memory}{when}. Hatched phases are parts of the one above."
-    rows = "".join(_time_row(name, seconds, one.seconds) for name, seconds in _main_phases(one).items())
-    return _scrolled(head, rows, caption)
-
-
-def _main_phases(one: CommandTimes) -> dict[str, float]:
-    """Phases of two levels that matter, and what all others took."""
+    # two levels of phases that matter, and what all others took
     shown = {
         name: seconds
         for name, seconds in one.phases.items()
         if name != OTHER and name.count(INSIDE) < DEEPEST and seconds >= LEAST_SHARE * one.seconds
     }
     rest = one.seconds - math.fsum(seconds for name, seconds in shown.items() if INSIDE not in name)
-    return {**shown, OTHER: max(rest, 0.0)}
+    shown[OTHER] = max(rest, 0.0)
+    rows = (_time_row(name, seconds, one.seconds) for name, seconds in shown.items())
+    return _scrolled(("phase", "seconds", "share", "bar"), (0, 3), rows, caption)
 
 
 def _time_row(name: str, seconds: float, total: float) -> str:
@@ -352,28 +321,24 @@ def reproduction(how: Reproduction) -> str:
     parts = [f"<p>{html.escape(what)}</p><pre>{html.escape(command)}</pre>" for what, command in how.commands]
     parts.append(definitions(how.facts))
     if how.config:
-        config = f"<pre>{html.escape(how.config)}</pre>"
-        parts.append(f"<details><summary>The run's configuration</summary>{config}</details>")
+        summary = "<summary>The run's configuration</summary>"
+        parts.append(f"<details>{summary}<pre>{html.escape(how.config)}</pre></details>")
     return "".join(parts)
 
 
-def _head(headings: Sequence[str], text: Sequence[int]) -> str:
-    """Headings of columns, those of text on the left."""
-    return "".join(
+def _scrolled(headings: Sequence[str], text: Sequence[int], rows: Iterable[str], caption: str) -> str:
+    """A table of rows in markup; headings of text stand on the left."""
+    label = html.escape(caption)
+    head = "".join(
         f'<th scope="col"{" class=text" if index in text else ""}>{html.escape(heading)}</th>'
         for index, heading in enumerate(headings)
     )
-
-
-def _scrolled(head: str, rows: str, caption: str) -> str:
-    label = html.escape(caption)
     return (
-        f'<div class="scroll" tabindex="0" role="region" aria-label="{label}">'
-        f"<table><caption><span>{label}</span></caption><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{label}"><table><caption><span>{label}</span>'
+        f"</caption><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
     )
 
 
-MILLIMETRES = 1000.0
 SHORT_S = 0.01  # costs from here on are shown as their limit
 
 
@@ -399,22 +364,21 @@ def audit_section(evaluation: Evaluation, audit: Audit) -> str:
     """Every row under the plan and under all effects, with a verdict each."""
     planned, everything = audit.seconds
     there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
-    skipped = html.escape(", ".join(_words(name) for name in audit.skipped if name in there))
-    skipped = skipped or "nothing that is there"
-    passed = "failed" if audit.failed else "passed"
+    skipped = html.escape(", ".join(_words(name) for name in audit.skipped if name in there) or "nothing that is there")
     head = (
-        f"<p>The audit {passed}. The plan skips {skipped}; all rows took {planned:.2f} s under it and "
-        f"{everything:.2f} s under all effects, with the same random numbers. A mean may move by {audit.tolerance:g} "
-        f"{html.escape(audit.unit)}, the metric's tolerance; the largest difference is {audit.worst:.2g}.</p>"
+        f"<p>The audit {'failed' if audit.failed else 'passed'}. The plan skips {skipped}; all rows took {planned:.2f} "
+        f"s under it and {everything:.2f} s under all effects, with the same random numbers. A mean may move by "
+        f"{audit.tolerance:g} {html.escape(audit.unit)}, the metric's tolerance; the largest difference is "
+        f"{audit.worst:.2g}.</p>"
     )
     unit = audit.unit
     headings = ["design", "rays", f"planned [{unit}]", f"all [{unit}]", "difference", "95 % interval"]
+    headings += ["planned [s]", "all [s]", "moved"]
     lines = [
         (_audit_cells(row), "worse" if row in audit.failed else "better", bool(index and _starts(audit.rows, index)))
         for index, row in enumerate(audit.rows)
     ]
     words = {"worse": "too far", "better": "within"}
-    headings += ["planned [s]", "all [s]", "moved"]
     return head + table(headings, lines, text_columns=1, words=words, caption="Every row under the plan and under all.")
 
 
@@ -427,22 +391,15 @@ def _starts(rows: Sequence[AuditRow], index: int) -> bool:
 
 
 def _effect_cells(effect: EffectSummary) -> list[str]:
-    shown = [_words(effect.name), _simulated(effect), effect.reason]
-    bounds = (plain_number(MILLIMETRES * effect.range_m, 3), plain_number(effect.lost, 2))
-    return [*shown, *bounds, plain_number(effect.seconds, 2, tiny=SHORT_S)]
-
-
-def _simulated(effect: EffectSummary) -> str:
+    simulated = "no" if effect.missing is None else "not possible here"
     if effect.on:
-        return "yes" if effect.scenes_on == 1 else f"in {100 * effect.scenes_on:.0f} % of scenes"
-    return "no" if effect.missing is None else "not possible here"
+        simulated = "yes" if effect.scenes_on == 1 else f"in {100 * effect.scenes_on:.0f} % of scenes"
+    bounds = (plain_number(MILLIMETRES * effect.range_m, 3), plain_number(effect.lost, 2))
+    return [_words(effect.name), simulated, effect.reason, *bounds, plain_number(effect.seconds, 2, tiny=SHORT_S)]
 
 
 def _audit_cells(row: AuditRow) -> list[str]:
     name = row.design if row.matched_to is None else f"{row.design} (bandwidth of {row.matched_to})"
     cells = [name, str(row.rays), four_digits(row.planned), four_digits(row.everything), f"{row.difference:.2g}"]
-    return [*cells, f"{row.ci_low:.2g} to {row.ci_high:.2g}", *_times(row), ""]
-
-
-def _times(row: AuditRow) -> list[str]:
-    return [f"{row.seconds:.2f}", f"{row.seconds_everything:.2f}"]
+    interval = f"{row.ci_low:.2g} to {row.ci_high:.2g}"
+    return [*cells, interval, f"{row.seconds:.2f}", f"{row.seconds_everything:.2f}", ""]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.layouts.grid import field_on_sphere
-from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
+from lidardesign.design.sensor import Sensor, interval_factor
 from lidardesign.evaluate.figures.canvas import Series
 from lidardesign.evaluate.figures.drawing import (
     MOST_FACES,
@@ -64,7 +64,6 @@ def view_document(shown: SceneFigure, looks: Sequence[Series], density_m: np.nda
     bodies = drawn_bodies(shown)
     bounds = view_bounds(shown)
     share, steps = drawn_share(shown.scene), round_steps(shown.scene)
-    moving = [body for body in bodies if body.poses.ndim == 3]
     return {
         "frames": len(shown.frames),
         "places": len(shown.places),
@@ -75,7 +74,7 @@ def view_document(shown: SceneFigure, looks: Sequence[Series], density_m: np.nda
             for code, _, colour, dash, symbol in OUTCOMES
         ],
         "rest": [_resting(bodies, target, bounds, share, steps) for target in (True, False)],
-        "moving": [_moving(body, shown, bounds, share, steps) for body in moving],
+        "moving": [_moving(body, shown, bounds, share, steps) for body in bodies if body.poses.ndim == 3],
         "designs": [_design(one, look) for one, look in zip(shown.designs, looks, strict=True)],
         "density": None if density_m is None else encoded(density_m, "<f4"),
         "many": MANY_RAYS,
@@ -93,8 +92,7 @@ def drawn_bodies(shown: SceneFigure) -> list[Body]:
     bodies = list(shown.scene.bodies)
     if len(bodies) <= MOST_BODIES:
         return bodies
-    sizes = [_size(body) for body in bodies]
-    largest = np.argsort(sizes, kind="stable")[::-1][:MOST_BODIES]
+    largest = np.argsort([_size(body) for body in bodies], kind="stable")[::-1][:MOST_BODIES]
     return [bodies[index] for index in np.sort(largest)]
 
 
@@ -110,27 +108,24 @@ def _size(body: Body) -> float:
 def view_bounds(shown: SceneFigure) -> np.ndarray:
     """The box that is drawn, shape (2, 3) [m]: scene, sensors, and their rays as far as they stay near."""
     rays = [one for design in shown.designs for one in design.rays]
-    each = [scene_bounds(shown.scene, frame, rays) for frame in {shown.frames[0], shown.frames[-1]}]
-    low, high = np.min([one[0] for one in each], axis=0), np.max([one[1] for one in each], axis=0)
+    each = np.array([scene_bounds(shown.scene, frame, rays) for frame in {shown.frames[0], shown.frames[-1]}])
+    low, high = each[:, 0].min(axis=0), each[:, 1].max(axis=0)
     reach = MARGIN * float((high - low).max())
-    ends = np.concatenate([np.zeros((0, 3)), *(design.ends_m.reshape(-1, 3) for design in shown.designs)])
-    ends = np.concatenate([ends, *(shell for design in shown.designs for shell in _shells(design))])
+    ends = np.concatenate([np.zeros((0, 3)), *(piece for design in shown.designs for piece in _drawn_points(design))])
     if len(ends):
         low = np.minimum(low, np.maximum(ends.min(axis=0), low - reach))
         high = np.maximum(high, np.minimum(ends.max(axis=0), high + reach))
     return np.stack([low, high])
 
 
-def _shells(one: DrawnDesign) -> list[np.ndarray]:
-    """Gates and origins that are drawn, at the first and the last position."""
-    if len(one.design.sensors) > MOST_SENSORS:
-        return []
-    found = []
-    for design in (one.placed[0], one.placed[-1]):
+def _drawn_points(one: DrawnDesign) -> list[np.ndarray]:
+    """Ends of rays, and gates and origins that are drawn at the first and the last position."""
+    points = [one.ends_m.reshape(-1, 3)]
+    for design in (one.placed[0], one.placed[-1]) if len(one.design.sensors) <= MOST_SENSORS else ():
         for sensor in design.sensors:
             starts = origin_lines(sensor, design.level)
-            found += [gate_shell(sensor)[0], starts[~np.isnan(starts[:, 0])]]
-    return found
+            points += [gate_shell(sensor)[0], starts[~np.isnan(starts[:, 0])]]
+    return points
 
 
 def is_flat(directions: np.ndarray) -> bool:
@@ -143,18 +138,14 @@ def camera(directions: np.ndarray) -> dict[str, Any]:
     if is_flat(directions):
         up, center = {"x": 0, "y": 1, "z": 0}, {"x": 0, "y": 0, "z": 0}
         return {"eye": {"x": 0, "y": 0, "z": 1.9}, "up": up, "center": center}
-    up = {"x": 0, "y": 0, "z": 1}
-    return {"eye": _side_view(directions), "up": up, "center": {"x": 0, "y": 0, "z": -0.1}}
-
-
-def _side_view(directions: np.ndarray) -> dict[str, float]:
-    """A camera beside the mean direction of the rays, a little behind the sensors and above them."""
+    # beside the mean direction of the rays, a little behind the sensors and above them
     mean = directions.mean(axis=0) if len(directions) else np.array([1.0, 0.0, 0.0])
     forward = np.array([mean[0], mean[1], 0.0])
     length = np.linalg.norm(forward)
     forward = forward / length if length > EPSILON_FLOAT32 else np.array([1.0, 0.0, 0.0])
     eye = 1.25 * np.array([-forward[1], forward[0], 0.0]) - 1.0 * forward + np.array([0.0, 0.0, 0.7])
-    return {name: float(value) for name, value in zip("xyz", eye, strict=True)}
+    up, center = {"x": 0, "y": 0, "z": 1}, {"x": 0, "y": 0, "z": -0.1}
+    return {"eye": dict(zip("xyz", eye.tolist(), strict=True)), "up": up, "center": center}
 
 
 def _mesh(vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
@@ -184,25 +175,20 @@ def _moving(body: Body, shown: SceneFigure, bounds: np.ndarray, share: float, st
 
 def _design(one: DrawnDesign, look: Series) -> dict[str, Any]:
     few = len(one.design.sensors) <= MOST_SENSORS
-    first = one.rays[0]
+    cones = [[_cone(sensor, design.level) for sensor in design.sensors] for design in one.placed] if few else []
     return {
         "name": html.escape(one.design.name),
         "colour": look.colour,
         "dash": DASHES[look.dash],
         "sensors": len(one.design.sensors) if few else 0,
-        "cones": encoded(np.stack([_cones(design) for design in one.placed]), "<f4") if few else "",
-        "rays": len(first),
-        "owner": encoded(first.sensor, "<u2"),
+        "cones": encoded(np.array(cones), "<f4"),
+        "rays": len(one.rays[0]),
+        "owner": encoded(one.rays[0].sensor, "<u2"),
         "origin": encoded(np.stack([rays.origin_m for rays in one.rays]), "<f4"),
         "direction": encoded(np.stack([rays.direction for rays in one.rays]), "<f4"),
         "length": encoded(one.length_m, "<f4"),
         "outcome": encoded(one.outcome, "|u1"),
     }
-
-
-def _cones(design: DesignSpec) -> np.ndarray:
-    """What a sensor's drawing follows from, shape (S, 25): see `_cone`."""
-    return np.stack([_cone(sensor, design.level) for sensor in design.sensors])
 
 
 def _cone(sensor: Sensor, level: float) -> np.ndarray:
@@ -232,7 +218,6 @@ OF_SOLID = ("up", "down", "above")
 
 def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndarray | None) -> str:
     """Everything of the view; `looks` are the designs' colours and dashes, `density_m` (K, 3) observed points."""
-    document = view_document(shown, looks, density_m)
     stage = (
         f'<div class="stage"><div id="view-scene" tabindex="0" role="application" aria-label="3D view of the scene. '
         'Arrow keys turn it, plus and minus go closer and farther, Home shows the first view."></div>'
@@ -246,23 +231,22 @@ def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndar
         for code, name, colour, dash, symbol in OUTCOMES
         if int(code) in there
     )
-    density = density_m is not None
-    occluders = any(not body.is_target for body in shown.scene.bodies)
     layers = [switch("scene", picture=swatch("#c9b8a8", None), layer="scene")]
-    layers += [switch("occluders", picture=swatch("#6b7280", None), layer="occluders")] if occluders else []
+    if not all(body.is_target for body in shown.scene.bodies):
+        layers.append(switch("occluders", picture=swatch("#6b7280", None), layer="occluders"))
     layers += [switch("fields of view", layer="fields"), switch("gates", layer="gates")]
     layers += [switch("where rays start", layer="starts")]
-    if density:
+    if density_m is not None:
         dots = swatch("#7b2d8b", "dotted")
         layers.append(switch("what the learned density observes", picture=dots, checked=False, layer="density"))
-    controls = "".join(
-        (_sliders(shown), _group("Rays", switches), _group("Shown", "".join(layers)), _designs(shown, looks))
-    )
+    groups = (_group("Rays", switches), _group("Shown", "".join(layers)), _designs(shown, looks))
+    controls = _sliders(shown) + "".join(groups)
+    data = embedded(view_document(shown, looks, density_m), id="view-data")
     return (
         f"{''.join(f'<p>{html.escape(text)}</p>' for text in view_notes(shown))}"
         f'<noscript><p class="note">The view needs JavaScript; all figures stand in the tables too.</p></noscript>'
         f'<div class="view">{stage}<div class="controls" role="group" aria-label="What is shown">{controls}</div></div>'
-        f'<p id="view-status" role="status" aria-live="polite"></p>{embedded(document, id="view-data")}'
+        f'<p id="view-status" role="status" aria-live="polite"></p>{data}'
     )
 
 
@@ -284,26 +268,19 @@ def view_notes(shown: SceneFigure) -> list[str]:
     for one in shown.designs:
         if len(one.rays[0]) < one.fired:
             left_out.append(f"{len(one.rays[0])} of {one.fired} rays of {one.design.name} are drawn")
-    reason = "the detector's effects decide what returns" if shown.physics else ""
-    further = "; ".join([*left_out, *([reason] if reason else [])])
+    if shown.physics:
+        left_out.append("the detector's effects decide what returns")
+    further = "; ".join(left_out)
     return [how, *([further[0].upper() + further[1:] + "."] if further else [])]
-
-
-def place_labels(shown: SceneFigure) -> list[str]:
-    """What each position is called."""
-    return [", ".join(f"{name} = {value:.4g}" for name, value in place.items()) for place in shown.places]
-
-
-def frame_labels(shown: SceneFigure) -> list[str]:
-    """What each frame is called."""
-    rate_hz, frames = shown.scene.frame_rate_hz, shown.scene.frames
-    return [f"frame {frame + 1} of {frames}, {frame / rate_hz:.2f} s" for frame in shown.frames]
 
 
 def _camera_buttons(flat: bool) -> str:
     """What moves the camera; a world in a plane is always seen from above."""
-    moves = [(how, word) for how, word in CAMERA if not (flat and how in OF_SOLID)]
-    buttons = "".join(f'<button type="button" data-camera="{how}">{word}</button>' for how, word in moves)
+    buttons = "".join(
+        f'<button type="button" data-camera="{how}">{word}</button>'
+        for how, word in CAMERA
+        if not (flat and how in OF_SOLID)
+    )
     save = '<button type="button" id="view-save">Save picture</button>'
     return f'<div class="buttons" role="group" aria-label="Camera">{buttons}{save}</div>'
 
@@ -311,34 +288,33 @@ def _camera_buttons(flat: bool) -> str:
 def _sliders(shown: SceneFigure) -> str:
     """One slider over positions, one over frames, where there is more than one."""
     names = " and ".join(shown.places[0]) or "position"
-    found = ""
-    for step, title, labels in (
-        ("place", f"Position: {names}", place_labels(shown)),
-        ("frame", "Time", frame_labels(shown)),
-    ):
+    places = [", ".join(f"{name} = {value:.4g}" for name, value in place.items()) for place in shown.places]
+    rate_hz, count = shown.scene.frame_rate_hz, shown.scene.frames
+    frames = [f"frame {frame + 1} of {count}, {frame / rate_hz:.2f} s" for frame in shown.frames]
+    sliders = ""
+    for step, title, labels in (("place", f"Position: {names}", places), ("frame", "Time", frames)):
         if len(labels) > 1:
-            middle = len(labels) // 2
-            named = html.escape(json.dumps(labels))
-            found += (
+            sliders += (
                 f'<div class="slider"><label for="view-{step}">{html.escape(title)}</label>'
                 f'<output for="view-{step}"></output><input type="range" id="view-{step}" data-step="{step}" min="0" '
-                f'max="{len(labels) - 1}" step="1" value="{middle}" data-labels="{named}"></div>'
+                f'max="{len(labels) - 1}" step="1" value="{len(labels) // 2}" '
+                f'data-labels="{html.escape(json.dumps(labels))}"></div>'
             )
-    return found
+    return sliders
 
 
 def _designs(shown: SceneFigure, looks: Sequence[Series]) -> str:
     """A switch per design, and one per sensor inside of it."""
-    parts = []
+    parts = ""
     for number, (one, look) in enumerate(zip(shown.designs, looks, strict=True)):
         picture = swatch(look.colour, DASHES[look.dash])
-        parts.append(switch(one.design.name, picture=picture, checked=number == 0, design=str(number)))
-        parts.append(_sensors(one, number))
-    return _group("Designs", "".join(parts)) if parts else ""
+        parts += switch(one.design.name, picture=picture, checked=number == 0, design=str(number))
+        parts += _sensors(one, number)
+    return _group("Designs", parts) if parts else ""
 
 
 def _sensors(one: DrawnDesign, number: int) -> str:
-    sensors = one.design.sensors
+    sensors, name = one.design.sensors, html.escape(one.design.name)
     if len(sensors) > MOST_SENSORS:
         return f'<p class="sensors">{len(sensors)} sensors, drawn by their rays</p>'
     rays = np.bincount(one.rays[0].sensor, minlength=len(sensors))
@@ -346,8 +322,6 @@ def _sensors(one: DrawnDesign, number: int) -> str:
         switch(f"{sensor.name}: {count} {'ray' if count == 1 else 'rays'}", sensor=f"{number}.{index}")
         for index, (sensor, count) in enumerate(zip(sensors, rays, strict=False))
     )
-    word = "sensor" if len(sensors) == 1 else "sensors"
-    name = html.escape(one.design.name)
     buttons = "".join(
         f'<button type="button" data-every="{number}" data-to="{to}" aria-label="{label} sensors of {name}">{label}'
         "</button>"
@@ -355,7 +329,7 @@ def _sensors(one: DrawnDesign, number: int) -> str:
     )
     return (
         f'<details class="sensors"{" open" if number == 0 and len(sensors) <= 12 else ""}>'
-        f"<summary>{len(sensors)} {word} of {name}</summary>"
+        f"<summary>{len(sensors)} {'sensor' if len(sensors) == 1 else 'sensors'} of {name}</summary>"
         f'<div class="buttons">{buttons}</div>{rows}</details>'
     )
 
