@@ -12,7 +12,7 @@ from support.tables import each_row
 from lidardesign.evaluate.accuracy.settings import Accuracy, Measurement, Sweep
 from lidardesign.evaluate.figures.canvas import picture, picture_style
 from lidardesign.evaluate.figures.pareto import label_places, panels, pareto_picture
-from lidardesign.evaluate.figures.plots import ACCURACY, pictures
+from lidardesign.evaluate.figures.plots import pictures
 from lidardesign.evaluate.figures.scene_figure import FigureData
 from lidardesign.evaluate.report.figures import accuracy_tables, pareto_figure, pareto_height_px
 
@@ -92,9 +92,9 @@ def test_ladders_of_one_rung_have_tables_and_no_panel():
 
 def test_plots_hold_the_picture_where_accuracy_was_measured():
     evaluation = replace(make_evaluation(), accuracy=Accuracy([make_sweep()], {"visibility": 1.0}))
-    assert pictures(make_evaluation(), FigureData())[ACCURACY]() is None
+    assert pictures(make_evaluation(), FigureData())["accuracy"]() is None
     with picture_style():
-        assert len(pictures(evaluation, FigureData())[ACCURACY]().axes) == 1
+        assert len(pictures(evaluation, FigureData())["accuracy"]().axes) == 1
 
 
 def test_figures_have_one_pair_of_axes_per_ladder_with_all_its_rungs():

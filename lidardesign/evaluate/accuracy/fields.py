@@ -18,6 +18,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -48,8 +49,6 @@ from lidardesign.run.clock import phase
 from lidardesign.scene import Body, Mesh, Scene, inverse_rigid
 from lidardesign.space import DesignSpace
 
-Chosen = Callable[[Body], bool]
-
 
 class ExactField:
     """The exact distances of the chosen bodies of all scenes: to meshes by libigl, triangle by triangle.
@@ -59,7 +58,7 @@ class ExactField:
         chosen: Which bodies count.
     """
 
-    def __init__(self, scenes: Sequence[Scene], chosen: Chosen) -> None:
+    def __init__(self, scenes: Sequence[Scene], chosen: Callable[[Body], bool]) -> None:
         entries = [
             (column, body, frame)
             for column, (index, frame) in enumerate(scene_columns(scenes))
@@ -78,7 +77,7 @@ class ExactField:
         for column, body, frame in self._meshes:
             to_body = inverse_rigid(body.pose(frame))
             local = points @ to_body[:3, :3].T + to_body[:3, 3]
-            np.minimum(out[:, column], mesh_distances(body.shape, local), out=out[:, column])
+            out[:, column] = np.minimum(out[:, column], mesh_distances(body.shape, local))
         return out
 
 
@@ -264,7 +263,12 @@ def resolution_sweep(case: FieldCase) -> Sweep:
             if last.seconds * (count / int(last.setting)) ** 3 * len(case.few) > LONGEST_SECONDS:
                 left_out = f"; {count} and more points would take long to measure"
                 break
-        measurements.append(_resolution_measure(case, count))
+        started = time.perf_counter()
+        field = fresh(case.few, case.scenes, count, case.settings)
+        seconds = (time.perf_counter() - started) / len(case.few)
+        error, uncertainty, values = case.errors(field)
+        of_all = _bytes(field, case)
+        measurements.append(Measurement(str(count), error, uncertainty, seconds, of_all, count == own, values=values))
     return Sweep(
         knob="density.field_resolution",
         error_of=ERROR_OF,
@@ -278,15 +282,6 @@ def resolution_sweep(case: FieldCase) -> Sweep:
     )
 
 
-def _resolution_measure(case: FieldCase, resolution: int) -> Measurement:
-    started = time.perf_counter()
-    field = fresh(case.few, case.scenes, resolution, case.settings)
-    seconds = (time.perf_counter() - started) / len(case.few)
-    error, uncertainty, values = case.errors(field)
-    own = resolution == case.settings.field_resolution
-    return Measurement(str(resolution), error, uncertainty, seconds, _bytes(field, case), own, values=values)
-
-
 def _bytes(field: Field, case: FieldCase) -> int:
     """The memory of the fields of all scenes; moving meshes have one each, however many scenes they are in."""
     if isinstance(field, TableField):
@@ -295,7 +290,6 @@ def _bytes(field: Field, case: FieldCase) -> int:
 
 
 def _meshes(scenes: list[Scene]) -> int:
-    """How many different target meshes scenes have."""
     bodies = [body for scene in scenes for body in scene.bodies if body.is_target]
     return len({body.shape.content_hash for body in bodies if isinstance(body.shape, Mesh)})
 
@@ -304,10 +298,17 @@ def interpolation_sweep(case: FieldCase) -> Sweep:
     """How distances between grid points are found, at the run's own resolution."""
     table, points = case.target.surfaces.field, case.observed[:TIMED_POINTS]
     exact = ExactField(case.few, lambda body: body.is_target)
-    _, seconds, memory = timed(lambda: exact.distances(points))
-    ways = {
-        name: table if name == DEFAULT_ORDER else InterpolatedField.of(table, order) for name, order in ORDERS.items()
-    }
+    _, exact_seconds, exact_memory = timed(lambda: exact.distances(points))
+    measurements = []
+    for name, order in ORDERS.items():
+        default = name == DEFAULT_ORDER
+        field = table if default else InterpolatedField.of(table, order)
+        _, seconds, memory = timed(partial(field.distances, points))
+        error, uncertainty, values = case.errors(field)
+        measurements.append(Measurement(name, error, uncertainty, seconds, memory, default, values=values))
+    reference = Measurement(
+        "exact", 0.0, 0.0, exact_seconds, exact_memory, reference=True, values={"distance_error_mm": 0.0}
+    )
     return Sweep(
         knob="interpolation of fields",
         error_of=ERROR_OF,
@@ -316,18 +317,9 @@ def interpolation_sweep(case: FieldCase) -> Sweep:
         tolerance=TOLERANCE,
         because=BECAUSE,
         work=f"distances of {len(points)} points in {table.columns} scenes",
-        measurements=[
-            *(_way_measure(case, name, field, points) for name, field in ways.items()),
-            Measurement("exact", 0.0, 0.0, seconds, memory, reference=True, values={"distance_error_mm": 0.0}),
-        ],
+        measurements=[*measurements, reference],
         note=_part(case, f"with {case.settings.field_resolution} grid points along the longest side"),
     )
-
-
-def _way_measure(case: FieldCase, name: str, field: Field, points: np.ndarray) -> Measurement:
-    _, seconds, memory = timed(lambda: field.distances(points))
-    error, uncertainty, values = case.errors(field)
-    return Measurement(name, error, uncertainty, seconds, memory, name == DEFAULT_ORDER, values=values)
 
 
 def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: DensitySettings) -> Field:

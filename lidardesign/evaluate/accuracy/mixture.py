@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -60,25 +60,23 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     for repeat in range(max(repeats for _, _, repeats in settings)):
         for count, seeds, repeats in settings:
             if repeat < repeats:
-                bench.fitted(repeat, count, seeds)
+                bench.fit(repeat, count, seeds)
     whole = _command_seconds(request.run, design)
     # what the command does besides is the same for all settings
     besides = 0.0 if whole is None else max(whole - bench.seconds(usual, RESTARTS), 0.0)
-    of_samples = [bench.measure(one, RESTARTS, besides, default=one == usual) for one in counts]
-    of_restarts = [bench.measure(usual, one, besides, default=one == RESTARTS) for one in restarts]
-    named = [replace(measurement, setting=f"{count:,}") for measurement, count in zip(of_samples, counts, strict=True)]
+    of_samples = [bench.measure(f"{one:,}", one, RESTARTS, besides, default=one == usual) for one in counts]
+    of_restarts = [bench.measure(str(one), usual, one, besides, default=one == RESTARTS) for one in restarts]
     work = "expectation maximisation" if whole is None else "the command `fit`, from its start to its end"
-    found = [_sweep("samples of the fit", f"{RESTARTS} seeds", named, design, work)]
-    if not restarts:
-        return found
-    named = [replace(measurement, setting=str(count)) for measurement, count in zip(of_restarts, restarts, strict=True)]
-    return [*found, _sweep("seeds of the fit", f"{usual:,} samples", named, design, work)]
+    sweeps = [_sweep("samples of the fit", f"{RESTARTS} seeds", of_samples, design, work)]
+    if restarts:
+        sweeps.append(_sweep("seeds of the fit", f"{usual:,} samples", of_restarts, design, work))
+    return sweeps
 
 
 def _sweep(knob: str, beside: str, measurements: Sequence[Measurement], design: DesignSpec, work: str) -> Sweep:
-    fitted = f"{len(design.sensors)} sensors, as {design.name} has"
-    where = f", at {condition_text(design.at)}" if design.at else ""
-    held = ", without its constraints" if design.constraints else ""
+    note = f"{len(design.sensors)} sensors, as {design.name} has"
+    note += f", at {condition_text(design.at)}" if design.at else ""
+    note += ", without its constraints" if design.constraints else ""
     return Sweep(
         knob=knob,
         error_of="log density of held-out samples that is lost",
@@ -88,7 +86,7 @@ def _sweep(knob: str, beside: str, measurements: Sequence[Measurement], design: 
         because="log densities that are 0.01 nats lower have one ray in a hundred fewer everywhere",
         work=work,
         measurements=measurements,
-        note=f"{fitted}{where}{held}, with {beside}",
+        note=f"{note}, with {beside}",
     )
 
 
@@ -161,9 +159,9 @@ class FitBench:
     @cached_property
     def bounds(self) -> Bounds:
         """What the space alone asks of the sensors."""
-        space, free = self.samples.space, Constraints()
-        group = sensor_groups(free.rules, space, self.sensors)[0]
-        return bounds_of(free.rules, space, group.sensors, interval_factor(self.level))
+        space, rules = self.samples.space, Constraints().rules
+        group = sensor_groups(rules, space, self.sensors)[0]
+        return bounds_of(rules, space, group.sensors, interval_factor(self.level))
 
     @property
     def splits(self) -> int:
@@ -175,18 +173,14 @@ class FitBench:
         """Samples that are left to fit to."""
         return len(self.samples) - round(HELD_OUT_SHARE * len(self.samples))
 
-    def fitted(self, repeat: int, count: int, restarts: int) -> Fitted:
-        """A fit to `count` of the pool's samples with so many seeds.
+    def fit(self, repeat: int, count: int, restarts: int) -> None:
+        """Fit to `count` of the pool's samples with so many seeds, once.
 
         Repeats differ in their draws and seeds, and take one split after the other; of one repeat, fits with more
         seeds also try those with fewer.
         """
-        key = repeat, count, restarts
-        if key not in self._known:
-            self._known[key] = self._fit(*key)
-        return self._known[key]
-
-    def _fit(self, repeat: int, count: int, restarts: int) -> Fitted:
+        if (repeat, count, restarts) in self._known:
+            return
         order = random_generator(self.seed, "mixture split", repeat % self.splits).permutation(len(self.samples))
         pool, held = order[: self.pool], order[self.pool :]
         generator = random_generator(self.seed, "mixture fit", repeat)
@@ -196,7 +190,8 @@ class FitBench:
         )
         seconds = time.perf_counter() - started
         judged = self._features(self.samples.points[held], self.samples.weights[held])
-        return Fitted(float(judged.weights @ log_density(trace.mixture, judged)), seconds, memory)
+        likelihood = float(judged.weights @ log_density(trace.mixture, judged))
+        self._known[repeat, count, restarts] = Fitted(likelihood, seconds, memory)
 
     def _drawn(self, pool: np.ndarray, count: int, generator: np.random.Generator) -> Features:
         """So many of the pool's samples, of equal weight; all of them as they are."""
@@ -209,29 +204,25 @@ class FitBench:
     def _features(self, points: np.ndarray, weights: np.ndarray) -> Features:
         return Features.of(points, weights, Axes.of(self.samples.space), self.samples.space)
 
-    def lost(self, count: int, restarts: int) -> list[float]:
-        """What every fit of a setting lost against the best fit of its split, of all settings [nats]."""
-        best: dict[int, float] = {}
-        for (repeat, _, _), one in self._known.items():
-            best[repeat % self.splits] = max(best.get(repeat % self.splits, -math.inf), one.log_likelihood)
-        return [best[repeat % self.splits] - one.log_likelihood for repeat, one in self._of(count, restarts)]
-
     def seconds(self, count: int, restarts: int) -> float:
         """The median time of a setting's fits [s]."""
         return float(np.median([one.seconds for _, one in self._of(count, restarts)]))
 
-    def measure(self, count: int, restarts: int, besides: float, *, default: bool) -> Measurement:
+    def measure(self, setting: str, count: int, restarts: int, besides: float, *, default: bool) -> Measurement:
         """A setting, once all settings have been fitted; `besides`: what a fit takes besides [s]."""
-        lost = np.array(self.lost(count, restarts))
-        fits = [one for _, one in self._of(count, restarts)]
+        # against the best fit of the split, of all settings
+        best: dict[int, float] = {}
+        for (repeat, _, _), one in self._known.items():
+            best[repeat % self.splits] = max(best.get(repeat % self.splits, -math.inf), one.log_likelihood)
+        fits = self._of(count, restarts)
+        lost = np.array([best[repeat % self.splits] - one.log_likelihood for repeat, one in fits])
         maximising = self.seconds(count, restarts)
-        memory = [one.memory_bytes for one in fits if one.memory_bytes is not None]
         return Measurement(
-            "",
+            setting,
             error=float(lost.mean()),
             uncertainty=float(lost.std(ddof=1) / math.sqrt(len(lost))),
             seconds=besides + maximising,
-            memory_bytes=max(memory, default=None),
+            memory_bytes=max((one.memory_bytes for _, one in fits if one.memory_bytes is not None), default=None),
             default=default,
             values={"worst_nats": float(lost.max()), "fit_seconds": maximising},
         )

@@ -115,7 +115,6 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
 
 
 def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, Positions]:
-    """The number of rays that is simulated, and the design's rays."""
     counts = sorted(set(asked.rays))
     with plugin_guard(asked.task.name):
         conditions = conditions_of(asked.task, asked.config, asked.space)
@@ -132,7 +131,6 @@ def _paired(values: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
 
 
 def _mean(values: np.ndarray) -> tuple[float, float]:
-    """A mean and its standard error, 0 for a single value."""
     spread = values.std(ddof=1) if len(values) > 1 else 0.0
     return float(values.mean()), float(spread / math.sqrt(len(values)))
 
@@ -230,20 +228,20 @@ def _effect_measurements(bench: Bench, there: Sequence[str], *, marks: bool) -> 
     if planned not in settings.values():
         settings[bench.planner.choice if isinstance(bench.planner.choice, str) else "those named"] = planned
     alone = {f"{name} alone": [frozenset({name})] * count for name in there}
-    found = _passes(bench, settings | alone)
-    full, none = found["all"], found["none"]
+    passes = _passes(bench, settings | alone)
+    full, none = passes["all"], passes["none"]
     changes = {
         f"without {name}": {
-            "left_out": _paired(found[f"without {name}"].values, full.values),
-            "alone": _paired(found[f"{name} alone"].values, none.values),
+            "left_out": _paired(passes[f"without {name}"].values, full.values),
+            "alone": _paired(passes[f"{name} alone"].values, none.values),
         }
         for name in there
     }
-    measurements = [_measure(name, found[name], full, changes.get(name, {})) for name in settings if name != "all"]
+    measurements = [_measure(name, passes[name], full, changes.get(name, {})) for name in settings if name != "all"]
     measurements.sort(key=lambda measurement: -measurement.error)
     measurements.append(replace(_measure("all", full, full, {}), reference=True))
-    planned_name = next(name for name, choice in settings.items() if choice == planned)
-    return [replace(measurement, default=marks and measurement.setting == planned_name) for measurement in measurements]
+    own = next(name for name, choice in settings.items() if choice == planned)
+    return [replace(measurement, default=marks and measurement.setting == own) for measurement in measurements]
 
 
 def _measure(setting: str, found: _Pass, full: _Pass, changes: Mapping[str, tuple[float, float]]) -> Measurement:

@@ -92,7 +92,7 @@ class Sweep:
         if not inside:
             return min(self.measurements, key=lambda one: (one.error, one.seconds))
         least = min(one.seconds for one in inside)
-        cheap = [one for one in inside if one.seconds <= SAME_COST * least]
+        cheap = (one for one in inside if one.seconds <= SAME_COST * least)
         best = min(cheap, key=lambda one: (not one.default, one.error, one.seconds))
         no_worse = (
             one
@@ -171,7 +171,6 @@ class Accuracy:
 
 
 def _sure_difference(first: Measurement, second: Measurement) -> float:
-    """Errors of two measurements that differ by less than this do not differ."""
     return STANDARD_ERRORS * math.hypot(first.uncertainty, second.uncertainty)
 
 

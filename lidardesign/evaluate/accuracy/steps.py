@@ -52,8 +52,8 @@ def run_steps(request: AccuracyRequest) -> LearningSteps | None:
     if len(probes.points):
         unit = config.space.to_unit(probes.points)
         pool = Pool.of(unit, target.log_density(probes.points), probes.log_proposal)
-        flow = load_flow(request.run, FLOW, config, target, config.seed).flow
-        steps = LearningSteps(flow, target, config.learning, pool)
+        learned = load_flow(request.run, FLOW, config, target, config.seed)
+        steps = LearningSteps(learned.flow, target, config.learning, pool)
     return _STEPS.setdefault(request, steps)
 
 
@@ -110,7 +110,6 @@ def _dtype_measure(
 
 
 def _densities(dtype: str, steps: LearningSteps, drawn: FlowSamples) -> dict[str, float]:
-    """What densities of the flow's samples would lose and cost in an arithmetic."""
     flow, exact = in_arithmetic(steps.flow, dtype), drawn.log_prob
     found, seconds, _ = timed(lambda: drawn.log_densities(flow))
     usable = np.isfinite(found)

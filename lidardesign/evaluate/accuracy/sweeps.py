@@ -31,15 +31,15 @@ def measure_accuracy(request: AccuracyRequest, progress: Callable[[int, int, str
         request: What to measure on.
         progress: Called with the kinds of sweeps done, all kinds, and the label of the next.
     """
-    found: list[Sweep] = []
+    measured: list[Sweep] = []
     seconds: dict[str, float] = {}
     for done, (name, label, sweeps) in enumerate(SWEEPS):
         if progress:
             progress(done, len(SWEEPS), label)
         started = time.perf_counter()
         with phase(name):
-            found += sweeps(request)
+            measured += sweeps(request)
         seconds[name] = round(time.perf_counter() - started, 3)
     if progress:
         progress(len(SWEEPS), len(SWEEPS), "")
-    return Accuracy(found, seconds)
+    return Accuracy(measured, seconds)

@@ -81,36 +81,29 @@ def _preset_sweep(
     request: AccuracyRequest, own: SnapshotQuality, target: Target, probes: IndependentProbes
 ) -> Sequence[Sweep]:
     """Runs of other presets against the same target, in the order of effort; empty where none lies beside this one."""
-    config, seconds = request.config, _seconds(request.run)
-    beside = [_measurement_beside(run, other, target, probes, config.seed) for run, other in _presets(request)]
-    measurements = [measurement for measurement in beside if measurement is not None]
-    if not measurements or seconds is None:
+    config, own_seconds, measurements = request.config, _seconds(request.run), []
+    for run, other in _presets(request):
+        # what cannot be measured is left out: this run's figures do not depend on what lies beside it
+        try:
+            seconds, learned = _seconds(run), load_flow(run, FLOW, other, target, config.seed)
+        except LidardesignError:
+            continue
+        if seconds is not None:
+            estimates = measure(learned, probes, SAMPLES).estimates
+            measurements.append(_measure(other.preset, estimates, seconds, {}, default=False))
+    if not measurements or own_seconds is None:
         return []
-    measurements.append(_measure(config.preset, own.estimates, seconds, {}, default=True))
+    measurements.append(_measure(config.preset, own.estimates, own_seconds, {}, default=True))
     measurements.sort(key=lambda measurement: PRESETS.index(measurement.setting))
     note = "runs of the same task, space and density beside this one"
     return [_sweep("preset", "the whole of learn", measurements, note)]
 
 
-def _measurement_beside(
-    run: Path, config: RunConfig, target: Target, probes: IndependentProbes, seed: int
-) -> Measurement | None:
-    """Another run; None where it cannot be measured: this run's figures do not depend on what lies beside it."""
-    try:
-        seconds, learned = _seconds(run), load_flow(run, FLOW, config, target, seed)
-    except LidardesignError:
-        return None
-    if seconds is None:
-        return None
-    return _measure(config.preset, measure(learned, probes, SAMPLES).estimates, seconds, {}, default=False)
-
-
 def _presets(request: AccuracyRequest) -> list[tuple[Path, RunConfig]]:
-    """The finished runs beside this one that learned the same density by other presets, one of each."""
     mine, found = request.config, {}
     for folder in sorted(request.run.absolute().parent.iterdir()):
         config = _config_of(folder)
-        if config is None or config.preset == mine.preset or config.preset in found:
+        if config is None or config.preset in (mine.preset, *found):
             continue
         if (config.task_name, config.task, config.space, config.density) == (
             mine.task_name, mine.task, mine.space, mine.density
@@ -197,9 +190,8 @@ class _Judge:
         """The mean score, and its standard error beside the last measurement's, on the same scenes."""
         if scores is None or last is None:
             return {}
-        apart = scores - last
+        apart, unit = scores - last, re.sub(r"\W+", "", self._asked.task.metric.unit)
         error = float(apart.std(ddof=1) / math.sqrt(len(apart))) if len(apart) > 1 else 0.0
-        unit = re.sub(r"\W+", "", self._asked.task.metric.unit)
         name = f"score_{unit}" if unit else "score"
         return {name: float(scores.mean()), f"{name}_difference_error": error}
 

@@ -226,8 +226,7 @@ def affordable_scenes(scenes: list[Scene]) -> list[Scene]:
     occluders = [[body for body in scene.bodies if body.is_occluder] for scene in scenes]
     if all(isinstance(body.shape, Mesh) and body.poses.ndim == 2 for bodies in occluders for body in bodies):
         return scenes
-    per_column = max(map(len, occluders))
-    return few_columns(scenes, max(MOST_BODIES // max(per_column, 1), 1))
+    return few_columns(scenes, max(MOST_BODIES // max(1, *map(len, occluders)), 1))
 
 
 def _own_setting(request: AccuracyRequest) -> tuple[str, int]:

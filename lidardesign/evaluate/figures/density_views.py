@@ -88,8 +88,7 @@ def silhouette(
             vertices, faces = body_triangles(body, frame, np.zeros((2, 3)), share)
             # mark the cells that hold a point of a lattice, no wider than a cell, on triangles (F, 3, 2)
             places = (vertices[:, list(axes)][faces].astype(np.float64) - low) / cell
-            near = (places.max(axis=1) >= 0).all(axis=1) & (places.min(axis=1) < upper).all(axis=1)
-            places = places[near]
+            places = places[((places.max(axis=1) >= 0) & (places.min(axis=1) < upper)).all(axis=1)]
             sides = np.abs(places - np.roll(places, 1, axis=1)).max(axis=(1, 2))
             steps = np.minimum(2 ** np.ceil(np.log2(np.maximum(sides, 1.0))), MOST_STEPS).astype(int)
             for count in np.unique(steps):
@@ -285,7 +284,7 @@ def plane_densities(samples: Samples, scene: Scene, frame: int) -> tuple[PlaneDe
     ranked = sorted(wide, key=lambda pair: -float(spans[pair[0]] * spans[pair[1]]))
     # along a condition the density is even: a second picture without it shows more
     beside = sorted(ranked[1:], key=lambda pair: bool(set(pair) & set(samples.space.conditioned)))
-    chosen = [*ranked[:1], *beside[:1]]
+    chosen = (*ranked[:1], *beside[:1])
     return tuple(_plane(pair, points, weights, [ends[axis] for axis in pair], scene, frame) for pair in chosen)
 
 

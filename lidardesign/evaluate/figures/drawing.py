@@ -54,8 +54,8 @@ def own_triangles(
         corners = np.array([[x, y, z] for x in bounds_m[:, 0] for y in bounds_m[:, 1] for z in bounds_m[:, 2]])
         local = (corners - pose[:3, 3]) @ pose[:3, :3]
         (x0, y0), (x1, y1) = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
-        square = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
-        vertices, faces = square, np.array([[0, 1, 2], [0, 2, 3]])
+        vertices = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+        faces = np.array([[0, 1, 2], [0, 2, 3]])
     return vertices, faces.astype(np.int32)
 
 
@@ -151,9 +151,8 @@ def _patch(sensor: Sensor, across: np.ndarray, up: np.ndarray) -> np.ndarray:
 def _grid_faces(rows: int, columns: int) -> np.ndarray:
     """Two triangles per cell of a grid of vertices, shape (2 (rows - 1) (columns - 1), 3)."""
     first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    lower = np.stack([first, first + 1, first + columns], axis=1)
-    upper = np.stack([first + 1, first + columns + 1, first + columns], axis=1)
-    return np.concatenate([lower, upper])
+    right, up = first + 1, first + columns
+    return np.concatenate([np.stack([first, right, up], axis=1), np.stack([right, up + 1, up], axis=1)])
 
 
 def _capsule(radius_m: float, half_length_m: float, steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -227,7 +227,6 @@ def label_places(panel: Panel, height: float, line: float) -> list[tuple[float, 
 
 
 def _share(value: float, ends: tuple[float, float]) -> float:
-    """How far along a logarithmic axis a value stands."""
     low, high = ends
     return math.log(value / low) / math.log(high / low)
 

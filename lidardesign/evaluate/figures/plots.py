@@ -25,10 +25,6 @@ from lidardesign.evaluate.results import Evaluation
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SCENE, MARGINALS, FIELD = "scene", "density_marginals", "density_field"
-RAYS, BANDWIDTH, DIFFERENCES = "score_against_rays", "score_against_bandwidth", "paired_differences"
-CONSTRAINTS, EFFECTS, ACCURACY, TIMES = "constraints", "effects", "accuracy", "times"
-
 
 def write_plots(evaluation: Evaluation, directory: Path, pictured: FigureData | None = None) -> list[Path]:
     """Write all pictures that there is something to draw for; returns the files, in the order of the report.
@@ -51,14 +47,14 @@ def pictures(evaluation: Evaluation, pictured: FigureData) -> dict[str, Callable
     shown, density = pictured.shown, pictured.density
     sweeps = evaluation.accuracy.sweeps if evaluation.accuracy is not None else ()
     return {
-        SCENE: lambda: scene_picture(shown) if shown is not None and shown.designs else None,
-        MARGINALS: lambda: marginals_picture(density) if density is not None and density.marginals else None,
-        FIELD: lambda: field_picture(density) if density is not None and density.planes else None,
-        RAYS: lambda: curve_picture(evaluation, "rays"),
-        BANDWIDTH: lambda: curve_picture(evaluation, "bandwidth"),
-        DIFFERENCES: lambda: differences_picture(evaluation) if evaluation.paired else None,
-        CONSTRAINTS: lambda: constraints_picture(pictured.tightness),
-        EFFECTS: lambda: effects_picture(evaluation.effects),
-        ACCURACY: lambda: pareto_picture(sweeps),
-        TIMES: lambda: times_picture(pictured.times),
+        "scene": lambda: scene_picture(shown) if shown is not None and shown.designs else None,
+        "density_marginals": lambda: marginals_picture(density) if density is not None and density.marginals else None,
+        "density_field": lambda: field_picture(density) if density is not None and density.planes else None,
+        "score_against_rays": lambda: curve_picture(evaluation, "rays"),
+        "score_against_bandwidth": lambda: curve_picture(evaluation, "bandwidth"),
+        "paired_differences": lambda: differences_picture(evaluation) if evaluation.paired else None,
+        "constraints": lambda: constraints_picture(pictured.tightness),
+        "effects": lambda: effects_picture(evaluation.effects),
+        "accuracy": lambda: pareto_picture(sweeps),
+        "times": lambda: times_picture(pictured.times),
     }

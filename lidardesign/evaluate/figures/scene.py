@@ -79,7 +79,12 @@ def view_of(directions: np.ndarray, points_m: np.ndarray, margin: float = 0.04) 
     if len(directions) and np.abs(directions[:, 2]).max() < EPSILON_FLOAT32:
         forward, up = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
     else:
-        forward = -_from(directions)
+        mean = directions.mean(axis=0) * (1.0, 1.0, 0.0) if len(directions) else np.array([1.0, 0.0, 0.0])
+        length = float(np.linalg.norm(mean))
+        # what looks down or all around has no side
+        ahead = mean / length if length > 0.1 else np.array([0.6, 0.8, 0.0])
+        eye = SIDE * np.array([-ahead[1], ahead[0], 0.0]) - BEHIND * ahead + np.array([0.0, 0.0, ABOVE])
+        forward = -(eye / np.linalg.norm(eye))
         up = np.array([0.0, 0.0, 1.0]) - forward[2] * forward
         up /= np.linalg.norm(up)
     view = View(np.cross(forward, up), up, forward, (0.0, 1.0, 0.0, 1.0), 0.0)
@@ -91,17 +96,6 @@ def view_of(directions: np.ndarray, points_m: np.ndarray, margin: float = 0.04) 
     (left, right), (bottom, top) = zip((low - pad).tolist(), (high + pad).tolist(), strict=True)
     depth = view.depth(points_m)
     return replace(view, window=(left, right, bottom, top), near_m=float(depth.min() - 3 * np.ptp(depth) - 3 * least))
-
-
-def _from(directions: np.ndarray) -> np.ndarray:
-    """The unit vector towards the camera."""
-    mean = directions.mean(axis=0) if len(directions) else np.array([1.0, 0.0, 0.0])
-    forward = np.array([mean[0], mean[1], 0.0])
-    length = float(np.linalg.norm(forward))
-    # what looks down or all around has no side
-    forward = forward / length if length > 0.1 else np.array([0.6, 0.8, 0.0])
-    eye = SIDE * np.array([-forward[1], forward[0], 0.0]) - BEHIND * forward + np.array([0.0, 0.0, ABOVE])
-    return eye / np.linalg.norm(eye)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +252,7 @@ def framed_points(shown: SceneFigure, place: int, step: int) -> np.ndarray:
         met = one.outcome[place, step] != Outcome.MISS
         ends += [rays.origin_m, one.ends_m[place, step][met] if met.any() else one.ends_m[place, step]]
     points = np.concatenate(ends)
-    around = [frustum_lines(sensor) for one in shown.designs for sensor in _drawn_sensors(one.placed[place].sensors)]
+    around = [lines for one in shown.designs for lines in _frusta(one.placed[place].sensors)]
     # ends of all finite targets along the axes
     boxes = [np.zeros((0, 3))]
     for body in shown.scene.bodies:
@@ -300,7 +294,11 @@ def _draw_design(axes: Axes, one: DrawnDesign, place: int, step: int, image: Sha
         if kind == Outcome.RETURN:
             seen = ends[some][~image.hides(view, ends[some], 2 * slack)]
             axes.plot(*view.project(seen).T, "o", color=colour, markersize=2.2 * share + 0.3, zorder=4)
-    _draw_sensors(axes, one.placed[place].sensors, rays.origin_m[keep], view)
+    for lines in _frusta(one.placed[place].sensors):
+        axes.plot(*view.project(lines).T, color=SENSOR, linewidth=0.6, alpha=0.75, zorder=3)
+    places = np.unique(np.round(view.project(rays.origin_m[keep]), 6), axis=0)
+    few = len(places) < FEW_PLACES
+    axes.plot(*places.T, "D" if few else ".", color=SENSOR, markersize=3.2 if few else 1.6, zorder=5)
     drawn = "" if len(outcome) == one.fired else f"{len(outcome)} of "
     title = f"{plain_label(one.design.name)}: {(outcome == Outcome.RETURN).sum()} of {drawn}{one.fired} rays"
     title += " drawn return" if drawn else " return"
@@ -330,16 +328,8 @@ def _runs(line: np.ndarray, mask: np.ndarray) -> list[np.ndarray]:
     return [line[[begin, end]] for begin, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _draw_sensors(axes: Axes, sensors: Sequence[Sensor], origins_m: np.ndarray, view: View) -> None:
-    for sensor in _drawn_sensors(sensors):
-        axes.plot(*view.project(frustum_lines(sensor)).T, color=SENSOR, linewidth=0.6, alpha=0.75, zorder=3)
-    places = np.unique(np.round(view.project(origins_m), 6), axis=0)
-    few = len(places) < FEW_PLACES
-    axes.plot(*places.T, "D" if few else ".", color=SENSOR, markersize=3.2 if few else 1.6, zorder=5)
-
-
-def _drawn_sensors(sensors: Sequence[Sensor]) -> Sequence[Sensor]:
-    return sensors if len(sensors) <= MOST_SENSORS else ()
+def _frusta(sensors: Sequence[Sensor]) -> list[np.ndarray]:
+    return [frustum_lines(sensor) for sensor in sensors] if len(sensors) <= MOST_SENSORS else []
 
 
 def _legend(figure: Figure, kinds: Sequence[Outcome], *, receiver: bool) -> None:
@@ -354,17 +344,15 @@ def _legend(figure: Figure, kinds: Sequence[Outcome], *, receiver: bool) -> None
     if receiver:
         handles.append(Line2D([], [], **RECEIVER_LOOK))
         names.append("detector")
-    place = "outside lower center"
-    figure.legend(handles, names, loc=place, ncols=6, frameon=False, handlelength=2.4, columnspacing=1.2)
+    look = {"ncols": 6, "frameon": False, "handlelength": 2.4, "columnspacing": 1.2}
+    figure.legend(handles, names, loc="outside lower center", **look)
 
 
 def _caption(shown: SceneFigure, place: int, step: int) -> str:
-    """Which scene it is, when and where."""
     caption = f"held-out scene {plain_label(shown.scene.name)}"
     if shown.scene.frames > 1:
         caption += f", frame {shown.frames[step] + 1} of {shown.scene.frames}"
-    at = shown.places[place] if shown.places else {}
-    if at:
-        caption += ", seen from " + ", ".join(f"{name}={value:g}" for name, value in at.items())
+    if shown.places and shown.places[place]:
+        caption += ", seen from " + ", ".join(f"{name}={value:g}" for name, value in shown.places[place].items())
     left_out = len(shown.designs) - MOST_DESIGNS
     return f"{caption}; {left_out} more designs are not drawn" if left_out > 0 else caption

@@ -192,41 +192,24 @@ def figure_data(
     evaluation: Evaluation, request: EvaluationRequest, times: Mapping[str, Mapping[str, float]]
 ) -> FigureData:
     """Everything that can be drawn of an evaluation's designs, in its first held-out scene."""
-    return FigureData(
-        scene_figure_of(request, physics=any(effect.on for effect in evaluation.effects)),
-        density_of(request),
-        {design.name: constraint_slack_of(design, request.space) for design in request.designs},
-        times,
-    )
-
-
-def scene_figure_of(request: EvaluationRequest, *, physics: bool) -> SceneFigure:
-    """The designs in the first held-out scene, with the physics that it calls for or by geometry alone."""
-
     most = max(fired_numbers(request.designs, request.rays))
 
     def laid_out(design: DesignSpec, at: Conditions) -> Rays:
         count = design.rays or pattern_size(design) or most
         return request.lay_out(design, count, request.samples.get(design.name), at=at)
 
-    return scene_figure(
-        request.test[0],
-        request.designs,
-        ordered_conditions(request),
-        laid_out,
-        planner=request.planner if physics else None,
-        seed=request.seed,
-    )
-
-
-def density_of(request: EvaluationRequest) -> DensityView | None:
-    """Views of what was learned; None where no run left samples."""
+    # with the physics that the scenes call for, or by geometry alone
+    planner = request.planner if any(effect.on for effect in evaluation.effects) else None
+    scene, places = request.test[0], ordered_conditions(request)
+    shown = scene_figure(scene, request.designs, places, laid_out, planner=planner, seed=request.seed)
     density = request.density() if request.density is not None else None
-    return None if density is None else density_view(density.samples, request.test[0], request.designs)
+    view = None if density is None else density_view(density.samples, scene, request.designs)
+    tightness = {design.name: constraint_slack_of(design, request.space) for design in request.designs}
+    return FigureData(shown, view, tightness, times)
 
 
 def constraint_slack_of(design: DesignSpec, space: DesignSpace) -> list[ConstraintSlack]:
     """How tight each constraint of a design is, by the independent checker; the bounds of its space last."""
     checks = check_design(design_document(design), design.constraints, space)
-    found = constraint_slack(checks, [sensor.name for sensor in design.sensors])
-    return sorted(found, key=lambda one: one.name.startswith(SPACE_MARK))
+    slacks = constraint_slack(checks, [sensor.name for sensor in design.sensors])
+    return sorted(slacks, key=lambda one: one.name.startswith(SPACE_MARK))

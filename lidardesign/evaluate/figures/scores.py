@@ -103,7 +103,6 @@ def _soft_title(axes: Axes, title: str) -> None:
 
 
 def _list_rows(axes: Axes, labels: Sequence[str]) -> None:
-    """A row per label, the first on top."""
     axes.set_yticks(range(len(labels)), labels)
     axes.set_ylim(max(len(labels), 1) - 0.4, -0.6)
 

@@ -218,7 +218,6 @@ def _array(values: np.ndarray) -> dict[str, str]:
 
 
 def _steps(edges: np.ndarray, heights: np.ndarray) -> dict[str, Any]:
-    """A histogram's outline."""
     return {
         "type": "scatter",
         "mode": "lines",
@@ -308,7 +307,6 @@ def _marks(panel: Panel) -> dict[str, Any]:
 
 
 def _settings(panel: Panel, name: str) -> list[dict[str, Any]]:
-    """The setting beside each mark."""
     places = label_places(panel, ROW_PX - ABOVE_PX - BELOW_PX, LINE_PX)
     return [
         {
@@ -407,7 +405,6 @@ def _table(sweep: Sweep) -> str:
 
 
 def _cells(measurement: Measurement) -> list[str]:
-    """The setting, its error and uncertainty, seconds and memory; the last cell is for the verdict."""
     size = measurement.memory_bytes
     memory = "" if size is None else plain_number(size / BYTES_PER_MB, 3, tiny=1.0)
     error = (f"{measurement.error:.3g}", f"{measurement.uncertainty:.2g}")

@@ -123,7 +123,6 @@ POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; "
     "img-src data: blob:; worker-src blob:; font-src data:; base-uri 'none'; form-action 'none'"
 )
-STYLE = "report.css"
 
 
 def asset(name: str) -> str:
@@ -148,7 +147,7 @@ def page(title: str, lead: str, body: str, plotly: str, links: Sequence[tuple[st
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{name}</title>\n<style>{asset(STYLE)}</style>\n</head>\n"
+        f"<title>{name}</title>\n<style>{asset('report.css')}</style>\n</head>\n"
         '<body>\n<a class="skip" href="#content">Skip to the result</a>\n<main>\n'
         f"<header><h1>{name}</h1><p>{html.escape(lead)}</p>"
         f'<nav aria-label="Sections"><ul>{items}</ul></nav></header>\n<div id="content">\n{body}\n</div>\n</main>\n'

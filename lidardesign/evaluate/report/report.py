@@ -57,7 +57,6 @@ from lidardesign.run.manifest import read_manifest, versions
 from lidardesign.space import observed_point
 from lidardesign.task import random_generator
 
-RAYS_ID, BANDWIDTH_ID, ACCURACY_ID = "curve-rays", "curve-bandwidth", "accuracy-figure"
 CURVE_PX, SMALL_PX, PLANE_PX = 440, 250, 400
 
 
@@ -144,9 +143,9 @@ def _curves(evaluation: Evaluation) -> str:
     scenes = f"over {held_out_scenes(evaluation.scenes)}"
     return (
         f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>'
-        + figure(curve_figure(evaluation, "rays"), RAYS_ID, CURVE_PX, f"Score against rays per frame: means {scenes}, "
+        + figure(curve_figure(evaluation, "rays"), "curve-rays", CURVE_PX, f"Score against rays per frame: means {scenes}, "
                  "with 95 % bootstrap intervals as bands.", "curves")
-        + figure(curve_figure(evaluation, "bandwidth"), BANDWIDTH_ID, CURVE_PX, "The same scores against the bandwidth "
+        + figure(curve_figure(evaluation, "bandwidth"), "curve-bandwidth", CURVE_PX, "The same scores against the bandwidth "
                  "that it takes to read the gates out.", "curves")
     )  # fmt: skip
 
@@ -182,7 +181,6 @@ def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
 
 
 def _accuracy(sweeps: Sequence[Sweep]) -> str:
-    """The figure of all sweeps, how to read it, and their tables."""
     if not sweeps:
         return "<p>It was not measured: <code>lidardesign evaluate --accuracy</code> does, in some minutes.</p>"
     read = (
@@ -191,15 +189,13 @@ def _accuracy(sweeps: Sequence[Sweep]) -> str:
         "edge have no error to show, references among them."
     )
     height = pareto_height_px(sweeps)
-    picture = figure(pareto_figure(sweeps), ACCURACY_ID, height, "Error against seconds") if height else ""
+    picture = figure(pareto_figure(sweeps), "accuracy-figure", height, "Error against seconds") if height else ""
     wide = f'<div class="scroll" tabindex="0"><div class="panels">{picture}</div></div>'
     return f"<p>{read}</p>{wide}{accuracy_tables(sweeps)}"
 
 
 # Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
 DENSITY_POINTS = 3000
-# Of the points' draw, beside everything else that is drawn from a run's seed.
-STREAM = "report"
 COMMAND = "evaluate"
 
 
@@ -225,7 +221,7 @@ def evaluation_report(
     density = request.density() if request.density is not None else None
     points = None
     if density is not None:
-        points = observed_point(density.samples.resample(DENSITY_POINTS, random_generator(config.seed, STREAM)))
+        points = observed_point(density.samples.resample(DENSITY_POINTS, random_generator(config.seed, "report")))
     learned = manifest.get("command")
     commands = [("The run that was learned", _line(learned))] if isinstance(learned, list) and learned else []
     commands.append(("The scores and this page", _line(command)))
@@ -259,9 +255,8 @@ def evaluation_report(
 
 
 def _origin(provenance: Mapping[str, object]) -> str:
-    """What a design's file says of where it came from."""
-    further = {name: value for name, value in provenance.items() if name not in ("versions", "task", "run")}
-    return ", ".join(f"{name} {value}" for name, value in further.items()) or "made by hand"
+    told = [f"{name} {value}" for name, value in provenance.items() if name not in ("versions", "task", "run")]
+    return ", ".join(told) or "made by hand"
 
 
 def _line(words: Sequence[object]) -> str:

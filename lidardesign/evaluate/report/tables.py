@@ -256,8 +256,8 @@ def _constraint_row(one: ConstraintSlack) -> str:
 
 
 def _room(room: float, bound: Any) -> str:
-    """The room under a bound; next to none is none."""
     size = max(abs(float(value)) for value in (bound if isinstance(bound, list | tuple) else [bound]))
+    # next to none is none
     return "0" if abs(room) < TINY * size else number(room)
 
 
@@ -383,7 +383,6 @@ def audit_section(evaluation: Evaluation, audit: Audit) -> str:
 
 
 def _starts(rows: Sequence[AuditRow], index: int) -> bool:
-    """Whether a row begins a group: another design, or the rows at equal bandwidth of another one."""
     row, before = rows[index], rows[index - 1]
     if row.matched_to is None:
         return row.design != before.design

@@ -97,7 +97,6 @@ def drawn_bodies(shown: SceneFigure) -> list[Body]:
 
 
 def _size(body: Body) -> float:
-    """The extent of a body [m]; of a plane infinite."""
     shape = body.shape
     if hasattr(shape, "bounds_m"):
         return float(np.ptp(shape.bounds_m, axis=0).max())
@@ -286,7 +285,6 @@ def _camera_buttons(flat: bool) -> str:
 
 
 def _sliders(shown: SceneFigure) -> str:
-    """One slider over positions, one over frames, where there is more than one."""
     names = " and ".join(shown.places[0]) or "position"
     places = [", ".join(f"{name} = {value:.4g}" for name, value in place.items()) for place in shown.places]
     rate_hz, count = shown.scene.frame_rate_hz, shown.scene.frames
@@ -304,7 +302,6 @@ def _sliders(shown: SceneFigure) -> str:
 
 
 def _designs(shown: SceneFigure, looks: Sequence[Series]) -> str:
-    """A switch per design, and one per sensor inside of it."""
     parts = ""
     for number, (one, look) in enumerate(zip(shown.designs, looks, strict=True)):
         picture = swatch(look.colour, DASHES[look.dash])
