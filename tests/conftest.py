@@ -73,6 +73,9 @@ def lidardesign(capsys, tmp_path, monkeypatch):
     return caller(capsys, tmp_path, monkeypatch)
 
 
+call = lidardesign
+
+
 @pytest.fixture
 def own_cache(tmp_path, monkeypatch):
     """No field of another test is read from the cache."""

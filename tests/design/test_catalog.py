@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.command_line import caller, make_run
+from support.command_line import make_run
 from support.tables import each_row
 
 from lidardesign.design.catalog.library import (
@@ -71,11 +71,6 @@ def own(tmp_path):
     path = tmp_path / "homemade.yaml"
     path.write_text(OWN)
     return path
-
-
-@pytest.fixture
-def call(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def some_pose(seed: int = 1) -> Pose:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.command_line import caller, make_run
+from support.command_line import make_run
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.compare import angle_between, paired_sensors, readout_of
@@ -93,11 +93,6 @@ def run(tmp_path_factory):
             program(["fit", str(folder), "--sensors", "2", "--rays", str(rays), "--name", name, "--quiet"])
         assert not ended.value.code
     return folder
-
-
-@pytest.fixture
-def call(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def test_scores_of_two_designs_pair_as_evaluate_pairs_them(call, run):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import caller, make_run
+from support.command_line import make_run
 
 from lidardesign.design.files import load_design, save_design
 from lidardesign.design.sensor import DesignSpec, Sensor
@@ -22,11 +22,6 @@ SDF = """<sdf version="1.9"><model name="m"><link name="l"><sensor name="fan" ty
 <min_angle>-0.5</min_angle><max_angle>0.5</max_angle></horizontal></scan>
 <range><min>0.1</min><max>0.9</max></range></lidar></sensor></link></model></sdf>
 """
-
-
-@pytest.fixture
-def call(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def semicolons(text):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.strategies import finite, length, sensors
 from support.tables import each_row
 
 from lidardesign.design.files import (
@@ -20,7 +21,7 @@ from lidardesign.design.files import (
     save_design,
 )
 from lidardesign.design.layouts.rays import gates_of, lay_out
-from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, interval_factor
+from lidardesign.design.sensor import DesignSpec, interval_factor
 from lidardesign.errors import ConfigError, DataError, NumericalError
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.yaml import dump_yaml, parse_yaml
@@ -29,39 +30,8 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "hand_written_design.yaml"
 DOCS = Path(__file__).parents[2] / "docs" / "design-file.md"
 SCHEMA = json.loads(SCHEMA_FILE.read_text(encoding="utf-8"))
 
-finite = st.floats(-1e6, 1e6)
-length = st.floats(0, 1e5)
 anything = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)))
 words = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc"))).filter(str.strip)
-
-
-@st.composite
-def covariances(draw):
-    root = np.array(draw(st.lists(st.floats(-2, 2), min_size=9, max_size=9))).reshape(3, 3)
-    covariance = root @ root.T
-    return (covariance + covariance.T) / 2
-
-
-@st.composite
-def sensors(draw, name, weight, level, rays):
-    return Sensor(
-        name=name, weight=weight, level=level, rays=rays,
-        origin_m=np.array(draw(st.tuples(finite, finite, finite))),
-        origin_covariance_m2=draw(covariances()),
-        azimuth_rad=draw(st.floats(-10, 10)), elevation_rad=draw(st.floats(-math.pi / 2, math.pi / 2)),
-        roll_rad=draw(st.floats(-4, 4)), spread_horizontal_rad=draw(st.floats(0, 4)),
-        spread_vertical_rad=draw(st.floats(0, 4)), range_m=draw(length), spread_range_m=draw(length),
-        coupling=draw(st.none() | couplings()),
-    )  # fmt: skip
-
-
-@st.composite
-def couplings(draw):
-    numbers = lambda values, count: np.array(draw(st.lists(values, min_size=count, max_size=count)))  # noqa: E731
-    return Coupling(
-        direction_per_m=numbers(finite, 6).reshape(2, 3), range_per_m=numbers(finite, 3),
-        range_per_rad=numbers(finite, 2), spread_rad=numbers(length, 2), spread_m=draw(length),
-    )  # fmt: skip
 
 
 @st.composite
@@ -87,13 +57,7 @@ def designs(draw):
     own = draw(st.booleans())
     counts = draw(st.lists(st.integers(0, 9), min_size=len(names), max_size=len(names)))
     table = draw(st.none() | ray_tables(len(names))) if not own else None
-    total = (
-        sum(counts)
-        if own
-        else len(table.sensor)
-        if table is not None
-        else draw(st.none() | st.integers(0, 999))
-    )
+    total = sum(counts) if own else len(table.sensor) if table is not None else draw(st.none() | st.integers(0, 999))
     chosen = tuple(
         draw(sensors(name, float(share), level, rays if own else None))
         for name, share, rays in zip(names, shares, counts, strict=True)
@@ -215,9 +179,7 @@ def test_intervals_alone_give_the_spreads_and_come_back(level, start, width, fie
 
 def test_the_spread_alone_is_enough_and_agrees_with_its_own_intervals():
     spread = {"horizontal_rad": 0.1, "vertical_rad": 0.05, "range_m": 0.2}
-    alone = design_from_document(
-        hand_written(field_of_view_rad=None, gate_m=None, range_m=1.0, spread=spread)
-    )
+    alone = design_from_document(hand_written(field_of_view_rad=None, gate_m=None, range_m=1.0, spread=spread))
     written = design_document(alone)["sensors"][0]
     both = design_from_document(
         hand_written(

@@ -1,13 +1,11 @@
 """Steering mirrors: angles of two real mirrors, little travel, gates that lose nothing, and back again."""
 
 import itertools
-import json
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.command_line import caller
 from support.tables import each_row
 
 from lidardesign.design.files import save_design
@@ -272,12 +270,11 @@ def test_bytes_that_are_no_text_and_no_file_at_all_are_refused(tmp_path):
             read_galvo(path)
 
 
-def test_the_program_exports_and_says_what_the_mirrors_travel(capsys, tmp_path, monkeypatch):
-    call = caller(capsys, tmp_path, monkeypatch)
+def test_the_program_exports_and_says_what_the_mirrors_travel(call, tmp_path):
     save_design(design(), tmp_path / "faces.yaml")
     done = call("export", "faces.yaml", "--format", "galvo", "--json")
     assert done.code == 0
-    document = json.loads(done.out)
+    document = done.json
     assert document["out"] == "faces.galvo.csv"
     assert is_galvo_file(tmp_path / "faces.galvo.csv")
     assert any("in the design's own order" in note for note in document["notes"])

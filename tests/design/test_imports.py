@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from support.command_line import caller, make_run
+from support.command_line import make_run
 from support.tables import each_row
 
 from lidardesign.design.constraints.document import Constraints
@@ -478,19 +478,12 @@ def test_degrees_and_quaternions_are_the_same_poses(tmp_path):
         assert_same_rays(one, found[0], 1e-9)
 
 
-def test_a_model_stands_by_its_placement_frame(tmp_path):
-    inner = '<frame name="foot"><pose>0 0 -1 0 0 1</pose></frame>'
-    model = f'<pose>5 0 0 0 0 1</pose>{inner}<link name="l">{lidar()}</link>'
-    text = f'<world name="w"><model name="m" placement_frame="foot">{model}</model></world>'
-    design = load_sdf(tmp_path, text)
+@each_row(("turn", "outer"), [(1, '<world name="w">{}</world>'), (0, "{}")])
+def test_a_model_stands_by_its_placement_frame_in_a_world_and_topmost(tmp_path, turn, outer):
+    inner = f'<frame name="foot"><pose>0 0 -1 0 0 {turn}</pose></frame>'
+    model = f'<pose>5 0 0 0 0 {turn}</pose>{inner}<link name="l">{lidar()}</link>'
+    design = load_sdf(tmp_path, outer.format(f'<model name="m" placement_frame="foot">{model}</model>'))
     np.testing.assert_allclose(design.sensors[0].origin_m, [5, 0, 1], atol=EXACT)
-
-
-def test_a_topmost_model_stands_by_its_placement_frame_too(tmp_path):
-    inner = '<frame name="foot"><pose>0 0 -1 0 0 0</pose></frame>'
-    model = f'<pose>5 0 0 0 0 0</pose>{inner}<link name="l">{lidar()}</link>'
-    text = f'<model name="m" placement_frame="foot">{model}</model>'
-    np.testing.assert_allclose(load_sdf(tmp_path, text).sensors[0].origin_m, [5, 0, 1], atol=EXACT)
 
 
 @pytest.mark.parametrize(("version", "where"), [("1.5", 6), ("1.6", 6), ("1.7", 2), ("1.9", 2)])
@@ -594,21 +587,6 @@ def test_a_scan_that_cannot_be_is_refused(tmp_path, options):
         load_sdf(tmp_path, f'<model name="m"><link name="l">{lidar(**options)}</link></model>')
 
 
-def test_what_is_written_for_gazebo_fires_as_it_is_read(tmp_path):
-    from lidardesign.export.common.names import read_xml
-    from lidardesign.export.common.poses import mounts
-    from lidardesign.export.robots import read_sensor
-
-    design = rig(3, counts=(9, 6), names=("a", "b"))
-    rays = lay_out(design)
-    path = tmp_path / "rig.sdf"
-    EXPORTERS["sdf"].write(design, rays, path)
-    found = lay_out(load_design(path))
-    fired = [read_sensor(one, path) for one in read_xml(path, "sdf").iter("sensor")]
-    assert len(fired) == len(mounts(design, rays)) == 2
-    np.testing.assert_allclose(found.direction, np.concatenate([one.direction for one in fired]), atol=1e-9)
-
-
 # ------------------------------------------------------------------- garbage
 
 
@@ -656,11 +634,6 @@ def test_damaged_files_are_read_or_refused_and_nothing_else(tmp_path, originals)
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("runs") / "flat", count=2000)
-
-
-@pytest.fixture
-def call(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def flat_rig(tmp_path, count=16, end=True):

@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from support.command_line import caller, make_run
+from support.command_line import make_run
 
 from lidardesign.design.files import save_design
 from lidardesign.design.sensor import DesignSpec, Sensor
@@ -53,11 +53,6 @@ def run(tmp_path_factory):
     for design in (pattern("any", 1, "grid"), pattern("few", 7)):
         save_design(design, folder / "designs" / f"{design.name}.yaml")
     return folder
-
-
-@pytest.fixture
-def call(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def numbers_of(document, name):

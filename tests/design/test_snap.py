@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.command_line import caller, make_run
+from support.command_line import make_run
 from support.tables import each_row
 
 from lidardesign.design.catalog.library import find_part, load_library
@@ -271,7 +271,7 @@ def test_losses_are_what_the_mixture_loses_by_each_part_alone():
     assert isinstance(ensemble, Ensemble)
     (group,), (trace,) = ensemble.parts, ensemble.results
     shapes = [shape for name in ("vl53l5cx", "tmf8828") for shape in shapes_of(find_part(name), SPACE)]
-    choices = nearest_parts(ensemble, [PartOptions(shapes, True), PartOptions(shapes, True)], 200, seed=0)
+    choices = nearest_parts(ensemble, [PartOptions(shapes), PartOptions(shapes)], 200, seed=0)
     heaviest = int(np.argmax(trace.mixture.weights))
     before = group.features.weights @ log_density(trace.mixture, group.features)
     for shape, loss in zip(shapes, choices[heaviest].losses, strict=True):
@@ -437,7 +437,7 @@ def test_rays_that_nobody_asked_for_are_those_that_see_something():
 
 def test_choices_that_are_affordable_stay():
     shape = shapes_of(find_part("vl53l5cx"), SPACE)[0]
-    options = [PartOptions([shape], True)]
+    options = [PartOptions([shape])]
     choice = [PartChoice(shape, (0.1,))]
     found = afford_rays(choice, options, np.ones(1), np.ones(1), BandwidthBudget.of(Constraints(), 64))
     assert found == choice
@@ -525,11 +525,6 @@ def test_the_checker_admits_only_the_parts_that_are_named(tmp_path):
 
 
 # the command line
-
-
-@pytest.fixture
-def call(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def test_constrain_snaps_shows_the_losses_and_evaluate_takes_the_design(call, tmp_path):

@@ -146,16 +146,6 @@ def test_profiles_hold_every_ray_with_its_gate(profiles):
         assert body["farRangeM"] == mine.gate_m[:, 1].max()
 
 
-def test_a_folder_keeps_what_else_lies_there_and_says_so(profiles):
-    path, _, found = profiles
-    other = path / "Mine.json"
-    other.write_text("{}")
-    notes = EXPORTERS["isaac-json"].write(DESIGN, RAYS, path)
-    assert any("Mine.json" in note for note in notes)
-    assert other.read_text() == "{}"
-    assert len(list(path.iterdir())) == len(found) + 2
-
-
 def test_usd_has_an_omnilidar_per_sensor_with_the_schemas_types(stage):
     assert str(stage.GetDefaultPrim().GetPath()) == "/Lidar"
     assert stage.GetMetadata("upAxis") == "Z"

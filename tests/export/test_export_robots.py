@@ -13,11 +13,10 @@ from support.tables import each_row
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import ConfigError
 from lidardesign.export.common.names import identifier
 from lidardesign.export.common.poses import mounts
 from lidardesign.export.registry import EXPORTERS
-from lidardesign.export.robots import read_mjcf
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
 
@@ -291,22 +290,6 @@ def test_a_gate_start_that_is_not_held_is_told(exported, name):
         assert f"{RAYS.gate_m[RAYS.gate_m[:, 0] > 0, 0].min():.3g} to 1 m" in told[0]
 
 
-@each_row("name", ROBOTS)
-def test_a_format_holds_its_frame_rate_or_refuses_one(tmp_path, name):
-    path = tmp_path / "out"
-    if name == "mjcf":
-        with pytest.raises(ConfigError, match="no frame rate"):
-            EXPORTERS[name].write(DESIGN, RAYS, path, 25.0)
-        return
-    EXPORTERS[name].write(DESIGN, RAYS, path, 25.0)
-    found = EXPORTERS[name].rounding(DESIGN, RAYS, path)
-    if name in GRIDS:
-        assert "time_s" not in found
-    else:
-        # the rays were laid out for ten frames a second: firing times shrink with the frame
-        assert found["time_s"].error < 1.01e-9
-
-
 @each_row("rate_hz", [np.nan, np.inf, 0.0, -1.0, 1e-320, 1e300])
 def test_no_sensor_has_such_a_frame_rate(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match=r"0\.001 to 1e"):
@@ -323,38 +306,6 @@ def test_carla_fires_whole_numbers_of_points_per_second(tmp_path):
         found.append(EXPORTERS["carla"].rounding(DESIGN, RAYS, tmp_path / "out"))
     assert found[0]["rays"] == found[1]["rays"]
     assert found[0]["direction_rad"].error == pytest.approx(found[1]["direction_rad"].error)
-
-
-@each_row("name", ROBOTS)
-def test_no_rays_are_no_sensors(tmp_path, name):
-    none = RAYS.subset(np.zeros(0, dtype=np.int64))
-    path = tmp_path / "out"
-    notes = EXPORTERS[name].write(DESIGN, none, path)
-    assert any("4 of 4 sensors fire no ray" in note for note in notes)
-    assert all(estimate.error == 0 for estimate in EXPORTERS[name].rounding(DESIGN, none, path).values())
-
-
-@each_row("name", ROBOTS)
-def test_another_or_a_damaged_file_is_no_round_trip(exported, tmp_path, name):
-    exporter = EXPORTERS[name]
-    with pytest.raises(DataError):
-        exporter.rounding(DESIGN, RAYS, tmp_path / "none")
-    one, first = DesignSpec("one", DESIGN.sensors[:1]), RAYS.subset(RAYS.sensor == 0)
-    path = tmp_path / "out"
-    exporter.write(one, first, path)
-    with pytest.raises(DataError):
-        exporter.rounding(DESIGN, RAYS, path)
-    for file in [path] if path.is_file() else sorted(path.iterdir()):
-        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    with pytest.raises(DataError):
-        exporter.rounding(one, first, path)
-
-
-def test_a_document_type_is_refused(tmp_path):
-    path = tmp_path / "x.xml"
-    path.write_text('<!DOCTYPE mujoco [<!ENTITY a "b">]><mujoco>&a;</mujoco>')
-    with pytest.raises(DataError, match="document type"):
-        read_mjcf(path)
 
 
 @each_row("name", ["mjcf", "sdf", "urdf", "xacro"])
