@@ -140,14 +140,15 @@ def _curves(evaluation: Evaluation) -> str:
         switch(curve.name, picture=swatch(curve.colour, curve.dash, curve.marker), curve=str(index))
         for index, curve in enumerate(series(evaluation))
     )
-    scenes = f"over {held_out_scenes(evaluation.scenes)}"
-    return (
-        f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>'
-        + figure(curve_figure(evaluation, "rays"), "curve-rays", CURVE_PX, f"Score against rays per frame: means {scenes}, "
-                 "with 95 % bootstrap intervals as bands.", "curves")
-        + figure(curve_figure(evaluation, "bandwidth"), "curve-bandwidth", CURVE_PX, "The same scores against the bandwidth "
-                 "that it takes to read the gates out.", "curves")
-    )  # fmt: skip
+    means = f"means over {held_out_scenes(evaluation.scenes)}, with 95 % bootstrap intervals as bands."
+    captions = {
+        "rays": f"Score against rays per frame: {means}",
+        "bandwidth": "The same scores against the bandwidth that it takes to read the gates out.",
+    }
+    return f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>' + "".join(
+        figure(curve_figure(evaluation, against), f"curve-{against}", CURVE_PX, caption, "curves")
+        for against, caption in captions.items()
+    )
 
 
 def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
