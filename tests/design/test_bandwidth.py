@@ -15,9 +15,7 @@ from lidardesign.scene import SPEED_OF_LIGHT_M_S
 def rays_with_gates(gates):
     count = len(gates)
     forward = np.tile([1.0, 0.0, 0.0], (count, 1))
-    return Rays(
-        np.zeros((count, 3)), forward, np.array(gates, float).reshape(-1, 2), np.zeros(count), np.zeros(count)
-    )
+    return Rays(np.zeros((count, 3)), forward, np.array(gates, float).reshape(-1, 2), np.zeros(count), np.zeros(count))
 
 
 @pytest.mark.parametrize(("rays", "printed"), [(196, 5.2), (361, 9.5), (576, 15.2)])

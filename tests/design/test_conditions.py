@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,13 +59,15 @@ def estimate(samples, values):
 
 
 @each_row("value", [0.0, 0.37, 1.2, 3.91, 4.0])
-def test_moments_at_a_value_are_those_of_the_conditional_density(value):
+def test_moments_at_a_value_are_those_of_the_conditional_density_and_the_mean_weight_is_its_mass(value):
     found = at_condition(SAMPLES, {"x_m": value}, log_target, 20_000, np.random.default_rng(1))
     for column, centre, spread in zip((AZIMUTH, RANGE), means(value), TARGET, strict=True):
         mean, error = estimate(found, found.points[:, column])
         assert abs(mean - centre) < 4 * error
         square, error = estimate(found, np.square(found.points[:, column] - centre))
         assert abs(square - spread**2) < 4 * error
+    weights = np.exp(found.log_weights)
+    assert abs(weights.mean() - math.exp(LOG_MASS)) < 4 * weights.std() / math.sqrt(len(weights))
 
 
 @pytest.mark.parametrize("value", [0.0, 2.0, 4.0])
@@ -80,14 +83,6 @@ def test_a_window_of_the_same_samples_is_biased_where_exact_weights_are_not(valu
         assert abs(mean - truth) < 4 * error
     mean, error = estimate(window, np.square(window.points[:, AZIMUTH] - centre))
     assert abs(mean - TARGET[0] ** 2) > 20 * error
-
-
-@pytest.mark.parametrize("value", [0.0, 0.37, 3.91])
-def test_the_mean_weight_is_the_mass_of_the_target_at_the_value(value):
-    found = at_condition(SAMPLES, {"x_m": value}, log_target, 20_000, np.random.default_rng(1))
-    weights = np.exp(found.log_weights)
-    error = weights.std() / math.sqrt(len(weights))
-    assert abs(weights.mean() - math.exp(LOG_MASS)) < 4 * error
 
 
 def test_samples_so_far_that_they_would_spoil_the_rest_are_left_away():
@@ -168,45 +163,28 @@ def test_without_a_condition_nothing_changes():
     assert at_condition(SAMPLES, {}, None, 10, np.random.default_rng(0)) is SAMPLES
 
 
-@pytest.mark.parametrize(
-    ("condition", "words"),
+FIXED = replace(SAMPLES, space=DesignSpace(AISLE.low, AISLE.high))
+WORTH = r"x_m=1 the 1000 nearest samples are worth [0-3]\n(.|\n)*at least 50"
+
+
+@each_row(
+    ("samples", "condition", "target", "error", "words"),
     [
-        ({"x_m": 4.2}, "0 to 4"),
-        ({"x_m": math.nan}, "0 to 4"),
-        ({"y_m": 0.0}, "x_m"),
-        ({"speed": 1.0}, "x_m"),
+        (SAMPLES, {"x_m": 4.2}, log_target, ConfigError, "0 to 4"),
+        (SAMPLES, {"x_m": math.nan}, log_target, ConfigError, "0 to 4"),
+        (SAMPLES, {"y_m": 0.0}, log_target, ConfigError, "x_m"),
+        (SAMPLES, {"speed": 1.0}, log_target, ConfigError, "x_m"),
+        (FIXED, {"x_m": 1.0}, log_target, ConfigError, "no conditions"),
+        (SAMPLES, {"x_m": 1.0}, None, ConfigError, "give the run folder"),
+        (SAMPLES, {"x_m": 1.0}, lambda p: np.full(len(p), -np.inf), DataError, WORTH),
+        (SAMPLES, {"x_m": 1.0}, lambda p: np.where(np.arange(len(p)) < 3, 0.0, -np.inf), DataError, WORTH),
+        (SAMPLES, {"x_m": 1.0}, lambda p: np.full(len(p), np.nan), NumericalError, "x_m=1"),
+        (SAMPLES, {"x_m": 1.0}, lambda p: np.zeros(3), NumericalError, "x_m=1"),
     ],
 )
-def test_values_outside_and_unknown_names_are_refused_with_what_is_allowed(condition, words):
-    with pytest.raises(ConfigError, match=words):
-        at_condition(SAMPLES, condition, log_target, 100, np.random.default_rng(0))
-
-
-def test_a_density_without_conditions_says_so():
-    fixed = Samples(SAMPLES.points, SAMPLES.log_prob, SAMPLES.log_target, DesignSpace(AISLE.low, AISLE.high))
-    with pytest.raises(ConfigError, match="no conditions"):
-        at_condition(fixed, {"x_m": 1.0}, log_target, 100, np.random.default_rng(0))
-
-
-def test_without_a_target_density_the_run_is_asked_for():
-    with pytest.raises(ConfigError, match="give the run folder"):
-        at_condition(SAMPLES, {"x_m": 1.0}, None, 100, np.random.default_rng(0))
-
-
-@pytest.mark.parametrize(
-    "target",
-    [lambda p: np.full(len(p), -np.inf), lambda p: np.where(np.arange(len(p)) < 3, 0.0, -np.inf)],
-    ids=["nothing there", "three samples there"],
-)
-def test_a_value_where_samples_are_worth_too_few_is_refused_with_their_worth(target):
-    with pytest.raises(DataError, match=r"x_m=1 the 1000 nearest samples are worth [0-3]\n(.|\n)*at least 50"):
-        at_condition(SAMPLES, {"x_m": 1.0}, target, 1000, np.random.default_rng(0))
-
-
-@pytest.mark.parametrize("target", [lambda p: np.full(len(p), np.nan), lambda p: np.zeros(3)])
-def test_a_target_that_is_no_density_is_a_numerical_failure(target):
-    with pytest.raises(NumericalError, match="x_m=1"):
-        at_condition(SAMPLES, {"x_m": 1.0}, target, 1000, np.random.default_rng(0))
+def test_what_cannot_be_moved_to_a_value_is_refused_in_words(samples, condition, target, error, words):
+    with pytest.raises(error, match=words):
+        at_condition(samples, condition, target, 1000, np.random.default_rng(0))
 
 
 def test_samples_at_a_condition_are_remembered_while_the_run_is():

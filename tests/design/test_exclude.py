@@ -57,10 +57,9 @@ def fitted(samples=SAMPLES, count=None, layout="grid", rays=None, **values):
     )  # fmt: skip
 
 
-def interval(sensor, level=0.95):
-    """Lowest and highest origin along each axis, by a factor of its own."""
-    z = {0.95: 1.959963984540054}[level]
-    reach = z * np.sqrt(np.diag(sensor.origin_covariance_m2))
+def interval(sensor):
+    """Lowest and highest origin along each axis at the level 0.95, by a factor of its own."""
+    reach = 1.959963984540054 * np.sqrt(np.diag(sensor.origin_covariance_m2))
     return sensor.origin_m - reach, sensor.origin_m + reach
 
 
@@ -72,9 +71,11 @@ def assert_outside(design, boxes):
             into &= np.array(box["low_m"]) < np.array(box["high_m"])
             assert not into.all(), (sensor.origin_m, low, high, box)
     if design.ray_table is not None:
-        for box in boxes:
-            inside = (design.ray_table.origin_m > box["low_m"]) & (design.ray_table.origin_m < box["high_m"])
-            assert not inside.all(axis=1).any()
+        assert not any(starting_in(box, design.ray_table) for box in boxes)
+
+
+def starting_in(box, rays):
+    return ((rays.origin_m > box["low_m"]) & (rays.origin_m < box["high_m"])).all(axis=1).any()
 
 
 def places(result):
@@ -106,12 +107,10 @@ def test_boxes_beyond_the_space_change_nothing():
 
 
 def test_the_order_of_the_boxes_does_not_matter():
-    boxes = [
-        PILLAR,
-        {"low_m": [0.6, 0.2, 0], "high_m": [0.8, 0.9, 1]},
-        {"low_m": [-0.8, -0.9, 0], "high_m": [-0.6, -0.2, 1]},
-    ]
-    first, *others = [places(fitted(origin={"exclude": list(some)})) for some in itertools.permutations(boxes)]
+    right = {"low_m": [0.6, 0.2, 0], "high_m": [0.8, 0.9, 1]}
+    left = {"low_m": [-0.8, -0.9, 0], "high_m": [-0.6, -0.2, 1]}
+    orders = itertools.permutations([PILLAR, right, left])
+    first, *others = [places(fitted(origin={"exclude": list(boxes)})) for boxes in orders]
     assert all(other == first for other in others)
 
 
@@ -202,26 +201,22 @@ def test_boxes_that_leave_no_place_are_refused_by_name(values, conflicts):
 
 
 @each_row(
-    ("box", "message"),
+    ("boxes", "message"),
     [
-        ({"low_m": [0, 0, 1], "high_m": [1, 1, 0]}, "low_m is above high_m along z"),
-        ({"low_m": [0, 0, math.nan], "high_m": [1, 1, 1]}, "finite"),
-        ({"low_m": [0, 0], "high_m": [1, 1, 1]}, "at least 3"),
-        ({"low_m": [0, 0, 0, 0], "high_m": [1, 1, 1]}, "at most 3"),
-        ({"low_m": [0, 0, 0]}, "high_m is missing"),
-        ({"low_m": [0, 0, 0], "high_m": [1, 1, 1], "heigh_m": 3}, "unknown key"),
-        ({"low_m": ["a", 0, 0], "high_m": [1, 1, 1]}, "number"),
-        ([0, 0, 0, 1, 1, 1], "origin.exclude.0"),
+        ([{"low_m": [0, 0, 1], "high_m": [1, 1, 0]}], "low_m is above high_m along z"),
+        ([{"low_m": [0, 0, math.nan], "high_m": [1, 1, 1]}], "finite"),
+        ([{"low_m": [0, 0], "high_m": [1, 1, 1]}], "at least 3"),
+        ([{"low_m": [0, 0, 0, 0], "high_m": [1, 1, 1]}], "at most 3"),
+        ([{"low_m": [0, 0, 0]}], "high_m is missing"),
+        ([{"low_m": [0, 0, 0], "high_m": [1, 1, 1], "heigh_m": 3}], "unknown key"),
+        ([{"low_m": ["a", 0, 0], "high_m": [1, 1, 1]}], "number"),
+        ([[0, 0, 0, 1, 1, 1]], "origin.exclude.0"),
+        ([SLAB] * 33, "32"),
     ],
 )
-def test_boxes_that_are_none_are_refused(box, message):
+def test_boxes_that_are_none_and_too_many_are_refused(boxes, message):
     with pytest.raises(ConfigError, match=message):
-        Constraints.from_mapping({"origin": {"exclude": [box]}})
-
-
-def test_too_many_boxes_are_refused():
-    with pytest.raises(ConfigError, match="32"):
-        Constraints.from_mapping({"origin": {"exclude": [SLAB] * 33}})
+        Constraints.from_mapping({"origin": {"exclude": boxes}})
 
 
 @pytest.mark.parametrize("count", [40, 90])
@@ -232,10 +227,8 @@ def test_rays_of_another_number_keep_out_with_and_without_samples(count, tmp_pat
     design = load_design(path)
     assert design.constraints == {"origin": {"exclude": [PILLAR]}}
     for samples in (SAMPLES, None):
-        rays = lay_out(design, count, samples)
-        assert not ((rays.origin_m > PILLAR["low_m"]) & (rays.origin_m < PILLAR["high_m"])).all(axis=1).any()
-        again = lay_out(replace(design, ray_table=None), count, samples)
-        assert not ((again.origin_m > PILLAR["low_m"]) & (again.origin_m < PILLAR["high_m"])).all(axis=1).any()
+        for one in (design, replace(design, ray_table=None)):
+            assert not starting_in(PILLAR, lay_out(one, count, samples))
 
 
 def test_the_number_of_sensors_is_found_between_boxes():
@@ -304,22 +297,18 @@ def broken(document):
     return [check.name for check in checks if not check.satisfied and "exclude" in check.name]
 
 
-def test_a_mean_inside_a_box_is_seen(document):
-    assert broken(document) == []
+@each_row(
+    ("mean_x", "spread_x", "names"),
+    [(0.0, 0.0, ["s1.origin.exclude[0]"]), (0.7, 0.1, []), (0.7, 0.11, ["s1.origin.exclude[0]"])],
+)
+def test_a_mean_in_a_box_and_an_interval_that_reaches_into_it_are_seen(document, mean_x, spread_x, names):
     moved = copy.deepcopy(document)
-    moved["sensors"][0]["origin_m"] = {"mean": [0.0, 0.0, 1.0], "covariance": np.zeros((3, 3)).tolist()}
-    assert broken(moved) == ["s0.origin.exclude[0]"]
-
-
-def test_an_interval_that_reaches_into_a_box_is_seen(document):
-    moved = copy.deepcopy(document)
-    moved["sensors"][1]["origin_m"] = {"mean": [0.7, 0.0, 1.0], "covariance": np.diag([0.1**2, 0, 0]).tolist()}
-    assert broken(moved) == []
-    moved["sensors"][1]["origin_m"]["covariance"][0][0] = 0.11**2
-    assert broken(moved) == ["s1.origin.exclude[0]"]
+    moved["sensors"][1]["origin_m"] = {"mean": [mean_x, 0.0, 1.0], "covariance": np.diag([spread_x**2, 0, 0]).tolist()}
+    assert broken(moved) == names
 
 
 def test_a_ray_that_starts_in_a_box_is_seen(document):
+    assert broken(document) == []
     moved = copy.deepcopy(document)
     for key in ("origin_x_m", "origin_y_m"):
         moved["ray_table"][key][7] = 0.0
@@ -348,9 +337,13 @@ def shelf(count=6000):
     return Samples(points, np.zeros(count), np.zeros(count), AISLE)
 
 
+def tracked(box, **origin):
+    rules = Constraints.from_mapping({"origin": {"exclude": [box], **origin}})
+    return fit(shelf(), layout="scan", rays=4, constraints=rules)
+
+
 def test_a_track_ends_at_a_box():
-    gate = {"low_m": [3.0, -1, -1], "high_m": [9, 1, 1]}
-    result = fit(shelf(), layout="scan", rays=4, constraints=Constraints.from_mapping({"origin": {"exclude": [gate]}}))
+    result = tracked({"low_m": [3.0, -1, -1], "high_m": [9, 1, 1]})
     assert (result.design.track.knots[0], result.design.track.knots[-1]) == (-0.5, 3.0)
     assert result.satisfied
     written = design_document(result.design)
@@ -360,21 +353,18 @@ def test_a_track_ends_at_a_box():
 
 
 def test_a_box_beside_a_track_is_in_nobodys_way():
-    rules = Constraints.from_mapping({"origin": {"exclude": [{"low_m": [1.0, 0.0, -1], "high_m": [2.0, 1, 1]}]}})
-    result = fit(shelf(), layout="scan", rays=4, constraints=rules)
+    result = tracked({"low_m": [1.0, 0.0, -1], "high_m": [2.0, 1, 1]})
     assert (result.design.track.knots[0], result.design.track.knots[-1]) == (-0.5, 4.0)
     assert result.satisfied
 
 
 def test_a_box_that_cuts_a_track_is_refused_with_the_pieces():
     cut = {"low_m": [1.0, -1, -1], "high_m": [2.0, 1, 1]}
-    rules = Constraints.from_mapping({"origin": {"exclude": [cut]}})
     with pytest.raises(InfeasibleError, match="2 pieces") as caught:
-        fit(shelf(), layout="scan", rays=4, constraints=rules)
+        tracked(cut)
     assert list(caught.value.conflicts) == ["origin.exclude", "--layout scan"]
     assert "up to 1 or from 2" in caught.value.hint
-    kept = Constraints.from_mapping({"origin": {"exclude": [cut], "low_m": [2, -1, -1]}})
-    assert fit(shelf(), layout="scan", rays=4, constraints=kept).design.track.knots[0] == 2
+    assert tracked(cut, low_m=[2, -1, -1]).design.track.knots[0] == 2
 
 
 # --- the command line

@@ -36,18 +36,12 @@ def written(**changes):
 
 EMPTY = {key: [[], []] for key in ("azimuth_rad", "elevation_rad", "gate_start_m", "gate_end_m")}
 MISTAKES = {
-    "unsorted": ({"knots_m": [1.0, 0.0]}, "each above"),
     "equal": ({"knots_m": [1.0, 1.0]}, "each above"),
     "one knot": ({"knots_m": [1.0]}, "at least two"),
     "nan": ({"knots_m": [0.0, float("nan")]}, "a number"),
     "beyond all measure": ({"knots_m": [-1.7e308, 1.7e308]}, "within 1e"),
     "no rays": ({"sensor": [], **EMPTY}, "at least one ray"),
-    "no such sensor": ({"sensor": [1]}, "from 0 to 0"),
-    "a row too few": ({"azimuth_rad": [[1.4]]}, "one per knot"),
     "a ray too many": ({"azimuth_rad": [[1.4, 1.5], [1.6, 1.7]]}, "has 2 numbers"),
-    "backward gate": ({"gate_end_m": [[1.0], [0.1]]}, "before the gate's start"),
-    "sideways": ({"dimension": "range_m"}, "x_m or y_m or z_m"),
-    "above the zenith": ({"elevation_rad": [[0.0], [2.0]]}, "from -1.57"),
 }
 
 

@@ -133,19 +133,19 @@ def test_the_rays_of_a_scan_have_no_mounts():
 def test_the_checker_finds_sensors_that_left_or_share_a_mount():
     rules = {"origin": {"mounts_m": MOUNTS}}
     document = design_document(fitted(sensors={"count": 2}, **rules).design)
-    assert all(check.satisfied for check in check_design(document, rules))
-    moved = document["sensors"][0]["origin_m"]["mean"]
-    moved[0] += 1e-6
-    failed = [check.name for check in check_design(document, rules) if not check.satisfied]
-    assert failed == ["s0.origin.mounts_m"]
-    document["sensors"][0]["origin_m"]["mean"] = list(document["sensors"][1]["origin_m"]["mean"])
-    failed = [check.name for check in check_design(document, rules) if not check.satisfied]
-    assert failed == ["s1.origin.mounts_m"]
-    document["sensors"][1]["origin_m"]["mean"] = list(MOUNTS[0])
-    document["sensors"][0]["origin_m"]["mean"] = list(MOUNTS[1])
-    document["sensors"][0]["origin_m"]["covariance"][0][0] = 1e-6
-    failed = [check.name for check in check_design(document, rules) if not check.satisfied]
-    assert failed == ["s0.origin.mounts_m"]
+    first, second = (sensor["origin_m"] for sensor in document["sensors"])
+
+    def failed():
+        return [check.name for check in check_design(document, rules) if not check.satisfied]
+
+    assert failed() == []
+    first["mean"][0] += 1e-6
+    assert failed() == ["s0.origin.mounts_m"]
+    first["mean"] = list(second["mean"])
+    assert failed() == ["s1.origin.mounts_m"]
+    first["mean"], second["mean"] = list(MOUNTS[1]), list(MOUNTS[0])
+    first["covariance"][0][0] = 1e-6
+    assert failed() == ["s0.origin.mounts_m"]
 
 
 @settings(max_examples=60, deadline=None)

@@ -40,6 +40,13 @@ from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, di
 DRAWS = 20_000
 
 
+def assert_drawn(points, edges, density, inside, whole=True):
+    """Draws have a density over cells, each known from so many midpoints per axis; the cells hold all of it."""
+    mass = mass_of_cells(density, edges, inside)
+    assert not whole or mass.sum() == pytest.approx(1.0, abs=5e-3)
+    assert p_value(counts_of_cells(points, edges), len(points) * mass / mass.sum()) > UNLIKELY
+
+
 def edges_of(*sizes, low=-1.0, high=1.0):
     return [np.linspace(low, high, size + 1) for size in sizes]
 
@@ -103,13 +110,11 @@ def test_samples_of_a_flow_have_its_integrated_density(name, dtype):
     sizes, inside, scale = GRIDS[name]
     flow = flow_of(name, layers=2, scale=scale)
     context = torch.tensor([[0.3, -0.8][: flow.context]], dtype=torch.float64) if flow.context else None
-    edges = edges_of(*sizes)
-    mass = mass_of_cells(of_flow(flow, context), edges, inside)
-    assert mass.sum() == pytest.approx(1.0, abs=5e-3)
     base = flow.draw(DRAWS, torch.Generator().manual_seed(2))[0].to(dtype)
     with torch.no_grad():
-        values, _ = flow.to(dtype)(base, None if context is None else context.to(dtype).expand(DRAWS, -1))
-    assert p_value(counts_of_cells(values.double().numpy(), edges), DRAWS * mass / mass.sum()) > UNLIKELY
+        single = flow_of(name, layers=2, scale=scale).to(dtype)
+        values, _ = single(base, None if context is None else context.to(dtype).expand(DRAWS, -1))
+    assert_drawn(values.double().numpy(), edges_of(*sizes), of_flow(flow, context), inside)
 
 
 def test_a_sampler_that_is_a_little_wrong_is_found_out():
@@ -159,10 +164,7 @@ def test_samples_of_a_run_have_the_density_per_chart_volume_that_is_stored_with_
         points = space.from_chart(np.column_stack([np.zeros((len(chart), 3)), chart]))
         return np.exp(log_density_of(learned, points))
 
-    mass = mass_of_cells(density, edges, 6)
-    assert mass.sum() == pytest.approx(1.0, abs=5e-3)
-    drawn = np.clip(space.to_chart(samples.points)[:, 3:], low, high)
-    assert p_value(counts_of_cells(drawn, edges), DRAWS * mass / mass.sum()) > UNLIKELY
+    assert_drawn(np.clip(space.to_chart(samples.points)[:, 3:], low, high), edges, density, 6)
 
 
 def test_conditions_and_proposals_are_drawn_as_they_say():
@@ -197,17 +199,11 @@ def test_draws_of_a_mixture_over_the_sphere_have_its_density_per_solid_angle():
     generator = np.random.default_rng(7)
     mixture = random_mixture(generator, 3, width=0.8)
     points = drawn_from_mixture(mixture, DRAWS, generator, POINT)
-    mass = mass_of_cells(of_directions(lambda p: np.exp(log_density(mixture, features_of(p, POINT)))), SPHERE_EDGES, 8)
-    assert mass.sum() == pytest.approx(1.0, abs=5e-3)
     chart = np.column_stack([points[:, AZIMUTH], np.sin(points[:, ELEVATION]), points[:, RANGE]])
-    assert p_value(counts_of_cells(chart, SPHERE_EDGES), DRAWS * mass / mass.sum()) > UNLIKELY
+    density = of_directions(lambda p: np.exp(log_density(mixture, features_of(p, POINT))))
+    assert_drawn(chart, SPHERE_EDGES, density, 8)
 
-
-def test_without_the_share_of_the_tangent_plane_the_same_draws_would_be_refused():
-    generator = np.random.default_rng(7)
-    mixture = random_mixture(generator, 3, width=0.8)
-    points = drawn_from_mixture(mixture, DRAWS, generator, POINT)
-
+    # without the share of the tangent plane the same draws would be refused
     def flat(points):
         looking, total = direction(points[:, AZIMUTH], points[:, ELEVATION]), np.zeros(len(points))
         for k in range(3):
@@ -220,7 +216,6 @@ def test_without_the_share_of_the_tangent_plane_the_same_draws_would_be_refused(
         return total
 
     mass = mass_of_cells(of_directions(flat), SPHERE_EDGES, 4)
-    chart = np.column_stack([points[:, AZIMUTH], np.sin(points[:, ELEVATION]), points[:, RANGE]])
     assert p_value(counts_of_cells(chart, SPHERE_EDGES), DRAWS * mass / mass.sum()) < UNLIKELY
 
 
@@ -235,9 +230,7 @@ def test_draws_of_origins_have_the_mixtures_density_with_its_full_covariance():
         rays = np.column_stack([origins, np.tile([0.3, 0.1, 2.0], (len(origins), 1))])
         return np.exp(log_density(mixture, features_of(rays, space)))
 
-    mass = mass_of_cells(density, edges, 6)
-    assert mass.sum() == pytest.approx(1.0, abs=5e-3)
-    assert p_value(counts_of_cells(points, edges), DRAWS * mass / mass.sum()) > UNLIKELY
+    assert_drawn(points, edges, density, 6)
 
 
 # --- truncated sampling
@@ -291,24 +284,17 @@ def test_draws_inside_a_gate_have_the_density_renormalised_there():
 
 
 def test_draws_inside_an_origin_box_without_an_excluded_one_have_the_density_renormalised_there():
-    support, drawn = restricted_draws(
-        {
-            "origin": {
-                "low_m": [-0.4, -0.2, 0.0],
-                "high_m": [0.4, 0.4, 0.0],
-                "exclude": [{"low_m": [0.0, 0.0, -1.0], "high_m": [0.2, 0.2, 1.0]}],
-            }
-        }
-    )
-    x, y = drawn[:, 0], drawn[:, 1]
-    assert not ((x > 0) & (x < 0.2) & (y > 0) & (y < 0.2)).any()
+    hole = {"low_m": [0.0, 0.0, -1.0], "high_m": [0.2, 0.2, 1.0]}
+    box = {"low_m": [-0.4, -0.2, 0.0], "high_m": [0.4, 0.4, 0.0]}
+    support, drawn = restricted_draws({"origin": {**box, "exclude": [hole]}})
     edges = [np.linspace(-0.4, 0.4, 9), np.linspace(-0.2, 0.4, 7)]
 
     def within(points):
         x, y = points[:, 0], points[:, 1]
-        hole = (x > 0) & (x < 0.2) & (y > 0) & (y < 0.2)
-        return (np.abs(x) <= 0.4) & (y >= -0.2) & (y <= 0.4) & ~hole
+        inside = (x > 0) & (x < 0.2) & (y > 0) & (y < 0.2)
+        return (np.abs(x) <= 0.4) & (y >= -0.2) & (y <= 0.4) & ~inside
 
+    assert within(drawn).all()
     mass, share = axis_mass([0, 1], edges, within)
     assert support.total == pytest.approx(share, rel=0.01)
     assert p_value(counts_of_cells(drawn[:, :2], edges), len(drawn) * mass) > UNLIKELY
@@ -349,8 +335,7 @@ def test_draws_from_a_pinned_origin_have_the_density_at_that_origin():
     assert (drawn[:, 0] == 0.04).all()
     edges = [np.linspace(-0.8, 0.8, 15), np.linspace(-0.7, 0.7, 13), np.linspace(0.5, 2.0, 13)]
     chart = np.column_stack([drawn[:, AZIMUTH], np.sin(drawn[:, ELEVATION]), drawn[:, RANGE]])
-    mass = mass_of_cells(of_directions(lambda p: np.exp(log_p_star(p)), (0.04, 0, 0)), edges, 8)
-    assert p_value(counts_of_cells(chart, edges), len(drawn) * mass / mass.sum()) > UNLIKELY
+    assert_drawn(chart, edges, of_directions(lambda p: np.exp(log_p_star(p)), (0.04, 0, 0)), 8, whole=False)
 
 
 # --- layouts of rays

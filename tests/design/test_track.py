@@ -142,9 +142,7 @@ def test_azimuths_pass_through_north_without_a_jump():
     assert all(-2 * math.pi < sensor.azimuth_rad < 2 * math.pi for sensor in design.sensors)
 
 
-DOME = DesignSpace(
-    (0.0, 0, 0, 0.0, -0.5, 0.5), (3.0, 0, 0, 2 * math.pi, math.pi / 2, 1.6), condition=("x_m",)
-)  # fmt: skip
+DOME = DesignSpace((0.0, 0, 0, 0.0, -0.5, 0.5), (3.0, 0, 0, 2 * math.pi, math.pi / 2, 1.6), condition=("x_m",))
 
 
 def dome(count=9000):
@@ -298,9 +296,6 @@ def test_another_number_of_rays_is_another_track_and_needs_the_samples(free):
     np.testing.assert_array_equal(
         rays.gate_m, lay_out(fit(SAMPLES, layout="scan", rays=5).design, at={"x_m": 1.0}).gate_m
     )
-    assert len(lay_out(free.design, 0, at={"x_m": 1.0})) == 0
-    with pytest.raises(ConfigError, match="need samples"):
-        lay_out(free.design, 5, at={"x_m": 1.0})
 
 
 def test_a_refitted_track_keeps_the_constraints(tight):
@@ -375,22 +370,17 @@ def test_other_layouts_need_a_value(layout):
         fit(SAMPLES, layout=layout, rays=8, sensors=2)
 
 
-def test_two_conditions_need_a_value():
-    space = replace(AISLE, high=(4.0, 1.0, *AISLE.high[2:]), condition=("x_m", "y_m"))
-    with pytest.raises(ConfigError, match=r"--at x_m=VALUE --at y_m=VALUE"):
-        fit(Samples(SAMPLES.points, SAMPLES.log_prob, SAMPLES.log_target, space), layout="scan", rays=8)
-
-
-@pytest.mark.parametrize(
+@each_row(
     ("space", "words"),
     [
+        (replace(AISLE, high=(4.0, 1.0, *AISLE.high[2:]), condition=("x_m", "y_m")), "--at x_m=VALUE --at y_m=VALUE"),
         (replace(AISLE, condition=("range_m",)), "coordinate of the origin"),
         (replace(AISLE, high=(4.0, 1.0, *AISLE.high[2:])), r"y_m is free(.|\n)*--at x_m=VALUE"),
     ],
 )
 def test_a_track_follows_one_coordinate_of_an_origin_that_is_fixed_beside_it(space, words):
     with pytest.raises(ConfigError, match=words):
-        fit(Samples(SAMPLES.points, SAMPLES.log_prob, SAMPLES.log_target, space), layout="scan", rays=8)
+        fit(replace(SAMPLES, space=space), layout="scan", rays=8)
 
 
 @pytest.mark.parametrize(
@@ -477,15 +467,18 @@ def broken(design, change):
 
 
 BROKEN = [
-    (lambda d: d["track"]["knots_m"].reverse(), "knots_m are no knots"),
+    (lambda d: d["track"]["knots_m"].reverse(), r"knots_m are no knots(.|\n)*each above"),
     (lambda d: d["track"]["knots_m"].clear(), "knots_m are no knots"),
-    (lambda d: d["track"]["gate_end_m"].pop(), "gate_end_m has"),
+    (lambda d: d["track"]["gate_end_m"].pop(), r"gate_end_m has(.|\n)*one per knot"),
     (lambda d: d["track"]["azimuth_rad"][2].pop(), r"azimuth_rad\[2\] has 7 numbers"),
-    (lambda d: d["track"]["elevation_rad"][1].__setitem__(3, 2.0), r"elevation_rad\[1\]\[3\]"),
-    (lambda d: d["track"]["gate_end_m"][4].__setitem__(0, 0.2), r"gate_end_m\[4\]\[0\] is 0.2, before"),
-    (lambda d: d["track"].__setitem__("dimension", "range_m"), "dimension"),
+    (lambda d: d["track"]["elevation_rad"][1].__setitem__(3, 2.0), r"elevation_rad\[1\]\[3\](.|\n)*from -1.57"),
+    (
+        lambda d: d["track"]["gate_end_m"][4].__setitem__(0, 0.2),
+        r"gate_end_m\[4\]\[0\] is 0.2, before the gate's start",
+    ),
+    (lambda d: d["track"].__setitem__("dimension", "range_m"), r"dimension(.|\n)*x_m or y_m or z_m"),
     (lambda d: d["track"].__setitem__("speed", 1), "speed is an unknown key"),
-    (lambda d: d["track"]["sensor"].__setitem__(0, 99), r"sensor\[0\]"),
+    (lambda d: d["track"]["sensor"].__setitem__(0, 99), r"sensor\[0\](.|\n)*from 0 to 7"),
     (lambda d: d.__setitem__("rays", 3), "contradicts"),
     (lambda d: d.__setitem__("at", {"speed": 1.0}), "speed is an unknown key"),
     (lambda d: d.__setitem__("at", {"x_m": "here"}), "at.x_m is 'here'"),
@@ -537,9 +530,7 @@ def test_the_check_names_the_ray_and_the_knot_that_break_a_bound(tight, change, 
     assert name.format(last=last) in unsatisfied(broken(tight.design, lambda d: change(d["track"])))
 
 
-@given(
-    widths=st.lists(st.lists(st.floats(0.001, 0.3), min_size=3, max_size=3), min_size=2, max_size=4),
-)
+@given(widths=st.lists(st.lists(st.floats(0.001, 0.3), min_size=3, max_size=3), min_size=2, max_size=4))
 def test_the_checked_bandwidth_is_that_of_the_dearest_position(widths):
     gate = np.stack([np.zeros_like(widths), np.array(widths)], axis=-1)
     rows = np.zeros(gate.shape[:2])
