@@ -14,8 +14,11 @@ from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of,
 from lidardesign.density import learn as learning
 from lidardesign.density.learn import learn, prepare_training_data
 from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.training.checkpoint import FOLDER
 from lidardesign.density.training.quality import log_density_of
+from lidardesign.density.training.training import BETAS, Adam
 from lidardesign.errors import ConfigError, DataError, PluginError
+from lidardesign.numerics import HALF_DIGITS
 from lidardesign.samples import load_samples
 from lidardesign.space import DesignSpace
 
@@ -26,14 +29,13 @@ def finished(tmp_path_factory):
     return run, learn(BallTask(), config_of(), run)
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(finished, tmp_path):
-    run, _ = finished
-    (tmp_path / "same").mkdir()
-    learn(BallTask(), config_of(), tmp_path / "same")
-    assert result_bytes(tmp_path / "same") == result_bytes(run)
-    (tmp_path / "other").mkdir()
-    learn(BallTask(), config_of(seed=4), tmp_path / "other")
-    assert result_bytes(tmp_path / "other")[0] != result_bytes(run)[0]
+def snapshots(run):
+    return {path.name: path.read_bytes() for path in (run / FOLDER).iterdir()}
+
+
+def test_another_seed_gives_other_bytes(finished, tmp_path):
+    learn(BallTask(), config_of(seed=4), tmp_path)
+    assert result_bytes(tmp_path)[0] != result_bytes(finished[0])[0]
 
 
 @pytest.mark.parametrize("step", [10, 50, 90, 110])
@@ -43,6 +45,7 @@ def test_a_resumed_run_is_an_uninterrupted_run_bit_for_bit(finished, tmp_path, s
     assert not (tmp_path / "flow.safetensors").exists()
     result = learn(BallTask(), config_of(), tmp_path, resume=True)
     assert result_bytes(tmp_path) == result_bytes(finished[0])
+    assert snapshots(tmp_path) == snapshots(finished[0])
     assert result.steps == 120
     rows = [json.loads(line) for line in (tmp_path / "progress.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == list(range(10, 121, 10))
@@ -195,3 +198,39 @@ def test_spaces_that_see_nothing_or_have_nothing_to_learn_are_refused(tmp_path):
     fixed = replace(SPACE, low=(0, 0, 0, 0, 0, 1.0), high=(0, 0, 0, 0, 0, 1.0))
     with pytest.raises(ConfigError, match="every dimension"):
         learn(BallTask(), config_of(fixed), tmp_path)
+
+
+class PlainAdam:
+    """Algorithm 1 of Kingma and Ba 2015 for one weight, in float64."""
+
+    def __init__(self, weight):
+        self.weight, self.count, self.mean, self.square = weight.copy(), 0, 0.0, 0.0
+
+    def step(self, gradient, rate):
+        self.count += 1
+        self.mean = BETAS[0] * self.mean + (1 - BETAS[0]) * gradient
+        self.square = BETAS[1] * self.square + (1 - BETAS[1]) * gradient**2
+        mean, square = self.mean / (1 - BETAS[0] ** self.count), self.square / (1 - BETAS[1] ** self.count)
+        self.weight -= rate * mean / (np.sqrt(square) + HALF_DIGITS)
+
+
+@pytest.mark.parametrize(("dtype", "within"), [(torch.float64, 1e-13), (torch.float32, 1e-5)])
+def test_steps_of_adam_are_those_of_the_paper_with_rates_that_change_and_weights_that_wait(dtype, within):
+    generator = np.random.default_rng(0)
+    twins = [PlainAdam(generator.normal(size=shape)) for shape in ((3, 2), (4,), (1,))]
+    weights = [torch.nn.Parameter(torch.as_tensor(twin.weight, dtype=dtype)) for twin in twins]
+    optimiser = Adam(weights, 0.1)
+    for turn in range(12):
+        optimiser.clear()
+        assert all(weight.grad is None for weight in weights)
+        optimiser.rate = 0.1 / (1 + turn)
+        for index, (twin, weight) in enumerate(zip(twins, weights, strict=True)):
+            if index == 2 or (index == 1 and turn % 3 == 0):
+                continue  # the last never has a gradient
+            gradient = generator.normal(size=twin.weight.shape) * 10.0 ** generator.integers(-3, 4)
+            weight.grad = torch.as_tensor(gradient, dtype=dtype)
+            twin.step(gradient, optimiser.rate)
+        optimiser.step()
+    for twin, weight in zip(twins, weights, strict=True):
+        np.testing.assert_allclose(weight.detach().numpy(), twin.weight, rtol=within, atol=within)
+    assert [weight in optimiser.state for weight in weights] == [True, True, False]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.learning import BallTask, Interrupter, config_of
+from support.learning import BallTask, config_of
 from support.tables import each_row
 
 from lidardesign.config import LearningSettings
@@ -29,10 +31,6 @@ def finished(tmp_path_factory):
     run = tmp_path_factory.mktemp("finished")
     learn(BallTask(), config_of(), run)
     return run
-
-
-def contents(run):
-    return {path.name: path.read_bytes() for path in (run / FOLDER).iterdir()}
 
 
 @each_row(
@@ -85,20 +83,12 @@ def test_snapshots_hold_the_weights_of_the_flow_on_the_way_to_its_last_ones(fini
     assert distance(early) > distance(late) > 0
 
 
-@pytest.mark.parametrize("step", [70, 110])
-def test_a_resumed_run_keeps_the_same_snapshots_bit_for_bit(finished, tmp_path, step):
-    with pytest.raises(KeyboardInterrupt):
-        learn(BallTask(), config_of(), tmp_path, progress=Interrupter(step))
-    learn(BallTask(), config_of(), tmp_path, resume=True)
-    assert contents(tmp_path) == contents(finished)
-
-
 def test_clearing_keeps_earlier_snapshots_and_removes_what_a_killed_process_left(tmp_path):
     learn(BallTask(), config_of(), tmp_path)
     (tmp_path / FOLDER / ".step-000060.safetensors.1.aa.tmp").write_bytes(b"half")
     clear_snapshots(tmp_path, beyond=74)
-    assert sorted(contents(tmp_path)) == ["step-000060.safetensors", "step-000073.safetensors"]
+    assert sorted(os.listdir(tmp_path / FOLDER)) == ["step-000060.safetensors", "step-000073.safetensors"]
     assert list(stored_snapshots(tmp_path)) == [60, 73]
     clear_snapshots(tmp_path)
-    assert not contents(tmp_path)
+    assert not os.listdir(tmp_path / FOLDER)
     assert not stored_snapshots(tmp_path)

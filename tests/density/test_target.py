@@ -10,9 +10,9 @@ from support import references
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.target.target import build_target
+from lidardesign.density.target.target import build_target, nearby_order
 from lidardesign.scene import Body, Capsule, Plane, Scene, Sphere, rigid
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, observed_point
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 
 FACING = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # turns a plane's +z to face the sensor along -x
 SPACE = DesignSpace((-0.1, -0.1, -0.1, -0.5, -0.5, 0.2), (0.1, 0.1, 0.1, 0.5, 0.5, 4.0))
@@ -75,17 +75,6 @@ def test_gradients_match_differences_of_the_values(visibility, space):
     assert np.quantile(error, 0.98) < 1e-4
 
 
-@pytest.mark.parametrize("visibility", ["off", "quadrature", "raycast"])
-def test_values_are_the_same_with_and_without_gradient_and_in_any_chunks(visibility):
-    target = build_target(balls(), SPACE, SETTINGS, visibility)
-    points = points_near(count=101)
-    values, gradient = target.log_density_and_gradient(points)
-    np.testing.assert_array_equal(target.log_density(points), values)
-    parts = [target.log_density_and_gradient(points[rows]) for rows in (slice(0, 3), slice(3, 64), slice(64, None))]
-    np.testing.assert_array_equal(np.concatenate([part[0] for part in parts]), values)
-    np.testing.assert_array_equal(np.concatenate([part[1] for part in parts]), gradient)
-
-
 @each_row(
     ("visibility", "incidence_deg"),
     # at an angle the soft edge of the quadrature reaches into the margin: T is 0.96 at 45 degrees
@@ -103,27 +92,6 @@ def test_the_peak_on_a_plane_at_three_metres_moves_less_than_a_millimetre(visibi
     assert math.exp(values[2000]) > 0.99  # T on the visible surface, where the proximity is 1
 
 
-def test_scenes_below_the_surface_tolerance_change_the_density_by_no_more_than_stated():
-    tolerance = 4.0
-    exact = build_target(balls(), SPACE, SETTINGS.model_copy(update={"surface_tolerance_nats": 1e6}), "raycast")
-    quick = build_target(balls(), SPACE, SETTINGS.model_copy(update={"surface_tolerance_nats": tolerance}), "raycast")
-    points = points_near(count=500, spread=0.4)
-    observed = observed_point(points)
-    proximity = np.stack([np.linalg.norm(observed - centre, axis=1) - 0.5 for centre in CENTRES], axis=1)
-    largest = np.exp(-np.square(proximity / SETTINGS.sigma_m).min(axis=1) / 2)
-    error = np.abs(np.exp(exact.log_density(points)) - np.exp(quick.log_density(points)))
-    assert (error <= 3 * math.exp(-tolerance) * largest + 1e-300).all()
-    assert error.max() > 0
-
-
-def test_frames_of_a_moving_scene_are_averaged():
-    poses = np.stack([rigid(translation_m=centre) for centre in CENTRES])
-    moving = build_target([Scene((Body(Sphere(0.5), poses=poses),))], SPACE, SETTINGS, "raycast")
-    still = build_target(balls(), SPACE, SETTINGS, "raycast")
-    points = points_near()
-    np.testing.assert_allclose(moving.log_density(points), still.log_density(points) - math.log(3), atol=1e-12)
-
-
 def test_a_capsule_without_length_is_a_ball_in_moving_scenes_too():
     poses = np.stack([rigid(translation_m=(1.2, 0.02 * i, 0.0)) for i in range(3)])
     behind = Body(Sphere(0.5), "target", "target", rigid(translation_m=(2.0, 0, 0)))
@@ -135,3 +103,24 @@ def test_a_capsule_without_length_is_a_ball_in_moving_scenes_too():
     alone = build_target([Scene((behind,))], SPACE, SETTINGS, "off")
     assert (sphere.log_density(points) < alone.log_density(points)).any()
     np.testing.assert_allclose(capsule.log_density(points), sphere.log_density(points), atol=1e-9)
+
+
+@each_row("count", [0, 1, 2, 1000])
+def test_every_point_is_visited_once(count):
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    np.testing.assert_array_equal(np.sort(nearby_order(points)), np.arange(count))
+
+
+def test_points_are_visited_neighbour_after_neighbour_whatever_their_scale_and_place():
+    points = np.random.default_rng(1).uniform(size=(2000, 3)) * (1.0, 5.0, 0.1)
+    step = np.linalg.norm(np.diff(points[nearby_order(points)], axis=0), axis=1).mean()
+    assert step < 0.25 * np.linalg.norm(np.diff(points, axis=0), axis=1).mean()
+    points = np.random.default_rng(3).integers(0, 1024, size=(300, 3)).astype(float)
+    np.testing.assert_array_equal(nearby_order(points), nearby_order(8 * points + 4096))
+
+
+def test_points_on_a_line_or_all_in_one_place_have_an_order_too():
+    line = np.zeros((50, 3))
+    line[:, 1] = np.random.default_rng(2).permutation(50)
+    assert (np.diff(line[nearby_order(line), 1]) >= 0).mean() > 0.9
+    np.testing.assert_array_equal(nearby_order(np.ones((5, 3))), np.arange(5))

@@ -571,6 +571,7 @@ class TestManyFacesAndManyQueries:
         target = build_target([Scene((Body(shape), before))], AROUND, settings, way)
         points = AROUND.sample(301, np.random.default_rng(10))
         values, gradient = target.log_density_and_gradient(points)
+        assert target.log_density(points).tobytes() == values.tobytes()
         order = np.random.default_rng(11).permutation(301)
         shuffled, turned = target.log_density_and_gradient(points[order])
         assert shuffled.tobytes() == values[order].tobytes()
