@@ -199,10 +199,8 @@ class LearningSteps:
 
     def balancing(self) -> Loss:
         """The loss of a balancing step."""
-        coordinates = Coordinates(self.target.space)
-        return lambda flow, generator: balancing_loss(
-            flow, self.target, coordinates, self.settings.batch, self.pool, generator
-        )[0]
+        coordinates, count = Coordinates(self.target.space), self.settings.batch
+        return lambda flow, generator: balancing_loss(flow, self.target, coordinates, count, self.pool, generator)[0]
 
 
 def gradient(flow: DesignFlow, loss: Loss, seed: int, clip_norm: float) -> np.ndarray:

@@ -185,10 +185,8 @@ def resolution_notes(target: Target, settings: DensitySettings) -> list[str]:
 
 def flatness_notes(target: Target, sigma_m: float, generator: np.random.Generator) -> list[str]:
     """Whether a sigma wider than all that the space can observe leaves the density flat, measured by uniform points."""
-    if not target.space.free:
-        return []
     points = target.space.sample(FLATNESS_PROBES, generator)
-    if sigma_m < float(np.linalg.norm(np.ptp(observed_point(points), axis=0))):
+    if not target.space.free or sigma_m < float(np.linalg.norm(np.ptp(observed_point(points), axis=0))):
         return []
     varies = float(np.ptp(target.log_proximity(points, sigma_m)))
     if varies >= FLAT_NATS:

@@ -179,9 +179,21 @@ def _from_aimed_rays(
 ) -> _Drawn:
     """Points, the ranges of their surfaces, their columns and their densities per volume and solid angle.
 
+    They lie on rays from uniform origins to area-uniform target points.
+
     A point of an area A at range s and incidence theta has the density s^2 / (A cos theta) per solid angle.
     """
-    rays, column = _aimed_rays(scenes, columns, space, count, generator)
+    column, surface = np.sort(generator.integers(len(columns), size=count)), np.empty((count, 3))
+    for number, (index, frame) in enumerate(columns):
+        rows = np.flatnonzero(column == number)
+        if len(rows):
+            targets = [body for body in scenes[index].bodies if body.is_target]
+            surface[rows] = generator.permutation(sample_body(targets, space, len(rows), generator, frame).points)
+    rays = space.wrap(aim(space.sample(count, generator)[:, :3], surface))
+    nearest = rays.copy()
+    nearest[:, RANGE] = space.low[RANGE]
+    admissible = space.contains(nearest)
+    rays, column = rays[admissible], column[admissible]
     points, surface_range, accepted = _with_range_error(rays, space, spread_m, generator)
     directions = direction(points[:, AZIMUTH], points[:, ELEVATION])
     start = np.maximum(points[:, RANGE] - WINDOW_SPREADS * spread_m, 0.0)
@@ -249,25 +261,3 @@ def _add_shares(
     """Add every surface's share with its range error, up to the normal's constant."""
     z = (points[crossed.row, RANGE] - crossed.range_m) / spread_m
     np.add.at(density, crossed.row, share * np.exp(-np.square(z) / 2))
-
-
-def _aimed_rays(
-    scenes: Sequence[Scene],
-    columns: list[tuple[int, int]],
-    space: DesignSpace,
-    count: int,
-    generator: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rays from uniform origins to area-uniform target points, with the points' ranges, and their columns."""
-    column = np.sort(generator.integers(len(columns), size=count))
-    surface = np.empty((count, 3))
-    for number, (index, frame) in enumerate(columns):
-        rows = np.flatnonzero(column == number)
-        if len(rows):
-            targets = [body for body in scenes[index].bodies if body.is_target]
-            surface[rows] = generator.permutation(sample_body(targets, space, len(rows), generator, frame).points)
-    rays = space.wrap(aim(space.sample(count, generator)[:, :3], surface))
-    angles_only = rays.copy()
-    angles_only[:, RANGE] = space.low[RANGE]
-    admissible = space.contains(angles_only)
-    return rays[admissible], column[admissible]

@@ -12,11 +12,11 @@ from lidardesign.density.fields.distance import Field, TableField
 from lidardesign.density.target.visibility import (
     ROWS_AT_ONCE,
     Columns,
-    OneWay,
     Optics,
     RayBatch,
     RayGradient,
     Transmittance,
+    Visibility,
 )
 
 # Beyond this many sharpness lengths from every surface, sigmoid(-k d) is below 1e-13 and is not evaluated.
@@ -45,7 +45,7 @@ class _Depth:
         return out
 
 
-class Quadrature(OneWay):
+class Quadrature(Visibility):
     """The transmittance integral over the occluders' distances by midpoints.
 
     A surface without an inside occludes as a shell of its `shell_m` to either side. The margin grows by the thickest

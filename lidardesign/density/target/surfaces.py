@@ -63,19 +63,24 @@ class NearSurfaces(Protocol):
         """The gradient of log p* by the points at fixed T, shape (N, 3)."""
 
 
-class Surfaces(Protocol):
+class Surfaces:
     """The surfaces that p* is near to, one column per scene and frame.
 
-    `log_column_weights` are the columns' own weights (columns,), `log_peak` is what no surface term of a single column
-    exceeds, `rows_at_once` how many points keep the memory bounded, `grid_steps_m` the grid steps of all meshes,
-    `can_propose` whether `propose` draws them all.
+    `log_column_weights` are the columns' own weights (columns,), `importance` is how much the surfaces count,
+    `rows_at_once` how many points keep the memory bounded, `grid_steps_m` the grid steps of all meshes, `can_propose`
+    whether `propose` draws them all.
     """
 
     log_column_weights: np.ndarray
-    log_peak: float
+    importance: LogWeights | None
     rows_at_once: int
     grid_steps_m: np.ndarray
     can_propose: bool
+
+    @property
+    def log_peak(self) -> float:
+        """What no surface term of a single column exceeds."""
+        return float(self.log_column_weights.max()) + (0.0 if self.importance is None else self.importance.peak)
 
     def near(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> NearSurfaces:
         """What matters at scene points (N, 3): columns within a tolerance of the best one there."""
@@ -93,16 +98,6 @@ class Surfaces(Protocol):
         self, scenes: Sequence[Scene], space: DesignSpace, count: int, sigma_m: float, generator: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """Points (N, 6) inside the space, at most `count`, and their log density per chart volume up to a constant."""
-
-
-class _Weighted:
-    log_column_weights: np.ndarray
-    importance: LogWeights | None
-
-    @property
-    def log_peak(self) -> float:
-        """See `Surfaces`."""
-        return float(self.log_column_weights.max()) + (0.0 if self.importance is None else self.importance.peak)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +125,7 @@ class _NearTable:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneTable(_Weighted):
+class SceneTable(Surfaces):
     """Every column at every point; see `Surfaces`.
 
     Arguments:
@@ -241,7 +236,7 @@ class _NearFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class MovingFrames(_Weighted):
+class MovingFrames(Surfaces):
     """Primitives and moving bodies, of which only those columns are evaluated that matter; see `Surfaces`.
 
     Arguments:

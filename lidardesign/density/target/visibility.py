@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -137,16 +138,19 @@ class Transmittance(Protocol):
         """Derivatives of sum weights * log T by each ray, weights of the shape of the values."""
 
 
-class Visibility(Protocol):
+class Visibility:
     """A way to compute visibility.
 
-    `name` is that of the setting, `rows_at_once` how many rays keep its memory bounded with gradients, and `one_way`
-    the way from a ray's origin alone, where light also has to come back to a receiver.
+    `name` is that of the setting, and `rows_at_once` how many rays keep its memory bounded with gradients.
     """
 
     name: str
-    rows_at_once: int
-    one_way: Visibility
+    rows_at_once = ROWS_AT_ONCE
+
+    @cached_property
+    def one_way(self) -> Visibility:
+        """The way from a ray's origin alone, where light also has to come back to a receiver."""
+        return self
 
     def transmittance(
         self, rays: RayBatch, columns: Columns, optics: Optics, *, differentiable: bool = True
@@ -155,20 +159,6 @@ class Visibility(Protocol):
 
     def take(self, columns: np.ndarray) -> Visibility:
         """The same for some columns, where it knows them one by one."""
-
-
-class OneWay:
-    """What ways from a ray's origin have in common."""
-
-    rows_at_once = ROWS_AT_ONCE
-
-    @property
-    def one_way(self) -> Visibility:
-        """See `Visibility`."""
-        return self
-
-    def take(self, columns: np.ndarray) -> Visibility:
-        """See `Visibility`."""
         return self
 
 
@@ -225,15 +215,18 @@ class Blocked:
 
 
 @dataclass(frozen=True, eq=False)
-class _Clear:
+class Unmoved:
+    """log T that no ray changes by moving."""
+
     log_values: np.ndarray
     rays: int
 
     def gradient(self, weights: np.ndarray) -> RayGradient:
+        """See `Transmittance`: 0."""
         return RayGradient.zeros(self.rays)
 
 
-class NoVisibility(OneWay):
+class NoVisibility(Visibility):
     """Every ray reaches its point: T = 1."""
 
     name = "off"
@@ -242,10 +235,10 @@ class NoVisibility(OneWay):
         self, rays: RayBatch, columns: Columns, optics: Optics, *, differentiable: bool = True
     ) -> Transmittance:
         """See `Visibility`."""
-        return _Clear(np.zeros(columns.shape), len(rays.ranges))
+        return Unmoved(np.zeros(columns.shape), len(rays.ranges))
 
 
-class Raycast(OneWay):
+class Raycast(Visibility):
     """Exact first hits: exact also for plates that are thinner than any quadrature step."""
 
     name = "raycast"
@@ -264,11 +257,12 @@ class Raycast(OneWay):
         limit_m = rays.ranges[rows] - optics.margin_m
         hits = trace_each(self._casters, starts, rays.origins[rows], rays.directions[rows], limit_m)
         blocked = np.flatnonzero(hits.body >= 0)
-        rows, found = rows[blocked], (hits.range_m[blocked], hits.normal[blocked])
-        return Blocked.at(np.zeros(columns.shape), rays, rows, (rows, column[blocked]), found, optics)
+        rows, hits = rows[blocked], hits.subset(blocked)
+        index, met = (rows, column[blocked]), (hits.range_m, hits.normal)
+        return Blocked.at(np.zeros(columns.shape), rays, rows, index, met, optics)
 
 
-class BodyRaycast(OneWay):
+class BodyRaycast(Visibility):
     """First hits on the occluders of columns, in their own frames: primitives in closed form by compiled loops.
 
     Arguments:
@@ -305,8 +299,6 @@ class BodyRaycast(OneWay):
             rows, chosen, body = self._candidates(rays, pairs, limit_m)
             for number, caster in enumerate(self._casters, start=1):
                 mine = np.flatnonzero(self.bodies.grid[body] == number)
-                if not len(mine):
-                    continue
                 pose, ray, pair = self.bodies.to_body[body[mine]], rows[mine], chosen[mine]
                 origins = np.einsum("pij,pj->pi", pose[:, :, :3], rays.origins[ray]) + pose[:, :, 3]
                 directions = np.einsum("pij,pj->pi", pose[:, :, :3], rays.directions[ray])
@@ -376,7 +368,7 @@ class _BothWays:
         return total
 
 
-class BistaticVisibility:
+class BistaticVisibility(Visibility):
     """Visibility from the emitter and from a fixed receiver.
 
     Arguments:
@@ -429,5 +421,5 @@ class BistaticVisibility:
         inside = np.column_stack([offset @ self._inward.T, reach - near_m, far_m - reach]) / width_m
         slope = expit(-inside) / width_m
         outward = offset / np.where(reach > 0, reach, 1.0)[:, None]
-        gradient = slope[:, :4] @ self._inward + (slope[:, 4] - slope[:, 5])[:, None] * outward
-        return log_expit(inside).sum(axis=1), gradient
+        by_point = slope[:, :4] @ self._inward + (slope[:, 4] - slope[:, 5])[:, None] * outward
+        return log_expit(inside).sum(axis=1), by_point

@@ -96,14 +96,11 @@ def quality_by_group(log_weights: np.ndarray, groups: np.ndarray) -> dict[int, Q
 
 
 def _quality(log_weights: np.ndarray) -> Quality:
-    log_count = math.log(len(log_weights))
-    log_sum = float(logsumexp(log_weights))
+    log_count, log_sum = math.log(len(log_weights)), float(logsumexp(log_weights))
     log_z = log_sum - log_count
-    ess = math.exp(2 * log_sum - float(logsumexp(2 * log_weights)) - log_count)
-    weights = np.exp(log_weights - log_weights.max())
-    mean = log_weights.mean()
+    weights, mean = np.exp(log_weights - log_weights.max()), log_weights.mean()
     return Quality(
-        ess=ess,
+        ess=math.exp(2 * log_sum - float(logsumexp(2 * log_weights)) - log_count),
         kl_nats=float(log_z - mean),
         log_z=log_z,
         ess_error=effective_share_error(weights),
@@ -125,8 +122,8 @@ def coverage(
     log_mass = log_target - log_proposal
     mass = np.exp(log_mass - log_mass.max())
     covered = log_prob >= log_target - log_z + math.log(COVERED_RATIO)
-    share = float(mass[covered].sum() / mass.sum())
-    return Estimate(share, weighted_mean_error(covered.astype(np.float64), mass))
+    error = weighted_mean_error(covered.astype(np.float64), mass)
+    return Estimate(float(mass[covered].sum() / mass.sum()), error)
 
 
 # Where log Z is found to: far below what samples can tell.
@@ -222,14 +219,13 @@ def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.n
 
 def _bracket(gap: Callable[[float], float], start: float) -> tuple[float, float]:
     """Two values of log Z with the root between them; the gap falls from 1 to -1, to 0 where nothing is shared."""
-    low = high = start
-    reach = 1.0
-    while gap(low) < 0:
-        low, reach = low - reach, 2 * reach
-    reach = 1.0
-    while gap(high) > 0:
-        high, reach = high + reach, 2 * reach
-    return low, high
+    ends = []
+    for side in (-1.0, 1.0):
+        end, reach = start, 1.0
+        while side * gap(end) > 0:
+            end, reach = end + side * reach, 2 * reach
+        ends.append(end)
+    return ends[0], ends[1]
 
 
 SAMPLE_CHUNK = 16384
@@ -325,15 +321,14 @@ def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> Meas
 
 def draw_samples(learned: LearnedFlow, count: int) -> Samples:
     """Fresh samples of the flow with their log density and log target, in chunks."""
-    points, log_prob = [], []
-    flow, coordinates = learned.flow, learned.coordinates
+    points, log_prob, flow, coordinates = [], [], learned.flow, learned.coordinates
     with torch.no_grad():
         for start in range(0, count, SAMPLE_CHUNK):
             size = min(SAMPLE_CHUNK, count - start)
             base, conditions = flow.draw(size, learned.generator)
             values, log_density = flow(base, conditions)
-            unit = coordinates.join(values, conditions)
-            points.append(coordinates.space.from_unit(unit.cpu().double().numpy()))
+            unit = coordinates.join(values, conditions).cpu().double().numpy()
+            points.append(coordinates.space.from_unit(unit))
             log_prob.append(log_density.cpu().double().numpy())
     points = np.concatenate(points)
     offset = coordinates.log_condition_density - coordinates.log_unit_volume

@@ -286,8 +286,7 @@ class Trainer(LearnedFlow):
         self.skipped_in_a_row += 1
         if self.skipped_in_a_row < SKIPS_BEFORE_BACKING_OFF:
             return
-        self.halvings += 1
-        self.skipped_in_a_row = 0
+        self.halvings, self.skipped_in_a_row = self.halvings + 1, 0
         if self.halvings > HALVINGS_BEFORE_GIVING_UP:
             self._save(*self._snapshot)
             raise DivergenceError(

@@ -20,10 +20,9 @@ from lidardesign.density.target.target import Target, build_target
 from lidardesign.density.target.visibility import (
     Columns,
     NoVisibility,
-    OneWay,
     Optics,
     RayBatch,
-    RayGradient,
+    Unmoved,
     Visibility,
 )
 from lidardesign.evaluate.accuracy.probes import (
@@ -48,16 +47,7 @@ def opaque_target(target: Target) -> Target:
     return target.with_visibility(Opaque(target.surfaces.raycast(target.scenes)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Hidden:
-    log_values: np.ndarray
-    rays: int
-
-    def gradient(self, weights: np.ndarray) -> RayGradient:
-        return RayGradient.zeros(self.rays)
-
-
-class Opaque(OneWay):
+class Opaque(Visibility):
     """Exact first hits on opaque scenes."""
 
     name = "opaque"
@@ -67,10 +57,10 @@ class Opaque(OneWay):
 
     def transmittance(
         self, rays: RayBatch, columns: Columns, optics: Optics, *, differentiable: bool = True
-    ) -> _Hidden:
+    ) -> Unmoved:
         """See `Visibility`; its gradient is 0 wherever there is one."""
         exact = self._exact.transmittance(rays, columns, optics, differentiable=False)
-        return _Hidden(np.where(exact.log_values < 0, LOG_OPAQUE, 0.0), len(rays.ranges))
+        return Unmoved(np.where(exact.log_values < 0, LOG_OPAQUE, 0.0), len(rays.ranges))
 
     def take(self, columns: np.ndarray) -> Opaque:
         """See `Visibility`."""
