@@ -31,34 +31,35 @@ FIXED = DesignSpace((0, 0, 0, -0.4, -0.4, 0.5), (0, 0, 0, 0.4, 0.4, 3.0))
 FREE = DesignSpace((-0.2, -0.2, -0.2, -0.4, -0.4, 0.5), (0.2, 0.2, 0.2, 0.4, 0.4, 3.0), measure="angles")
 
 
-def scenes(count=3):
-    made = []
-    for n in range(count):
-        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
-        slab = trimesh.creation.box((0.1, 0.3, 0.3))
-        made.append(
-            Scene(
-                (
-                    Body(Mesh(ball.vertices, ball.faces), "target", "both", rigid(translation_m=(2.0 + 0.1 * n, 0, 0))),
-                    Body(Mesh(slab.vertices, slab.faces), "slab", "occluder", rigid(translation_m=(1.2, 0.1 * n, 0))),
-                ),
-                f"scene {n}",
-            )
+def scenes(weighted=False):
+    ball, slab = trimesh.creation.icosphere(subdivisions=2, radius=0.3), trimesh.creation.box((0.1, 0.3, 0.3))
+    # from right to left the surface counts twentyfold
+    target = Mesh(ball.vertices, ball.faces, importance=np.exp(5.0 * ball.vertices[:, 1]) if weighted else None)
+    before = Mesh(slab.vertices, slab.faces)
+    return [
+        Scene(
+            (
+                Body(target, "target", "both", rigid(translation_m=(2.0 + 0.1 * n, 0, 0))),
+                Body(before, "slab", "occluder", rigid(translation_m=(1.2, 0.1 * n, 0))),
+            ),
+            f"scene {n}",
         )
-    return made
+        for n in range(3)
+    ]
 
 
-def targets(space, visibility, sigma_m=0.03):
-    settings = DensitySettings(sigma_m=sigma_m, field_resolution=24, quadrature_points=32)
-    host = replace(build_target(scenes(), space, settings, visibility), surface_tolerance_nats=200.0)
+def targets(space, visibility, weighted=False):
+    settings = DensitySettings(sigma_m=0.03, field_resolution=24, quadrature_points=32)
+    host = replace(build_target(scenes(weighted), space, settings, visibility), surface_tolerance_nats=200.0)
     return host, on_device(host, CPU)
 
 
 @each_row("visibility", ["off", "quadrature"])
 @each_row("space", [FIXED, FREE], ids=["fixed origin", "free origin, in angles"])
 @each_row("sigma_m", [None, 0.1])
-def test_values_and_gradients_are_those_of_the_compiled_loops(space, visibility, sigma_m):
-    host, device = targets(space, visibility)
+@each_row("weighted", [False, True])
+def test_values_and_gradients_are_those_of_the_compiled_loops(space, visibility, sigma_m, weighted):
+    host, device = targets(space, visibility, weighted)
     assert isinstance(device, DeviceTarget)
     coordinates = Coordinates(space)
     generator = torch.Generator().manual_seed(0)
@@ -104,13 +105,15 @@ def test_a_step_has_the_same_loss_and_gradient(loss):
     assert (gradients[1] - gradients[0]).norm() < 2e-3 * gradients[0].norm()
 
 
-def test_columns_that_are_drawn_stand_for_all_on_the_device_too():
-    host, device = targets(FIXED, "quadrature")
+@each_row("weighted", [False, True])
+def test_columns_that_are_drawn_stand_for_all_on_the_device_too(weighted):
+    host, device = targets(FIXED, "quadrature", weighted)
     chosen, unit = np.array([0, 2]), torch.zeros(4, 3, dtype=torch.float64)
     few = device.drawn(chosen)
     assert isinstance(few, DeviceTarget)
     # its tables went to the device once, not for every step's columns anew
-    assert (few._table, few._occluders) == (device._table, device._occluders)
+    for name in ("_table", "_occluders", "_weights"):
+        assert getattr(few, name) is getattr(device, name)
     points = FIXED.from_unit(unit.numpy())
     np.testing.assert_allclose(few.log_density_of_unit(unit), host.drawn(chosen).log_density(points), rtol=1e-4)
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from lidardesign_tasks.face import FaceConfig, FaceTask
 from support.small_runs import shifted
@@ -22,7 +21,6 @@ from lidardesign.density.fields.importance import (
     is_weighted,
     log_weight_grid,
 )
-from lidardesign.density.flow.objective import Coordinates, DeviceTarget, log_target, on_device
 from lidardesign.density.learn import learn
 from lidardesign.density.target.prepare import prepare_target
 from lidardesign.density.target.proposals import independent_points
@@ -224,27 +222,6 @@ def test_a_scene_far_off_that_counts_a_million_times_is_not_left_out():
     naive = np.logaddexp(*(part.log_density(points) for part in parts))
     assert np.allclose(both.log_density(points), naive, atol=1e-6)
     assert (naive > parts[0].log_density(points) + 5).sum() > 100
-
-
-@pytest.mark.parametrize("visibility", ["off", "quadrature"])
-def test_the_target_on_a_device_counts_the_same(visibility):
-    scenes = at_rest(ball(sideways))
-    scenes = [replace(s, bodies=(s.bodies[0], replace(s.bodies[0], role="occluder"))) for s in scenes]
-    host = replace(build_target(scenes, SPACE, SETTINGS, visibility), surface_tolerance_nats=300.0)
-    device = on_device(host, torch.device("cpu"))
-    assert isinstance(device, DeviceTarget)
-    coordinates = Coordinates(SPACE)
-    unit = 2 * torch.rand(300, len(SPACE.free), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1
-    for few in (False, True):
-        found = []
-        for target in (host, device):
-            target = target.drawn(np.array([0, 2])) if few else target
-            leaf = unit.clone().requires_grad_(True)
-            values = log_target(leaf, target, coordinates, 0.1)
-            values.sum().backward()
-            found.append((values.detach().numpy(), leaf.grad.numpy()))
-        assert np.allclose(found[0][0], found[1][0], atol=1e-4)
-        assert np.allclose(found[0][1], found[1][1], atol=1e-3 * np.abs(found[0][1]).max())
 
 
 @pytest.mark.parametrize("make", [at_rest, moving])

@@ -255,13 +255,6 @@ def test_crossings_keep_to_their_window():
     assert (window.cosine <= 1 + 1e-6).all()
 
 
-def test_moving_bodies_are_where_their_frame_puts_them():
-    poses = np.stack([rigid(translation_m=(0, 0, z)) for z in (0.0, 5.0)])
-    scene = Scene((Body(Sphere(1.0), poses=poses), Body(solid_mesh(trimesh.creation.box((1, 1, 1))), poses=poses)))
-    for frame, expected in ((0, 9.0), (1, 4.0)):
-        assert SceneCaster(scene, frame).first_hit([[0.0, 0, 10]], [[0.0, 0, -1]]).range_m[0] == pytest.approx(expected)
-
-
 def test_a_shared_caster_is_built_once_per_frame_and_set_of_bodies():
     both = Scene((Body(Sphere(1.0)),))
     assert shared_caster(both, only="targets") is shared_caster(both, only="occluders")

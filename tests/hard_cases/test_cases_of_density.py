@@ -203,24 +203,20 @@ class TestScenesOfAnyScale:
         # vertices at 1e7 m are rounded to 2e-9 m; distances are float32 relative to the scene
         np.testing.assert_allclose(values(scale, offset), values(1.0, 0.0), atol=references.SCALED_NATS)
 
-    @pytest.mark.parametrize("scale", [1e-4, 1e-3, 1e3, 1e5])
-    def test_a_moving_scene_of_another_size_has_the_same_density(self, scale):
-        # rounding of distances, 1e-16 of the scene, times distance / sigma^2 of up to 30 sigma
-        np.testing.assert_allclose(
-            moving_target(scale).log_density(ceiling_points(scale)),
-            moving_target().log_density(ceiling_points()),
-            rtol=1e-9,
-            atol=1e-9,
-        )
-
-    @pytest.mark.parametrize(
-        ("offset", "atol"), [((1e5, -1e5, 1e5), 1e-9), ((-3e4, 0.0, 2e5), 1e-9), ((1e7, -1e7, 1e7), 1e-5)]
+    @each_row(
+        ("scale", "offset", "atol"),
+        [
+            # rounding of distances, 1e-16 of the scene, times distance / sigma^2 of up to 30 sigma
+            *((scale, (0.0, 0.0, 0.0), 1e-9) for scale in (1e-4, 1e-3, 1e3, 1e5)),
+            # coordinates of 1e5 m are known to 1.5e-11 m, which 30 sigma away changes the exponent by some 1e-8 of
+            # itself; those of 1e7 m to 2e-9 m
+            *((1.0, offset, 1e-9) for offset in ((1e5, -1e5, 1e5), (-3e4, 0.0, 2e5))),
+            (1.0, (1e7, -1e7, 1e7), 1e-5),
+        ],
     )
-    def test_a_moving_scene_far_from_the_origin_has_the_same_density(self, offset, atol):
-        # coordinates of 1e5 m are known to 1.5e-11 m, which 30 sigma away changes the exponent by some 1e-8 of itself;
-        # those of 1e7 m to 2e-9 m
-        far = moving_target(offset=offset).log_density(ceiling_points(offset=offset))
-        np.testing.assert_allclose(far, moving_target().log_density(ceiling_points()), rtol=atol, atol=atol)
+    def test_a_moving_scene_of_another_size_or_far_away_has_the_same_density(self, scale, offset, atol):
+        found = moving_target(scale, offset).log_density(ceiling_points(scale, offset))
+        np.testing.assert_allclose(found, moving_target().log_density(ceiling_points()), rtol=atol, atol=atol)
 
     @given(st.floats(-4, 5), st.floats(-1, 1), st.integers(0, 2**20))
     def test_turning_moving_and_scaling_the_world_leaves_every_density_as_it_is(self, decade, shift, seed):

@@ -45,6 +45,7 @@ GARBAGE = {
     "no facets": b"solid nothing\nendsolid nothing\n",
     "no triangles": bytes(84),
 }
+NOT_FINITE = (np.nan, np.inf, -np.inf)
 AROUND = DesignSpace((-2, -2, -2, 0, -math.pi / 2, 0), (2, 2, 2, 2 * math.pi, math.pi / 2, 4))
 
 
@@ -112,12 +113,27 @@ class TestPartsOfMeshesThatAreNone:
         wrong = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, np.nan]], [[0, 1, 2]], process=False)
         return f"the unit normal of three points on a line is {unit}; trimesh gives a NaN vertex the area {wrong.area}"
 
-    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-    def test_vertices_that_are_not_finite_are_counted_and_refused(self, value):
-        vertices = BOX_VERTICES.copy()
-        vertices[2, 1] = value
-        with pytest.raises(DataError, match="scan: 1 of 8 vertices"):
-            check_mesh(vertices, BOX_FACES, where="scan")
+    @each_row(
+        ("vertices", "faces", "words"),
+        [
+            *((np.vstack([BOX_VERTICES[:7], [1, x, 1]]), BOX_FACES, "part: 1 of 8 vertices") for x in NOT_FINITE),
+            *((BOX_VERTICES, np.vstack([BOX_FACES, [0, 1, x]]), "part: 1 faces name vertices that do not exist")
+              for x in (-1, 8)),
+            (np.zeros((0, 3)), np.zeros((0, 3), int), "part"),
+            (BOX_VERTICES, np.zeros((0, 3), int), "part"),
+            (BOX_VERTICES[:, :2], BOX_FACES, "part"),
+            (BOX_VERTICES, BOX_FACES[:, :2], "part"),
+            (BOX_VERTICES, BOX_FACES.astype(float), "part"),
+            ([["a"] * 3] * 3, [[0, 1, 2]], "part"),
+            (BOX_VERTICES * 0, BOX_FACES, "part"),
+            (BOX_VERTICES * 1e-200, BOX_FACES, "part"),
+        ],
+        ids=[*map(str, NOT_FINITE), "face to -1", "face to 8",
+             "nothing", "no faces", "2D", "edges", "float faces", "text", "one point", "no size"],
+    )  # fmt: skip
+    def test_what_is_no_mesh_is_refused_and_its_wrong_parts_are_counted(self, vertices, faces, words):
+        with pytest.raises(DataError, match=words):
+            check_mesh(vertices, faces, where="part")
 
     @pytest.mark.parametrize("scale", [1e10, 1e150, 1e308])
     def test_vertices_that_are_absurdly_far_are_refused(self, tmp_path, scale):
@@ -137,29 +153,6 @@ class TestPartsOfMeshesThatAreNone:
         if not math.isfinite(length) or abs(length) > 1:
             with pytest.raises(DataError, match="body"):
                 Body(Sphere(1.0), poses=rigid(translation_m=(0.0, length, 0.0)))
-
-    @pytest.mark.parametrize("index", [-1, 8])
-    def test_faces_that_name_missing_vertices_are_refused(self, index):
-        with pytest.raises(DataError, match="1 faces name vertices that do not exist"):
-            check_mesh(BOX_VERTICES, np.vstack([BOX_FACES, [0, 1, index]]))
-
-    @each_row(
-        ("vertices", "faces"),
-        [
-            (np.zeros((0, 3)), np.zeros((0, 3), int)),
-            (BOX_VERTICES, np.zeros((0, 3), int)),
-            (BOX_VERTICES[:, :2], BOX_FACES),
-            (BOX_VERTICES, BOX_FACES[:, :2]),
-            (BOX_VERTICES, BOX_FACES.astype(float)),
-            ([["a"] * 3] * 3, [[0, 1, 2]]),
-            (BOX_VERTICES * 0, BOX_FACES),
-            (BOX_VERTICES * 1e-200, BOX_FACES),
-        ],
-        ids=["nothing", "no faces", "2D", "edges", "float faces", "text", "one point", "no size"],
-    )
-    def test_what_is_no_mesh_is_refused(self, vertices, faces):
-        with pytest.raises(DataError, match="part"):
-            check_mesh(vertices, faces, where="part")
 
     def test_degenerate_and_duplicate_faces_are_dropped_with_a_count(self):
         line = len(BOX_VERTICES)
