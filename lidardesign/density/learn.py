@@ -214,7 +214,6 @@ def learn(
 
 
 def _notes(trainer: Trainer, place: torch.device) -> list[str]:
-    """What the user should know about the training."""
     notes = [] if stays_on(trainer.target, place) else [ON_PROCESSOR]
     if trainer.skipped:
         notes.append(f"{trainer.skipped} steps were not finite and skipped")

@@ -91,7 +91,6 @@ class PrimitiveGroup:
         return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _pairs(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Iterator[_Pairs]:
-        """The pairs of all rays, in chunks that bound the memory."""
         size = max(1, GROUP_CHUNK // len(self._body))
         for start in range(0, len(origins), size):
             rows = slice(start, min(start + size, len(origins)))
@@ -157,8 +156,7 @@ def _box(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tupl
 
 def _box_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
     axis = np.argmax(np.abs(points) / sizes, axis=1)
-    normal = np.zeros_like(points)
-    rows = np.arange(len(points))
+    normal, rows = np.zeros_like(points), np.arange(len(points))
     normal[rows, axis] = np.sign(points[rows, axis])
     return normal
 

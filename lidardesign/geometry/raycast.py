@@ -40,7 +40,11 @@ class SceneCaster:
     def __init__(self, scene: Scene, frame: int = 0, *, only: Only = "all") -> None:
         chosen = _chosen(scene, only)
         self.second_casts = SecondCasts()
-        self._meshes = _Meshes(scene, [(i, body) for i, body in chosen if isinstance(body.shape, Mesh)], frame)
+        meshes = [(i, body) for i, body in chosen if isinstance(body.shape, Mesh)]
+        resting = [(i, body) for i, body in meshes if body.poses.ndim == 2]
+        moving = [(i, body) for i, body in meshes if body.poses.ndim == 3]
+        self._resting = _shared_at_rest(resting) if resting else None
+        self._moving = _Moving(moving, frame) if moving else None
         kinds = {type(body.shape) for _, body in chosen} - {Mesh}
         self._groups = [
             PrimitiveGroup([(i, body) for i, body in chosen if isinstance(body.shape, kind)], frame)
@@ -50,7 +54,7 @@ class SceneCaster:
     @property
     def resting(self) -> _AtRest | None:
         """Its meshes at rest, where it casts at nothing else."""
-        return None if self._groups or self._meshes.moving else self._meshes.resting
+        return None if self._groups or self._moving else self._resting
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """The nearest hit of every ray, shapes (N, 3) and (N, 3); directions are normalised here.
@@ -71,7 +75,7 @@ class SceneCaster:
     def _traced(
         self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
     ) -> Hits:
-        hits = self._meshes.trace(origins, directions, limit_m, twice)
+        hits = self._traced_meshes(origins, directions, limit_m, twice)
         for group in self._groups:
             group.keep_nearer(hits, origins, directions, limit_m)
         rows = np.flatnonzero(hits.body >= 0)
@@ -85,9 +89,34 @@ class SceneCaster:
 
         Up to `MAXIMUM_LAYERS` triangles per ray are found; triangles closer than the step between them count once.
         """
-        parts = [self._meshes.crossings(origins, directions, start_m, limit_m)]
+        parts = [Crossings(np.empty(0, int), np.empty(0), np.empty(0))]
+        meshes = [part for part in (self._resting, self._moving) if part]
+        if meshes:
+            reach_m = float(limit_m[np.isfinite(limit_m)].max(initial=0.0))
+            step_m = STEP_SHARE * max(reach_m, *(part.radius_m for part in meshes))
+            alive, start = np.arange(len(origins)), start_m.copy()
+            for _ in range(MAXIMUM_LAYERS):
+                ahead, toward = start[alive], directions[alive]
+                places, left_m = origins[alive] + ahead[:, None] * toward, limit_m[alive] - ahead
+                hits = self._traced_meshes(places, toward, left_m, None)
+                hit = hits.body >= 0
+                alive = alive[hit]
+                if not len(alive):
+                    break
+                reached = ahead[hit] + hits.range_m[hit]
+                cosine = np.abs(np.einsum("nk,nk->n", hits.normal[hit], toward[hit]))
+                parts.append(Crossings(alive, reached, cosine))
+                start[alive] = reached + step_m
         parts += [group.crossings(origins, directions, start_m, limit_m) for group in self._groups]
         return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def _traced_meshes(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
+    ) -> Hits:
+        hits = self._resting.trace(origins, directions, limit_m, twice) if self._resting else Hits.none(len(origins))
+        if self._moving:
+            self._moving.keep_nearer(hits, origins, directions, limit_m, twice)
+        return hits
 
 
 def trace_each(
@@ -167,8 +196,6 @@ def _checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarr
 
 
 class _AtRest:
-    """All meshes of a scene that do not move, in one Embree scene."""
-
     def __init__(self, bodies: Sequence[tuple[int, Body]]) -> None:
         self.body_of_geometry = np.array([index for index, _ in bodies], dtype=np.int64)
         self.triangles = Triangles([body.shape.transformed(body.poses) for _, body in bodies])
@@ -199,8 +226,6 @@ def _shared_at_rest(bodies: Sequence[tuple[int, Body]]) -> _AtRest:
 
 
 class _Moving:
-    """The meshes of a frame that move, each traced in its own frame."""
-
     def __init__(self, bodies: Sequence[tuple[int, Body]], frame: int) -> None:
         self._body = [index for index, _ in bodies]
         self._casters = [mesh_caster(body.shape) for _, body in bodies]
@@ -241,45 +266,6 @@ class _Moving:
             won = rows[hit]
             hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
             hits.normal[won] = _turned(normal[hit], rotation)
-
-
-class _Meshes:
-    """All meshes of a frame."""
-
-    def __init__(self, scene: Scene, bodies: list[tuple[int, Body]], frame: int) -> None:
-        resting = [(index, body) for index, body in bodies if body.poses.ndim == 2]
-        moving = [(index, body) for index, body in bodies if body.poses.ndim == 3]
-        self.resting = _shared_at_rest(resting) if resting else None
-        self.moving = _Moving(moving, frame) if moving else None
-
-    def trace(
-        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
-    ) -> Hits:
-        hits = self.resting.trace(origins, directions, limit_m, twice) if self.resting else Hits.none(len(origins))
-        if self.moving:
-            self.moving.keep_nearer(hits, origins, directions, limit_m, twice)
-        return hits
-
-    def crossings(
-        self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
-    ) -> Crossings:
-        parts = [Crossings(np.empty(0, int), np.empty(0), np.empty(0))]
-        if self.resting or self.moving:
-            reach_m = float(limit_m[np.isfinite(limit_m)].max(initial=0.0))
-            step_m = STEP_SHARE * max(reach_m, *(part.radius_m for part in (self.resting, self.moving) if part))
-            alive, start = np.arange(len(origins)), start_m.copy()
-            for _ in range(MAXIMUM_LAYERS):
-                ahead, toward = start[alive], directions[alive]
-                hits = self.trace(origins[alive] + ahead[:, None] * toward, toward, limit_m[alive] - ahead, None)
-                hit = hits.body >= 0
-                alive = alive[hit]
-                if not len(alive):
-                    break
-                reached = ahead[hit] + hits.range_m[hit]
-                cosine = np.abs(np.einsum("nk,nk->n", hits.normal[hit], toward[hit]))
-                parts.append(Crossings(alive, reached, cosine))
-                start[alive] = reached + step_m
-        return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:

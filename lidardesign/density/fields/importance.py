@@ -167,8 +167,8 @@ class BodyWeights:
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `LogWeights`."""
         out = np.zeros(points.shape)
-        weights = np.ascontiguousarray(weights, dtype=np.float64).ravel()
-        self.add_pair_gradients(points, all_pairs(self.bodies, points), weights, out)
+        pulls = np.ascontiguousarray(weights, dtype=np.float64).ravel()
+        self.add_pair_gradients(points, all_pairs(self.bodies, points), pulls, out)
         return out
 
     def of_pairs(self, points: np.ndarray, pairs: Pairs) -> np.ndarray:

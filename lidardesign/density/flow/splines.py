@@ -48,7 +48,6 @@ class BoundedSpline(MonotonicRQSTransform):
         self.vertical = torch.cat([self.vertical[..., :-1], torch.full_like(self.vertical[..., :1], BOUND)], -1)
 
     def _turned(self, values: Tensor) -> Tensor:
-        """The periodic dimensions half a turn on."""
         if self.periodic is None:
             return values
         return torch.where(self.periodic, torch.where(values >= 0, values - BOUND, values + BOUND), values)
@@ -72,8 +71,6 @@ class BoundedSpline(MonotonicRQSTransform):
 
 
 class _CompiledSpline(torch.autograd.Function):
-    """The kernels as a differentiable function; see `spline`."""
-
     @staticmethod
     def forward(
         ctx: Any, values: Tensor, parameters: Tensor, periodic: Tensor, inverted: bool

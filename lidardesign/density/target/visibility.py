@@ -347,8 +347,6 @@ def common_receiver(scenes: Sequence[Scene]) -> Receiver | None:
 
 @dataclass(frozen=True, eq=False)
 class _BothWays:
-    """Both ways of a batch, and the view of the receiver."""
-
     log_values: np.ndarray
     rays: RayBatch
     out: Transmittance
