@@ -260,7 +260,6 @@ def _keys(model: type[BaseModel], prefix: str, current: str) -> Iterator[tuple[s
 
 
 def _words_of(annotation: Any) -> tuple[str, ...]:
-    """The values of a key that takes one of a few words."""
     if get_origin(annotation) is Literal:
         return tuple(str(value) for value in get_args(annotation))
     words = tuple(word for part in get_args(annotation) for word in _words_of(part))

@@ -20,7 +20,6 @@ THREAD_DEFAULTS = {
     "MKL_NUM_THREADS": "1",
     "OMP_WAIT_POLICY": "PASSIVE",
 }
-STREAM_DESCRIPTORS = (0, 1, 2)
 
 
 class TerminatedError(KeyboardInterrupt):
@@ -58,7 +57,7 @@ def _can_be_written(folder: Path) -> bool:
 
 def make_streams_tolerant() -> None:
     """Escape characters that the terminal lacks; a stream that was closed swallows its output."""
-    for descriptor in STREAM_DESCRIPTORS:
+    for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:  # closed: else the next file that is opened takes its place, and what is printed there

@@ -95,7 +95,6 @@ def _describe_keys(model: type[BaseModel], suggested: Mapping[str, Any]) -> list
 
 
 def _default(info: FieldInfo) -> Any:
-    """The default of a key as plain values; None where it has none."""
     value = None if info.is_required() else info.get_default(call_default_factory=True)
     return value.model_dump(mode="json") if hasattr(value, "model_dump") else value
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +26,6 @@ from lidardesign.workflow.run_folder import (
     Notes,
     RequestPlan,
     RunFolder,
-    check_name,
     last_time,
     log_note,
     reach_of,
@@ -34,6 +34,8 @@ from lidardesign.workflow.run_folder import (
 )
 from lidardesign.workflow.run_samples import Weighting
 
+# Of designs: names that a file may have everywhere.
+NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
 # Keys by which tasks are told where sensors may be.
 PLACE_KEYS = ("origin_m", "origin_box_m")
 
@@ -74,8 +76,9 @@ class FitOptions:
     seed: int | None = None
 
     def __post_init__(self) -> None:
-        if self.name is not None:
-            check_name(self.name)
+        if self.name is not None and not NAME_PATTERN.fullmatch(self.name):
+            allowed = "letters, digits, _, -, + and . (not in front), at most 100"
+            raise ConfigError(f"{self.name!r} is no name for a design", where="--name", allowed=allowed)
         if self.layout is not None:
             check_choice(self.layout, "--layout", FITTED_LAYOUTS)
         if self.gates is not None:

@@ -24,13 +24,14 @@ from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
 from lidardesign.run.clock import phase
+from lidardesign.run.manifest import versions
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scene import Scene
 from lidardesign.space import observed_point
 from lidardesign.task import conditions_of, random_generator
 from lidardesign.workflow.fit import FitRequest
-from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, provenance
+from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, relative_folder
 from lidardesign.workflow.run_samples import KEY, Layouts, RunTarget, Weighting
 
 if TYPE_CHECKING:
@@ -42,7 +43,6 @@ LOOK_SHARE = 0.6
 FEWEST_SCENES = 2
 # So many places drawn from the density decide where the anchors are.
 ANCHOR_POOL = 20_000
-LEARN_LONGER = "learn longer (--preset standard or fine), or with a larger density.sigma_m"
 
 
 class Fitter:
@@ -61,7 +61,7 @@ class Fitter:
         self._has_noted_condition = False
         with phase("samples"):
             self.base = load_samples(request.run.folder)
-            self._check_effective_samples(LEARN_LONGER)
+            self._check_effective_samples("learn longer (--preset standard or fine), or with a larger density.sigma_m")
             if request.weighting.settings:
                 before = self.base.effective_sample_size
                 self.base = settings_alone.log_target(self.base, self.target)
@@ -163,8 +163,14 @@ def fit_design(
     if len(request.names) == len(design.sensors):
         named = (replace(sensor, name=name) for sensor, name in zip(design.sensors, request.names, strict=True))
         design = replace(design, sensors=tuple(named))
-    origin = provenance(run, run.design_path(request.name), request.command, request.seed, **further)
-    design = replace(design, provenance={**design.provenance, **origin})
+    origin = {
+        "command": request.command,
+        "task": run.task.name,
+        "run": relative_folder(run.folder, run.design_path(request.name)),
+        "seed": request.seed,
+        "versions": versions(),
+    }
+    design = replace(design, provenance={**design.provenance, **origin, **further})
     with phase("writing"):
         checks = check_written(design, request)
     # broken ones were refused
@@ -291,8 +297,8 @@ def refinement_scenes(request: FitRequest) -> tuple[list[Scene], list[Scene]]:
     Raises:
         ConfigError: There are too few.
     """
-    seed = int(random_generator(request.seed, "refinement scenes").integers(2**31))
-    scenes = request.run.scenes("train", seed)
+    seed = random_generator(request.seed, "refinement scenes").integers(2**31)
+    scenes = request.run.scenes("train", int(seed))
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} training scene", where="--refine", allowed=f"at least {FEWEST_SCENES}",

@@ -36,7 +36,6 @@ from lidardesign.workflow.run_folder import (
 if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress, LearnResult
 
-DEVICES = ("auto", "cpu", "cuda")
 LOCK = ".lock"
 # A run has begun once it has its configuration, which is written last; snapshots are of no use without a checkpoint.
 STARTED_FILES = {CONFIGURATION, MANIFEST, "progress.jsonl", "snapshots"}
@@ -112,7 +111,7 @@ class LearnRequest:
             ConfigError: An unknown task, settings that cannot be, or a folder that is not empty.
             DataError: There is no run to resume.
         """
-        check_choice(options.device, "--device", DEVICES)
+        check_choice(options.device, "--device", ("auto", "cpu", "cuda"))
         config_file = None if options.config is None else Path(options.config)
         choices = {
             "preset": options.preset,

@@ -9,7 +9,6 @@ import contextlib
 import json
 import logging
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.files import STDIO, is_input, is_there, readable
-from lidardesign.run.manifest import changed_since_recorded, read_manifest, versions
+from lidardesign.run.manifest import changed_since_recorded, read_manifest
 from lidardesign.scene import Scene
 from lidardesign.space import RANGE
 from lidardesign.task import Split, Task, scenes_of
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
 
 DESIGN_FOLDER = "designs"
 CONFIGURATION, MANIFEST, SAMPLES = "config.yaml", "manifest.json", "samples.npz"
-NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
 
 Notes = Callable[[str], None]
 
@@ -182,33 +180,9 @@ def need_run(run: RunFolder | None, path: Path | str) -> RunFolder:
     return run
 
 
-def provenance(run: RunFolder, path: Path, command: str, seed: int, **further: Any) -> dict[str, Any]:
-    """What a design file says about where it came from; the run's place is relative to the design's."""
-    return {
-        "command": command,
-        "task": run.task.name,
-        "run": relative_folder(run.folder, path),
-        "seed": seed,
-        "versions": versions(),
-        **further,
-    }
-
-
 def relative_folder(folder: Path, path: Path) -> str:
     """How the file of a design names the folder of its run."""
     return os.path.relpath(folder.absolute(), path.parent.absolute())
-
-
-def check_name(name: str) -> str:
-    """A design's name, which is also its file's.
-
-    Raises:
-        ConfigError: It could not be a file's name everywhere.
-    """
-    if not NAME_PATTERN.fullmatch(name):
-        allowed = "letters, digits, _, -, + and . (not in front), at most 100"
-        raise ConfigError(f"{name!r} is no name for a design", where="--name", allowed=allowed)
-    return name
 
 
 def reach_of(runs: Sequence[RunFolder]) -> float | None:

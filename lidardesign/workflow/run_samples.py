@@ -60,12 +60,9 @@ class Weighting:
         Raises:
             ConfigError: It says something else.
         """
-        document = design.provenance.get(KEY)
-        return cls() if document is None else cls.from_document(document, f"{KEY} of design {design.name}")
-
-    @classmethod
-    def from_document(cls, document: Any, where: str) -> Weighting:
-        """What `as_document` gave."""
+        document, where = design.provenance.get(KEY), f"{KEY} of design {design.name}"
+        if document is None:
+            return cls()
         from lidardesign.evaluate.reweighting import FIT_AGAIN, Reweighting
 
         known = {"set", "factors", "range_spread_m"}

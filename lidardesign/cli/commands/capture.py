@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from lidardesign.evaluate.captures.score import CaptureEvaluation
     from lidardesign.geometry.rays import Rays
 
-ESTIMATORS = ("peak", "matched")
 COLUMNS = {
     "rays": "rays",
     "captured": "captured",
@@ -90,7 +89,7 @@ def capture(
             raise ConfigError(f"{within_deg}", where="--within-deg", allowed="above 0, at most 180 degrees")
         if not (math.isfinite(outlier_mm) and outlier_mm > 0):
             raise ConfigError(f"{outlier_mm}", where="--outlier-mm", allowed="a finite number above 0")
-        check_choice(estimator, "--estimator", ESTIMATORS)
+        check_choice(estimator, "--estimator", ("peak", "matched"))
         with phase("libraries"):
             from lidardesign.evaluate.captures.capture import load_capture
             from lidardesign.evaluate.captures.scan import Estimation, default_within_rad

@@ -92,8 +92,8 @@ def list_(
             with contextlib.suppress(ConfigError):  # no source states a range under such conditions
                 vouched.append(_under(part, reflectance, klux))
         left_out = len(parts) - len(vouched)
-        document = {"parts": [part_entry(part) for part in vouched], "left_out": left_out}
-        output.result(document, lambda rich: show_parts(vouched, rich), show_costs=False)
+        entries = {"parts": [part_entry(part) for part in vouched], "left_out": left_out}
+        output.result(entries, lambda rich: show_parts(vouched, rich), show_costs=False)
         if left_out:
             output.note(f"note: {left_out} of {len(parts)} parts and modes have no range stated for such conditions")
 

@@ -97,5 +97,5 @@ def _list(output: Output) -> None:
     keys = ("suffix", "summary", "reader", "checked", "folder")
     formats = [{"name": name, **{key: getattr(exporter, key) for key in keys}} for name, exporter in EXPORTERS.items()]
     headings = ("format", "suffix", "what it is", "for", "how that is checked")
-    rows = [(entry["name"], *(entry[key] for key in keys[:-1])) for entry in formats]
+    rows = [[entry[key] for key in ("name", *keys[:-1])] for entry in formats]
     output.result({"formats": formats}, lambda rich: rich.print(text_table(headings, rows)), show_costs=False)

@@ -66,10 +66,13 @@ def run_fit(request: FitRequest, output: Output) -> None:
     """Fit the design of a request, save it, and give the result."""
     from lidardesign.workflow.designs import Design
 
-    unit = request.run.task.metric.unit
-
     def show_round(entry: Round) -> None:
-        output.note(f"refine {entry.number}: {_round_text(entry, unit)}")
+        text = f"{entry.change} (refused, {number(entry.seconds, 2)} s)"
+        if entry.score is not None:
+            score = f"{number(entry.score)} {request.run.task.metric.unit} at {number(entry.bandwidth_mbps, 3)} Mbit/s"
+            verdict = "kept" if entry.kept else "not better"
+            text = f"{entry.change}: {score}, {verdict} ({number(entry.seconds, 2)} s)"
+        output.note(f"refine {entry.number}: {text}")
 
     design = Design.fitted(request, progress=show_round, notes=output.remark)
     design.save()
@@ -82,14 +85,6 @@ def run_fit(request: FitRequest, output: Output) -> None:
         show_fit(document, design.specification, design.result.constraints if design.result else (), rich)
 
     output.result(document, show)
-
-
-def _round_text(entry: Round, unit: str) -> str:
-    if entry.score is None:
-        return f"{entry.change} (refused, {number(entry.seconds, 2)} s)"
-    verdict = "kept" if entry.kept else "not better"
-    score, cost = number(entry.score), number(entry.bandwidth_mbps, 3)
-    return f"{entry.change}: {score} {unit} at {cost} Mbit/s, {verdict} ({number(entry.seconds, 2)} s)"
 
 
 def _show_refinement(document: Mapping[str, Any], rich: RichConsole) -> None:

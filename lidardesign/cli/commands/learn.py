@@ -108,7 +108,6 @@ def learn(
 
 
 def _progress(bar: Progress | None, output: Output) -> Callable[[LearnProgress], None]:
-    """A function that shows the progress: in a bar, else by one note per phase."""
     begun: list[str] = []
 
     def show(now: LearnProgress) -> None:

@@ -169,7 +169,6 @@ def _signed(value: float, decimals: int = 2) -> str:
 
 
 def _verdict(pair: dict[str, Any], metric: dict[str, Any]) -> str:
-    """Which of two is better in the scenes that both met, and how surely."""
     rays = f"{pair['rays']}" if pair.get("rays_b") in (None, pair["rays"]) else f"{pair['rays']} and {pair['rays_b']}"
     low, high, unit = pair["ci_low"], pair["ci_high"], metric["unit"]
     span = f"{pair['a']} minus {pair['b']}: {number(pair['difference'], 3)} {unit}, 95 % interval {number(low, 3)} to "

@@ -13,7 +13,6 @@ from lidardesign.cli.output import FIRST_LINE, command
 from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.run.clock import phase
 
-MEBIBYTE = 2**20
 OUTCOMES = {"pass": ("pass", "green"), "fail": ("FAIL", "bold red"), "skip": ("skip", "dim")}
 
 tasks_app = typer.Typer(help="List, show, check or begin tasks.", invoke_without_command=True)
@@ -122,7 +121,6 @@ def _show_keys(entries: list[dict[str, Any]], title: str, rich: RichConsole) -> 
 
 
 def _yaml_value(value: Any) -> str:
-    """A default as one would write it in YAML; a dash where it is left empty."""
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(str, value)) + "]"
     return "-" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
@@ -152,7 +150,7 @@ def check(
             from lidardesign.testing.law import Limits
             from lidardesign.testing.process import CheckRequest, check_in_process
 
-        request = CheckRequest(name, config, tuple(overrides or ()), seed, Limits(seconds, memory_mb * MEBIBYTE))
+        request = CheckRequest(name, config, tuple(overrides or ()), seed, Limits(seconds, memory_mb * 2**20))
         findings = []
         with output.progress("contract", "law") as bar, phase("contract"):
             for finding in check_in_process(request):
@@ -160,8 +158,12 @@ def check(
                 if bar is not None:
                     bar.update(FIRST_LINE, completed=len(findings), total=len(LAWS) + 1, law=finding.law)
         counts = {outcome: sum(finding.outcome == outcome for finding in findings) for outcome in OUTCOMES}
-        laws = [finding.as_dict() for finding in findings]
-        document = {"task": name, "keeps": not counts["fail"], **counts, "laws": laws}
+        document = {
+            "task": name,
+            "keeps": not counts["fail"],
+            **counts,
+            "laws": [finding.as_dict() for finding in findings],
+        }
         output.result(document, lambda rich: _show_laws(document, rich))
         refuse_broken(name, findings)
 

@@ -137,13 +137,12 @@ def _words(name: str) -> str:
 # Phases of a smaller share are left to --json; `other` shows what they took.
 LEAST_SHARE = 0.005
 MEBIBYTE = 1024**2
-# People are shown phases and those directly inside of them.
-DEEPEST = 2
 
 
 def show_times(timings: Mapping[str, float], memory_bytes: int | None, rich: RichConsole) -> None:
     """Print the phases of a clock's timings with their seconds and shares, phases inside of phases indented."""
-    timings = {key: seconds for key, seconds in timings.items() if key.count(INSIDE) < DEEPEST}
+    # people are shown phases and those directly inside of them
+    timings = {key: seconds for key, seconds in timings.items() if key.count(INSIDE) < 2}
     total = sum(seconds for key, seconds in timings.items() if INSIDE not in key)
     if total <= 0:
         return
@@ -176,8 +175,9 @@ def show_accuracy(accuracy: Accuracy, rich: RichConsole) -> None:
         if sweep.note:
             rich.print(f"note: {sweep.note}")
         rich.print()
-    taken = f"accuracy measured in {sum(accuracy.seconds.values()):.0f} s; "
-    rich.print(Text.assemble(taken, ("*", "bold"), " is what to choose, (run) what this run does"))
+    taken = sum(accuracy.seconds.values())
+    marks = (("*", "bold"), " is what to choose, (run) what this run does")
+    rich.print(Text.assemble(f"accuracy measured in {taken:.0f} s; ", *marks))
     for sweep in accuracy.sweeps:
         if sweep.default is not None and sweep.chosen is not sweep.default:
             rich.print(f"note: {sweep.knob}: {sweep.verdict}")
