@@ -53,13 +53,34 @@ TEXTS = {
     "other_task.yaml": "task_name: face\n",
     "upside_down.yaml": "space: {range_m: [1.0, 0.5]}\n",
     "garbage.yaml": "\x00\x01\x02",
+    "design.yaml": "schema_version: 1\nsensors: 3\n",
+    "gate.yaml": "gate: {width_m: {max: -1}}\n",
+    "gates.yaml": "gates: {width_m: {max: 1}}\n",
+    "contradiction.yaml": "gate: {start_m: {min: 0.8}, end_m: {max: 0.5}}\n",
+    "empty.yaml": "",
+    "notes.txt": "not a design at all",
     "rows.csv": "a,b,c\n1,2,3\n",
     "short.csv": "1,2,3\n",
 }
 
 CASES = [
+    # commands
+    ("fly", 2, "fly"),
+    ("learn", 2, "TASK"),
+    ("learn nothing", 2, "unknown task 'nothing'"),
+    ("learn flatland --unknown", 2, "unknown"),
+    ("tasks show nothing", 2, "unknown task"),
+    ("tasks remove", 2, "remove"),
+    ("config init nothing", 2, "unknown task"),
+    ("config init flatland --preset quick", 2, "draft, standard, fine"),
+    ("config init flatland --set colour=red", 2, "colour"),
+    ("config schema recipe", 2, "config, constraints, design, evaluate"),
+    ("config schema design --task face", 2, "--task"),
+    ("config schema config --task nothing", 2, "unknown task"),
     # meshes
+    ("learn meshes", 2, "--set folder=PATH"),
     ("learn meshes --set folder=absent", 3, "absent"),
+    ("learn meshes --set folder=nothing", 3, "nothing"),
     ("learn meshes --set folder=no_mesh", 3, "no_mesh"),
     ("learn meshes --set folder=open --set sign=solid", 3, "a.obj"),
     ("learn meshes --set folder=open --set sign=inside", 2, "--set sign=inside"),
@@ -74,6 +95,7 @@ CASES = [
         if name not in ("open", "one_bad_of_two", "no_mesh")
     ),
     # configuration: file, line and column
+    ("learn flatland --config absent.yaml", 2, "absent.yaml: cannot be read: No such file"),
     ("learn flatland --config typo.yaml", 2, "typo.yaml:3:1"),
     ("learn flatland --config tabs.yaml", 2, "tabs.yaml:2:1"),
     ("learn flatland --config unknown.yaml", 2, "unknown.yaml:2:3: unknown key 'density.sigma_mm'"),
@@ -90,6 +112,7 @@ CASES = [
     ("learn flatland --config upside_down.yaml", 2, "upside_down.yaml:1:"),
     ("learn flatland --config garbage.yaml", 2, "garbage.yaml"),
     ("learn flatland --config open", 2, "open"),
+    ("learn flatland --set sigma", 2, "KEY=VALUE"),
     ("learn flatland --set density.sigma_m=-1", 2, "--set density.sigma_m=-1"),
     ("learn flatland --set density.sigma_m=nan", 2, "--set density.sigma_m=nan"),
     ("learn flatland --set learning.steps=1.5", 2, "--set learning.steps=1.5"),
@@ -101,6 +124,8 @@ CASES = [
     ("learn flatland --preset quick", 2, "draft, standard, fine"),
     ("learn flatlan", 2, "did you mean 'flatland'"),
     ("learn flatland --device cuda:9", 2, "auto, cpu, cuda"),
+    ("learn flatland --seed -1", 2, "seed"),
+    ("learn flatland --seed x", 2, "seed"),
     # morphable models
     ("learn face --set model=absent.h5", 3, "absent.h5"),
     ("learn face --set model=text.h5", 3, "text.h5"),
@@ -120,6 +145,9 @@ CASES = [
     ("fit bad_manifest", 3, "manifest.json"),
     ("fit newer", 3, "schema version"),
     ("learn flatland --out run", 2, "not empty"),
+    ("learn flatland --out open", 2, "not empty"),
+    ("learn flatland --out notes.txt", 2, "is a file"),
+    ("learn flatland --out notes.txt/run", 3, "cannot be made"),
     ("learn flatland --resume --out absent", 3, "no run to resume"),
     ("learn flatland --resume --out open", 3, "no run folder"),
     ("learn flatland --resume --out locked", 2, "is writing this run"),
@@ -130,16 +158,34 @@ CASES = [
     ("fit run --sensors 0", 2, "from 1, or auto"),
     ("fit run --sensors -2", 2, "from 1, or auto"),
     ("fit run --sensors 2.5", 2, "from 1, or auto"),
+    ("fit run --sensors many", 2, "from 1, or auto"),
+    *((f"fit run --refine {rounds}", 2, "--refine") for rounds in ("0", "-1", "101", "many", "1.5")),
+    ("fit run --layout spiral", 2, "grid, density, scan"),
+    ("fit run --gates one", 2, "sensor, ray"),
+    ("fit run --name ../elsewhere", 2, "no name for a design"),
     ("fit run --sensors 5 --rays 3", 4, "3 rays for 5 sensors"),
     ("constrain run --sensors 5 --set budget.rays=3", 4, "budget.rays"),
     ("evaluate run --rays 0", 2, "rays"),
     ("evaluate run --rays many", 2, "rays"),
     ("evaluate run --fail-above inf", 2, "finite"),
+    ("evaluate run --fail-above nan", 2, "finite"),
+    ("evaluate run", 3, "no designs yet"),
+    ("evaluate absent", 3, "absent"),
+    ("export", 2, "no design"),
+    ("export good.yaml", 2, "no format"),
+    ("export good.yaml --format jpeg", 2, "csv"),
     ("export good.yaml --format csv --rays 0", 2, "rays"),
     ("export good.yaml --format csv --out open", 3, "is a folder"),
     ("export good.yaml --format csv --out good.yaml", 2, "overwrite the design"),
     # constraints
+    ("constrain absent.yaml", 3, "absent.yaml"),
+    ("constrain run --constraints absent.yaml", 2, "absent.yaml"),
     ("constrain run --constraints typo.yaml", 2, "typo.yaml:3:1"),
+    ("constrain run --constraints gate.yaml", 2, "gate.yaml:1:23"),
+    ("constrain run --constraints gates.yaml", 2, "did you mean 'gate'"),
+    ("constrain run --constraints contradiction.yaml", 4, "gate."),
+    ("constrain run --set gate.width_m.max=wide", 2, "--set gate.width_m.max=wide"),
+    ("constrain run --set gate.width_m.most=1", 2, "--set gate.width_m.most=1"),
     ("constrain run --set gate.width_m.max=-1", 2, "--set gate.width_m.max=-1"),
     ("constrain run --set gate.width_m.max=nan", 2, "--set gate.width_m.max=nan"),
     ("constrain run --set gate.width.max=1", 2, "did you mean 'width_m'"),
@@ -153,6 +199,12 @@ CASES = [
     ("constrain run --set budget.bandwidth_mbps=1e-9", 4, "bandwidth_mbps"),
     ("constrain run --set gate.end_m.max=0.02", 4, "density"),
     # designs
+    ("show absent.yaml", 3, "absent.yaml"),
+    ("show notes.txt", 2, "notes.txt"),
+    ("evaluate design.yaml", 2, "design.yaml:2:10"),
+    ("export absent.yaml --format csv", 3, "absent.yaml"),
+    ("export design.yaml --format csv", 2, "design.yaml"),
+    ("export empty.yaml --format csv", 2, "empty.yaml"),
     ("show rows.csv", 3, "rows.csv:1"),
     ("show short.csv", 3, "short.csv:1"),
     ("show garbage.yaml", 2, "garbage.yaml"),
@@ -204,6 +256,7 @@ def mistakes(tmp_path_factory):
     for name, file, content in MESHES:
         (folder / name).mkdir(exist_ok=True)
         (folder / name / file).write_bytes(content)
+    (folder / "nothing").mkdir()
     for name, text in TEXTS.items():
         (folder / name).write_text(text)
     (folder / "good.yaml").write_text(GOOD)

@@ -105,6 +105,7 @@ CASES = [
         ]
     ),
     ("learn face --set speed_m_s=1e9", 2, "--set speed_m_s=1e9"),
+    ("learn face --set speed_m_s=-1", 2, "--set speed_m_s=-1"),
     ("learn emitter --set field_of_view_deg=[0,50]", 2, "above 0 and below 180 degrees"),
     ("learn emitter --set field_of_view_deg=[60,180]", 2, "above 0 and below 180 degrees"),
     ("learn emitter --set emitter_box_m=-0.1", 2, "half sizes are 0 m or more"),

@@ -7,11 +7,9 @@ import math
 import struct
 import zipfile
 
-import h5py
 import numpy as np
 import pytest
 from lidardesign_tasks.arm_robot import load_robot
-from lidardesign_tasks.basel import load_model
 from support.captures import make_capture
 from support.command_line import make_run
 from support.tables import each_row
@@ -161,43 +159,6 @@ def test_a_scale_that_overflows_is_refused_without_a_warning(tmp_path):
     (tmp_path / "m.obj").write_text("v 1e300 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n")
     with pytest.raises(DataError, match="infinite"):
         load_mesh(tmp_path / "m.obj", scale=1e10)
-
-
-@pytest.mark.parametrize("dataset", ["shape/model/mean", "shape/model/pcaVariance", "shape/representer/cells"])
-def test_a_dataset_without_values_is_refused_by_name(tmp_path, dataset):
-    values = {
-        "shape/model/mean": np.arange(9.0),
-        "shape/model/pcaVariance": np.ones(1),
-        "shape/model/pcaBasis": np.full((9, 1), 1 / 3),
-        "shape/representer/cells": np.array([[0], [1], [2]]),
-    }
-    with h5py.File(tmp_path / "m.h5", "w") as file:
-        for name, array in values.items():
-            file[name] = h5py.Empty("f8") if name == dataset else array
-    with pytest.raises(DataError, match="not an array of numbers") as refused:
-        load_model(tmp_path / "m.h5", unit="mm")
-    assert dataset in str(refused.value)
-
-
-@pytest.mark.parametrize("dataset", ["model/mean", "model/pcaVariance", "model/pcaBasis"])
-def test_a_face_beyond_all_sizes_is_refused_without_a_warning(tmp_path, dataset):
-    values = {"model/mean": np.arange(9.0), "model/pcaVariance": np.ones(1), "model/pcaBasis": np.full((9, 1), 1 / 3)}
-    with h5py.File(tmp_path / "m.h5", "w") as file:
-        for name, array in values.items():
-            file[name] = array * (1e300 if name == dataset else 1.0)
-        file["representer/cells"] = np.array([[0], [1], [2]])
-    with pytest.raises(DataError, match="reaches") as refused:
-        load_model(tmp_path / "m.h5", unit="mm")
-    assert dataset in str(refused.value)
-
-
-def test_a_length_unit_without_a_value_is_refused(tmp_path):
-    with h5py.File(tmp_path / "m.h5", "w") as file:
-        file["model/mean"], file["model/pcaVariance"] = np.arange(9.0), np.ones(1)
-        file["model/pcaBasis"], file["representer/cells"] = np.full((9, 1), 1 / 3), np.array([[0], [1], [2]])
-        file["representer/length-unit"] = np.zeros(0)
-    with pytest.raises(DataError, match="length-unit"):
-        load_model(tmp_path / "m.h5")
 
 
 def test_directions_whose_length_overflows_are_refused_without_a_warning(tmp_path):

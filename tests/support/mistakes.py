@@ -27,4 +27,4 @@ def check_one_clear_message(result, code, words):
     assert document["error"]["message"]
     assert words in result.err
     assert "Traceback" not in result.err
-    assert len(result.err.strip().splitlines()) <= 5, result.err
+    assert len(result.err.strip().splitlines()) <= 4, result.err

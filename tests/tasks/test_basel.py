@@ -81,6 +81,11 @@ def test_a_length_unit_dataset_is_obeyed_and_a_size_of_no_head_is_refused(tmp_pa
     with h5py.File(path, "a") as file:
         file["shape/representer/length-unit"] = 0.001
     assert np.ptp(load_model(path).mean, axis=0).max() == pytest.approx(0.2, rel=0.01)
+    with h5py.File(path, "a") as file:
+        del file["shape/representer/length-unit"]
+        file["shape/representer/length-unit"] = np.zeros(0)
+    with pytest.raises(DataError, match="length-unit"):
+        load_model(path)
     model = parts()
     model["mean"] = model["mean"] * 1e4
     path = write(tmp_path / "big.h5", model, unit=None)
@@ -103,6 +108,10 @@ DAMAGE = {
     "negative variance": ("pcaVariance", lambda v: -v, "negative"),
     "basis of another scale": ("pcaBasis", lambda v: 3 * v, "columns of length"),
     "text": ("pcaVariance", lambda v: np.array([b"a", b"b", b"c"]), "not an array of numbers"),
+    **{f"{name} without values": (name, lambda v: h5py.Empty("f8"), rf"/{name}.*not an array of numbers")
+       for name in ("mean", "pcaVariance", "cells")},
+    **{f"{name} beyond all sizes": (name, lambda v: v * 1e300, rf"/{name}.*reaches")
+       for name in ("mean", "pcaVariance", "pcaBasis")},
     "faces beyond the vertices": ("cells", lambda v: v + VERTICES, "names vertex"),
     "faces of four": ("cells", lambda v: np.vstack([v, v[:1]]), "whole numbers"),
     **{f"no {name}": (name, lambda v: None, rf"m\.h5: dataset shape/\w+/{name}: is missing")

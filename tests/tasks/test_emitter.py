@@ -299,8 +299,6 @@ def test_the_truth_is_what_both_places_see_where_the_emitter_is_fixed(heads):
 @each_row(
     ("values", "message"),
     [
-        ({"field_of_view_deg": (180.0, 50.0)}, "below 180 degrees"),
-        ({"field_of_view_deg": (60.0, 0.0)}, "above 0"),
         ({"range_m": (0.5, 0.5)}, "the longest above it"),
         ({"range_m": (-0.1, 0.5)}, "0 m or more"),
         ({"detector_m": (0.4, 0.0)}, "detector_m"),

@@ -16,7 +16,6 @@ from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.surroundings import fog
 from lidardesign_tasks.warehouse import WarehouseTask
-from pydantic import ValidationError
 from support.rays import rays_along
 from support.tables import each_row
 
@@ -108,22 +107,6 @@ def test_fog_leaves_a_fiftieth_of_a_contrast_at_its_visibility():
     medium = fog(50.0)
     assert math.exp(-medium.extinction_per_m * 50.0) == pytest.approx(0.02)
     assert medium.extinction_per_m / medium.backscatter_per_m_sr == pytest.approx(18.8)
-
-
-@each_row(
-    "wrong",
-    [
-        {"illuminance_lux": -1},
-        {"light": "candle"},
-        {"visibility_m": 0},
-        {"reflectance": 1.1},
-        {"gloss": -0.1},
-        {"speed_m_s": -1},
-    ],
-)
-def test_surroundings_that_cannot_be_are_refused(wrong):
-    with pytest.raises(ValidationError):
-        FaceTask.Config(**wrong)
 
 
 def test_darkness_is_no_light_at_all(folder):

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from lidardesign_tasks.arm import ArmTask
 from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
@@ -26,7 +25,7 @@ from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim
-from lidardesign.task import Task, conditions_of, notes_of, scenes_of
+from lidardesign.task import Task, conditions_of, scenes_of
 
 REAL_MODEL = Path(__file__).parents[3] / "shared" / "data" / "ict_face.h5"
 SMALL = {"train": 2, "test": 2, "truth_points": 800}
@@ -138,13 +137,6 @@ def test_scenes_are_the_same_for_the_same_seed_and_differ_for_another(case, name
         assert bodies_equal(first, second)
         np.testing.assert_array_equal(truth_points(first), truth_points(second))
     assert not any(bodies_equal(first, second) for first, second in zip(scenes["train"], other, strict=False))
-
-
-@each_case
-def test_training_and_held_out_scenes_are_disjoint(case, name):
-    _, _, scenes = case(name)
-    for train in scenes["train"]:
-        assert not any(bodies_equal(train, test) for test in scenes["test"])
 
 
 @each_case
@@ -289,16 +281,6 @@ def test_a_task_that_is_seen_often_keeps_the_contract(name):
 
 
 @each_row("name", SEEN_OFTEN)
-def test_many_scenes_survive_the_way_to_a_worker_process_and_repeat(name):
-    task, config, lists, scenes = often(name)
-    again = task.scenes(config, "train", 0)
-    for scene, other in zip(scenes["train"], again, strict=True):
-        value = score_often(task, scene, lists).value
-        assert score_often(task, pickle.loads(pickle.dumps(scene)), lists).value == value
-        assert score_often(task, other, lists).value == value
-
-
-@each_row("name", SEEN_OFTEN)
 def test_residuals_of_many_frames_or_positions_add_up_to_the_score(name):
     task, _, lists, scenes = often(name)
     # rays at the first position alone leave something to be missed
@@ -350,17 +332,10 @@ def test_what_gives_no_scenes_or_the_same_ones_everywhere_is_refused(folders, tm
             getattr(task, call)(task.Config(**values), *split)
 
 
-def test_each_mesh_is_in_exactly_one_split(folders):
-    config = MeshesTask.Config(folder=str(folders / "three"), poses=1, truth_points=100)
-    names = [{s.bodies[0].name for s in MeshesTask().scenes(config, split, 4)} for split in ("train", "test")]
-    assert not names[0] & names[1]
-    assert len(names[0] | names[1]) == 3
-
-
 @each_case
 def test_what_is_held_out_stays_held_out_whatever_the_seed_of_training_scenes(case, name):
     task, config, scenes = case(name)
-    for seed in (1, 2, 3):
+    for seed in range(4):
         for train in task.scenes(config, "train", seed):
             assert not any(bodies_equal(train, test) for test in scenes["test"])
 
@@ -368,9 +343,10 @@ def test_what_is_held_out_stays_held_out_whatever_the_seed_of_training_scenes(ca
 def test_meshes_that_are_held_out_are_so_with_every_seed(folders):
     config = MeshesTask.Config(folder=str(folders / "three"), poses=1, truth_points=100)
     held_out = {scene.bodies[0].name for scene in MeshesTask().scenes(config, "test", 0)}
-    for seed in range(1, 9):
+    for seed in range(9):
         trained = {scene.bodies[0].name for scene in MeshesTask().scenes(config, "train", seed)}
         assert not trained & held_out
+        assert len(trained | held_out) == 3
 
 
 @each_row("up", ["x", "y", "z"])
@@ -405,12 +381,3 @@ def test_jitter_is_rigid_about_its_centre_and_bounded():
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
         angle = np.rad2deg(np.arccos((np.trace(pose[:3, :3]) - 1) / 2))
         assert angle <= 4.0 * 2.5 * np.sqrt(3) + 1e-9
-
-
-def test_a_mesh_in_millimetres_without_a_scale_is_noted_by_its_file(tmp_path):
-    trimesh.creation.box((120, 90, 70)).export(tmp_path / "box.obj")
-    for scale, noted in ((1.0, True), (0.001, False)):
-        task = MeshesTask()
-        config = task.Config(folder=tmp_path, scale=scale)
-        notes = " ".join(notes_of(task, config, task.space(config)))
-        assert ("box.obj: is 120 m long" in notes) == noted

@@ -361,7 +361,6 @@ def test_a_robot_that_stands_still_is_judged_where_it_stands():
 @each_row(
     "values",
     [
-        {"no_such_key": 1},
         {"train": 0},
         {"front_m": (float("nan"), 1.0)},
         {"box_height_m": (0.38, 0.05)},

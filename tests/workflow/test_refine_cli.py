@@ -219,13 +219,6 @@ def test_a_plugin_whose_residuals_are_broken_is_named(lidardesign, flat, monkeyp
     assert "Traceback" not in result.err
 
 
-@pytest.mark.parametrize("value", ["0", "-1", "101", "many", "1.5"])
-def test_rounds_are_a_whole_number_from_1_to_100(lidardesign, flat, value):
-    result = lidardesign("fit", flat, "--refine", value)
-    assert result.code == 2
-    assert "--refine" in result.err
-
-
 @pytest.fixture
 def weighted(lidardesign, flat, monkeypatch):
     """A design whose refinement found a factor and a spread, whatever they are worth."""
