@@ -64,13 +64,7 @@ for the seconds in them. Of two commands at once one worked at least, and the ot
 
 @dataclass
 class Tally:
-    """What was done and what came of it.
-
-    Arguments:
-        sent: Ends by way and command.
-        early: Those of them that met the command at work, rather than after its end.
-        faults: One sentence for each thing that was not as it must be.
-    """
+    """What was done, by way and command, how often it met the command at work, and what was not as it must be."""
 
     sent: Counter[tuple[str, str]] = field(default_factory=Counter)
     early: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -78,26 +72,13 @@ class Tally:
 
 
 class Killing:
-    """Ends commands and looks at what is left.
-
-    Arguments:
-        folder: Where to work.
-        straight: The undisturbed run.
-        tally: Where to count.
-    """
+    """Ends commands in a folder and looks at what is left, beside an undisturbed run."""
 
     def __init__(self, folder: Path, straight: Straight, tally: Tally) -> None:
         self.folder, self.straight, self.tally = folder, straight, tally
 
     def end(self, way: str, name: str, run_it: Callable[[Path], Ended], told: str) -> Ended:
-        """End one command in a folder of its own, look, give it again, and compare.
-
-        Arguments:
-            way: How, a key of WAYS.
-            name: The command.
-            run_it: Runs it in a folder and ends it.
-            told: The moment, for a fault's sentence.
-        """
+        """End one command in a folder of its own, look, give it again, and compare; `told` names the moment."""
         place = self.folder / "killed"
         shutil.copytree(self.straight.before[name], place)
         ended = run_it(place)
@@ -204,9 +185,7 @@ def spread(last: int, count: int) -> list[int]:
 
 def page(tally: Tally, seed: int, minutes: float) -> list[str]:
     """The parts of the result's page."""
-    rows = [
-        (WAYS[way], name, count, tally.early[way, name]) for (way, name), count in sorted(tally.sent.items())
-    ]
+    rows = [(WAYS[way], name, count, tally.early[way, name]) for (way, name), count in sorted(tally.sent.items())]
     killed, met, both, worked = (
         sum(count for (way, _), count in counted.items() if (way == "pair") == pairs)
         for pairs in (False, True)

@@ -34,14 +34,7 @@ SAID, COUNTED = "said", "steps"
 
 @dataclass(frozen=True)
 class Ended:
-    """How a process ended.
-
-    Arguments:
-        code: Its exit code, negative for a signal.
-        seconds: How long it took.
-        said: What it printed on stderr.
-        steps: Steps that changed files, where they were counted.
-    """
+    """How a process ended: negative codes are signals, steps are those that changed files."""
 
     code: int
     seconds: float
@@ -59,13 +52,7 @@ def import_all() -> None:
 
 
 class Fork:
-    """The program in a fork, in a folder; see `import_all`.
-
-    Arguments:
-        arguments: Of the command line.
-        folder: Its working directory.
-        at_step: Kill it before the step of this number, from 1; 0 does not.
-    """
+    """The program in a fork, in a folder, killed before the step of a number from 1, if one is given."""
 
     def __init__(self, arguments: Sequence[str], folder: Path, at_step: int = 0) -> None:
         self._started = time.monotonic()
@@ -94,7 +81,7 @@ class Fork:
 
 
 def forked(arguments: Sequence[str], folder: Path, *, at_step: int = 0) -> Ended:
-    """Run the program in a fork; arguments as of `Fork`."""
+    """Run the program in a fork."""
     return Fork(arguments, folder, at_step).ended()
 
 

@@ -35,12 +35,7 @@ SAMPLES = "samples.npz"
 
 
 class Straight:
-    """The run that nobody disturbed, and how long its commands take.
-
-    Arguments:
-        folder: Where; the run is `run` inside of it.
-        commands: One after the other, by name.
-    """
+    """The run that nobody disturbed, `run` inside of a folder, by commands one after the other, with their names."""
 
     def __init__(self, folder: Path, commands: Mapping[str, list[str]]) -> None:
         self.folder, self.commands, self.before, self.forks, self.after = folder, commands, {}, {}, {}
@@ -55,11 +50,8 @@ class Straight:
 
     def measure_fresh(self, folder: Path) -> dict[str, float]:
         """Seconds of each command in a process of its own."""
-        return {name: self._timed(name, folder / f"timed {name}") for name in self.commands}
-
-    def _timed(self, name: str, folder: Path) -> float:
-        shutil.copytree(self.before[name], folder)
-        return fresh(self.commands[name], folder).seconds
+        copies = {name: shutil.copytree(self.before[name], folder / f"timed {name}") for name in self.commands}
+        return {name: fresh(self.commands[name], copy).seconds for name, copy in copies.items()}
 
 
 def contents(run: Path) -> dict[str, object]:

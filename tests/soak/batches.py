@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,8 @@ def soak(
 ) -> list[dict[str, Any]]:
     """Runs from one number on until so many of them were whole: learned, fitted, constrained and evaluated.
 
-    What an earlier soak did in the same folder counts. Every so many runs one is done twice; 0: none.
-
-    Returns:
-        The records of all numbers up to the last of these, in order, refused ones and faults among them; with 0 whole
-        ones, all that lie in the folder.
+    What an earlier soak did in the same folder counts. Every so many runs one is done twice; 0: none. The records of
+    all numbers up to the last of these are given, in order, faults among them; with 0 whole ones all in the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
     records = {record["seed"]: record for record in records_in(folder)}
@@ -63,7 +61,7 @@ def records_in(folder: Path) -> list[dict[str, Any]]:
 def keep(record: Record, folder: Path) -> None:
     """Write the record of a run into a soak's folder."""
     path = folder / f"record-{record.seed}.json"
-    path.with_suffix(".tmp").write_text(json.dumps({**record.as_dict(), "outcome": record.outcome}))
+    path.with_suffix(".tmp").write_text(json.dumps({**asdict(record), "outcome": record.outcome}))
     path.with_suffix(".tmp").replace(path)
 
 

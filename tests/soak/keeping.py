@@ -19,13 +19,7 @@ ROUNDING = 1e-9
 
 
 def broken_bounds(design: Mapping[str, Any], rules: Mapping[str, Any], space: Mapping[str, Any]) -> list[str]:
-    """The bounds that do not hold, each as one line with what was found.
-
-    Arguments:
-        design: A design file as plain values.
-        rules: The constraint file.
-        space: The configuration's section.
-    """
+    """The bounds that do not hold, each as one line with what was found."""
     return [f"{name}: {found}" for name, kept, found in checked_bounds(design, rules, space) if not kept]
 
 
@@ -144,10 +138,9 @@ def _origin(
     mean = np.array(sensor["origin_m"]["mean"])
     covariance = np.array(sensor["origin_m"]["covariance"])
     slack = ROUNDING * max(np.abs(mean).max(), 1e-30)
-    if "low_m" in asked:
-        yield f"origin.low_m {asked['low_m']}", bool((mean >= np.array(asked["low_m"]) - slack).all()), mean
-    if "high_m" in asked:
-        yield f"origin.high_m {asked['high_m']}", bool((mean <= np.array(asked["high_m"]) + slack).all()), mean
+    for name, sign in (("low_m", 1), ("high_m", -1)):
+        if name in asked:
+            yield f"origin.{name} {asked[name]}", bool((sign * (mean - np.array(asked[name])) >= -slack).all()), mean
     if "fixed_m" in asked:
         there = bool((np.abs(mean - np.array(asked["fixed_m"])) <= slack).all()) and not covariance.any()
         yield f"origin.fixed_m {asked['fixed_m']}", there, mean

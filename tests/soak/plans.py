@@ -38,15 +38,7 @@ FREE: dict[str, list[tuple[float, float]]] = {
 
 @dataclass(frozen=True)
 class RunPlan:
-    """One random run.
-
-    Arguments:
-        seed: What everything follows from.
-        config: The configuration file of `learn`.
-        sensors: How many are fitted.
-        fit: Further options of `fit`.
-        evaluate: Options of `evaluate`.
-    """
+    """One random run: the configuration of `learn`, how many sensors, and options of `fit` and `evaluate`."""
 
     seed: int
     config: dict[str, Any]
@@ -75,9 +67,9 @@ def random_plan(seed: int) -> RunPlan:
     generator = random_generator(seed, "soak", "plan")
     size = _power(generator, *SIZES_M)
     offset = [float(v) for v in size * _pick(generator, [0.0, 1.0, 100.0]) * generator.normal(size=3)]
-    space = _space(generator, size, offset)
-    density = _density(generator, size)
-    at = _condition_value(space, generator)
+    space, density = _space(generator, size, offset), _density(generator, size)
+    # the value that the designs are for, where the density has a condition
+    at = ("--at", f"x_m={float(generator.uniform(*space['x_m']))!r}") if "condition" in space else ()
     layout = _pick(generator, ["grid", "grid", "density", "scan", "distributed"])
     sensors = int(generator.integers(1, MOST_SENSORS + 1))
     return RunPlan(
@@ -91,7 +83,7 @@ def random_plan(seed: int) -> RunPlan:
         },
         sensors,
         (*_fit_options(generator, layout, sensors), *at),
-        _evaluate_options(generator, reach_m=_high(space["range_m"])),
+        _evaluate_options(generator, reach_m=np.max(space["range_m"])),
     )
 
 
@@ -121,18 +113,6 @@ def _space(generator: np.random.Generator, size: float, offset: list[float]) -> 
     return space
 
 
-def _high(bounds: float | list[float]) -> float:
-    return bounds[1] if isinstance(bounds, list) else bounds
-
-
-def _condition_value(space: dict[str, Any], generator: np.random.Generator) -> tuple[str, ...]:
-    """The value that the designs are for, where the density has a condition."""
-    if "condition" not in space:
-        return ()
-    low, high = space["x_m"]
-    return ("--at", f"x_m={float(generator.uniform(low, high))!r}")
-
-
 def _scenes(generator: np.random.Generator, size: float) -> dict[str, Any]:
     scenes: dict[str, Any] = {
         "scene": _pick(generator, ["surface", "discs", "occluded"]),
@@ -158,10 +138,9 @@ def _density(generator: np.random.Generator, size: float) -> dict[str, Any]:
         "visibility": _pick(generator, ["auto", "auto", "raycast", wide_only, "off"]),
         "quadrature_points": int(_pick(generator, [8, 32])),
     }
-    if generator.random() < 0.3:
-        density["attenuation_per_m"] = _power(generator, 0.0, 4.0) / size
-    if generator.random() < 0.3:
-        density["sharpness_per_m"] = _power(generator, 0.0, 4.0) / size
+    for name in ("attenuation_per_m", "sharpness_per_m"):
+        if generator.random() < 0.3:
+            density[name] = _power(generator, 0.0, 4.0) / size
     if generator.random() < 0.3:
         density["margin_m"] = size * _pick(generator, [0.0, 0.001, 0.05])
     return density
@@ -224,9 +203,8 @@ def _fit_options(generator: np.random.Generator, layout: str, sensors: int) -> t
 
 
 def _evaluate_options(generator: np.random.Generator, *, reach_m: float) -> tuple[str, ...]:
-    options = ["--rays", str(int(generator.integers(1, 65)))]
     detectors = ["ideal", *(name for name, farthest_m in DETECTORS.items() if reach_m < farthest_m)]
-    options += ["--detector", _pick(generator, detectors)]
+    options = ["--rays", str(int(generator.integers(1, 65))), "--detector", _pick(generator, detectors)]
     options += ["--effects", _pick(generator, ["auto", "auto", "none", "all"])]
     if generator.random() < 0.2:
         options += ["--baseline", _pick(generator, ["occupancy", "no-visibility"])]

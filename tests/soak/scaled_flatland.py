@@ -13,7 +13,7 @@ from pydantic import Field
 
 from lidardesign.evaluate.metrics import chamfer_m
 from lidardesign.geometry.rays import Returns
-from lidardesign.scene import Body, Capsule, Scene, Sphere
+from lidardesign.scene import Body, Scene
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, Split
 
@@ -72,11 +72,7 @@ class ScaledFlatlandTask:
 
 
 def offer(folder: Path) -> Path:
-    """Write what an installed package would: with this folder on the path, the task is found.
-
-    Returns:
-        The folder.
-    """
+    """Write what an installed package would: with this folder, which is given back, on the path, the task is found."""
     made = folder / "lidardesign_soak-1.0.dist-info"
     made.mkdir(parents=True, exist_ok=True)
     (made / "METADATA").write_text("Metadata-Version: 2.1\nName: lidardesign-soak\nVersion: 1.0\n")
@@ -91,11 +87,7 @@ def _lengths(size_m: float) -> np.ndarray:
 
 def _grown(body: Body, config: ScaledFlatlandConfig) -> Body:
     size, shape = config.size_m, body.shape
-    grown = (
-        Sphere(size * shape.radius_m)
-        if isinstance(shape, Sphere)
-        else Capsule(size * shape.radius_m, size * shape.half_length_m)
-    )
+    grown = type(shape)(*(size * length_m for length_m in vars(shape).values()))
     pose = body.pose().copy()
     pose[:3, 3] = size * pose[:3, 3] + np.array(config.offset_m)
     return replace(body, shape=grown, poses=pose)

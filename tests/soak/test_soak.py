@@ -24,7 +24,7 @@ from lidardesign.space import DesignSpace
 from soak import batches
 from soak.keeping import broken_bounds
 from soak.limits import Bounds, contradictions, drawn, kept_already
-from soak.plans import MOST_SENSORS, SIGMA_SHARES, SIZES_M, random_plan
+from soak.plans import DIMENSIONS, MOST_SENSORS, SIGMA_SHARES, SIZES_M, random_plan
 from soak.runs_page import runs_page
 from soak.scaled_flatland import NAME, ScaledFlatlandTask, offer
 from soak.seeds import Learned, seeds_page
@@ -92,24 +92,18 @@ def hand_made():
             "boresight": {"azimuth_rad": 1.0 + index, "elevation_rad": 0.1 - 0.2 * index, "roll_rad": 0.0},
             "field_of_view_rad": {"horizontal": 0.4, "vertical": 0.2},
             "gate_m": {"start": 0.5, "end": 0.8 + 0.1 * index},
-            "spread": {"horizontal_rad": 0.4 / 3.919927969080108, "vertical_rad": 0.2 / 3.919927969080108},
+            "spread": {
+                name: width / 3.919927969080108
+                for name, width in (("horizontal_rad", 0.4), ("vertical_rad", 0.2), ("range_m", 0.3 + 0.1 * index))
+            },
             "rays": 10,
         }
         for index in range(2)
     ]
-    for sensor in sensors:
-        sensor["spread"]["range_m"] = (sensor["gate_m"]["end"] - sensor["gate_m"]["start"]) / 3.919927969080108
     return {"level": 0.95, "layout": "grid", "sensors": sensors, "rays": 20}
 
 
-SPACE = {
-    "x_m": [0, 2],
-    "y_m": [-1, 1],
-    "z_m": [0, 0],
-    "azimuth_rad": [0, 3],
-    "elevation_rad": [-1, 1],
-    "range_m": [0, 2],
-}
+SPACE = dict(zip(DIMENSIONS, ([0, 2], [-1, 1], [0, 0], [0, 3], [-1, 1], [0, 2]), strict=True))
 KEPT_AND_BROKEN = {
     "count": ({"sensors": {"count": 2}}, {"sensors": {"count": 3}}),
     "most sensors": ({"sensors": {"max": 2}}, {"sensors": {"max": 1}}),
@@ -199,16 +193,11 @@ def test_outcomes_tell_refusals_from_whole_runs_and_faults():
     assert record_of(0, ess=0.1, steps=[("learn", "", 0, 1.0), ("fit", "", 3, 1.0)]).outcome == ROUGH
     assert record_of(0, ess=0.1, steps=[("learn", "", 0, 1.0), ("fit", "", 0, 1.0)]).outcome == WHOLE
     assert record_of(0, ess=0.1, faults=["it ended"]).outcome == "fault"
-    assert record_of(0, digests={"a": "1", "b": "1"}).differences(record_of(0, digests={"a": "2", "c": "1"})) == [
-        "a",
-        "b",
-        "c",
-    ]
+    one, other = (record_of(0, digests=found) for found in ({"a": "1", "b": "1"}, {"a": "2", "c": "1"}))
+    assert one.differences(other) == ["a", "b", "c"]
 
 
-@each_row(
-    ("code", "words"), [("import os; os._exit(3)", "ended with 3"), ("import time; time.sleep(60)", "hung")]
-)
+@each_row(("code", "words"), [("import os; os._exit(3)", "ended with 3"), ("import time; time.sleep(60)", "hung")])
 def test_a_run_that_takes_its_process_down_or_hangs_is_a_fault_and_the_others_go_on(tmp_path, monkeypatch, code, words):
     def started(seed, folder, _):
         if seed != 8:
@@ -234,7 +223,8 @@ def test_what_an_ended_soak_did_is_read_and_its_page_names_the_runs_that_are_mis
 def test_pages_say_how_many_runs_were_whole_and_which_were_not(tmp_path):
     whole = record_of(1, ess=0.5, bounds=9, repeated=True, steps=[("constrain", "drawn", 4, 0.1)])
     fault = record_of(2, ess=0.5, faults=["fit.yaml breaks gate.end_m.max"])
-    runs_page(tmp_path / "runs.md", [{**r.as_dict(), "outcome": r.outcome} for r in (whole, fault)], "soak runs")
+    records = [{**dataclasses.asdict(record), "outcome": record.outcome} for record in (whole, fault)]
+    runs_page(tmp_path / "runs.md", records, "soak runs")
     text = (tmp_path / "runs.md").read_text()
     assert "1 runs did all of learn, fit, constrain and evaluate" in text
     assert "- seed 2: fit.yaml breaks gate.end_m.max" in text

@@ -13,7 +13,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -49,19 +49,7 @@ CONTRADICTORY_SHARE = 0.5
 
 @dataclass
 class Record:
-    """What one run did.
-
-    Arguments:
-        seed: Its number.
-        size_m, sigma_share, free, sensors, layout: What it was about.
-        ess: Of the learned density; None where learning failed.
-        steps: Command, what was asked of it, exit code, processor time [s].
-        bounds: Bounds that the second reader checked on written files.
-        faults: What should not have happened, one line each.
-        digests: SHA-256 of everything that a second run of the seed has to repeat: documents by command, and files.
-        repeated: Whether a second run did the same; None where there was none.
-        seconds: Processor time of the whole run [s].
-    """
+    """What one run was about and what it did."""
 
     seed: int
     size_m: float
@@ -69,13 +57,13 @@ class Record:
     free: int
     sensors: int
     layout: str
-    ess: float | None = None
-    steps: list[tuple[str, str, int, float]] = field(default_factory=list)
-    bounds: int = 0
+    ess: float | None = None  # None where learning failed
+    steps: list[tuple[str, str, int, float]] = field(default_factory=list)  # command, asked, exit code, seconds
+    bounds: int = 0  # that the second reader checked on written files
     faults: list[str] = field(default_factory=list)
-    digests: dict[str, str] = field(default_factory=dict)
-    repeated: bool | None = None
-    seconds: float = 0.0
+    digests: dict[str, str] = field(default_factory=dict)  # of what a second run has to repeat: documents and files
+    repeated: bool | None = None  # None where there was no second run
+    seconds: float = 0.0  # of the processor
 
     @classmethod
     def of(cls, plan: RunPlan) -> Record:
@@ -85,7 +73,7 @@ class Record:
 
     def differences(self, other: Record) -> list[str]:
         """What two runs of one seed did not repeat: commands whose document, and files whose bytes differ."""
-        names = [*self.digests, *(name for name in other.digests if name not in self.digests)]
+        names = dict.fromkeys([*self.digests, *other.digests])
         return [name for name in names if self.digests.get(name) != other.digests.get(name)]
 
     @property
@@ -98,10 +86,6 @@ class Record:
         if any(command == "fit" and code == TOO_ROUGH for command, _, code, _ in self.steps):
             return ROUGH
         return WHOLE
-
-    def as_dict(self) -> dict[str, Any]:
-        """For one line of JSON."""
-        return asdict(self)
 
 
 class StoppedError(Exception):
@@ -135,19 +119,16 @@ class _Doing:
         """Learn, fit, constrain twice at most, evaluate."""
         Path("asked.yaml").write_text(dump_yaml(self.plan.config))
         try:
-            self._commands()
+            self._learn()
+            self._fit()
+            self._constrain()
+            if self.generator.random() < CONTRADICTORY_SHARE:
+                self._contradict()
+            self._evaluate()
         finally:
             for path in [*(Path("run") / name for name in FILES), *sorted(Path("run/designs").glob("*.yaml"))]:
                 if path.exists():
                     self.record.digests[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
-
-    def _commands(self) -> None:
-        self._learn()
-        self._fit()
-        self._constrain()
-        if self.generator.random() < CONTRADICTORY_SHARE:
-            self._contradict()
-        self._evaluate()
 
     def _learn(self) -> None:
         options = ("--config", "asked.yaml", "--preset", "draft", "--out", "run", "--seed", str(self.plan.seed))
