@@ -117,8 +117,7 @@ def can_fire(design: DesignSpec, count: int) -> bool:
 def usual_numbers(designs: Iterable[DesignSpec], budgets: Iterable[int]) -> list[int]:
     """The numbers to evaluate at where none is asked for: the task's, and those that smaller fixed patterns have."""
     usual = set(budgets)
-    sizes = {size for size in map(pattern_size, designs) if size is not None}
-    return sorted(usual | {size for size in sizes if size < max(usual)})
+    return sorted(usual | {size for size in map(pattern_size, designs) if size is not None and size < max(usual)})
 
 
 def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[int]:
@@ -147,8 +146,10 @@ def left_out(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[str]:
     for design in designs:
         beyond = [count for count in asked if not can_fire(design, count)]
         if beyond:
-            fires = f"{design.name} fires {pattern_size(design)} rays, its fixed pattern"
-            lines.append(f"{fires}: it is left out at {_listed(beyond, 'and')} rays")
+            lines.append(
+                f"{design.name} fires {pattern_size(design)} rays, its fixed pattern: "
+                f"it is left out at {_listed(beyond, 'and')} rays"
+            )
     empty = [count for count in asked if designs and not any(can_fire(design, count) for design in designs)]
     if empty:
         lines.append(f"no design fires {_listed(empty, 'or')} rays: nothing is evaluated there")

@@ -101,11 +101,10 @@ class ScenePoints:
     @property
     def still(self) -> DesignSpace:
         """The space of a part where it is bolted on: what carries it stands at its first place."""
-        low, high = list(self.space.low), list(self.space.high)
-        for axis in self.travelled:
-            high[axis] = low[axis]
+        ends = enumerate(zip(self.space.low, self.space.high, strict=True))
+        high = tuple(low if axis in self.travelled else high for axis, (low, high) in ends)
         kept = tuple(name for name in self.space.condition if DIMENSIONS.index(name) not in self.travelled)
-        return replace(self.space, low=tuple(low), high=tuple(high), condition=kept)
+        return replace(self.space, high=high, condition=kept)
 
     def brought_back(self) -> np.ndarray:
         """The design points as they are seen from what carries them, at its first place, shape (N, 6)."""

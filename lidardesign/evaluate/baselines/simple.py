@@ -98,7 +98,7 @@ def _boxed(name: str, space: DesignSpace, low: np.ndarray, high: np.ndarray, gat
     conditions = [axis for axis in space.conditioned if axis < RAY_AXES]
 
     def place(count: int, spot: Spot) -> np.ndarray:
-        lowest, highest = np.array(low[:RAY_AXES]), np.array(high[:RAY_AXES])
+        lowest, highest = (np.array(end[:RAY_AXES], dtype=np.float64) for end in (low, high))
         lowest[conditions] = np.array(spot.space.low)[conditions]
         highest[conditions] = np.array(spot.space.high)[conditions]
         return even_placement(lowest, highest, count)
@@ -227,11 +227,7 @@ def _keyed(name: str, options: Sequence[Option]) -> list[tuple[tuple[str, str, i
 
 
 def _uniform(source: Baselines, argument: str) -> list[Candidate]:
-    def place(count: int, spot: Spot) -> np.ndarray:
-        low, high = np.array(spot.space.low[:RAY_AXES]), np.array(spot.space.high[:RAY_AXES])
-        return even_placement(low, high, count)
-
-    return [BaselineLayout("even", place, whole_range(source.space))]
+    return [_boxed("even", source.space, source.space.low, source.space.high, whole_range(source.space))]
 
 
 def _random(source: Baselines, argument: str) -> list[Candidate]:

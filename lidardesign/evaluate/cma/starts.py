@@ -164,8 +164,7 @@ def _tile_sensor(rules: SearchRules, seen: _Seen, tile: Tile, index: int, weight
 
 def _gate(rules: SearchRules, range_m: np.ndarray) -> np.ndarray:
     """The central 99 % of distances inside the range of the space, shape (2,) [m]."""
-    lowest, highest = whole_range(rules.space)
-    low, high = np.clip(central(range_m), lowest, highest)
+    low, high = np.clip(central(range_m), *whole_range(rules.space))
     return opened_gate(float(low), float(high))
 
 

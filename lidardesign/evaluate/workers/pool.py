@@ -156,7 +156,7 @@ ALLOWED = f"a whole number from 1 to {MOST_PROCESSES}, or tcp://HOST:PORT of a d
 LOOK_SECONDS = 2.0
 
 
-class WorkerScorer:
+class WorkerScorer(contextlib.AbstractContextManager):
     """Scores scenes with workers; a context that ends them.
 
     Arguments:
@@ -165,9 +165,6 @@ class WorkerScorer:
 
     def __init__(self, engine: Processes | Cluster) -> None:
         self._engine = engine
-
-    def __enter__(self) -> WorkerScorer:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._engine.close()
