@@ -82,6 +82,7 @@ CASES = [
         }.items()
     ),
     ("evaluate run --effects ambint", 2, "did you mean 'ambient'"),
+    ("evaluate run --effects dew", 2, "unknown effect 'dew'"),
     ("evaluate run --effects Jitter", 2, "did you mean 'jitter'"),
     ("evaluate run --effects ALL", 2, "did you mean 'all'"),
     ("evaluate run --effects audit,all", 2, "'audit' stands among effects"),

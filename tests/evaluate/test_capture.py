@@ -400,7 +400,6 @@ def test_the_table_names_its_judges(call):
 
 
 BAD = [
-    ("capture absent.npz ball.yaml", 3, "absent.npz"),
     ("capture clean.npz absent.yaml", 3, "absent.yaml"),
     ("capture ball.yaml ball.yaml", 3, "suffix '.yaml'"),
     ("capture clean.npz ball.yaml --estimator mean", 2, "peak, matched"),

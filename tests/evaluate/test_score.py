@@ -1,6 +1,5 @@
 """Scoring on held-out scenes, with a task of a few lines: the share of rays without a return."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -26,6 +25,8 @@ def test_rows_are_designs_then_baselines_at_every_number_of_rays():
         assert row.seconds > 0
     rows = rows_by_key(evaluation)
     assert rows["aimed", 25].value < rows["uniform", 25].value
+    metric = {"name": "misses", "unit": "%", "better": "lower", "worst": 150.0}
+    assert evaluation.as_dict()["metric"] == metric
 
 
 def test_failures_are_counted_at_the_worst_value_and_never_dropped():
@@ -94,22 +95,6 @@ def test_a_judged_baseline_of_free_origins_is_scored_too():
         rows = rows_by_key(evaluation)
         sign = 1 if task.metric.better == "lower" else -1
         assert sign * rows["bounding", 25].value < sign * rows["uniform", 25].value
-
-
-def test_the_document_has_the_keys_of_the_contract_and_is_plain_json():
-    document = evaluate(make_request()).as_dict()
-    assert json.loads(json.dumps(document, allow_nan=False)) == document
-    keys = {"metric", "scenes", "rows", "paired", "equal_bandwidth", "effects", "accuracy"}
-    assert keys <= set(document)
-    row = {
-        "design", "rays", "value", "ci_low", "ci_high", "half_width", "failures", "bandwidth_mbps", "seconds",
-        "details",
-    }  # fmt: skip
-    assert all(set(entry) == row for entry in document["rows"])
-    assert all(set(entry) == {*row, "matched_to", "matched_rays"} for entry in document["equal_bandwidth"])
-    pair = {"a", "b", "rays", "difference", "ci_low", "ci_high", "half_width"}
-    assert all(set(entry) == pair for entry in document["paired"])
-    assert document["metric"] == {"name": "misses", "unit": "%", "better": "lower", "worst": 150.0}
 
 
 def test_one_held_out_scene_is_noted():
