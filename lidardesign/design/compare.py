@@ -107,8 +107,8 @@ class Readout:
     def as_dict(self) -> dict[str, Any]:
         """Plain values for scripts."""
         model = {name: getattr(self.model, name) for name in MODEL_KEYS}
-        values = {"low_mbps": self.low_mbps, "high_mbps": self.high_mbps}
-        return {**values, "rays": self.rays, "of_one_ray": self.rays is None, **model}
+        rays = {"rays": self.rays, "of_one_ray": self.rays is None}
+        return {"low_mbps": self.low_mbps, "high_mbps": self.high_mbps, **rays, **model}
 
 
 def readout_of(design: DesignSpec) -> Readout:
@@ -121,9 +121,8 @@ def readout_of(design: DesignSpec) -> Readout:
         found = [model.mbps_of_widths(row) for row in widths]
         return Readout(model, min(found), max(found), len(track.sensor))
     if design.ray_table is not None:
-        gates = design.ray_table.gate_m
-        once = model.mbps_of_widths(gates[:, 1] - gates[:, 0])
-        return Readout(model, once, once, len(gates))
+        once = model.mbps(design.ray_table)
+        return Readout(model, once, once, len(design.ray_table))
     widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in design.sensors])
     count = layout_of(design).own_count(design)
     if count is None:

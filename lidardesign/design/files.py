@@ -55,13 +55,10 @@ WEIGHT_SUM_TOLERANCE = SLACK
 # How much below zero rounding may push an eigenvalue of a covariance, relative to the largest.
 COVARIANCE_ROUNDING = SLACK
 
-REQUIRED = ("schema_version", "sensors")
 OPTIONAL = ("name", "layout", "level", "rays", "at", "gates", "ray_table", "track", "constraints", "provenance")
-SENSOR_REQUIRED = ("origin_m", "boresight")
 SENSOR_OPTIONAL = (
     "name", "part", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays",
 )  # fmt: skip
-COUPLING_KEYS = ("direction_rad_per_m", "range_m_per_m", "range_m_per_rad", "spread_rad", "spread_m")
 TABLE_KEYS = (
     "origin_x_m", "origin_y_m", "origin_z_m", "azimuth_rad", "elevation_rad", "gate_start_m", "gate_end_m", "sensor",
 )  # fmt: skip
@@ -247,7 +244,7 @@ def design_from_document(
         raise root.child("schema_version").error(
             f"is {version}", allowed=str(SCHEMA_VERSION), hint="use a newer version of lidardesign"
         )
-    keys = root.mapping(REQUIRED, OPTIONAL)
+    keys = root.mapping(("schema_version", "sensors"), OPTIONAL)
     level = keys["level"].number(*LEVELS) if "level" in keys else DEFAULT_LEVEL
     sensors = _sensors(keys["sensors"], level)
     rays = keys["rays"].integer(0, MOST_RAYS) if "rays" in keys else None
@@ -294,7 +291,7 @@ def _sensors(node: Node, level: float) -> tuple[Sensor, ...]:
 
 
 def _sensor(node: Node, index: int, level: float) -> Sensor:
-    keys = node.mapping(SENSOR_REQUIRED, SENSOR_OPTIONAL)
+    keys = node.mapping(("origin_m", "boresight"), SENSOR_OPTIONAL)
     mean, covariance = _origin(keys["origin_m"])
     boresight = keys["boresight"].mapping(("azimuth_rad", "elevation_rad"), ("roll_rad",))
     spreads = keys["spread"].mapping((), ("horizontal_rad", "vertical_rad", "range_m")) if "spread" in keys else {}
@@ -332,7 +329,7 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
 
 
 def _coupling(node: Node) -> Coupling:
-    keys = node.mapping(COUPLING_KEYS)
+    keys = node.mapping(("direction_rad_per_m", "range_m_per_m", "range_m_per_rad", "spread_rad", "spread_m"))
     rows = keys["direction_rad_per_m"].items()
     if len(rows) != 2:
         raise keys["direction_rad_per_m"].error(

@@ -262,9 +262,7 @@ def read_osi(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
             times_us[place.ray] = lidar["timings"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"cannot be read as OSI: {error}", where=str(path), hint="export it again") from error
-    read_back = rays_of_parts(rays, parts, str(path))
-    held = (read_back.origin_m, read_back.direction, read_back.gate_m, read_back.sensor)
-    return Rays(*held, times_us / MICROSECONDS_PER_S), rate_hz
+    return replace(rays_of_parts(rays, parts, str(path)), time_s=times_us / MICROSECONDS_PER_S), rate_hz
 
 
 def _rays_of_lidar(place: Place, lidar: dict[str, Any], rays: Rays) -> Part:

@@ -271,9 +271,15 @@ def plan(design: DesignSpec, rays: Rays) -> list[Position]:
                 allowed="one origin per sensor",
                 hint="lidardesign constrain RUN --layout grid, or with origin.fixed_m in the constraints",
             )
-    found = [_position(origins[here], rays, np.flatnonzero(place == here)) for here in np.argsort(first)]
-    _refuse_far_rays(design, rays, found)
-    return found
+    positions = []
+    for here in np.argsort(first):
+        chosen = np.flatnonzero(place == here)
+        boresight = middle_boresight_deg(rays.direction[chosen])
+        angles_deg = scan_angles_deg(degree_frame(*boresight), rays.direction[chosen])
+        order = short_tour(angles_deg)
+        positions.append(Position(origins[here], boresight, chosen[order], angles_deg[order], travel(angles_deg)))
+    _refuse_far_rays(design, rays, positions)
+    return positions
 
 
 def read_galvo(path: Path) -> Rays:
@@ -311,14 +317,6 @@ def is_galvo_file(path: Path) -> bool:
             return file.read(len(BOM) + len(header)).removeprefix(BOM).startswith(header)
     except OSError:
         return False
-
-
-def _position(origin_m: np.ndarray, rays: Rays, chosen: np.ndarray) -> Position:
-    directions = rays.direction[chosen]
-    boresight = middle_boresight_deg(directions)
-    angles_deg = scan_angles_deg(degree_frame(*boresight), directions)
-    order = short_tour(angles_deg)
-    return Position(origin_m, boresight, chosen[order], angles_deg[order], travel(angles_deg))
 
 
 def _refuse_far_rays(design: DesignSpec, rays: Rays, positions: list[Position]) -> None:

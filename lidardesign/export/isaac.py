@@ -323,23 +323,25 @@ def quoted(text: str) -> str:
 
 
 def _prim(mount: Mount, rays: Rays, rate_hz: int) -> list[str]:
-    schemas = json.dumps(SCHEMAS)
-    lines = [f'    def OmniLidar "{mount.name}" (', f"        displayName = {quoted(mount.sensor.name)}"]
-    lines += [f"        prepend apiSchemas = {schemas}", "    )", "    {"]
-    held = emitters_of(mount, rays, rate_hz)
-    lines += [f"        {kind} {name} = {value}" for kind, name, value in [*_core(mount, held, rate_hz), *_state(held)]]
-    lines += [
+    attributes = _attributes(mount, emitters_of(mount, rays, rate_hz), rate_hz)
+    return [
+        f'    def OmniLidar "{mount.name}" (',
+        f"        displayName = {quoted(mount.sensor.name)}",
+        f"        prepend apiSchemas = {json.dumps(SCHEMAS)}",
+        "    )",
+        "    {",
+        *(f"        {kind} {name} = {value}" for kind, name, value in attributes),
         f"        double3 xformOp:translate = {_vector(mount.origin_m)}",
         f"        quatd xformOp:orient = {_vector(mount.quaternion)}",
         '        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]',
+        "    }",
     ]
-    return [*lines, "    }"]
 
 
-def _core(mount: Mount, held: Emitters, rate_hz: int) -> list[tuple[str, str, str]]:
-    """Type, name and value of what holds for all emitters of a sensor."""
+def _attributes(mount: Mount, held: Emitters, rate_hz: int) -> list[tuple[str, str, str]]:
+    """Type, name and value of what holds for all emitters of a sensor, then of the arrays of their state."""
     count, (near, far) = len(mount.ray), mount.gate_m
-    values: list[tuple[str, str, str]] = [
+    core = [
         ("token", "scanType", '"SOLID_STATE"'),
         ("token", "rayType", '"IDEALIZED"'),
         ("token", "elementsCoordsType", '"CARTESIAN"'),
@@ -360,17 +362,7 @@ def _core(mount: Mount, held: Emitters, rate_hz: int) -> list[tuple[str, str, st
         *(("float", f"{axis}Error{what}", "0") for axis in ("azimuth", "elevation") for what in ("Mean", "Std")),
         ("float", "rangeAccuracyM", "0"),
     ]
-    return [
-        ("string", "omni:sensor:marketName", quoted(mount.sensor.name)),
-        ("float", "omni:sensor:tickRate", str(rate_hz)),
-        *((kind, CORE + name, value) for kind, name, value in values),
-    ]
-
-
-def _state(held: Emitters) -> list[tuple[str, str, str]]:
-    """Type, name and value of the arrays of one emitter state."""
-    count = len(held.azimuth_deg)
-    values = [
+    state = [
         ("float[]", "azimuthDeg", _singles(held.azimuth_deg)),
         ("float[]", "elevationDeg", _singles(held.elevation_deg)),
         ("uint[]", "fireTimeNs", json.dumps(held.fire_time_ns.tolist())),
@@ -379,7 +371,12 @@ def _state(held: Emitters) -> list[tuple[str, str, str]]:
         ("uint[]", "rangeId", json.dumps(held.range_id.tolist())),
         ("uint[]", "bank", json.dumps([0] * count)),
     ]
-    return [(kind, STATE + name, value) for kind, name, value in values]
+    return [
+        ("string", "omni:sensor:marketName", quoted(mount.sensor.name)),
+        ("float", "omni:sensor:tickRate", str(rate_hz)),
+        *((kind, CORE + name, value) for kind, name, value in core),
+        *((kind, STATE + name, value) for kind, name, value in state),
+    ]
 
 
 def _single(value: float) -> str:

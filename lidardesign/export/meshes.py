@@ -83,18 +83,16 @@ def _properties(kinds: np.dtype) -> list[str]:
 def _points(places: np.ndarray, sensor: np.ndarray, kinds: list[tuple[str, str]]) -> np.ndarray:
     """Points with the colours of their sensors, and room for more."""
     table = np.zeros(len(places), dtype=kinds)
-    for name, column in zip("xyz", places.T, strict=True):
-        table[name] = column
-    for (name, _), column in zip(COLOUR, COLOURS[sensor % len(COLOURS)].T, strict=True):
+    columns = (*places.T, *COLOURS[sensor % len(COLOURS)].T)
+    for (name, _), column in zip(PLACE + COLOUR, columns, strict=True):
         table[name] = column
     return table
 
 
 def _ray_points(rays: Rays) -> np.ndarray:
     table = _points(rays.origin_m, rays.sensor, PLACE + NORMAL + COLOUR + RAY)
-    for (name, _), column in zip(NORMAL, rays.direction.T, strict=True):
-        table[name] = column
-    for (name, _), column in zip(RAY, (*rays.gate_m.T, rays.time_s, rays.sensor), strict=True):
+    columns = (*rays.direction.T, *rays.gate_m.T, rays.time_s, rays.sensor)
+    for (name, _), column in zip(NORMAL + RAY, columns, strict=True):
         table[name] = column
     return table
 

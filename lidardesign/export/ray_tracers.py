@@ -371,8 +371,7 @@ def read_rgl(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
         if len(times) != len(mount.ray):
             raise DataError(f"holds {len(times)} times of {len(mount.ray)} rays", where=str(path / mount.name))
         times_s[mount.ray] = times
-    held = rays_of_parts(rays, parts, str(path))
-    return Rays(held.origin_m, held.direction, held.gate_m, held.sensor, times_s), max(rates_hz)
+    return replace(rays_of_parts(rays, parts, str(path)), time_s=times_s), max(rates_hz)
 
 
 def _pose_and_rate(sensor: Element | None, mount: Mount, path: Path) -> tuple[list[float], float]:

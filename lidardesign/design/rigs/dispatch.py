@@ -80,8 +80,9 @@ def read_rig(path: Path, head: bytes) -> Rig | None:
         return read_ray_csv(path)
     # the research code's table begins with numbers, or with names of its columns
     if len(cells) not in (len(SENSOR_COLUMNS), len(SENSOR_COLUMNS) + 1) and not {*cells} & {*SENSOR_COLUMNS}:
-        found = "line 1 has numbers and no names of columns"
-        raise DataError(found, where=f"{path}:1", allowed=ALLOWED[CSV], hint=HEADER_HINT)
+        raise DataError(
+            "line 1 has numbers and no names of columns", where=f"{path}:1", allowed=ALLOWED[CSV], hint=HEADER_HINT
+        )
     return None
 
 

@@ -83,8 +83,9 @@ class _Copier:
             if child.tag == "attach":
                 raise DataError("attaches another model", where=where, allowed="one model, or <include>")
             if child.tag == "rangefinder" and "camera" in child.attrib:
-                allowed = "rangefinders of sites: one ray each"
-                raise DataError("has a rangefinder of a camera", where=where, allowed=allowed)
+                raise DataError(
+                    "has a rangefinder of a camera", where=where, allowed="rangefinders of sites: one ray each"
+                )
             if child.tag not in KEPT:
                 continue
             kept = {name: child.attrib[name] for name in KEPT[child.tag] if name in child.attrib}
@@ -92,8 +93,9 @@ class _Copier:
             if child.tag == "replicate":
                 count = child.attrib.get("count", "")
                 if not count.strip().isdecimal() or len(count) > len(str(MOST_COPIES)):
-                    allowed = f"a whole number up to {MOST_COPIES}"
-                    raise DataError(f"count is {count[:40]!r}", where=where, allowed=allowed)
+                    raise DataError(
+                        f"count is {count[:40]!r}", where=where, allowed=f"a whole number up to {MOST_COPIES}"
+                    )
                 inner *= int(count)
             self.copies += inner if inner > 1 else 0
             if self.copies > MOST_COPIES:

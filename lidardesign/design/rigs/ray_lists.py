@@ -222,8 +222,7 @@ def read_ray_npz(path: Path) -> Rig:
         numbers[name] = values.astype(np.float64)
         if not np.isfinite(numbers[name]).all():
             row = int(np.argmin(np.isfinite(numbers[name])))
-            found = f"{name} is {numbers[name][row]}"
-            raise DataError(found, where=locate(row, name), allowed="a finite number")
+            raise DataError(f"{name} is {numbers[name][row]}", where=locate(row, name), allowed="a finite number")
     indices = numbers.pop(SENSOR, np.zeros(shape))
     if (indices < 0).any() or (indices % 1 != 0).any():
         raise DataError(f"{SENSOR} is no whole number of 0 or more", where=str(path))
@@ -247,7 +246,6 @@ SENSOR_COLUMNS = (
     "azimuth_sigma", "elevation_sigma", "time_sigma", "weight",
 )  # fmt: skip
 QUERY_COLUMN = "x_query"
-YAML_BEGINNINGS = ("{", "[", "- ", "#", "%")
 NOT_NEGATIVE = ("time_mean", "azimuth_sigma", "elevation_sigma", "time_sigma", "weight")
 WEIGHT_SUM_TOLERANCE = SLACK
 
@@ -256,7 +254,7 @@ def begins_as_sensor_csv(head: bytes) -> bool:
     """Whether a file begins with a line of comma-separated cells that no YAML mapping begins with."""
     text = head.decode("utf-8-sig", errors="replace")
     first = next((line.strip() for line in text.splitlines() if line.strip()), "")
-    return "," in first and ":" not in first and not first.startswith(YAML_BEGINNINGS)
+    return "," in first and ":" not in first and not first.startswith(("{", "[", "- ", "#", "%"))
 
 
 def read_sensor_csv(path: Path) -> DesignSpec:

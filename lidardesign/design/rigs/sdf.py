@@ -290,11 +290,15 @@ def _axis(element: ElementTree.Element, scope: Scope, notes: dict[str, None], wi
         raise DataError(f"samples is {samples:g}", where=scope.where(element), allowed=f"1 to {MOST_RAYS}")
     low, high = _number(element, "min_angle", scope), _number(element, "max_angle", scope)
     if not (low <= high and high - low <= widest and max(-low, high) <= widest):
-        found = f"min_angle {low:g}, max_angle {high:g}"
-        raise DataError(found, where=scope.where(element), allowed=f"radians, ascending, at most {widest:.4g} wide")
+        raise DataError(
+            f"min_angle {low:g}, max_angle {high:g}",
+            where=scope.where(element),
+            allowed=f"radians, ascending, at most {widest:.4g} wide",
+        )
     if element.tag == "vertical" and max(-low, high) > math.pi / 2:
-        found = f"vertical angles from {low:g} to {high:g}"
-        raise DataError(found, where=scope.where(element), allowed="-pi/2 to pi/2 rad")
+        raise DataError(
+            f"vertical angles from {low:g} to {high:g}", where=scope.where(element), allowed="-pi/2 to pi/2 rad"
+        )
     resolution = element.find("resolution")
     if resolution is not None and numbers_of(resolution.text, 1, scope.where(resolution), "resolution")[0] != 1:
         notes["resolution is not held: Gazebo interpolates between the rays that are fired, `samples` of them"] = None
