@@ -11,6 +11,7 @@ import pytest
 import torch
 import trimesh
 from scipy.stats import norm
+from support.meshes import icosphere
 from support.references import shape_distance
 
 from lidardesign.config import DensitySettings, LearningSettings, resolve, save_run_config
@@ -55,9 +56,8 @@ def box_mesh(*half):
     return Mesh(made.vertices, made.faces)
 
 
-def ball_mesh(radius):
-    made = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-    return Mesh(made.vertices, made.faces)
+def ball_mesh():
+    return icosphere(0.3, subdivisions=3)
 
 
 def hidden_wall(place, kind=Box):
@@ -70,7 +70,7 @@ def hidden_wall(place, kind=Box):
 
 def balls(count, seed=0):
     places = np.random.default_rng(seed).uniform((1.9, -0.2, -0.2), (2.1, 0.2, 0.2), (count, 3))
-    return [Scene((Body(ball_mesh(0.3), "ball", "both", rigid(translation_m=place)),)) for place in places]
+    return [Scene((Body(ball_mesh(), "ball", "both", rigid(translation_m=place)),)) for place in places]
 
 
 def moving_ball(frames):
@@ -122,7 +122,7 @@ class TestMisplacedShare:
 
 class TestProbes:
     def test_points_are_distinct_and_stand_for_all_draws(self):
-        scene, space = Scene((Body(Sphere(0.3), poses=rigid(translation_m=(2, 0, 0))),)), SPACE
+        scene = Scene((Body(Sphere(0.3), poses=rigid(translation_m=(2, 0, 0))),))
         space = DesignSpace((0, 0, 0, 0, -0.35, 0.5), (0, 0, 0, 0, 0.35, 3.5))
         target = build_target([scene], space, SETTINGS, "raycast")
         probes = draw_probes(target, 5000, 0, "test")
@@ -312,7 +312,7 @@ class TestFieldSweeps:
         monkeypatch.setattr(fields, "PROBES", 512)
         monkeypatch.setattr(fields, "RESOLUTIONS", (12, 48))
         poses = np.stack([rigid(translation_m=(2.0, y, 0)) for y in (-0.1, 0.0, 0.1)])
-        scene = Scene((Body(ball_mesh(0.3), poses=poses),))
+        scene = Scene((Body(ball_mesh(), poses=poses),))
         case = fields.FieldCase.of([scene], SPACE, DensitySettings(sigma_m=0.02, field_resolution=48), 0, "off")
         sweep = fields.resolution_sweep(case)
         assert sweep.measurements[0].error > sweep.measurements[1].error

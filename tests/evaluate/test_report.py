@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import plotly.graph_objects as go
 import pytest
+from support.references import shape_distance
 from support.report_pages import (
     FRAMES,
     NASTY,
@@ -20,6 +21,7 @@ from support.report_pages import (
     make_shown,
     ray_segments,
 )
+from support.tables import each_row
 
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.figures.canvas import series
@@ -226,35 +228,27 @@ def test_a_verdict_needs_an_interval_that_excludes_zero_and_the_metrics_directio
     assert "no clear difference from uniform" in summary_sentences(lower)[1]
 
 
-@pytest.mark.parametrize(
-    ("shape", "distance"),
-    [
-        (Sphere(0.4), lambda p: np.linalg.norm(p, axis=1) - 0.4),
-        (Box((0.1, 0.2, 0.3)), lambda p: np.max(np.abs(p) - [0.1, 0.2, 0.3], axis=1)),
-        (
-            Capsule(0.1, 0.3),
-            lambda p: np.linalg.norm(p - np.clip(p, [0, 0, -0.3], [0, 0, 0.3]), axis=1) - 0.1,
-        ),
-        (Plane(), lambda p: p[:, 2]),
-    ],
-)
-def test_drawn_primitives_have_their_vertices_on_the_surface(shape, distance):
+@each_row("shape", [Sphere(0.4), Box((0.1, 0.2, 0.3)), Capsule(0.1, 0.3), Plane()])
+def test_drawn_primitives_have_their_vertices_on_the_surface(shape):
     bounds = np.array([[-1.0, -1, -1], [1, 1, 1]])
     vertices, faces = body_triangles(Body(shape), 0, bounds)
     assert vertices.dtype == np.float32
     assert faces.dtype == np.int32
     assert faces.max() < len(vertices)
     # float32 vertices near 1
-    assert np.abs(distance(vertices.astype(float))).max() < 1e-6
+    assert np.abs(shape_distance(shape)(vertices.astype(float))).max() < 1e-6
+
+
+def sheet(count, height=0.0):
+    """Half of the cells of a grid over the unit square, waves of a height."""
+    x, y = np.meshgrid(*[np.linspace(0, 1, count)] * 2)
+    first = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
+    vertices = np.stack([x.ravel(), y.ravel(), height * np.sin(7 * x.ravel())], axis=1)
+    return Mesh(vertices, np.stack([first, first + 1, first + count], axis=1), "unsigned")
 
 
 def test_thinning_keeps_the_shape_and_respects_the_limit():
-    side = np.linspace(0, 1, 120)
-    x, y = np.meshgrid(side, side)
-    vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    first = (np.arange(119)[:, None] * 120 + np.arange(119)).ravel()
-    faces = np.stack([first, first + 1, first + 120], axis=1)
-    mesh = Mesh(vertices, faces, "unsigned")
+    mesh = sheet(120)
     small, kept = thinned(mesh.vertices, mesh.faces, most=2000)
     assert 200 < len(kept) <= 2000
     assert kept.max() < len(small)
@@ -281,12 +275,6 @@ def test_rays_are_drawn_to_the_first_hit_or_the_end_of_the_gate():
     assert len(ends[Outcome.OCCLUDED]) > 0
     assert ((ends[Outcome.RETURN] >= 2.0) & (ends[Outcome.RETURN] < 4.0)).all()
     np.testing.assert_allclose(ends[Outcome.MISS], 4.0, atol=1e-5)
-
-
-def looks_of(shown):
-    return [curve for curve in series(make_evaluation(*(one.design.name for one in shown.designs)))][
-        : len(shown.designs)
-    ]
 
 
 def test_what_becomes_of_rays_is_known_at_every_position_and_frame():
@@ -322,7 +310,7 @@ def test_a_scan_of_hundreds_of_sensors_is_drawn_by_its_rays_alone():
     design = DesignSpec("scan", tuple(make_sensor(f"s{i}") for i in range(MOST_SENSORS + 1)), layout="scan")
     shown = make_shown(designs=1)
     one = replace(shown.designs[0], design=design, placed=(design,) * len(PLACES))
-    document = view_document(replace(shown, designs=(one,)), looks_of(shown))
+    document = view_document(replace(shown, designs=(one,)), series(make_evaluation("plain"))[:1])
     assert document["designs"][0]["sensors"] == 0
     assert document["designs"][0]["cones"] == ""
 
@@ -334,12 +322,8 @@ def test_everything_that_is_drawn_lies_in_the_box_unless_it_goes_far():
         ends = one.ends_m.reshape(-1, 3)
         assert (ends >= low - 1e-6).all()
         assert (ends <= high + 1e-6).all()
-    far = make_rays(25, 2)
-    far.gate_m[:, 1] = 1e4
-    from_afar = make_shown(rays=25)
-    lengths = np.full_like(from_afar.designs[0].length_m, 1e4)
-    one = replace(from_afar.designs[0], length_m=lengths)
-    size = float(np.ptp(view_bounds(replace(from_afar, designs=(one,))), axis=0).max())
+    from_afar = replace(shown.designs[0], length_m=np.full_like(shown.designs[0].length_m, 1e4))
+    size = float(np.ptp(view_bounds(replace(shown, designs=(from_afar,))), axis=0).max())
     assert size < 3.5 * float(np.ptp(np.stack([low, high]), axis=0).max())
 
 
@@ -354,27 +338,17 @@ def test_very_many_bodies_are_drawn_coarser_and_the_largest_first():
 
 
 def test_a_page_of_twenty_designs_in_a_large_scene_stays_small():
-    side = np.linspace(0, 1, 160)
-    x, y = np.meshgrid(side, side)
-    first = (np.arange(159)[:, None] * 160 + np.arange(159)).ravel()
-    faces = np.stack([first, first + 1, first + 160], axis=1)
-    sheet = Mesh(np.stack([x.ravel(), y.ravel(), np.sin(7 * x.ravel())], axis=1), faces, "unsigned")
     poses = np.stack([rigid(translation_m=(0, 0, frame)) for frame in range(40)])
-    scene = Scene((Body(sheet, "sheet", "both", poses),), "large")
+    scene = Scene((Body(sheet(160, 1.0), "sheet", "both", poses),), "large")
     report = make_report(designs=20, scene=scene, rays=2000, places=[{"y_m": 0.1 * i} for i in range(30)])
     assert len(report_html(report)) < 8e6
 
 
 def test_the_share_of_a_scene_that_is_drawn_bounds_all_its_meshes_together():
-    side = np.linspace(0, 1, 150)
-    x, y = np.meshgrid(side, side)
-    vertices = np.stack([x.ravel(), y.ravel(), np.sin(7 * x.ravel())], axis=1)
-    first = (np.arange(149)[:, None] * 150 + np.arange(149)).ravel()
-    sheet = Mesh(vertices, np.stack([first, first + 1, first + 150], axis=1), "unsigned")
-    poses = np.stack([rigid(translation_m=(0, 0, frame)) for frame in range(3)])
-    scene = Scene(tuple(Body(sheet, f"sheet {i}", poses=poses) for i in range(5)), "sheets")
+    mesh, poses = sheet(150, 1.0), np.stack([rigid(translation_m=(0, 0, frame)) for frame in range(3)])
+    scene = Scene(tuple(Body(mesh, f"sheet {i}", poses=poses) for i in range(5)), "sheets")
     assert drawn_share(make_scene()) == 1.0
-    assert drawn_share(scene) == pytest.approx(MOST_FACES / (5 * len(sheet.faces)))
+    assert drawn_share(scene) == pytest.approx(MOST_FACES / (5 * len(mesh.faces)))
     drawn = sum(len(body_triangles(body, 1, np.zeros((2, 3)), drawn_share(scene))[1]) for body in scene.bodies)
     assert 0.1 * MOST_FACES < drawn <= MOST_FACES + 5
     assert any("triangles of the meshes are drawn" in line for line in view_notes(make_shown(scene=scene)))

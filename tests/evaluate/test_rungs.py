@@ -2,6 +2,8 @@
 
 import mmap
 
+from support.tables import each_row
+
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
 
 
@@ -13,53 +15,50 @@ def measure(setting, error, seconds, **changes):
     return Measurement(setting, error, changes.pop("uncertainty", 0.0), seconds, **changes)
 
 
-def test_the_cheapest_measurement_inside_the_tolerance_is_chosen():
-    found = sweep(measure("a", 0.5, 1.0), measure("b", 0.05, 2.0), measure("c", 0.01, 4.0, default=True))
-    assert found.chosen.setting == "b"
-    assert found.verdict == "b suffices, 2 times cheaper than c, the setting of this run"
+OWN = {"default": True}
 
 
-def test_of_measurements_that_cost_the_same_the_most_accurate_is_chosen():
-    found = sweep(measure("a", 0.05, 1.0), measure("b", 0.01, 1.1), measure("c", 0.0, 2.0))
-    assert found.chosen.setting == "b"
-
-
-def test_of_measurements_that_cost_the_same_and_are_good_enough_the_runs_own_is_chosen():
-    found = sweep(measure("a", 0.05, 1.0, default=True), measure("b", 0.02, 1.1))
-    assert found.chosen.setting == "a"
-    outside = sweep(measure("a", 0.15, 1.0, default=True), measure("b", 0.02, 1.1))
-    assert outside.chosen.setting == "b"
-
-
-def test_what_the_run_does_stays_where_nothing_is_cheaper_by_more_than_can_be_told():
-    found = sweep(measure("a", 0.08, 1.0), measure("b", 0.05, 1.1), measure("c", 0.01, 1.25, default=True))
-    assert found.chosen.setting == "c"
-    slower = sweep(measure("a", 0.08, 1.0), measure("b", 0.05, 1.1), measure("c", 0.01, 1.4, default=True))
-    assert slower.chosen.setting == "b"
-
-
-def test_an_error_that_is_not_known_to_be_inside_the_tolerance_is_not():
-    found = sweep(measure("a", 0.05, 1.0, uncertainty=0.2), measure("b", 0.05, 2.0, uncertainty=0.01))
-    assert found.chosen.setting == "b"
-    unsure = sweep(measure("a", 0.05, 1.0, uncertainty=0.2, default=True), measure("b", 0.05, 2.0))
-    assert "may be outside" in unsure.verdict
-
-
-def test_outside_the_tolerance_the_most_accurate_is_closest():
-    found = sweep(measure("a", 0.5, 1.0), measure("b", 0.3, 2.0, default=True))
-    assert found.chosen.setting == "b"
-    assert found.verdict == "no setting is within 0.1 mm; b is closest"
+@each_row(
+    ("errors_and_seconds", "chosen", "verdict"),
+    [
+        # the cheapest inside the tolerance; of those that cost the same, the most accurate
+        (
+            [(0.5, 1.0), (0.05, 2.0), (0.01, 4.0, OWN)],
+            "b",
+            "b suffices, 2 times cheaper than c, the setting of this run",
+        ),
+        ([(0.05, 1.0), (0.01, 1.1), (0.0, 2.0)], "b", "b suffices"),
+        # what the run does stays where it is inside and nothing is cheaper by more than can be told
+        ([(0.05, 1.0, OWN), (0.02, 1.1)], "a", "a, the setting of this run, is the one to choose"),
+        ([(0.15, 1.0, OWN), (0.02, 1.1)], "b", "b is needed: a, as this run has it, may be outside the tolerance"),
+        ([(0.08, 1.0), (0.05, 1.1), (0.01, 1.25, OWN)], "c", "c, the setting of this run, is the one to choose"),
+        (
+            [(0.08, 1.0), (0.05, 1.1), (0.01, 1.4, OWN)],
+            "b",
+            "b suffices, 1.3 times cheaper than c, the setting of this run",
+        ),
+        # an error that is not known to be inside is not
+        ([(0.05, 1.0, {"uncertainty": 0.2}), (0.05, 2.0, {"uncertainty": 0.01})], "b", "b suffices"),
+        (
+            [(0.05, 1.0, {"uncertainty": 0.2, **OWN}), (0.05, 2.0)],
+            "b",
+            "b is needed: a, as this run has it, may be outside the tolerance",
+        ),
+        # outside the tolerance the most accurate is closest
+        ([(0.5, 1.0), (0.3, 2.0, OWN)], "b", "no setting is within 0.1 mm; b is closest"),
+        ([(0.3, 1.0), (0.5, 2.0), (0.05, 3.0)], "c", "c suffices; but errors do not fall here: by chance, perhaps"),
+    ],
+)
+def test_the_cheapest_measurement_that_is_surely_inside_the_tolerance_is_chosen(errors_and_seconds, chosen, verdict):
+    rows = zip("abc", errors_and_seconds, strict=False)
+    found = sweep(*(measure(name, *row[:2], **dict(*row[2:])) for name, row in rows))
+    assert (found.chosen.setting, found.verdict) == (chosen, verdict)
 
 
 def test_errors_fall_within_their_uncertainty():
     assert sweep(measure("a", 0.5, 1.0), measure("b", 0.3, 1.0)).falls
     assert not sweep(measure("a", 0.3, 1.0), measure("b", 0.5, 1.0)).falls
     assert sweep(measure("a", 0.3, 1.0, uncertainty=0.1), measure("b", 0.5, 1.0, uncertainty=0.1)).falls
-
-
-def test_the_verdict_says_where_errors_do_not_fall():
-    assert "by chance" in sweep(measure("a", 0.3, 1.0), measure("b", 0.5, 2.0), measure("c", 0.05, 3.0)).verdict
-    assert "by chance" not in sweep(measure("a", 0.5, 1.0), measure("b", 0.05, 3.0)).verdict
 
 
 def test_a_row_has_the_keys_of_the_contract():

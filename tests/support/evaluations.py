@@ -11,20 +11,9 @@ METRIC = Metric("Chamfer distance", "mm", "lower", worst=200.0, tolerance=0.1)
 
 
 def make_row(name, rays, value, baseline=False, matched_to=None):
-    return Row(
-        name,
-        rays,
-        value,
-        value * 0.9,
-        value * 1.1,
-        1,
-        rays * 0.01,
-        0.5,
-        np.array([value]),
-        baseline,
-        matched_to,
-        rays if matched_to else None,
-    )
+    interval, matched_rays = (value * 0.9, value * 1.1), rays if matched_to else None
+    values = np.array([value])
+    return Row(name, rays, value, *interval, 1, rays * 0.01, 0.5, values, baseline, matched_to, matched_rays)
 
 
 def make_evaluation(names=("first", "second"), rays=(36, 100, 576), value=30.0):

@@ -26,8 +26,8 @@ def write_box(path, vertices=BOX_VERTICES, faces=BOX_FACES):
     return path
 
 
-def icosphere(radius=0.5, centre=(0.0, 0.0, 0.0), sign="solid"):
-    mesh = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+def icosphere(radius=0.5, centre=(0.0, 0.0, 0.0), sign="solid", subdivisions=5):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     return Mesh(mesh.vertices + np.asarray(centre), mesh.faces, sign)
 
 
