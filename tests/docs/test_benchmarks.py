@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import json
 import math
 import runpy
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from support.docs_session import in_process
+from support.meshes import BOX_FACES, BOX_VERTICES
 from support.small_runs import shifting_environment
 from support.tables import each_row
 
@@ -25,20 +25,25 @@ ROOT = Path(__file__).parents[2]
 SCRIPTS = sorted(path for path in (ROOT / "benchmarks").glob("*.py") if path.stem != "common")
 
 
-@pytest.fixture(scope="module")
-def common():
-    spec = importlib.util.spec_from_file_location("benchmarks_common", ROOT / "benchmarks" / "common.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
+@pytest.fixture
+def script(monkeypatch):
+    """A benchmark script as a module, by its name."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    before = set(sys.modules)
+    yield importlib.import_module
+    for name in {"common", *(path.stem for path in SCRIPTS)} & (set(sys.modules) - before):
+        del sys.modules[name]
 
 
 @pytest.fixture
-def run_here(monkeypatch, capsys):
+def common(script):
+    return script("common")
+
+
+@pytest.fixture
+def run_here(monkeypatch, capsys, common):
     """Runs a script of benchmarks/ in this process, which has imported what takes long; what it prints."""
-    before, state = set(sys.modules), torch.get_rng_state()
+    state = torch.get_rng_state()
 
     def run(name, *words):
         path = ROOT / "benchmarks" / f"{name}.py"
@@ -46,8 +51,6 @@ def run_here(monkeypatch, capsys):
         runpy.run_path(str(path), run_name="__main__")
         return capsys.readouterr().out
 
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    common = importlib.import_module("common")
     from_outside = common.run_process
 
     def from_inside(command, environment=None):
@@ -67,8 +70,6 @@ def run_here(monkeypatch, capsys):
         monkeypatch.setenv(key, value)
     yield run
     torch.set_rng_state(state)
-    for name in {"common", *(path.stem for path in SCRIPTS)} & (set(sys.modules) - before):
-        del sys.modules[name]
 
 
 @each_row("script", SCRIPTS, ids=lambda path: path.stem)
@@ -103,16 +104,6 @@ def test_a_command_that_fails_ends_the_benchmark_with_its_message(common):
         result.document()
 
 
-@pytest.fixture
-def script(monkeypatch):
-    """A benchmark script as a module, by its name."""
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    before = set(sys.modules)
-    yield lambda name: importlib.import_module(name)
-    for name in {"common", *(path.stem for path in SCRIPTS)} & (set(sys.modules) - before):
-        del sys.modules[name]
-
-
 def test_a_claim_is_said_to_hold_or_where_it_does_not(common):
     assert common.verdict("lower", {"a": True, "b": True}) == "holds: lower (2 of 2)"
     assert common.verdict("lower", {"a": True, "b": False}) == "does not hold: lower (1 of 2; not for b)"
@@ -138,7 +129,7 @@ def test_a_benchmark_that_is_refused_says_why_without_a_traceback(common):
         common.without_traceback(refused)
 
 
-def test_the_rays_that_a_distance_takes_are_exact_on_a_power_law(script):
+def test_the_rays_that_a_distance_takes_are_exact_on_a_power_law_and_bounded_beyond_the_curve(script):
     rays = (100, 200, 400, 1600)
     distances = [3 * count**-0.7 for count in rays]
     needed = script("occlusion").rays_needed
@@ -146,16 +137,9 @@ def test_the_rays_that_a_distance_takes_are_exact_on_a_power_law(script):
         found = needed(rays, distances, 3 * wanted**-0.7)
         assert found.rays == pytest.approx(wanted)
         assert not found.bound
-
-
-def test_the_rays_that_a_distance_takes_are_bounded_beyond_the_curve(script):
-    needed = script("occlusion").rays_needed
     assert needed((100, 200), (0.4, 0.2), 0.5).text() == "<= 100"
     assert needed((100, 200), (0.4, 0.2), 0.1).text() == "> 200"
-
-
-def test_a_curve_that_rises_again_counts_where_it_first_comes_down(script):
-    needed = script("occlusion").rays_needed
+    # of a curve that rises again, where it first comes down
     assert needed((100, 200, 400, 800), (0.4, 0.2, 0.3, 0.1), 0.2).rays == pytest.approx(200)
 
 
@@ -175,7 +159,7 @@ def rows_of(**values):
     }
 
 
-@pytest.mark.parametrize(("spent", "value", "holds"), [(1.0, 0.1, True), (1.01, 0.1, False), (0.5, 0.5, False)])
+@each_row(("spent", "value", "holds"), [(1.0, 0.1, True), (1.01, 0.1, False), (0.5, 0.5, False)])
 def test_the_arm_must_be_better_at_half_the_bandwidth(script, spent, value, holds):
     others = {"uniform": (0.5, 2.0), "random": (0.6, 2.0), "bounding": (0.4, 2.0)}
     others |= {"occupancy": (0.4, 2.0), "no_visibility": (0.4, 2.0)}
@@ -183,9 +167,7 @@ def test_the_arm_must_be_better_at_half_the_bandwidth(script, spent, value, hold
     assert first.startswith("holds") == holds
 
 
-@pytest.mark.parametrize(
-    ("mine", "theirs", "holds"), [(9.0, 10.0, True), (10.0, 10.0, False), (2.0, 2.0, True), (2.1, 2.0, False)]
-)
+@each_row(("mine", "theirs", "holds"), [(9.0, 10.0, True), (10.0, 10.0, False), (2.0, 2.0, True), (2.1, 2.0, False)])
 def test_the_warehouse_must_beat_bounding_where_that_misses_much(script, mine, theirs, holds):
     others = {"uniform": (50.0, 8.0), "random": (50.0, 8.0), "bounding": (theirs, 2.0)}
     sparse, bounded = script("warehouse").verdicts(rows_of(mine=(mine, 1.0), **others))
@@ -209,9 +191,7 @@ def test_positions_between_are_held_against_the_worst_of_the_papers(script):
 
 
 def test_the_reference_of_ray_casting_meets_a_box_where_planes_do(script):
-    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    box = Mesh(corners, np.array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]))
+    box = Mesh(2 * BOX_VERTICES - 1, BOX_FACES)
     generator = np.random.default_rng(0)
     origins = np.column_stack([np.full(200, 3.0), generator.uniform(-2, 2, (200, 2))])
     targets = np.column_stack([np.full(200, 1.0), generator.uniform(-2, 2, (200, 2))])
@@ -268,12 +248,12 @@ def test_a_search_has_the_time_of_learning_ten_changes_and_a_refinement(script):
 
 
 @pytest.fixture
-def fill_benchmarks():
-    spec = importlib.util.spec_from_file_location("fill_benchmarks", ROOT / "tools" / "fill_benchmarks.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+def fill_benchmarks(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    module = importlib.import_module("fill_benchmarks")
     yield module
-    sys.modules.pop(module.SHARED, None)
+    for name in (module.SHARED, "fill_benchmarks"):
+        sys.modules.pop(name, None)
 
 
 def test_figures_replace_what_stood_between_the_marks_and_nothing_else(fill_benchmarks):

@@ -42,22 +42,18 @@ def yaml_of(page: str, name: str) -> str:
     return next(block for block in blocks("yaml", page) if block.startswith(f"# {name}"))
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/constraints.md"])
-def test_the_constraint_file_is_accepted(page):
-    text = yaml_of((ROOT / page).read_text(encoding="utf-8"), "buyable.yaml")
-    constraints = Constraints.from_mapping(parse_yaml(text, where=page).value)
-    assert constraints.budget.rays == 576
+def constraints_of(page: str, name: str) -> Constraints:
+    text = yaml_of((ROOT / page).read_text(encoding="utf-8"), name)
+    return Constraints.from_mapping(parse_yaml(text, where=page).value)
 
 
-@pytest.mark.parametrize("page", ["arm.md", "constraints.md"])
-def test_the_mounts_of_the_ceiling_are_accepted(page):
-    text = yaml_of((ROOT / "docs" / page).read_text(encoding="utf-8"), "ceiling.yaml")
-    constraints = Constraints.from_mapping(parse_yaml(text, where=page).value)
-    assert len(constraints.origin.mounts_m or ()) == 9
-    assert constraints.sensors.count == 4
-
-
-def test_the_mounts_that_a_comment_shows_are_accepted():
+def test_the_constraint_files_and_mounts_that_are_shown_are_accepted():
+    for page in ("README.md", "docs/constraints.md"):
+        assert constraints_of(page, "buyable.yaml").budget.rays == 576
+    for page in ("docs/arm.md", "docs/constraints.md"):
+        ceiling = constraints_of(page, "ceiling.yaml")
+        assert len(ceiling.origin.mounts_m or ()) == 9
+        assert ceiling.sensors.count == 4
     (shown,) = re.findall(r"# (mounts_m: \[.*?\]\])", CONSTRAINTS)
     origin = parse_yaml(shown, where="constraints.md").value
     assert len(Constraints.from_mapping({"origin": origin}).origin.mounts_m or ()) == 2

@@ -1,6 +1,7 @@
 """Views of a density: what is drawn holds all of it, in the right places and units, and the designs' own beside it."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,20 +36,8 @@ def even(space, count=20_000, seed=0):
 
 
 def make_sensor(**changes):
-    values = {
-        "name": "s",
-        "weight": 1.0,
-        "origin_m": np.array([0.1, -0.2, 0.5]),
-        "origin_covariance_m2": np.diag([0.04, 0.01, 0.0]),
-        "azimuth_rad": 0.3,
-        "elevation_rad": -0.4,
-        "roll_rad": 0.2,
-        "spread_horizontal_rad": 0.1,
-        "spread_vertical_rad": 0.05,
-        "range_m": 1.7,
-        "spread_range_m": 0.2,
-    }
-    return Sensor(**{**values, **changes})
+    origin_m, covariance_m2 = np.array([0.1, -0.2, 0.5]), np.diag([0.04, 0.01, 0.0])
+    return replace(Sensor("s", 1.0, origin_m, covariance_m2, 0.3, -0.4, 0.2, 0.1, 0.05, 1.7, 0.2), **changes)
 
 
 def held(marginal, heights):
@@ -60,9 +49,8 @@ def held(marginal, heights):
 @pytest.mark.parametrize("space", [FIXED, ANYWHERE], ids=["fixed origin", "free origin"])
 def test_every_free_dimension_has_one_marginal_that_holds_all_but_the_tails(space):
     found = marginals(even(space))
-    assert [one.dimension for one in found] == [
-        name for name, low, high in zip(space.as_dict(), space.low, space.high, strict=False) if low < high
-    ]
+    free = zip(space.as_dict(), space.low, space.high, strict=False)
+    assert [one.dimension for one in found] == [name for name, low, high in free if low < high]
     for one in found:
         assert held(one, one.heights) == pytest.approx(1.0, abs=0.003)
 
@@ -170,9 +158,8 @@ def test_a_flat_world_has_one_plane_and_a_single_spot_none():
 
 def test_one_heavy_sample_is_drawn_without_a_number_that_is_none():
     points = FIXED.sample(50, np.random.default_rng(3))
-    view = density_view(
-        samples_of(points, FIXED, np.r_[0.0, np.full(49, -np.inf)]), BALL, [DesignSpec("d", (make_sensor(),))]
-    )
+    heavy = samples_of(points, FIXED, np.r_[0.0, np.full(49, -np.inf)])
+    view = density_view(heavy, BALL, [DesignSpec("d", (make_sensor(),))])
     assert view.effective == pytest.approx(1.0)
     for one in view.marginals:
         assert np.isfinite(one.heights).all()

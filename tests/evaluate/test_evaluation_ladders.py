@@ -142,22 +142,16 @@ def with_footprint(request, count):
 def test_changes_of_effects_are_those_of_evaluations_under_them():
     asked = of_light("single-photon")
     sweep = next(one for one in physics.sweeps(asked) if one.knob == "effects")
-    there = [
-        measurement.setting.removeprefix("without ")
-        for measurement in sweep.measurements
-        if measurement.setting.startswith("without")
-    ]
+    found = {measurement.setting: measurement for measurement in sweep.measurements}
+    there = [name.removeprefix("without ") for name in found if name.startswith("without")]
     assert {"footprint", "photon_noise", "jitter", "quantisation"} <= set(there)
     full, none = scored(asked.request, there), scored(asked.request, ())
-    for measurement in sweep.measurements:
-        if measurement.setting == "none":
-            assert measurement.error == pytest.approx(abs((none - full).mean()))
-        elif measurement.setting == "without footprint":
-            left = scored(asked.request, [name for name in there if name != "footprint"])
-            assert measurement.values["change_left_out"] == pytest.approx(abs((left - full).mean()))
-            alone = scored(asked.request, ["footprint"])
-            assert measurement.values["change_alone"] == pytest.approx(abs((alone - none).mean()))
-            assert measurement.error == max(measurement.values["change_left_out"], measurement.values["change_alone"])
+    assert found["none"].error == pytest.approx(abs((none - full).mean()))
+    left = scored(asked.request, [name for name in there if name != "footprint"])
+    alone, values = scored(asked.request, ["footprint"]), found["without footprint"].values
+    assert values["change_left_out"] == pytest.approx(abs((left - full).mean()))
+    assert values["change_alone"] == pytest.approx(abs((alone - none).mean()))
+    assert found["without footprint"].error == max(values["change_left_out"], values["change_alone"])
     assert sweep.measurements[-1].setting == "all"
     assert sweep.measurements[-1].reference
     assert sweep.tolerance == pytest.approx(asked.request.task.metric.tolerance / len(there))

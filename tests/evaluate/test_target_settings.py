@@ -16,9 +16,9 @@ from lidardesign.space import DesignSpace
 SPACE = DesignSpace((0, 0, 0, -0.4, -0.4, 0.2), (0, 0, 0, 0.4, 0.4, 2.5))
 
 
-def thin_shells():
+def thin_shells(**density):
     config = config_of(SPACE)
-    return replace(config, density=config.density.model_copy(update={"sigma_m": 0.02}))
+    return replace(config, density=config.density.model_copy(update={"sigma_m": 0.02, **density}))
 
 
 @pytest.fixture(scope="module")
@@ -44,16 +44,12 @@ def test_the_coarsest_fields_within_a_fifth_of_the_tolerance_are_taken(choices):
 def test_a_coarser_field_would_not_have_done(meshes, choices):
     chosen = choices[0.05].density.field_resolution
     coarser = [resolution for resolution in RESOLUTIONS if resolution < chosen]
-    config = thin_shells()
-    density = config.density.model_copy(update={"field_resolution": coarser[-1]})
-    held = fields_within(meshes, replace(config, density=density), 0.05, fixed=True)
+    held = fields_within(meshes, thin_shells(field_resolution=coarser[-1]), 0.05, fixed=True)
     assert held.misplaced > FIELD_SHARE * 0.05
 
 
 def test_a_resolution_of_the_users_own_is_kept_and_measured(meshes):
-    config = thin_shells()
-    density = config.density.model_copy(update={"field_resolution": 17})
-    choice = fields_within(meshes, replace(config, density=density), 1e-6, fixed=True)
+    choice = fields_within(meshes, thin_shells(field_resolution=17), 1e-6, fixed=True)
     assert choice.density.field_resolution == 17
     assert choice.misplaced > 1e-6
 

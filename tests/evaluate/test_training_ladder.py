@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.small_runs import shifted
+from support.tables import each_row
 
 from lidardesign.config import load_run_config, resolve, save_run_config
 from lidardesign.density import learn as learning
@@ -127,7 +128,7 @@ def test_seconds_between_rows_of_the_progress_are_interpolated(runs):
     assert seconds[25] == pytest.approx((seconds[20] + seconds[30]) / 2)
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"step": 1}', '{"step": null, "seconds": 1}'])
+@each_row("text", ["{", "[]", '{"step": 1}', '{"step": null, "seconds": 1}'])
 def test_progress_that_is_none_is_told(runs, tmp_path, text):
     shutil.copytree(runs, tmp_path / "run")
     (tmp_path / "run" / "progress.jsonl").write_text(text)
@@ -141,12 +142,9 @@ def test_stages_of_a_tolerance_are_a_sweep_of_their_own(runs, tmp_path, sweeps):
     shutil.copytree(runs, tmp_path / "run")
     request = request_for(tmp_path / "run")
     note(tmp_path / "run", goal=goal.as_dict())
-    found = training._stages_sweep(request)
-    assert [(measurement.setting, measurement.error) for measurement in found[0].measurements] == [
-        ("32", 0.6),
-        ("64", 0.3),
-    ]
-    assert "tolerance of 0.4" in found[0].note
+    (found,) = training._stages_sweep(request)
+    assert [(one.setting, one.error) for one in found.measurements] == [("32", 0.6), ("64", 0.3)]
+    assert "tolerance of 0.4" in found.note
 
 
 def test_runs_beside_this_one_that_cannot_be_measured_are_left_out(runs, tmp_path, sweeps):
@@ -199,31 +197,25 @@ def flatland(lidardesign, out, *options):
     return lidardesign("learn", "flatland", "--preset", "draft", "--seed", shifted(), "--out", out, *small, *options)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("options", "message"),
     [
-        (("--tolerance", "0.1", "--time-budget", "60"), "both decide"),
-        (("--tolerance", "0"), "between 0 and 1"),
-        (("--tolerance", "nan"), "between 0 and 1"),
-        (("--time-budget", "-3"), "above 0"),
-        (("--time-budget", "inf"), "above 0"),
-        (("--time-budget", "1e300"), "a year at most"),
-        (("--time-budget", "60", "--set", "learning.steps=7"), "the time decides learning.steps"),
+        ("--tolerance 0.1 --time-budget 60", "both decide"),
+        ("--tolerance 0", "between 0 and 1"),
+        ("--tolerance nan", "between 0 and 1"),
+        ("--time-budget -3", "above 0"),
+        ("--time-budget inf", "above 0"),
+        ("--time-budget 1e300", "a year at most"),
+        ("--time-budget 60 --set learning.steps=7", "the time decides learning.steps"),
+        ("--time-budget 60 --config other.yaml", "other.yaml:2:10: the time decides learning.steps"),
     ],
 )
-def test_goals_that_make_no_sense_are_config_errors(lidardesign, tmp_path, options, message):
-    done = flatland(lidardesign, "run", *options)
+def test_goals_that_make_no_sense_are_config_errors(lidardesign, options, message):
+    Path("other.yaml").write_text("learning:\n  steps: 30\n")
+    done = flatland(lidardesign, "run", *options.split())
     assert done.code == 2
     assert message in done.err
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_file_that_sets_the_steps_beside_a_time_is_told_where(lidardesign, tmp_path):
-    (tmp_path / "other.yaml").write_text("learning:\n  steps: 30\n")
-    done = flatland(lidardesign, "run", "--time-budget", "60", "--config", "other.yaml")
-    assert done.code == 2
-    assert "other.yaml:2:10: the time decides learning.steps" in done.err
-    assert not (tmp_path / "run").exists()
+    assert not Path("run").exists()
 
 
 def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_run(lidardesign, tmp_path):
