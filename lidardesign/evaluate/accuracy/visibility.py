@@ -149,7 +149,10 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     case = VisibilityCase.of(few, config.space, config.density, config.seed, config.learning.batch)
     if case.is_blind:
         return []
-    default, points = _own_setting(request)
+    # what the run's probe decided, and the points of its quadrature, refined as they were
+    default, points = request.decided_visibility or config.density.visibility, config.density.quadrature_points
+    if default == "quadrature":
+        points = request.target.visibility.one_way.points
     part = _part(few, scenes)
     by_ways = replace(visibility_sweep(case, points, default), note=part)
     if default == "quadrature":
@@ -217,10 +220,3 @@ def affordable_scenes(scenes: list[Scene]) -> list[Scene]:
     if all(isinstance(body.shape, Mesh) and body.poses.ndim == 2 for bodies in occluders for body in bodies):
         return scenes
     return few_columns(scenes, max(MOST_BODIES // max(1, *map(len, occluders)), 1))
-
-
-def _own_setting(request: AccuracyRequest) -> tuple[str, int]:
-    """What the run's probe decided, and the points of its quadrature, refined as they were."""
-    density = request.config.density
-    name = request.decided_visibility or density.visibility
-    return name, request.target.visibility.one_way.points if name == "quadrature" else density.quadrature_points

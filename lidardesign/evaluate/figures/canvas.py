@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,6 +107,14 @@ def plain_axes(axes: Axes, *, grid: str | None = "both") -> None:
     axes.set_axisbelow(True)
     if grid is not None:
         axes.grid(True, axis=grid, which="major", color=GRID, linewidth=0.6)
+
+
+def add_legend(figure: Figure, looks: Sequence[tuple[str, Mapping[str, Any]]], columns: int, **further: Any) -> None:
+    """A legend below all panels: names with the looks of their lines or marks."""
+    from matplotlib.lines import Line2D
+
+    names, handles = [name for name, _ in looks], [Line2D([], [], **look) for _, look in looks]
+    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False, **further)
 
 
 def label_ticks(axis: Any, at: Sequence[float] | None = None, *, fine: bool = False) -> None:

@@ -284,8 +284,8 @@ def plane_densities(samples: Samples, scene: Scene, frame: int) -> tuple[PlaneDe
     ranked = sorted(wide, key=lambda pair: -float(spans[pair[0]] * spans[pair[1]]))
     # along a condition the density is even: a second picture without it shows more
     beside = sorted(ranked[1:], key=lambda pair: bool(set(pair) & set(samples.space.conditioned)))
-    chosen = (*ranked[:1], *beside[:1])
-    return tuple(_plane(pair, points, weights, [ends[axis] for axis in pair], scene, frame) for pair in chosen)
+    shown = [_widened(*end) for end in ends]
+    return tuple(_plane(pair, points, weights, shown, scene, frame) for pair in (*ranked[:1], *beside[:1]))
 
 
 def _plane(
@@ -296,22 +296,21 @@ def _plane(
     scene: Scene,
     frame: int,
 ) -> PlaneDensity:
-    ends = [_widened(*end) for end in ends]
-    spans = [high - low for low, high in ends]
+    spans = [ends[axis][1] - ends[axis][0] for axis in axes]
     cell = max(spans) / np.clip(np.sqrt(effective_count(weights) / 5.0), LEAST_CELLS, MOST_CELLS)
     counts = [max(int(np.ceil(span / cell)), 1) for span in spans]
-    edges = tuple(np.linspace(low, high, count + 1) for (low, high), count in zip(ends, counts, strict=True))
-    held, _, _ = np.histogram2d(points[:, axes[1]], points[:, axes[0]], bins=edges[::-1], weights=weights)
+    across, up = (np.linspace(*ends[axis], count + 1) for axis, count in zip(axes, counts, strict=True))
+    held, _, _ = np.histogram2d(points[:, axes[1]], points[:, axes[0]], bins=(up, across), weights=weights)
     name, per = METRES if max(spans) > LONG_M else CENTIMETRES
-    area = np.outer(np.diff(edges[1]), np.diff(edges[0])) * per**2
+    area = np.outer(np.diff(up), np.diff(across)) * per**2
     return PlaneDensity(
         axes,
         (f"{NAMES[axes[0]]} [m]", f"{NAMES[axes[1]]} [m]"),
         f"% per {name}2",
-        (edges[0], edges[1]),
+        (across, up),
         PERCENT * smoothed(held) / area,
-        silhouette(scene, frame, axes, (edges[0], edges[1])),
-        silhouette(scene, frame, axes, (edges[0], edges[1]), targets=False),
+        silhouette(scene, frame, axes, (across, up)),
+        silhouette(scene, frame, axes, (across, up), targets=False),
     )
 
 

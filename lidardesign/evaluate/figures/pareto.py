@@ -17,6 +17,7 @@ from lidardesign.evaluate.figures.canvas import (
     LETTERS_POINTS,
     PAGE_INCHES,
     SMALL_POINTS,
+    add_legend,
     label_ticks,
     new_figure,
     plain_label,
@@ -40,6 +41,15 @@ PALE = 0.45
 POINTS, LINE_POINTS = 72.0, 8.0
 # Text on marks whose places along the axis differ by more than this share of it does not meet.
 TEXT_SHARE = 0.45
+LEGEND = (
+    ("the one to choose", {"color": CHOSEN, "markersize": 4.5, "linestyle": "none", "marker": "o"}),
+    (
+        "the run's own",
+        {"color": "none", "markeredgecolor": "#222222", "markersize": 8.5, "linestyle": "none", "marker": "o"},
+    ),
+    ("reference, or next to no error", {"color": LINE, "linestyle": "none", "marker": "v", "markersize": 4.5}),
+    ("tolerance", {"color": TOLERANCE, "linestyle": "dashed", "linewidth": 1.0}),
+)
 # Of a panel's height, what its title and axis take.
 MARGIN_INCHES = 0.75
 
@@ -201,7 +211,7 @@ def pareto_picture(sweeps: Sequence[Sweep]) -> Figure | None:
                 bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6},
                 zorder=3.5,
             )
-    figure.legend(*_legend(), loc="outside lower center", ncols=4 if columns > 1 else 2, frameon=False)
+    add_legend(figure, LEGEND, 4 if columns > 1 else 2)
     return figure
 
 
@@ -229,16 +239,3 @@ def label_places(panel: Panel, height: float, line: float) -> list[tuple[float, 
 def _share(value: float, ends: tuple[float, float]) -> float:
     low, high = ends
     return math.log(value / low) / math.log(high / low)
-
-
-def _legend() -> tuple[list[object], list[str]]:
-    from matplotlib.lines import Line2D
-
-    dot = {"linestyle": "none", "marker": "o"}
-    handles = [
-        Line2D([], [], color=CHOSEN, markersize=4.5, **dot),
-        Line2D([], [], color="none", markeredgecolor="#222222", markersize=8.5, **dot),
-        Line2D([], [], color=LINE, linestyle="none", marker="v", markersize=4.5),
-        Line2D([], [], color=TOLERANCE, linestyle="dashed", linewidth=1.0),
-    ]
-    return handles, ["the one to choose", "the run's own", "reference, or next to no error", "tolerance"]

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidardesign.design.sensor import Sensor
-from lidardesign.evaluate.figures.canvas import INK, PAGE_INCHES, SMALL_POINTS, SOFT, new_figure, plain_label
+from lidardesign.evaluate.figures.canvas import (
+    INK,
+    PAGE_INCHES,
+    SMALL_POINTS,
+    SOFT,
+    add_legend,
+    new_figure,
+    plain_label,
+)
 from lidardesign.evaluate.figures.drawing import body_triangles, frustum_lines
 from lidardesign.evaluate.figures.scene_figure import DrawnDesign, SceneFigure
 from lidardesign.geometry.raycast import SceneCaster
@@ -224,7 +232,8 @@ def scene_picture(shown: SceneFigure) -> Figure:
         if receiver is not None:
             axes.plot(*view.project(np.array(receiver.origin_m)), **RECEIVER_LOOK)
     kinds = {int(kind) for one in designs for kind in np.unique(one.outcome[place, step])}
-    _legend(figure, [kind for kind in Outcome if int(kind) in kinds], receiver=receiver is not None)
+    looks = _legend_looks([kind for kind in Outcome if int(kind) in kinds], receiver=receiver is not None)
+    add_legend(figure, looks, 6, handlelength=2.4, columnspacing=1.2)
     caption = _caption(shown, place, step) + "; cut open before the sensors" * cut
     figure.suptitle(caption, fontsize=SMALL_POINTS, color=SOFT)
     return figure
@@ -332,20 +341,14 @@ def _frusta(sensors: Sequence[Sensor]) -> list[np.ndarray]:
     return [frustum_lines(sensor) for sensor in sensors] if len(sensors) <= MOST_SENSORS else []
 
 
-def _legend(figure: Figure, kinds: Sequence[Outcome], *, receiver: bool) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [Line2D([], [], color=SENSOR, marker="D", markersize=3.2, linewidth=0.6)]
+def _legend_looks(kinds: Sequence[Outcome], *, receiver: bool) -> list[tuple[str, dict[str, Any]]]:
+    sensor = {"color": SENSOR, "marker": "D", "markersize": 3.2, "linewidth": 0.6}
+    looks = [("sensor, field of view and gate", sensor)]
     for kind in kinds:
         colour, dash, _ = OUTCOME_LOOKS[kind]
-        mark = "o" if kind == Outcome.RETURN else ""
-        handles.append(Line2D([], [], color=colour, linestyle=dash, linewidth=1.2, marker=mark))
-    names = ["sensor, field of view and gate", *(kind.name.lower().replace("_", " ") for kind in kinds)]
-    if receiver:
-        handles.append(Line2D([], [], **RECEIVER_LOOK))
-        names.append("detector")
-    look = {"ncols": 6, "frameon": False, "handlelength": 2.4, "columnspacing": 1.2}
-    figure.legend(handles, names, loc="outside lower center", **look)
+        look = {"color": colour, "linestyle": dash, "linewidth": 1.2, "marker": "o" if kind == Outcome.RETURN else ""}
+        looks.append((kind.name.lower().replace("_", " "), look))
+    return [*looks, ("detector", RECEIVER_LOOK)] if receiver else looks
 
 
 def _caption(shown: SceneFigure, place: int, step: int) -> str:

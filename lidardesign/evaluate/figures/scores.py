@@ -18,6 +18,7 @@ from lidardesign.evaluate.figures.canvas import (
     SOFT,
     Against,
     Series,
+    add_legend,
     axis_titles,
     label_ticks,
     log_ticks,
@@ -125,13 +126,11 @@ def differences_picture(evaluation: Evaluation) -> Figure:
     axes.set_xlabel(plain_label(f"a - b: {metric.name} [{metric.unit}], {metric.better} is better", longest=90))
     plain_axes(axes, grid="x")
     _soft_title(axes, title)
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], color=colour, marker=marker, markerfacecolor=colour if filled else "white", linewidth=1.2)
-        for colour, marker, filled in VERDICT_LOOKS.values()
+    looks = [
+        (words, {"color": colour, "marker": mark, "markerfacecolor": colour if filled else "white", "linewidth": 1.2})
+        for words, (colour, mark, filled) in zip(VERDICT_WORDS.values(), VERDICT_LOOKS.values(), strict=True)
     ]
-    figure.legend(handles, list(VERDICT_WORDS.values()), loc="outside lower center", ncols=3, frameon=False)
+    add_legend(figure, looks, 3)
     return figure
 
 
@@ -249,8 +248,17 @@ def constraints_picture(tightness: Mapping[str, Sequence[ConstraintSlack]]) -> F
     axes.set(xlim=(LEAST_ROOM, MOST_ROOM), xlabel="room left [% of the bound]; negative: broken")
     plain_axes(axes)
     _soft_title(axes, title)
-    figure.legend(*_room_legend(list(shown)), loc="outside lower center", ncols=4, frameon=False)
+    looks = [
+        *((plain_label(name), _design_look(number)) for number, name in enumerate(shown)),
+        ("kept, without a distance", {"color": SOFT, "marker": "o", "markerfacecolor": "white", "linestyle": "none"}),
+        ("broken", {"color": BROKEN, "marker": "X", "markersize": 5.5, "linestyle": "none"}),
+    ]
+    add_legend(figure, looks, 4)
     return figure
+
+
+def _design_look(number: int) -> dict[str, Any]:
+    return {"color": COLOURS[number], "marker": MARKERS[number], "linewidth": 0.8}
 
 
 def bound_label(row: ConstraintSlack) -> str:
@@ -301,17 +309,6 @@ def _place_of(row: ConstraintSlack) -> float:
     return LEAST_ROOM if row.broken else MOST_ROOM
 
 
-def _room_legend(names: Sequence[str]) -> tuple[list[Any], list[str]]:
-    from matplotlib.lines import Line2D
-
-    handles = [
-        *(Line2D([], [], color=COLOURS[i], marker=MARKERS[i], linewidth=0.8) for i in range(len(names))),
-        Line2D([], [], color=SOFT, marker="o", markerfacecolor="white", linestyle="none"),
-        Line2D([], [], color=BROKEN, marker="X", markersize=5.5, linestyle="none"),
-    ]
-    return handles, [*(plain_label(name) for name in names), "kept, without a distance", "broken"]
-
-
 def effects_picture(effects: Sequence[EffectSummary]) -> Figure | None:
     """The most that each effect could change, over what is tolerated, a page wide; None where none is called for."""
     if not any(effect.on or effect.range_m > 0 or effect.lost > 0 for effect in effects):
@@ -338,7 +335,8 @@ def effects_picture(effects: Sequence[EffectSummary]) -> Figure | None:
     plain_axes(axes)
     together = f"{MILLIMETRES * tolerance.range_m:.3g} mm, {tolerance.lost:.2g} of the returns"
     _soft_title(axes, f"tolerated together (dashed): {together}")
-    figure.legend(*_effect_legend(), loc="outside lower center", ncols=3, frameon=False)
+    marks = {"range": ("o", True), "returns": ("s", True), "skipped (hollow)": ("o", False)}
+    add_legend(figure, [(name, _effect_look(mark, filled=filled)) for name, (mark, filled) in marks.items()], 3)
     return figure
 
 
@@ -366,10 +364,3 @@ def _effect_words(effect: EffectSummary) -> str:
     if effect.missing is not None:
         return "not possible here"
     return "skipped" if any(_shares(effect)) else "not there"
-
-
-def _effect_legend() -> tuple[list[Any], list[str]]:
-    from matplotlib.lines import Line2D
-
-    names = {"range": ("o", True), "returns": ("s", True), "skipped (hollow)": ("o", False)}
-    return [Line2D([], [], **_effect_look(marker, filled=on)) for marker, on in names.values()], list(names)
