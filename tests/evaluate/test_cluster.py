@@ -63,6 +63,11 @@ class LocalScheduler:
             log.close()
 
 
+def after_one_scene(kill):
+    """Progress that kills once the first scene is there."""
+    return lambda done, total, name: kill() if done == 1 else None
+
+
 @pytest.fixture
 def scheduler(tmp_path):
     started = LocalScheduler(tmp_path)
@@ -77,12 +82,7 @@ def test_a_cluster_scores_as_this_process_does_though_a_worker_is_lost(scheduler
     scheduler.add_worker()
     with workers_of(scheduler.address, 1) as scorer:
         scorer.prepare(request)
-
-        def kill_once(done, total, name):
-            if done == 1:
-                lost.send_signal(signal.SIGKILL)
-
-        assert results(evaluate(replace(request, scorer=scorer), progress=kill_once)) == expected
+        assert results(evaluate(replace(request, scorer=scorer), progress=after_one_scene(lost.kill))) == expected
         assert lost.wait(PATIENCE_S) == -signal.SIGKILL
         assert results(evaluate(replace(request, scorer=scorer))) == expected
 
@@ -90,14 +90,11 @@ def test_a_cluster_scores_as_this_process_does_though_a_worker_is_lost(scheduler
 def test_a_scheduler_that_is_lost_ends_the_evaluation_with_its_address(scheduler):
     request = make_request()
     scheduler.add_worker()
-    with workers_of(scheduler.address, 1) as scorer:
-
-        def kill(done, total, name):
-            if done == 1:
-                scheduler.scheduler.kill()
-
-        with pytest.raises(ConfigError, match=f"the scheduler at {scheduler.address} was lost"):
-            evaluate(replace(request, scorer=scorer), progress=kill)
+    with (
+        workers_of(scheduler.address, 1) as scorer,
+        pytest.raises(ConfigError, match=f"the scheduler at {scheduler.address} was lost"),
+    ):
+        evaluate(replace(request, scorer=scorer), progress=after_one_scene(scheduler.scheduler.kill))
 
 
 def test_a_scheduler_without_workers_is_refused(scheduler, monkeypatch):
@@ -142,13 +139,8 @@ def test_a_cluster_that_lost_its_last_worker_is_given_up(scheduler, monkeypatch)
     only = scheduler.add_worker()
     with workers_of(scheduler.address, 1) as scorer:
         monkeypatch.setattr(worker_cluster, "WORKER_SECONDS", 1.0)
-
-        def kill(done, total, name):
-            if done == 1:
-                only.kill()
-
         with pytest.raises(ConfigError, match="has had no worker for 1 s"):
-            evaluate(replace(request, scorer=scorer), progress=kill)
+            evaluate(replace(request, scorer=scorer), progress=after_one_scene(only.kill))
 
 
 def test_long_jobs_are_sent_and_nonsense_is_answered(scheduler):

@@ -88,31 +88,23 @@ class CaptureRow:
     chamfer_mm: float | None
     baseline: bool = False
 
-    @property
-    def judged(self) -> int:
-        """How many returns can be told to be outliers or not."""
-        return int((self.scan.returned & (self.outlier | ~np.isnan(self.reference_m))).sum())
-
-    @property
-    def range_errors_m(self) -> np.ndarray:
-        """How far the ranges of returns that are no outliers are off [m], shape (R,)."""
-        right = self.scan.returned & ~self.outlier & ~np.isnan(self.reference_m)
-        return np.abs(self.scan.range_m - self.reference_m)[right]
-
     def estimates(self) -> dict[str, Estimate]:
         """The figures that are means or medians over rays, with their standard errors over other rays."""
-        found, outliers, errors = {}, int(self.outlier.sum()), self.range_errors_m
-        if self.judged:
-            percent = 100.0 * outliers / self.judged
-            found["outliers_percent"] = Estimate(percent, 100.0 * share_error(outliers, self.judged), "%")
-        if len(errors):
-            median = MILLIMETRES * float(np.median(errors))
-            found["range_error_mm"] = Estimate(median, MILLIMETRES * median_error(errors), "mm")
-        return found
+        estimates, outliers, known = {}, int(self.outlier.sum()), ~np.isnan(self.reference_m)
+        # returns that can be told to be outliers or not, and how far those that are none are off
+        judged = int((self.scan.returned & (self.outlier | known)).sum())
+        errors_m = np.abs(self.scan.range_m - self.reference_m)[self.scan.returned & ~self.outlier & known]
+        if judged:
+            percent = 100.0 * outliers / judged
+            estimates["outliers_percent"] = Estimate(percent, 100.0 * share_error(outliers, judged), "%")
+        if len(errors_m):
+            median = MILLIMETRES * float(np.median(errors_m))
+            estimates["range_error_mm"] = Estimate(median, MILLIMETRES * median_error(errors_m), "mm")
+        return estimates
 
     def as_dict(self) -> dict[str, Any]:
         """The row for `--json`; figures of which there are none are None."""
-        scan, returned, judged, error = self.scan, self.scan.returned, self.judged, self.range_errors_m
+        scan, values = self.scan, {name: estimate.value for name, estimate in self.estimates().items()}
         taken = scan.captured == Captured.YES
         return {
             "design": self.design,
@@ -123,10 +115,10 @@ class CaptureRow:
                 reason.name.lower(): int((scan.captured == reason).sum()) for reason in Captured if reason
             },
             "pixels": len(np.unique(scan.pixel[taken])),
-            "returns": int(returned.sum()),
+            "returns": int(scan.returned.sum()),
             "outliers": int(self.outlier.sum()),
-            "outliers_percent": 100.0 * int(self.outlier.sum()) / judged if judged else None,
-            "range_error_mm": MILLIMETRES * float(np.median(error)) if len(error) else None,
+            "outliers_percent": values.get("outliers_percent"),
+            "range_error_mm": values.get("range_error_mm"),
             "chamfer_mm": self.chamfer_mm,
             "bins_per_ray": float((scan.last_bin - scan.first_bin)[taken].mean()) if taken.any() else None,
             "photons_per_ray": float(scan.photons[taken].mean()) if taken.any() else None,
