@@ -99,7 +99,21 @@ def prepare_training_data(task: Task, config: RunConfig) -> TrainingData:
     with plugin_guard(config.task_name):
         task_notes = notes_of(task, config.task, config.space)
     target, notes = prepare_target(training_scenes(task, config), config)
-    return TrainingData(target, (*task_notes, *notes), _pool(target, config))
+    with phase("proposals"):
+        # independent of those that coverage is measured on
+        generator = random_generator(config.seed, "balancing")
+        points, log_density = independent_points(target, config.learning.balance_proposals, generator)
+        if not len(points):
+            raise DataError(
+                "no ray of the design space reaches a target surface in any training scene",
+                where="space",
+                hint="widen the angles or the range, move the origin, or raise density.sigma_m",
+            )
+        refuse_blind_receiver(target.scenes, points)
+        # points on the space's faces may leave it by rounding
+        unit = config.space.to_unit(points).clip(-1.0, 1.0)
+        pool = Pool.of(unit, target.log_density(points), log_density)
+    return TrainingData(target, (*task_notes, *notes), pool)
 
 
 @phase("scenes")
@@ -115,22 +129,6 @@ def training_scenes(task: Task, config: RunConfig) -> list[Scene]:
     if not scenes:
         raise DataError(f"the task {config.task_name!r} gave no training scenes", where="task")
     return scenes
-
-
-@phase("proposals")
-def _pool(target: Target, config: RunConfig) -> Pool:
-    """Proposals for balancing, independent of those that coverage is measured on."""
-    generator = random_generator(config.seed, "balancing")
-    points, log_density = independent_points(target, config.learning.balance_proposals, generator)
-    if not len(points):
-        raise DataError(
-            "no ray of the design space reaches a target surface in any training scene",
-            where="space",
-            hint="widen the angles or the range, move the origin, or raise density.sigma_m",
-        )
-    refuse_blind_receiver(target.scenes, points)
-    # points on the space's faces may leave it by rounding
-    return Pool.of(config.space.to_unit(points).clip(-1.0, 1.0), target.log_density(points), log_density)
 
 
 def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:

@@ -41,9 +41,8 @@ def angles_in_view(receiver: Receiver, points: np.ndarray) -> tuple[np.ndarray, 
 def in_view(receiver: Receiver, points: np.ndarray) -> np.ndarray:
     """Which points (..., 3) lie in a receiver's field of view and interval of ranges, ends included, shape (...)."""
     horizontal, vertical, distance_m = angles_in_view(receiver, points)
-    low_m, high_m = receiver.range_m
     inside = (np.abs(horizontal) <= receiver.horizontal_rad / 2) & (np.abs(vertical) <= receiver.vertical_rad / 2)
-    return inside & (distance_m >= low_m) & (distance_m <= high_m)
+    return inside & (distance_m >= receiver.range_m[0]) & (distance_m <= receiver.range_m[1])
 
 
 def path_of_range(rays: Rays, receiver: Receiver | None, range_m: np.ndarray) -> np.ndarray:

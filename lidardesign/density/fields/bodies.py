@@ -164,8 +164,7 @@ class Bodies:
         """Boxes around `GROUP_COLUMNS` neighbouring columns each, as `BodyArrays.edges`; empty groups are nowhere."""
         first = np.arange(0, self.columns, GROUP_COLUMNS)
         rows = self.starts[first]
-        low = np.full((len(first), 3), np.inf)
-        high = np.full((len(first), 3), -np.inf)
+        low, high = np.full((len(first), 3), np.inf), np.full((len(first), 3), -np.inf)
         filled = self.starts[np.minimum(first + GROUP_COLUMNS, self.columns)] > rows
         if filled.any():
             low[filled] = np.minimum.reduceat(self.low, rows[filled])

@@ -106,8 +106,7 @@ def distance_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
         import igl
 
         # -1 is the inside of a part whose faces all point inwards
-        inside = np.abs(igl.fast_winding_number(vertices, faces, points)) > 0.5
-        distance = np.where(inside, -distance, distance)
+        distance = np.where(np.abs(igl.fast_winding_number(vertices, faces, points)) > 0.5, -distance, distance)
     return distance.astype(np.float32)
 
 

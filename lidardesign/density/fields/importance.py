@@ -34,6 +34,7 @@ from lidardesign.density.fields.grids import (
     narrow_band,
     nearest_known,
 )
+from lidardesign.numerics import safe_divide
 from lidardesign.scene import Body, Mesh, Scene
 
 ALGORITHM = "log importance at the nearest surface point, narrow band 3 cells, filled by distance transform, float32"
@@ -71,7 +72,7 @@ def barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     crosses = [np.cross(p - points, q - points) for p, q in ((b, c), (c, a), (a, b))]
     areas = np.maximum(np.stack([np.einsum("nk,nk->n", cross, normal) for cross in crosses], axis=1), 0.0)
     total = areas.sum(axis=1, keepdims=True)
-    return np.where(total > 0, areas / np.where(total > 0, total, 1.0), 1 / 3)
+    return safe_divide(areas, total, otherwise=1 / 3)
 
 
 class LogWeights(Protocol):

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from lidardesign.density.fields.distance import TableField
-from lidardesign.density.fields.grids import Grid
+from lidardesign.density.fields.importance import TableWeights
 from lidardesign.density.target.quadrature import Quadrature
 from lidardesign.density.target.surfaces import SceneTable
 from lidardesign.density.target.target import Target
@@ -101,20 +101,19 @@ class DeviceTarget(Target):
 
     @cached_property
     def _table(self) -> _Table:
-        field = self.surfaces.field
-        return _Table(field.table, field.grid, self.device)
+        return _Table(self.surfaces.field, self.device)
 
     @cached_property
     def _occluders(self) -> _Table | None:
         if isinstance(self.visibility, NoVisibility):
             return None
         field = self.visibility.field
-        return self._table if field is self.surfaces.field else _Table(field.table, field.grid, self.device)
+        return self._table if field is self.surfaces.field else _Table(field, self.device)
 
     @cached_property
     def _weights(self) -> _Table | None:
         importance = self.surfaces.importance
-        return None if importance is None else _Table(importance.table, importance.grid, self.device)
+        return None if importance is None else _Table(importance, self.device)
 
     def drawn(self, columns: np.ndarray) -> DeviceTarget:
         """See `Target`; what is on the device stays there."""
@@ -171,8 +170,9 @@ class DeviceTarget(Target):
 class _Table:
     """A table of distances, or of other values, on a device: shape (grid points, columns)."""
 
-    def __init__(self, table: np.ndarray, grid: Grid, device: torch.device) -> None:
-        self._table = torch.as_tensor(table).to(device)
+    def __init__(self, source: TableField | TableWeights, device: torch.device) -> None:
+        grid = source.grid
+        self._table = torch.as_tensor(source.table).to(device)
         self._low = torch.as_tensor(grid.low).to(device)
         self._counts = torch.as_tensor(grid.counts).to(device)
         self._corners = CORNERS.to(device)

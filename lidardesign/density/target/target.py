@@ -198,7 +198,15 @@ def build_target(
             importance = BodyWeights(bodies)
         surfaces: Surfaces = MovingFrames(bodies, log_column_weights, importance)
     else:
-        check_quadrature(scenes, visibility)
+        moving = sum(scene.frames * len(scene.bodies) for scene in scenes if scene.frames > 1)
+        if visibility == "quadrature" and moving > MOST_QUADRATURE_BODIES:
+            # every body of thousands of frames would be evaluated at every midpoint
+            raise ConfigError(
+                f"a quadrature over {moving} bodies in all frames would take minutes a step",
+                where="density.visibility",
+                allowed=f"at most {MOST_QUADRATURE_BODIES}",
+                hint="density.visibility=raycast looks only at the frames that matter",
+            )
         field = build_field(scenes, lambda body: body.is_target, **fields)
         if isinstance(field, TableField):
             field = replace(field, compiled=compiled)
@@ -213,15 +221,3 @@ def build_target(
         way = Quadrature(occluders, settings.quadrature_points)
     target = Target(scenes, surfaces, way, Optics.of(settings), space, settings.surface_tolerance_nats)
     return target.with_visibility(way)
-
-
-def check_quadrature(scenes: Sequence[Scene], visibility: str) -> None:
-    """Refuse a quadrature that would evaluate every body of thousands of frames at every midpoint."""
-    moving = sum(scene.frames * len(scene.bodies) for scene in scenes if scene.frames > 1)
-    if visibility == "quadrature" and moving > MOST_QUADRATURE_BODIES:
-        raise ConfigError(
-            f"a quadrature over {moving} bodies in all frames would take minutes a step",
-            where="density.visibility",
-            allowed=f"at most {MOST_QUADRATURE_BODIES}",
-            hint="density.visibility=raycast looks only at the frames that matter",
-        )

@@ -282,8 +282,7 @@ class Trainer(LearnedFlow):
         return self.target.drawn(np.sort(chosen.numpy()))
 
     def _skip(self) -> None:
-        self.skipped += 1
-        self.skipped_in_a_row += 1
+        self.skipped, self.skipped_in_a_row = self.skipped + 1, self.skipped_in_a_row + 1
         if self.skipped_in_a_row < SKIPS_BEFORE_BACKING_OFF:
             return
         self.halvings, self.skipped_in_a_row = self.halvings + 1, 0
