@@ -1,24 +1,39 @@
-"""Learning: the same bytes for the same seed, also after interruptions; divergence, damage and misuse end clearly."""
+"""Learning: the same bytes for a seed, also after interruptions; snapshots on the way; damage ends clearly."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
+from support.tables import each_row
 
+from lidardesign.config import LearningSettings
 from lidardesign.density import learn as learning
 from lidardesign.density.learn import learn, prepare_training_data
 from lidardesign.density.target.prepare import prepare_target
-from lidardesign.density.training.checkpoint import FOLDER
+from lidardesign.density.training.checkpoint import (
+    FOLDER,
+    clear_snapshots,
+    load_arrays,
+    measured_steps,
+    snapshot_name,
+    snapshot_steps,
+    stored_snapshots,
+    twin_step,
+)
 from lidardesign.density.training.quality import log_density_of
 from lidardesign.density.training.training import BETAS, Adam
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.numerics import HALF_DIGITS
+from lidardesign.run.manifest import verify
 from lidardesign.samples import load_samples
 from lidardesign.space import DesignSpace
 
@@ -234,3 +249,66 @@ def test_steps_of_adam_are_those_of_the_paper_with_rates_that_change_and_weights
     for twin, weight in zip(twins, weights, strict=True):
         np.testing.assert_allclose(weight.detach().numpy(), twin.weight, rtol=within, atol=within)
     assert [weight in optimiser.state for weight in weights] == [True, True, False]
+
+
+@each_row(
+    ("steps", "balance", "kept"),
+    [
+        (1000, 0.5, (500, 609, 625, 734, 750)),
+        (290, 0.5, (145, 176, 181, 212, 217)),
+        (8, 1.0, (2, 3, 4)),
+        (2, 0.5, (1,)),
+        (1, 0.5, ()),
+    ],
+)
+def test_snapshots_are_kept_when_balancing_begins_and_twins_at_a_quarter_and_half_of_it(steps, balance, kept):
+    assert snapshot_steps(LearningSettings(steps=steps, balance=balance)) == kept
+
+
+@given(st.integers(1, 5000), st.floats(0, 1), st.floats(0, 1))
+def test_rungs_ascend_to_the_last_step_and_twins_lie_between_the_first_rung_and_their_own(steps, balance, anneal):
+    settings = LearningSettings(steps=steps, balance=balance, anneal=anneal)
+    rungs = measured_steps(settings)
+    assert list(rungs) == sorted(set(rungs))
+    assert rungs[-1] == steps
+    for step in rungs:
+        twin = twin_step(settings, step)
+        assert twin is None or rungs[0] < twin < step < steps
+    assert all(0 < step < steps for step in snapshot_steps(settings))
+
+
+def test_nothing_is_kept_before_sigma_has_its_final_value(tmp_path):
+    learn(BallTask(), config_of(steps=40, balance=0.0, anneal=0.5), tmp_path)
+    assert list(stored_snapshots(tmp_path)) == [20, 24, 25, 29, 30]
+
+
+def test_a_run_lists_its_snapshots_with_their_hashes(finished):
+    run, _ = finished
+    assert stored_snapshots(run) == {step: snapshot_name(step) for step in (60, 73, 75, 88, 90)}
+    for name in stored_snapshots(run).values():
+        verify(run, name)
+
+
+def test_snapshots_hold_the_weights_of_the_flow_on_the_way_to_its_last_ones(finished):
+    run, _ = finished
+    last, _ = load_arrays(run, "flow.safetensors")
+    early, state = load_arrays(run, snapshot_name(60))
+    late, _ = load_arrays(run, snapshot_name(90))
+    assert state["step"] == 60
+    assert early.keys() == last.keys()
+
+    def distance(weights):
+        return sum(float(np.square(weights[key] - last[key]).sum()) for key in last if last[key].dtype.kind == "f")
+
+    assert distance(early) > distance(late) > 0
+
+
+def test_clearing_keeps_earlier_snapshots_and_removes_what_a_killed_process_left(tmp_path):
+    learn(BallTask(), config_of(), tmp_path)
+    (tmp_path / FOLDER / ".step-000060.safetensors.1.aa.tmp").write_bytes(b"half")
+    clear_snapshots(tmp_path, beyond=74)
+    assert sorted(os.listdir(tmp_path / FOLDER)) == ["step-000060.safetensors", "step-000073.safetensors"]
+    assert list(stored_snapshots(tmp_path)) == [60, 73]
+    clear_snapshots(tmp_path)
+    assert not os.listdir(tmp_path / FOLDER)
+    assert not stored_snapshots(tmp_path)
