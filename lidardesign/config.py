@@ -134,16 +134,12 @@ def parse_override(text: str, option: str = "--set") -> Override:
     parts = key.strip().split(".")
     if not equals or not all(parts):
         raise ConfigError("is not of the form KEY=VALUE", where=where, allowed="a dotted key, as density.sigma_m=0.005")
-    return Override(tuple(parts), _value(value.strip(), where), where)
-
-
-def _value(text: str, where: str) -> Any:
-    if text.startswith(STRUCTURE_MARKS):
-        return parse_yaml(text, where=where).value
+    value = value.strip()
     try:
-        return resolve_scalar(text)
+        meant = parse_yaml(value, where=where).value if value.startswith(STRUCTURE_MARKS) else resolve_scalar(value)
     except ValueError as error:
         raise ConfigError(str(error), where=where, allowed="a finite number") from None
+    return Override(tuple(parts), meant, where)
 
 
 def apply_override(values: dict[str, Any], override: Override) -> KeyPath:
@@ -157,16 +153,13 @@ def apply_override(values: dict[str, Any], override: Override) -> KeyPath:
     """
     node: Any = values
     done: list[str | int] = []
-    for position, part in enumerate(override.path):
-        last = position == len(override.path) - 1
-        key = _key(node, str(part), done, override)
-        done.append(key)
-        if last:
-            node[key] = override.value
-        else:
-            if isinstance(node, dict) and node.get(key) is None:
-                node[key] = {}
-            node = node[key]
+    for part in override.path[:-1]:
+        done.append(_key(node, str(part), done, override))
+        if isinstance(node, dict) and node.get(done[-1]) is None:
+            node[done[-1]] = {}
+        node = node[done[-1]]
+    done.append(_key(node, str(override.path[-1]), done, override))
+    node[done[-1]] = override.value
     return tuple(done)
 
 
@@ -177,8 +170,11 @@ def _key(node: Any, part: str, done: list[str | int], override: Override) -> str
     if isinstance(node, list):
         if part.isdecimal() and int(part) < len(node):
             return int(part)
-        allowed = f"0 to {len(node) - 1}" if node else "nothing: the list is empty"
-        raise ConfigError(f"{parent} has no item {part!r}", where=override.where, allowed=allowed)
+        raise ConfigError(
+            f"{parent} has no item {part!r}",
+            where=override.where,
+            allowed=f"0 to {len(node) - 1}" if node else "nothing: the list is empty",
+        )
     raise ConfigError(f"{parent} is {node!r} and holds no key {part!r}", where=override.where)
 
 
@@ -263,10 +259,10 @@ class _Layers:
 
     def forget(self, path: KeyPath) -> None:
         """Drop the origins of a path, of all it holds, and of what holds it, before it is replaced."""
-        touching = [known for known in self.origins if known[: len(path)] == path or path[: len(known)] == known]
-        for known in touching:
-            del self.origins[known]
-            self.keys.pop(known, None)
+        for known in list(self.origins):
+            if known[: len(path)] == path or path[: len(known)] == known:
+                del self.origins[known]
+                self.keys.pop(known, None)
 
     def origin(self, path: KeyPath, *, key: bool = False) -> str:
         """Where the value (or key) of a path came from: its own origin, a parent's, or of what it holds."""
@@ -323,8 +319,9 @@ def with_task_settings(task: Task, config: RunConfig, overrides: Sequence[str], 
     for text in overrides:
         override = parse_override(text, option)
         if override.path[0] in SECTIONS[1:] and len(override.path) > 1:
-            allowed = f"keys of the task {task.name}"
-            raise ConfigError("what was learned cannot be changed", where=override.where, allowed=allowed)
+            raise ConfigError(
+                "what was learned cannot be changed", where=override.where, allowed=f"keys of the task {task.name}"
+            )
         _lay_override(layers, task, override)
     judged = check_model(task.Config, layers.values["task"], layers.origin, "task")
     with plugin_guard(task.name):
@@ -375,17 +372,15 @@ def _header(task: Task, document: Document, preset: str | None, seed: int | None
     values = document.mapping
     unknown = [key for key in values if key not in (*HEADER, *SECTIONS)]
     if unknown:
-        where = document.locate((unknown[0],), key=True)
         raise ConfigError(
             f"unknown section {unknown[0]!r}",
-            where=where,
+            where=document.locate((unknown[0],), key=True),
             allowed=", ".join((*HEADER, *SECTIONS)),
             hint=suggest(unknown[0], (*HEADER, *SECTIONS)),
         )
     if values.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
-        found = values["schema_version"]
         raise ConfigError(
-            f"schema version {found!r}",
+            f"schema version {values['schema_version']!r}",
             where=document.locate(("schema_version",)),
             allowed=str(SCHEMA_VERSION),
             hint="use the version of lidardesign that wrote it, or a newer one",
@@ -396,24 +391,21 @@ def _header(task: Task, document: Document, preset: str | None, seed: int | None
             where=document.locate(("task_name",)),
             allowed=task.name,
         )
-    return {
-        "preset": _checked_preset(preset or values.get("preset") or "standard", document, preset is not None),
-        "seed": _checked_seed(values.get("seed", 0) if seed is None else seed, document, seed is not None),
-    }
-
-
-def _checked_preset(preset: Any, document: Document, from_option: bool) -> str:
-    if preset not in PRESETS:
-        where = "--preset" if from_option else document.locate(("preset",))
-        raise ConfigError(f"unknown preset {preset!r}", where=where, allowed=", ".join(PRESETS))
-    return preset
-
-
-def _checked_seed(seed: Any, document: Document, from_option: bool) -> int:
-    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed <= MAX_SEED:
-        where = "--seed" if from_option else document.locate(("seed",))
-        raise ConfigError(f"seed {seed!r}", where=where, allowed=f"a whole number from 0 to {MAX_SEED}")
-    return seed
+    chosen = preset or values.get("preset") or "standard"
+    if chosen not in PRESETS:
+        raise ConfigError(
+            f"unknown preset {chosen!r}",
+            where=document.locate(("preset",)) if preset is None else "--preset",
+            allowed=", ".join(PRESETS),
+        )
+    root = values.get("seed", 0) if seed is None else seed
+    if not isinstance(root, int) or isinstance(root, bool) or not 0 <= root <= MAX_SEED:
+        raise ConfigError(
+            f"seed {root!r}",
+            where=document.locate(("seed",)) if seed is None else "--seed",
+            allowed=f"a whole number from 0 to {MAX_SEED}",
+        )
+    return {"preset": chosen, "seed": root}
 
 
 def _lay_file(layers: _Layers, task: Task, document: Document) -> None:
@@ -422,8 +414,11 @@ def _lay_file(layers: _Layers, task: Task, document: Document) -> None:
         if values is None:
             continue
         if not isinstance(values, dict):
-            where = document.locate((section,), key=True)
-            raise ConfigError(f"section {section!r} holds {values!r}", where=where, allowed="keys and values")
+            raise ConfigError(
+                f"section {section!r} holds {values!r}",
+                where=document.locate((section,), key=True),
+                allowed="keys and values",
+            )
         _merge(layers.values[section], values)
         for path, _ in leaves(values, (section,)):
             for length in range(2, len(path) + 1):
@@ -447,16 +442,14 @@ def _lay_override(layers: _Layers, task: Task, override: Override) -> None:
 
 def _build(task: Task, header: dict[str, Any], layers: _Layers) -> RunConfig:
     config = check_model(task.Config, layers.values["task"], layers.origin, "task")
-    density = check_model(DensitySettings, layers.values["density"], layers.origin, "density")
-    learning = check_model(LearningSettings, layers.values["learning"], layers.origin, "learning")
     return RunConfig(
         task_name=task.name,
         seed=header["seed"],
         preset=header["preset"],
         task=config,
+        density=check_model(DensitySettings, layers.values["density"], layers.origin, "density"),
+        learning=check_model(LearningSettings, layers.values["learning"], layers.origin, "learning"),
         space=_space(task, config, layers),
-        density=density,
-        learning=learning,
     )
 
 

@@ -49,7 +49,6 @@ class LidardesignError(Exception):
 
 
 def _short(text: Text) -> Text:
-    """The beginning and the end of a text that is too long to be read."""
     if text is None or len(text) <= LONGEST_PART:
         return text
     half = LONGEST_PART // 2

@@ -49,9 +49,7 @@ def as_documents(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
 
 def standard_error(influence: np.ndarray) -> float:
     """The standard error of a figure that sample i moves by influence_i / N, shape (N,): sqrt(mean of squares / N)."""
-    if not len(influence):
-        return 0.0
-    return float(np.sqrt(np.square(influence).mean() / len(influence)))
+    return float(np.sqrt(np.square(influence).mean() / len(influence))) if len(influence) else 0.0
 
 
 def effective_share_error(weights: np.ndarray) -> float:

@@ -77,8 +77,7 @@ def turned_to_agree(faces: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, i
     order = np.argsort(edge, kind="stable")
     starts = np.concatenate([[0], np.cumsum(count)[:-1]])[count == 2]
     one, other = order[starts], order[starts + 1]
-    first, second, agree = one // 3, other // 3, upwards[one] != upwards[other]
-    side = _sides(len(faces), first, second, agree)
+    side = _sides(len(faces), one // 3, other // 3, upwards[one] != upwards[other])
     if side is None:
         return faces, 0
     part, flipped = side
@@ -155,7 +154,16 @@ def painted_weights(part: trimesh.Trimesh, painted: Painted, where: str) -> np.n
         )
     if values.ndim != 1 or values.dtype.kind not in "iuf":
         raise DataError(f"vertex property {painted.attribute!r} is not one number per vertex", where=where)
-    return _checked(values.astype(np.float64), painted.attribute, where)
+    weights = values.astype(np.float64)
+    wrong = ~((weights >= 1 / LARGEST_WEIGHT) & (weights <= LARGEST_WEIGHT))
+    if wrong.any():
+        raise DataError(
+            f"{painted.attribute} of {int(wrong.sum())} vertices is not a usable weight, as {weights[wrong][0]:g}",
+            where=where,
+            allowed=f"{1 / LARGEST_WEIGHT:g} to {LARGEST_WEIGHT:g}",
+            hint="a part that hardly matters has a small weight, not 0",
+        )
+    return weights
 
 
 def brightness(part: trimesh.Trimesh, where: str) -> np.ndarray:
@@ -164,9 +172,8 @@ def brightness(part: trimesh.Trimesh, where: str) -> np.ndarray:
     Raises:
         DataError: The mesh has no vertex colours.
     """
-    kind = part.visual.kind
-    if kind != "vertex":
-        found = {"face": "colours of faces", "texture": "a texture"}.get(kind or "", "no colours")
+    if part.visual.kind != "vertex":
+        found = {"face": "colours of faces", "texture": "a texture"}.get(part.visual.kind or "", "no colours")
         raise DataError(
             f"has {found}, but none of vertices",
             where=where,
@@ -181,28 +188,12 @@ def vertex_properties(part: trimesh.Trimesh) -> dict[str, np.ndarray]:
     found = {name: _alone(values) for name, values in part.vertex_attributes.items()}
     data = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     names = getattr(getattr(data, "dtype", None), "names", None) or (data if isinstance(data, dict) else ())
-    for name in names:
-        if name not in POSITIONS:
-            found[name] = _alone(data[name])
-    return found
+    return found | {name: _alone(data[name]) for name in names if name not in POSITIONS}
 
 
 def _alone(values: np.ndarray) -> np.ndarray:
-    """The values of a property; a column of one number each as a list of numbers."""
     values = np.asarray(values)
     return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
-
-
-def _checked(weights: np.ndarray, name: str, where: str) -> np.ndarray:
-    wrong = ~((weights >= 1 / LARGEST_WEIGHT) & (weights <= LARGEST_WEIGHT))
-    if wrong.any():
-        raise DataError(
-            f"{name} of {int(wrong.sum())} vertices is not a usable weight, as {weights[wrong][0]:g}",
-            where=where,
-            allowed=f"{1 / LARGEST_WEIGHT:g} to {LARGEST_WEIGHT:g}",
-            hint="a part that hardly matters has a small weight, not 0",
-        )
-    return weights
 
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
@@ -278,8 +269,10 @@ def check_mesh(
     if importance is not None and np.shape(importance) != vertices.shape[:1]:
         raise DataError(f"has {np.shape(importance)} weights for {len(vertices)} vertices", where=where)
     notes: list[str] = []
-    vertices, faces, place = _merge_vertices(vertices, faces.astype(np.int64))
-    faces = usable_faces(vertices, faces, notes)
+    # vertices at exactly the same place become one, as formats without shared vertices (STL) need; -0.0 is 0.0
+    first, place = unique_rows(vertices + 0.0)
+    vertices = vertices[first] + 0.0
+    faces = usable_faces(vertices, place[faces.astype(np.int64)], notes)
     if not len(faces):
         raise DataError(f"no usable face is left ({'; '.join(notes)})", where=where)
     used, faces = np.unique(faces, return_inverse=True)
@@ -311,20 +304,17 @@ def _refuse_unusable(vertices: np.ndarray, faces: np.ndarray, where: str) -> Non
         )
     farthest = float(np.abs(vertices).max())
     if farthest > FARTHEST_M:
-        allowed = f"within {FARTHEST_M:g} m of the origin"
-        raise DataError(f"reaches {farthest:.3g} m", where=where, allowed=allowed, hint="is the scale right?")
+        raise DataError(
+            f"reaches {farthest:.3g} m",
+            where=where,
+            allowed=f"within {FARTHEST_M:g} m of the origin",
+            hint="is the scale right?",
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         wrong = int(((faces < 0) | (faces >= len(vertices))).any(axis=1).sum())
         raise DataError(
             f"{wrong} faces name vertices that do not exist", where=where, allowed=f"0 to {len(vertices) - 1}"
         )
-
-
-def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices at exactly the same place become one, as formats without shared vertices (STL) need; which one, (V,)."""
-    vertices = vertices + 0.0  # -0.0 and 0.0 are one place
-    first, index = unique_rows(vertices)
-    return vertices[first], index[faces], index
 
 
 def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
@@ -342,7 +332,6 @@ def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> n
 
 
 def _double_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Twice the area of each face, shape (F,)."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
@@ -350,10 +339,12 @@ def _double_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def _oriented(
     vertices: np.ndarray, faces: np.ndarray, sign: Sign, notes: list[str], where: str
 ) -> tuple[np.ndarray, Literal["solid", "winding", "unsigned"]]:
-    """Faces that point outwards where that is defined, and the sign rule that holds for them."""
     open_edges, mixed_edges = edge_defects(faces)
     if mixed_edges and sign in ("auto", "winding"):
-        faces, mixed_edges = _agreeing(vertices, faces, notes)
+        faces, turned = turned_to_agree(faces, _double_areas(vertices, faces))
+        mixed_edges = edge_defects(faces)[1]
+        if turned:
+            notes.append(f"turned {turned} faces that ran against their neighbours")
     if not open_edges and not mixed_edges and signed_volume_m3(vertices, faces) < 0:
         faces = faces[:, ::-1]
         notes.append("the mesh was inside out: all faces were turned")
@@ -369,21 +360,11 @@ def _oriented(
         )
     if sign != "auto":
         return faces, sign
-    if open_edges:
-        notes.append(f"open mesh ({found}): unsigned distances, no inside")
-        return faces, "unsigned"
-    if mixed_edges:
-        notes.append(f"closed mesh with {found}: it has no outside: unsigned distances")
-        return faces, "unsigned"
-    return faces, "solid"
-
-
-def _agreeing(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, int]:
-    """Faces turned where they disagree with their neighbours, and how many edges still join faces that disagree."""
-    faces, turned = turned_to_agree(faces, _double_areas(vertices, faces))
-    if turned:
-        notes.append(f"turned {turned} faces that ran against their neighbours")
-    return faces, edge_defects(faces)[1]
+    if not found:
+        return faces, "solid"
+    closed = f"closed mesh with {found}: it has no outside: unsigned distances"
+    notes.append(f"open mesh ({found}): unsigned distances, no inside" if open_edges else closed)
+    return faces, "unsigned"
 
 
 def signed_volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:

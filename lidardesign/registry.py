@@ -164,12 +164,12 @@ def probed(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:
     try:
         for offer in offers:
             running.append(ImportProcess(offer, seconds))
-        return [one.result() for one in running]
+        return [process.result() for process in running]
     except OSError:  # no further process may be started
         return [None] * len(offers)
     finally:
-        for one in running:
-            one.end()
+        for process in running:
+            process.end()
 
 
 def answer(result: Any, document: dict[str, Any]) -> None:
@@ -244,8 +244,12 @@ def _known(name: str) -> list[EntryPoint]:
     offers = _offers()
     if name not in offers:
         close = difflib.get_close_matches(name, offers, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else LIST_HINT
-        raise ConfigError(f"unknown task {name!r}", where="TASK", allowed=", ".join(sorted(offers)), hint=hint)
+        raise ConfigError(
+            f"unknown task {name!r}",
+            where="TASK",
+            allowed=", ".join(sorted(offers)),
+            hint=f"did you mean {close[0]!r}?" if close else LIST_HINT,
+        )
     return offers[name]
 
 

@@ -43,8 +43,8 @@ class Samples:
     space: DesignSpace
 
     def __post_init__(self) -> None:
-        finite = np.isfinite(self.points).all() and np.isfinite(self.log_prob).all()
-        if not (finite and (self.log_target < np.inf).all()):
+        numbers = np.isfinite(self.points).all() and np.isfinite(self.log_prob).all()
+        if not (numbers and (self.log_target < np.inf).all()):
             raise DataError(NOT_FINITE, where="samples", hint=DAMAGED_HINT)
 
     def __len__(self) -> int:
@@ -125,8 +125,12 @@ def load_samples(run: Path) -> Samples:
     count = len(points) if points.ndim else 0
     for array, shape in ((points, (count, 6)), (log_prob, (count,)), (log_target, (count,))):
         if array.shape != shape or array.dtype != np.float64 or not count:
-            found, allowed = f"holds an array of {array.dtype} of shape {array.shape}", f"float64 of shape {shape}"
-            raise DataError(found, where=str(path), allowed=allowed, hint=DAMAGED_HINT)
+            raise DataError(
+                f"holds an array of {array.dtype} of shape {array.shape}",
+                where=str(path),
+                allowed=f"float64 of shape {shape}",
+                hint=DAMAGED_HINT,
+            )
     space = guarded(lambda: DesignSpace.from_dict(json.loads(arrays["space"].tobytes())), path, DAMAGED_HINT)
     try:
         return Samples(points, log_prob, log_target, space)

@@ -50,8 +50,7 @@ def _check_weights(what: str, weights: np.ndarray, shape: tuple[int, ...] = ()) 
 def _check_lengths(shape: object, *lengths_m: float, low: float = SMALLEST_M) -> None:
     for length in lengths_m:
         if not low <= length <= FARTHEST_M:
-            allowed = f"lengths from {low:g} to {FARTHEST_M:g} m"
-            raise DataError(f"{shape} has the length {length} m", allowed=allowed)
+            raise DataError(f"{shape} has the length {length} m", allowed=f"lengths from {low:g} to {FARTHEST_M:g} m")
 
 
 @dataclass(frozen=True)
@@ -295,7 +294,7 @@ class Body:
             transmission=self.transmission,
         )
         _check_weights(f"body {self.name!r}", np.asarray(self.importance, dtype=np.float64))
-        velocity = tuple(float(value) for value in self.velocity_m_s)
+        velocity = tuple(map(float, self.velocity_m_s))
         if len(velocity) != 3 or not all(math.isfinite(value) for value in velocity):
             raise DataError(f"body {self.name!r}: velocity_m_s is {self.velocity_m_s}", allowed="three finite numbers")
         if math.hypot(*velocity) >= SPEED_OF_LIGHT_M_S:

@@ -119,8 +119,11 @@ class DesignSpace:
         for index in (X, Y, Z, RANGE):
             farthest = max(abs(self.low[index]), abs(self.high[index]))
             if farthest > FARTHEST_M:
-                where, allowed = f"space.{DIMENSIONS[index]}", f"at most {FARTHEST_M:g} m from the origin"
-                raise ConfigError(f"a bound is {farthest:g} m away", where=where, allowed=allowed)
+                raise ConfigError(
+                    f"a bound is {farthest:g} m away",
+                    where=f"space.{DIMENSIONS[index]}",
+                    allowed=f"at most {FARTHEST_M:g} m from the origin",
+                )
         if self.low[RANGE] < 0:
             raise ConfigError(f"range {self.low[RANGE]} m is negative", where="space.range_m", allowed="0 or more")
 
@@ -197,9 +200,9 @@ class DesignSpace:
         points = np.array(points, dtype=np.float64)
         azimuth = points[..., AZIMUTH]
         low, high = self.low[AZIMUTH], self.high[AZIMUTH]
-        lowest = (low + high) / 2 - math.pi
-        wrapped = wrap_turn(azimuth, lowest)
-        points[..., AZIMUTH] = np.where((azimuth < low) | (azimuth > high), wrapped, azimuth)
+        points[..., AZIMUTH] = np.where(
+            (azimuth < low) | (azimuth > high), wrap_turn(azimuth, (low + high) / 2 - math.pi), azimuth
+        )
         return points
 
     def contains(self, points: np.ndarray, tolerance: float = SLACK) -> np.ndarray:
@@ -217,12 +220,18 @@ class DesignSpace:
         low, high = list(self.low), list(self.high)
         for name, value in condition.items():
             if name not in self.condition:
-                allowed = ", ".join(self.condition) or "none: the density has no conditions"
-                raise ConfigError(f"{name!r} is no condition of the density", where="--at", allowed=allowed)
+                raise ConfigError(
+                    f"{name!r} is no condition of the density",
+                    where="--at",
+                    allowed=", ".join(self.condition) or "none: the density has no conditions",
+                )
             index = DIMENSIONS.index(name)
             if not self.low[index] <= value <= self.high[index]:
-                bounds = f"{self.low[index]:g} to {self.high[index]:g}"
-                raise ConfigError(f"{name}={value:g} is outside the design space", where="--at", allowed=bounds)
+                raise ConfigError(
+                    f"{name}={value:g} is outside the design space",
+                    where="--at",
+                    allowed=f"{self.low[index]:g} to {self.high[index]:g}",
+                )
             low[index] = high[index] = float(value)
         return replace(self, low=tuple(low), high=tuple(high))
 

@@ -161,8 +161,9 @@ class Task(Protocol):
 
 def random_generator(seed: int, *labels: str | int) -> np.random.Generator:
     """An independent generator per purpose, so that adding a draw to one never changes another."""
-    words = [int.from_bytes(str(label).encode(), "little") % (2**63) for label in labels]
-    return np.random.default_rng(np.random.SeedSequence([seed, *words]))
+    return np.random.default_rng(
+        np.random.SeedSequence([seed, *[int.from_bytes(str(label).encode(), "little") % (2**63) for label in labels]])
+    )
 
 
 def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpace) -> Sequence[Scene]:
@@ -178,8 +179,9 @@ def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpa
     scenes = list(task.scenes(config, split, seed, **({"space": space} if takes_space else {})))
     for scene in scenes:
         if not isinstance(scene, Scene):
-            found = f"scenes gave one {type(scene).__name__}"
-            raise PluginError(found, where=f"task {task.name}", allowed="lidardesign.scene.Scene")
+            raise PluginError(
+                f"scenes gave one {type(scene).__name__}", where=f"task {task.name}", allowed="lidardesign.scene.Scene"
+            )
     return scenes
 
 

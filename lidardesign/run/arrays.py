@@ -116,8 +116,7 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, kinds: str, where:
         if math.prod(shape) * dtype.itemsize != data:
             raise DataError(f"{name!r} of shape {shape} has {data} bytes of data", where=where, hint=hint)
     # the size that the archive states is no more than a promise either: reading stops where the data does
-    content = archive.read(member)
-    return np.load(io.BytesIO(content), allow_pickle=False, max_header_size=LARGEST_HEADER_BYTES)
+    return np.load(io.BytesIO(archive.read(member)), allow_pickle=False, max_header_size=LARGEST_HEADER_BYTES)
 
 
 def csv_rows(path: Path, largest_bytes: int) -> list[tuple[int, list[str]]]:

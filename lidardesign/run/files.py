@@ -34,10 +34,10 @@ def is_gone(pid: int) -> bool:
         return False
     try:
         os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
+    except OSError as error:
+        return isinstance(error, ProcessLookupError)
+    except OverflowError:
         return True
-    except OSError:
-        return False
     return False
 
 

@@ -72,10 +72,12 @@ def read_manifest(run: Path) -> dict[str, Any]:
         raise DataError("the manifest lists no files", where=str(path), hint="learn the run again")
     # Refuse entries that nothing of this program writes, before anybody works with them
     for name, entry in manifest["files"].items():
-        versions_of_it = [entry, entry.get("replaces") or entry] if isinstance(entry, dict) else [entry]
+        contents = [entry, entry.get("replaces") or entry] if isinstance(entry, dict) else [entry]
         if not all(
-            (isinstance(one, dict) and isinstance(one.get("sha256"), str) and isinstance(one.get("bytes"), int))
-            for one in versions_of_it
+            isinstance(content, dict)
+            and isinstance(content.get("sha256"), str)
+            and isinstance(content.get("bytes"), int)
+            for content in contents
         ):
             raise DataError(f"the manifest's entry of {name} is damaged", where=str(path), hint=DAMAGED_HINT)
     decided = manifest.get("visibility")

@@ -27,19 +27,16 @@ LIKE_TEXT = (str, bytes, Path)
 
 def is_name(value: Any) -> bool:
     """Whether a value is text that may be shown: not blank, and without characters that steer a terminal."""
-    if not isinstance(value, str) or not value.strip():
-        return False
-    return not any(unicodedata.category(letter) == "Cc" for letter in value)
+    shown = isinstance(value, str) and bool(value.strip())
+    return shown and not any(unicodedata.category(letter) == "Cc" for letter in value)
 
 
 def parts(annotation: Any) -> list[Any]:
     """An annotation and everything that it is a union, list or annotated form of."""
     origin = typing.get_origin(annotation)
-    if origin is None:
-        return [annotation]
     if origin in (typing.Union, UnionType, list, tuple, typing.Annotated):
         return [part for argument in typing.get_args(annotation) for part in parts(argument)]
-    return [annotation] if origin is typing.Literal else []
+    return [annotation] if origin in (None, typing.Literal) else []
 
 
 def nested_model(annotation: Any) -> type[BaseModel] | None:
@@ -144,8 +141,12 @@ def _explain(
     where = locate((*prefix, *path), key=detail["type"] == "extra_forbidden")
     if detail["type"] == "extra_forbidden":
         allowed = _fields_at(model, path[:-1])
-        hint = suggest(str(path[-1]), allowed) or _elsewhere(model, str(path[-1]))
-        return ConfigError(f"unknown key {name!r}", where=where, allowed=", ".join(allowed), hint=hint)
+        return ConfigError(
+            f"unknown key {name!r}",
+            where=where,
+            allowed=", ".join(allowed),
+            hint=suggest(str(path[-1]), allowed) or _elsewhere(model, str(path[-1])),
+        )
     if detail["type"] == "missing":
         if isinstance(detail["loc"][-1], int):
             length = 1 + max(other["loc"][-1] for other in details if other["loc"][:-1] == detail["loc"][:-1])
@@ -161,10 +162,10 @@ def _explain(
 
 
 def _allowed(kind: str, text: str) -> str:
-    """What pydantic would have taken, in the words of YAML."""
     if kind == "model_type":
         return "keys and values, as `{key: value}`"
-    return _lower(text.removeprefix("Input should be "))
+    words = text.removeprefix("Input should be ")
+    return words[:1].lower() + words[1:]
 
 
 def _real_path(location: tuple[Any, ...], values: Any) -> KeyPath:
@@ -172,9 +173,8 @@ def _real_path(location: tuple[Any, ...], values: Any) -> KeyPath:
     path: list[str | int] = []
     for index, key in enumerate(location):
         last = index == len(location) - 1
-        inside = isinstance(values, Mapping) and key in values
-        inside = inside or (isinstance(values, list | tuple) and isinstance(key, int) and key < len(values))
-        if inside:
+        in_list = isinstance(values, list | tuple) and isinstance(key, int) and key < len(values)
+        if in_list or (isinstance(values, Mapping) and key in values):
             path.append(key)
             values = values[key]
         elif last and isinstance(values, Mapping):
@@ -185,8 +185,7 @@ def _real_path(location: tuple[Any, ...], values: Any) -> KeyPath:
 def _fields_at(model: type[BaseModel], path: KeyPath) -> list[str]:
     for key in path:
         info = model.model_fields.get(str(key))
-        nested = nested_model(info.annotation) if info else None
-        model = nested or model
+        model = (nested_model(info.annotation) if info else None) or model
     return list(model.model_fields)
 
 
@@ -206,10 +205,6 @@ def _elsewhere(model: type[BaseModel], key: str) -> str | None:
 def _short(value: Any, limit: int = 60) -> str:
     text = repr(value)
     return text if len(text) <= limit else f"{text[: limit - 3]}..."
-
-
-def _lower(text: str) -> str:
-    return text[:1].lower() + text[1:]
 
 
 LocateKey = Callable[[KeyPath], str]
@@ -242,9 +237,7 @@ class Node:
 
     def wrong(self, allowed: str) -> ConfigError:
         """The error that this value is not of the allowed kind."""
-        quoted = repr(self.value)
-        shown = quoted if len(quoted) <= LONGEST_QUOTE else quoted[: LONGEST_QUOTE - 3] + "..."
-        return self.error(f"is {shown}", allowed=allowed)
+        return self.error(f"is {_short(self.value, LONGEST_QUOTE)}", allowed=allowed)
 
     def child(self, key: str | int) -> Node:
         """The value under a key or index."""
@@ -259,8 +252,9 @@ class Node:
         for key in self.value:
             if key not in known:
                 near = difflib.get_close_matches(str(key), known, 1)
-                hint = f"{near[0]}" if near else None
-                raise self.child(key).error("is an unknown key", allowed=", ".join(known), hint=hint)
+                raise self.child(key).error(
+                    "is an unknown key", allowed=", ".join(known), hint=f"{near[0]}" if near else None
+                )
         for key in required:
             if key not in self.value:
                 raise self.error(f"has no key `{key}`", allowed=", ".join(known))

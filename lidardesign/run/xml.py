@@ -92,14 +92,20 @@ class _Builder:
         return f"ends early: <{last.tag[:LONGEST_QUOTE]}> of line {last.line} is not closed"
 
     def _doctype(self, *_: object) -> None:
-        where = f"{self._path}:{self._parser.CurrentLineNumber}"
-        raise DataError("has a document type", where=where, allowed="plain XML: entities are not read")
+        raise DataError(
+            "has a document type",
+            where=f"{self._path}:{self._parser.CurrentLineNumber}",
+            allowed="plain XML: entities are not read",
+        )
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         self._count += 1
         if len(self._open) >= DEEPEST or self._count > self._most:
-            where = f"{self._path}:{self._parser.CurrentLineNumber}"
-            raise DataError("is nested too deep or has too many elements", where=where, allowed=f"{DEEPEST} levels")
+            raise DataError(
+                "is nested too deep or has too many elements",
+                where=f"{self._path}:{self._parser.CurrentLineNumber}",
+                allowed=f"{DEEPEST} levels",
+            )
         element = Element(tag, attributes)
         element.line = self._parser.CurrentLineNumber
         if self._open:
@@ -128,6 +134,7 @@ def numbers_of(text: str | None, count: int, where: str, name: str) -> list[floa
         values = []
     if len(values) != count or not all(math.isfinite(value) for value in values):
         shown = repr((text or "").strip()[:LONGEST_QUOTE])
-        allowed = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise DataError(f"{name} is {shown}", where=where, allowed=allowed)
+        raise DataError(
+            f"{name} is {shown}", where=where, allowed="a finite number" if count == 1 else f"{count} finite numbers"
+        )
     return values

@@ -77,9 +77,10 @@ class Document:
         if self.value is None:
             return {}
         if not isinstance(self.value, dict):
-            found = type(self.value).__name__
             raise ConfigError(
-                f"found one {found}", where=f"{self.where}:1:1", allowed="keys and values, as `key: value`"
+                f"found one {type(self.value).__name__}",
+                where=f"{self.where}:1:1",
+                allowed="keys and values, as `key: value`",
             )
         return self.value
 
@@ -91,24 +92,22 @@ def load_yaml(path: Path, *, max_bytes: int = MAX_BYTES) -> Document:
         ConfigError: The file cannot be read, is too large, is not UTF-8, or is not in the accepted subset.
     """
     path = Path(path)
-    content = read_input("a YAML file", max_bytes) if is_input(path) else _bytes_of(path, max_bytes)
+    if is_input(path):
+        content = read_input("a YAML file", max_bytes)
+    else:
+        try:
+            with path.open("rb") as file:
+                content = file.read(max_bytes + 1)
+        except OSError as error:
+            raise ConfigError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
+        if len(content) > max_bytes:
+            raise ConfigError("the file is too large", where=str(path), allowed=f"at most {max_bytes} bytes")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise ConfigError("is not UTF-8 text", where=f"{path}:{line}:1", hint="save it as UTF-8") from None
     return parse_yaml(text, where=str(path))
-
-
-def _bytes_of(path: Path, max_bytes: int) -> bytes:
-    try:
-        with path.open("rb") as file:
-            content = file.read(max_bytes + 1)
-    except OSError as error:
-        raise ConfigError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
-    if len(content) > max_bytes:
-        raise ConfigError("the file is too large", where=str(path), allowed=f"at most {max_bytes} bytes")
-    return content
 
 
 def parse_yaml(text: str, *, where: str) -> Document:
@@ -119,8 +118,10 @@ def parse_yaml(text: str, *, where: str) -> Document:
             builder.take(event)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        position = f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where
-        raise ConfigError(f"is not YAML: {error.problem or error.context}", where=position) from None
+        raise ConfigError(
+            f"is not YAML: {error.problem or error.context}",
+            where=f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where,
+        ) from None
     except yaml.YAMLError as error:
         raise ConfigError(f"is not YAML: {' '.join(str(error).split())}", where=where) from None
     return Document(builder.root, where, builder.keys, builder.values)
@@ -183,7 +184,6 @@ class _Builder:
         self._documents = 0
 
     def take(self, event: yaml.Event) -> None:
-        """Consume the next event."""
         if isinstance(event, yaml.DocumentStartEvent):
             self._documents += 1
             if self._documents > 1:
@@ -263,7 +263,6 @@ class _Builder:
         return bool(self._stack) and isinstance(self._stack[-1].value, dict) and self._stack[-1].key is None
 
     def _next_path(self) -> KeyPath:
-        """The path of the value that comes next."""
         if not self._stack:
             return ()
         frame = self._stack[-1]
@@ -273,12 +272,10 @@ class _Builder:
         path = self._next_path()
         if not self._stack:
             self.root = value
+        elif isinstance(self._stack[-1].value, dict):
+            self._stack[-1].value[self._stack[-1].key], self._stack[-1].key = value, None
         else:
-            frame = self._stack[-1]
-            if isinstance(frame.value, dict):
-                frame.value[frame.key], frame.key = value, None
-            else:
-                frame.value.append(value)
+            self._stack[-1].value.append(value)
         self.values[path] = _position(event)
         return path
 
@@ -339,25 +336,19 @@ def _plain(value: Any, path: KeyPath = ()) -> Any:
         raise NumericalError(f"{value} cannot be written to a file", where=".".join(map(str, path)))
     if isinstance(value, Path):
         return _plain(str(value), path)
-    if isinstance(value, str) and not _is_text(value):
-        raise ConfigError(f"{value!r} cannot be written to a file", where=".".join(map(str, path)), allowed="UTF-8")
+    if isinstance(value, str):
+        try:
+            value.encode()
+        except UnicodeEncodeError:  # bytes of a file name or an argument that are no UTF-8
+            where = ".".join(map(str, path))
+            raise ConfigError(f"{value!r} cannot be written to a file", where=where, allowed="UTF-8") from None
     return value
-
-
-def _is_text(value: str) -> bool:
-    try:
-        value.encode()
-    except UnicodeEncodeError:  # bytes of a file name or an argument that are no UTF-8
-        return False
-    return True
 
 
 def leaves(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
     """Every path of a document that ends in a scalar or in an empty collection, with its value."""
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    empty = True
-    for key, item in items:
-        empty = False
-        yield from leaves(item, (*path, key))
-    if empty:
+    if not isinstance(value, dict | list) or not value:
         yield path, value
+        return
+    for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+        yield from leaves(item, (*path, key))

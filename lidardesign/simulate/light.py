@@ -7,18 +7,38 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.scene import Ambient, Scene
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 # First hits of rays (N, 3), (N, 3) that are sent at times (N,) [s] within the frame.
 Tracer = Callable[[np.ndarray, np.ndarray, np.ndarray], Hits]
 
 
+class Columns:
+    """Flat lists side by side, as a dataclass that holds arrays of one length alone."""
+
+    def __len__(self) -> int:
+        return len(self.ray)
+
+    def subset(self, chosen: np.ndarray | slice) -> Self:
+        """The rows at an index or mask."""
+        return type(self)(*(column[chosen] for column in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Several lists as one, one after the other."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+
+
 @dataclass(frozen=True, eq=False)
-class Beams:
+class Beams(Columns):
     """Thin beams of light, B of them.
 
     Arguments:
@@ -41,21 +61,9 @@ class Beams:
         count = len(rays)
         return cls(np.arange(count), rays.origin_m, rays.direction, rays.time_s, np.ones(count))
 
-    def __len__(self) -> int:
-        return len(self.ray)
-
-    def subset(self, chosen: np.ndarray | slice) -> Beams:
-        """The beams at an index or mask."""
-        return Beams(*(column[chosen] for column in vars(self).values()))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Beams]) -> Beams:
-        """Several lists as one, one after the other."""
-        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
-
 
 @dataclass(frozen=True, eq=False)
-class Echoes:
+class Echoes(Columns):
     """Light that comes back, E echoes.
 
     Arguments:
@@ -71,18 +79,6 @@ class Echoes:
     path_m: np.ndarray
     gain: np.ndarray
     body: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.ray)
-
-    def subset(self, chosen: np.ndarray) -> Echoes:
-        """The echoes at an index or mask."""
-        return Echoes(*(column[chosen] for column in vars(self).values()))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Echoes]) -> Echoes:
-        """Several lists as one, one after the other."""
-        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,11 +58,8 @@ def predicted_seconds(effect: str, detector: Detector, rays: int) -> float:
     """Of an effect for so many rays over all frames [s]."""
     if effect == "footprint":
         return rays * (detector.footprint_rays - 1) * SUB_RAY_SECONDS
-    if effect in LIGHT_SECONDS:
-        return rays * LIGHT_SECONDS[effect]
-    if effect in PHOTON_SECONDS and detector.photons is not None:
-        return rays * PHOTON_SECONDS[effect]
-    return rays * ROUNDING_SECONDS
+    known = LIGHT_SECONDS if detector.photons is None else LIGHT_SECONDS | PHOTON_SECONDS
+    return rays * known.get(effect, ROUNDING_SECONDS)
 
 
 EFFECT_MODULES = {
@@ -268,8 +265,12 @@ def parse_effects(text: str) -> Choice:
         if name in WORDS:
             raise ConfigError(f"{name!r} stands among effects", where="--effects", allowed=f"{name} alone, or names")
         if name not in EFFECTS:
-            hint = suggest(name.lower(), [*EFFECTS, *WORDS])
-            raise ConfigError(f"unknown effect {name!r}", where="--effects", allowed=allowed, hint=hint)
+            raise ConfigError(
+                f"unknown effect {name!r}",
+                where="--effects",
+                allowed=allowed,
+                hint=suggest(name.lower(), [*EFFECTS, *WORDS]),
+            )
     return frozenset(names)
 
 

@@ -151,8 +151,12 @@ class Contract:
             limit = self.subject.limits.memory_bytes
             return Finding(*known, "fail", f"needs more than {limit / 2**20:.0f} MiB", time.perf_counter() - started)
         except Exception as error:  # what a task gives instead of what it should surprises in any way
-            words = f"{type(error).__name__}: {text_of(error)}{place_of(error)}"
-            return Finding(*known, "fail", words, time.perf_counter() - started)
+            return Finding(
+                *known,
+                "fail",
+                f"{type(error).__name__}: {text_of(error)}{place_of(error)}",
+                time.perf_counter() - started,
+            )
         seconds = time.perf_counter() - started
         if isinstance(found, NotApplicable):
             return Finding(*known, "skip", found.reason, seconds)

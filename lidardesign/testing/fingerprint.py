@@ -31,13 +31,11 @@ def fingerprint(value: Any) -> str:
 
 def geometry_fingerprint(scene: Scene) -> str:
     """The same of what rays meet in a scene and what light does there, whatever it and its bodies are called."""
-    others = [getattr(scene, field.name) for field in fields(scene) if field.name not in UNSEEN]
-    return fingerprint([*(_seen(body) for body in scene.bodies), *others])
+    return fingerprint([*((np.round(body.poses, 12), *_others(body)) for body in scene.bodies), *_others(scene)])
 
 
-def _seen(body: Body) -> tuple[Any, ...]:
-    others = [getattr(body, field.name) for field in fields(body) if field.name not in UNSEEN]
-    return np.round(body.poses, 12), *others
+def _others(of: Body | Scene) -> list[Any]:
+    return [getattr(of, field.name) for field in fields(of) if field.name not in UNSEEN]
 
 
 def _add(digest: Any, value: Any, depth: int) -> None:

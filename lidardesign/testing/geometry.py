@@ -10,7 +10,7 @@ import numpy as np
 
 from lidardesign.density.fields.distance import Field, build_field
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Body, Mesh, Scene
+from lidardesign.scene import Mesh, Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
 from lidardesign.testing.law import BrokenLawError, Law, LawHolds, Subject
 from lidardesign.testing.probing import rays_that_meet
@@ -142,13 +142,10 @@ def _seen(subject: Subject, number: int, scene: Scene) -> RaysAtTargets:
     while len(rounds) < ROUNDS and sum(map(len, rounds)) < ENOUGH:
         rounds.append(_tried(subject, scene, caster, RAYS, generator))
     design = np.concatenate(rounds)
-    solid = np.array([_is_solid(one) for one in scene.bodies], dtype=bool)[design[:, 6].astype(int)]
+    has_inside = [not isinstance(body.shape, Mesh) or body.shape.sign != "unsigned" for body in scene.bodies]
+    solid = np.array(has_inside, dtype=bool)[design[:, 6].astype(int)]
     looking = direction(design[:, AZIMUTH], design[:, ELEVATION])
     return RaysAtTargets(number, design[:, :3], looking, design[:, 7:], design[:, RANGE], solid, RAYS * len(rounds))
-
-
-def _is_solid(body: Body) -> bool:
-    return not isinstance(body.shape, Mesh) or body.shape.sign != "unsigned"
 
 
 def check_reach(subject: Subject) -> LawHolds:
@@ -218,8 +215,10 @@ def check_slope(subject: Subject) -> LawHolds:
             hint="a mesh of separate sheets or in other units than metres? density.field_resolution refines grids",
         )
     median = float(np.median(off))
-    words = f"{share:.0%} of {len(off)} within {SLOPE_WITHIN}, half within {median:.1g}"
-    return LawHolds(words, {"share": share, "median_off": median})
+    return LawHolds(
+        f"{share:.0%} of {len(off)} within {SLOPE_WITHIN}, half within {median:.1g}",
+        {"share": share, "median_off": median},
+    )
 
 
 def check_agreement(subject: Subject) -> LawHolds:

@@ -59,8 +59,10 @@ def check_metric(subject: Subject) -> LawHolds:
                 f"metric.{name} is {getattr(metric, name)!r}",
                 allowed="a name, a unit, better='lower' or 'higher', a finite worst value, a tolerance above 0",
             )
-    words = f"{metric.name} [{metric.unit}], {metric.better} is better, worst {metric.worst:g}"
-    return LawHolds(words, {"worst": float(metric.worst), "tolerance": float(metric.tolerance)})
+    return LawHolds(
+        f"{metric.name} [{metric.unit}], {metric.better} is better, worst {metric.worst:g}",
+        {"worst": float(metric.worst), "tolerance": float(metric.tolerance)},
+    )
 
 
 def _is_finite(value: object) -> bool:
@@ -73,7 +75,7 @@ def check_defaults(subject: Subject) -> LawHolds:
     allowed = "sensors and rays of 1 or more, a known layout, a level between 0 and 1"
     wrong = {
         "sensors": not _is_count(defaults.sensors),
-        "rays": not _are_counts(defaults.rays),
+        "rays": not (isinstance(defaults.rays, list | tuple) and defaults.rays and all(map(_is_count, defaults.rays))),
         "layout": defaults.layout not in FITTED_LAYOUTS,
         "level": not _is_finite(defaults.level) or not 0 < defaults.level < 1,
     }
@@ -102,10 +104,6 @@ def _as_yaml(value: object) -> str:
 
 def _is_count(value: object) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= 1
-
-
-def _are_counts(values: object) -> bool:
-    return isinstance(values, list | tuple) and len(values) > 0 and all(map(_is_count, values))
 
 
 def check_space(subject: Subject) -> LawHolds:

@@ -39,8 +39,7 @@ def rays_at_targets(scene: Scene, space: DesignSpace, casters: Sequence[SceneCas
             found.append(rays_that_meet(scene, space, casters[frame], int(frame), per, generator)[0])
         if sum(map(len, found)) >= count:
             break
-    points = generator.permutation(np.concatenate(found))[:count]
-    return full_rays(points, space)
+    return full_rays(generator.permutation(np.concatenate(found))[:count], space)
 
 
 def full_rays(points: np.ndarray, space: DesignSpace) -> Rays:
@@ -76,8 +75,7 @@ def rays_that_meet(
     design = np.where(low == high, low, design)
     hits = caster.first_hit(design[:, :3], direction(design[:, AZIMUTH], design[:, ELEVATION]))
     design[:, RANGE] = np.where(np.isfinite(hits.range_m), hits.range_m, 2 * FARTHEST_M)
-    of_target = np.array([*(body.is_target for body in scene.bodies), False])
-    kept = of_target[hits.body] & space.contains(design)
+    kept = np.array([*(body.is_target for body in scene.bodies), False])[hits.body] & space.contains(design)
     return design[kept], hits.subset(kept)
 
 
@@ -94,13 +92,11 @@ def with_noise(returns: Sequence[Returns], share: float, generator: np.random.Ge
 
 def shuffled(returns: Sequence[Returns], generator: np.random.Generator) -> list[Returns]:
     """The same returns with their rays in another order, each list in one of its own."""
-    found = []
-    for one in returns:
-        order = generator.permutation(len(one.rays))
-        found.append(
-            Returns(one.rays.subset(order), one.outcome[order], one.range_m[order], one.body[order], one.frame)
-        )
-    return found
+    orders = [generator.permutation(len(one.rays)) for one in returns]
+    return [
+        Returns(one.rays.subset(order), one.outcome[order], one.range_m[order], one.body[order], one.frame)
+        for one, order in zip(returns, orders, strict=True)
+    ]
 
 
 def without_returns(returns: Sequence[Returns]) -> list[Returns]:

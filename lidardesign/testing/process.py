@@ -73,25 +73,22 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
         yield from _all_lost(0, error_words(error))
         return
     with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
-        child = PluginProcess(CHILD, _as_document(request, offer, folder))
+        document = {
+            "path": sys.path,
+            "folder": folder,
+            "name": offer.name,
+            "value": offer.value,
+            "config_file": str(request.config_file) if request.config_file else None,
+            "overrides": list(request.overrides),
+            "seed": request.seed,
+            "seconds": request.limits.seconds,
+            "memory_bytes": request.limits.memory_bytes,
+        }
+        child = PluginProcess(CHILD, document)
         try:
             yield from _read_findings(child, request.limits.seconds)
         finally:
             child.end()
-
-
-def _as_document(request: CheckRequest, offer: EntryPoint, folder: str) -> dict[str, Any]:
-    return {
-        "path": sys.path,
-        "folder": folder,
-        "name": offer.name,
-        "value": offer.value,
-        "config_file": str(request.config_file) if request.config_file else None,
-        "overrides": list(request.overrides),
-        "seed": request.seed,
-        "seconds": request.limits.seconds,
-        "memory_bytes": request.limits.memory_bytes,
-    }
 
 
 def _read_findings(child: PluginProcess, seconds: float) -> Iterator[Finding]:
@@ -201,8 +198,7 @@ def answer_check(request: dict[str, Any]) -> None:
 
 def _settle(request: dict[str, Any]) -> None:
     """Limits on memory, a place for temporary files, and no compiled Python beside the plugin's sources."""
-    temporary = _make_folder(request, "temporary")
-    tempfile.tempdir = os.environ["TMPDIR"] = temporary
+    tempfile.tempdir = os.environ["TMPDIR"] = _make_folder(request, "temporary")
     os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
     try:
         import resource

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Sequence
 from importlib.util import find_spec
 
 from lidardesign.errors import LidardesignError
 from lidardesign.evaluate.scene_scores import gives_residuals
-from lidardesign.scene import Scene
 from lidardesign.task import Split
 from lidardesign.testing.elsewhere import fingerprints_in_process
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
@@ -34,19 +32,15 @@ def check_repeatable(subject: Subject) -> LawHolds:
     """The same configuration, split and seed give the same scenes, to the bit."""
     for split in SPLITS:
         first, again = subject.scenes(split), subject.new_scenes(split, subject.config.seed)
-        _compare(first, again, f"the second time the split {split}")
+        if len(first) != len(again):
+            raise BrokenLawError(f"the second time the split {split} has {len(again)} scenes, not {len(first)}")
+        for number, (one, other) in enumerate(zip(first, again, strict=True)):
+            if fingerprint(one) != fingerprint(other):
+                raise BrokenLawError(
+                    f"the second time the split {split} has another scene {number} ({one.name!r})",
+                    hint="draw all chance from lidardesign.task.random_generator(seed, ...)",
+                )
     return LawHolds("made twice, the same to the bit")
-
-
-def _compare(first: Sequence[Scene], again: Sequence[Scene], when: str) -> None:
-    if len(first) != len(again):
-        raise BrokenLawError(f"{when} has {len(again)} scenes, not {len(first)}")
-    for number, (one, other) in enumerate(zip(first, again, strict=True)):
-        if fingerprint(one) != fingerprint(other):
-            raise BrokenLawError(
-                f"{when} has another scene {number} ({one.name!r})",
-                hint="draw all chance from lidardesign.task.random_generator(seed, ...)",
-            )
 
 
 def check_seeds(subject: Subject) -> LawHolds | NotApplicable:

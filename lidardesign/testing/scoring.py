@@ -42,8 +42,10 @@ def check_number(subject: Subject) -> LawHolds:
         for lists in (subject.rays(number, DENSE), subject.rays(number, SPARSE), anywhere):
             values.append(subject.score(scene, subject.returns(number, lists)).value)
     unit = subject.task.metric.unit
-    words = f"{len(values)} scores from {min(values):.4g} to {max(values):.4g} {unit}"
-    return LawHolds(words, {"least": min(values), "most": max(values)})
+    return LawHolds(
+        f"{len(values)} scores from {min(values):.4g} to {max(values):.4g} {unit}",
+        {"least": min(values), "most": max(values)},
+    )
 
 
 def check_nothing(subject: Subject) -> LawHolds:
@@ -62,8 +64,10 @@ def check_nothing(subject: Subject) -> LawHolds:
                     hint="where there is too little to compute anything, return Score(metric.worst, failed=True)",
                 )
             found.append(score.failed)
-    words = "counts as failed" if all(found) else "scored as a number" if not any(found) else "failed or a number"
-    return LawHolds(words, {"failed": float(np.mean(found))})
+    return LawHolds(
+        "counts as failed" if all(found) else "scored as a number" if not any(found) else "failed or a number",
+        {"failed": float(np.mean(found))},
+    )
 
 
 def check_best(subject: Subject) -> LawHolds:

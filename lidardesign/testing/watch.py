@@ -119,8 +119,7 @@ def _audit(event: str, arguments: tuple[Any, ...]) -> None:
         return
     if event == "open":
         path, mode, flags = arguments
-        writes = any(sign in mode for sign in "wax+") if isinstance(mode, str) else bool((flags or 0) & WRITING)
-        if writes:
+        if any(sign in mode for sign in "wax+") if isinstance(mode, str) else bool((flags or 0) & WRITING):
             watch.refuse(event, path)
     elif event in CHANGING:
         for position in CHANGING[event]:
@@ -132,7 +131,6 @@ def _real(path: Path) -> Path:
 
 
 def _usual_folders() -> tuple[Path, ...]:
-    """Where temporary files and caches go."""
     folders = [Path(tempfile.gettempdir()), Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")]
     folders += [Path(os.environ[name]) for name in ("LIDARDESIGN_CACHE", "NUMBA_CACHE_DIR") if os.environ.get(name)]
     return tuple(folders)

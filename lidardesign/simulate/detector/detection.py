@@ -76,7 +76,6 @@ def detect(
     if physics.detector.photons is None or not physics.effects & COUNTED:
         return _strongest(scene, frame, windows_m, echoes, physics)
     path_m = np.full(len(windows_m), np.nan)
-
     light = ArrivingLight.of(windows_m, echoes, background, physics)
     for begin, end in light.bins.chunks():
         path_m[begin:end] = _from_photons(scene, frame, light.part(begin, end), physics)
@@ -92,7 +91,6 @@ def detect(
 
 def _from_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physics) -> np.ndarray:
     """The half paths that are read from a chunk's histograms, NaN without a return [m]."""
-
     detector, bins = physics.detector, light.bins
     counts = count_photons(scene, frame, light, physics)
     sigma_m = metres(detector.timing_sigma_s)
@@ -272,7 +270,6 @@ def _add_one_by_one(
     total: np.ndarray,
     physics: Physics,
 ) -> None:
-    """Photons of echoes in rays with few of them."""
     detector, effects, bins = physics.detector, physics.effects, light.bins
     noisy = "photon_noise" in effects
     if noisy:
@@ -298,7 +295,6 @@ def _add_one_by_one(
 def _add_bin_by_bin(
     counts: np.ndarray, scene: Scene, frame: int, light: ArrivingLight, many: np.ndarray, physics: Physics
 ) -> None:
-    """Photons of echoes in rays with many of them."""
     detector, effects, bins = physics.detector, physics.effects, light.bins
     sigma_m = metres(detector.timing_sigma_s if "jitter" in effects else detector.pulse_sigma_s)
     expected = expected_in_bins(

@@ -76,8 +76,7 @@ class Photons:
 
     def emitted(self, rays: int) -> float:
         """Photons of one pulse that each of so many rays sends."""
-        shared = self.pulse_energy_j / (max(rays, 1) if self.emission == "flood" else 1)
-        return shared / self.photon_energy_j
+        return (self.pulse_energy_j / (max(rays, 1) if self.emission == "flood" else 1)) / self.photon_energy_j
 
 
 @dataclass(frozen=True)
@@ -338,5 +337,6 @@ def check_effects(names: Iterable[str]) -> None:
         ConfigError: An unknown effect; all are listed.
     """
     for name in sorted(set(names) - EFFECTS.keys()):
-        hint = suggest(name.lower(), EFFECTS)
-        raise ConfigError(f"unknown effect {name!r}", where="effects", allowed=", ".join(EFFECTS), hint=hint)
+        raise ConfigError(
+            f"unknown effect {name!r}", where="effects", allowed=", ".join(EFFECTS), hint=suggest(name.lower(), EFFECTS)
+        )

@@ -102,8 +102,12 @@ def load_detector(name_or_path: str | Path) -> Detector:
     if not text.strip() or not os.path.exists(path):
         names = detector_names()
         hint = suggest(text, names) or "docs/detectors.md says how to write one"
-        allowed = f"{', '.join(names)}, or the path of a detector file"
-        raise ConfigError(f"there is no detector {text!r}", where="--detector", allowed=allowed, hint=hint)
+        raise ConfigError(
+            f"there is no detector {text!r}",
+            where="--detector",
+            allowed=f"{', '.join(names)}, or the path of a detector file",
+            hint=hint,
+        )
     document = load_yaml(path)
     if not document.mapping:
         raise ConfigError("says nothing about a detector", where=str(path), hint="--detector ideal needs no file")
@@ -115,19 +119,22 @@ def _detector(document: Document, fallback: str) -> Detector:
     _check_keys(document, values)
     chosen = {name: _choice(document, values, name, options) for name, options in CHOICES.items()}
     found = {name: _number(document, values, name, quantity) for name, quantity in QUANTITIES.items()}
-    photons = _photons(document, values, found, chosen["emission"])
-    whole = {name: None if found[name] is None else round(found[name]) for name in ("bins", "footprint_rays")}
+    photons = _photons(document, found, chosen["emission"])
+    name = values.get("name", fallback)
+    if not is_name(name):
+        allowed = "text without control characters"
+        raise ConfigError(f"name: found {name!r}", where=document.locate(("name",)), allowed=allowed)
     detector = Detector(
-        name=_name(document, values, fallback),
+        name=name,
         pulse_sigma_s=found["pulse_fwhm"] / FWHM_PER_SIGMA,
         jitter_sigma_s=found["jitter_fwhm"] / FWHM_PER_SIGMA,
         bin_s=found["bin"],
         divergence_rad=found["divergence"],
-        footprint_rays=whole["footprint_rays"],
+        footprint_rays=round(found["footprint_rays"]),
         photons=photons,
         estimator=chosen["estimator"] or "peak",
         false_alarm=found["false_alarm"],
-        bins=whole["bins"],
+        bins=None if found["bins"] is None else round(found["bins"]),
         histogram_start=chosen["histogram_start"] or "gate",
         correction=chosen["correction"] or "none",
     )
@@ -136,16 +143,13 @@ def _detector(document: Document, fallback: str) -> Detector:
 
 
 def _check_keys(document: Document, values: Mapping[str, Any]) -> None:
-    """Unknown keys, wrong units, and quantities that are given twice."""
     spelled = {key: name for name, quantity in QUANTITIES.items() for key in quantity.keys(name)}
     seen: dict[str, str] = {}
     for key in values:
         where = document.locate((key,), key=True)
-        if key == "name" or key in CHOICES:
-            continue
-        if key not in spelled:
+        name = key if key == "name" or key in CHOICES else spelled.get(key)
+        if name is None:
             raise _unknown(key, where, [*spelled, "name", *CHOICES])
-        name = spelled[key]
         if name in seen:
             raise ConfigError(f"{key!r} and {seen[name]!r} are the same quantity", where=where, allowed="one of them")
         seen[name] = key
@@ -190,29 +194,16 @@ def _choice(document: Document, values: Mapping[str, Any], name: str, options: t
     if name not in values:
         return None
     if values[name] not in options:
-        raise ConfigError(
-            f"{name}: found {values[name]!r}", where=document.locate((name,)), allowed=", ".join(options)
-        )
+        raise ConfigError(f"{name}: found {values[name]!r}", where=document.locate((name,)), allowed=", ".join(options))
     return values[name]
 
 
-def _name(document: Document, values: Mapping[str, Any], fallback: str) -> str:
-    name = values.get("name", fallback)
-    if not is_name(name):
-        allowed = "text without control characters"
-        raise ConfigError(f"name: found {name!r}", where=document.locate(("name",)), allowed=allowed)
-    return name
-
-
-def _photons(
-    document: Document, values: Mapping[str, Any], found: Mapping[str, float | None], emission: Any
-) -> Photons | None:
+def _photons(document: Document, found: Mapping[str, float | None], emission: Any) -> Photons | None:
     """The light budget; None where the file gives none of it."""
-    given = [name for name in LIGHT if found[name] is not None] + (["emission"] if emission else [])
-    if not given:
-        return None
-    missing = [key for name in LIGHT if found[name] is None for key in LIGHT[name].keys(name)[:1]]
+    missing = [LIGHT[name].keys(name)[0] for name in LIGHT if found[name] is None]
     missing += [] if emission else ["emission"]
+    if len(missing) == len(LIGHT) + 1:
+        return None
     if missing:
         raise ConfigError(
             f"counts photons, but does not say {', '.join(missing)}",
@@ -235,12 +226,7 @@ def _photons(
 
 
 def _check_together(document: Document, detector: Detector) -> None:
-    """What single values cannot show.
-
-    Raises:
-        ConfigError: Several sub-rays of a beam without width, bins without a width, a histogram longer than the time
-            between pulses, a filter wider than its wavelength.
-    """
+    """What single values cannot show."""
     if detector.footprint_rays > 1 and detector.divergence_rad == 0:
         raise ConfigError(
             f"footprint_rays: {detector.footprint_rays} rays in a beam of divergence 0 are all the same one",

@@ -140,11 +140,8 @@ class _Haze:
             # The share of the light in the aperture that falls on the pixel which looks along the ray, (N, C)
             blurred = 1 - safe_divide(range_m, np.broadcast_to(self.focus_m[:, None], range_m.shape), 1.0)
             sharp = self.photons.field_of_view_sr * range_m**2
-            overlap, back_m, seen = (
-                np.minimum(safe_divide(sharp, self.photons.aperture_m2 * blurred**2, 1.0), 1.0),
-                range_m,
-                1.0,
-            )
+            overlap = np.minimum(safe_divide(sharp, self.photons.aperture_m2 * blurred**2, 1.0), 1.0)
+            back_m, seen = range_m, 1.0
             if self.receiver is not None:
                 place = np.asarray(self.receiver.origin_m)
                 points = self.rays.origin_m[:, None] + range_m[..., None] * self.rays.direction[:, None]
@@ -182,5 +179,8 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     squared = counts.error_m(left, sigma_m) ** 2 * np.minimum(2 * np.sqrt(changed) + any_count, 1.0)
     lost = np.where(first_hits.returned, fewer + wrong, any_count)
     medium = first_hits.scene.medium
-    reason = f"air that dims light by {100 * -np.expm1(-2 * medium.extinction_per_m):.3g} % per metre of range"
-    return EffectBound(squared, np.minimum(lost, 1.0), reason)
+    return EffectBound(
+        squared,
+        np.minimum(lost, 1.0),
+        f"air that dims light by {100 * -np.expm1(-2 * medium.extinction_per_m):.3g} % per metre of range",
+    )

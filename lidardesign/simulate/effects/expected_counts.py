@@ -99,8 +99,7 @@ def _haze_beside_rays(first_hits: FirstHits, end_m: np.ndarray, bin_m: float) ->
     length = np.maximum(high - low, 0.0)
     whole = np.clip(seen, 0.0, 2 * math.pi * length)
     nearest = np.hypot(aside, np.clip(along, low, np.maximum(low, high)) - along)
-    slowest = (1 + (low - along) / np.hypot(aside, low - along)) / 2
-    in_bin = np.minimum(safe_divide(bin_m, slowest, np.inf), length)
+    in_bin = np.minimum(safe_divide(bin_m, (1 + (low - along) / np.hypot(aside, low - along)) / 2, np.inf), length)
     return whole, np.minimum(np.minimum(aperture_m2 / nearest**2, 2 * math.pi) * in_bin, whole)
 
 
@@ -217,7 +216,9 @@ class Counts:
 
         Levels and numbers of bins are rounded up to one of `LEVELS_PER_UNIT` per factor e: few are worked out.
         """
-        level, bins = (_rounded_up(values) for values in (per_bin * self.pulse_bins, self.bins))
+        with np.errstate(divide="ignore"):
+            steps = [np.ceil(LEVELS_PER_UNIT * np.log(values)) for values in (per_bin * self.pulse_bins, self.bins)]
+        level, bins = (np.exp(step / LEVELS_PER_UNIT) for step in steps)
         # pairs as complex numbers: those are told apart fastest
         pairs, place = np.unique(level + 1j * bins, return_inverse=True)
         return needed_counts(pairs.real, pairs.imag, self.first_hits.detector.false_alarm)[place]
@@ -245,9 +246,7 @@ class Counts:
         ]
         return np.maximum(np.maximum(*changes), 0.0)
 
-    def mistaken(
-        self, signal: np.ndarray, other: np.ndarray, per_bin: np.ndarray, sigma_m: np.ndarray
-    ) -> np.ndarray:
+    def mistaken(self, signal: np.ndarray, other: np.ndarray, per_bin: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
         """Bound of the probability that another bin beats the echo's, shape (N,).
 
         The union over all bins of P(X >= Y) <= exp(-(sqrt(E Y) - sqrt(E X))^2), Chernoff's bound for a difference of
@@ -266,11 +265,6 @@ class Counts:
     def _by_sharing(self, name: str) -> np.ndarray:
         shared, place = np.unique(self.first_hits.sharing, return_inverse=True)
         return np.array([getattr(self.first_hits.detector.photons, name)(int(rays)) for rays in shared])[place]
-
-
-def _rounded_up(values: np.ndarray) -> np.ndarray:
-    with np.errstate(divide="ignore"):
-        return np.exp(np.ceil(LEVELS_PER_UNIT * np.log(values)) / LEVELS_PER_UNIT)
 
 
 def count_text(number: float) -> str:

@@ -83,20 +83,15 @@ class FirstHits:
     @cached_property
     def neighbours(self) -> np.ndarray:
         """The `NEIGHBOURS` rays of the same list that end nearest to each; itself where there are fewer, (N, K)."""
-        ends = self.rays.origin_m + self._typical_range_m * self.rays.direction
+        met = self.range_m[self.hits.body >= 0]
+        ends = self.rays.origin_m + (float(np.median(met)) if len(met) else 1.0) * self.rays.direction
         # the lists side by side, further from each other than the rays of any
         apart = 4 * (1 + np.abs(ends).max(initial=0.0) + np.abs(self.rays.origin_m).max(initial=0.0))
         places = np.concatenate([self.rays.origin_m, ends, apart * self.row[:, None]], axis=1)
         from scipy.spatial import cKDTree
 
         away, near = cKDTree(places).query(places, k=NEIGHBOURS + 1, distance_upper_bound=apart)
-        own = np.arange(len(self))[:, None]
-        return np.where(np.isfinite(away), near, own)
-
-    @cached_property
-    def _typical_range_m(self) -> float:
-        met = self.range_m[self.hits.body >= 0]
-        return float(np.median(met)) if len(met) else 1.0
+        return np.where(np.isfinite(away), near, np.arange(len(self))[:, None])
 
     @cached_property
     def returned(self) -> np.ndarray:
@@ -142,8 +137,7 @@ class FirstHits:
     @cached_property
     def gate_edge_m(self) -> np.ndarray:
         """How far a first hit lies from the nearer end of its window, infinite on a miss, shape (N,) [m]."""
-        away_m = np.abs(self.path_m[:, None] - self.window_m).min(axis=1)
-        return np.where(self.hits.body >= 0, away_m, np.inf)
+        return np.where(self.hits.body >= 0, np.abs(self.path_m[:, None] - self.window_m).min(axis=1), np.inf)
 
     @cached_property
     def gain(self) -> np.ndarray:
@@ -156,9 +150,7 @@ class FirstHits:
     @cached_property
     def beam_m(self) -> np.ndarray:
         """Radius of each beam at its first hit; 0 where beams are lines, shape (N,) [m]."""
-        detector = self.detector
-        half_rad = detector.divergence_rad / 2 if detector.footprint_rays > 1 else 0.0
-        return half_rad * self.range_m
+        return (self.detector.divergence_rad / 2 if self.detector.footprint_rays > 1 else 0.0) * self.range_m
 
     def sigma_m(self, *, jitter: bool = True) -> np.ndarray:
         """How far one photon of an echo strays: the pulse, timing errors, and a slanted beam's spread, (N,) [m].
@@ -174,10 +166,8 @@ class FirstHits:
 
         The matched filter averages over all of a pulse, far into its tails.
         """
-        detector = self.detector
-        told_apart = resolution_m(detector)
-        averages = detector.photons is not None and detector.estimator == "matched"
-        return max(told_apart, PULSE_REACH * metres(detector.timing_sigma_s)) if averages else told_apart
+        averages = self.detector.photons is not None and self.detector.estimator == "matched"
+        return max(resolution_m(self.detector), averages * PULSE_REACH * metres(self.detector.timing_sigma_s))
 
 
 # A step in range counts as an edge where it exceeds the slope of both surfaces this many times over.
@@ -199,20 +189,17 @@ def edge_probability(first_hits: FirstHits, aside_m: np.ndarray) -> np.ndarray:
     if not aside_m.any():
         return np.zeros(len(first_hits))
     range_m, body, tangent = first_hits.range_m, first_hits.hits.body, first_hits.tangent
+    origin, along = first_hits.rays.origin_m, first_hits.rays.direction
     met = body >= 0
     chance = np.zeros(len(first_hits))
     for other in first_hits.neighbours.T:
         reach_m = np.minimum(first_hits.hits.range_m, first_hits.hits.range_m[other])
-        apart_m = _apart_m(first_hits, other, np.where(np.isfinite(reach_m), reach_m, 0.0))
+        # how far rays are from their neighbours at the shorter range of the two, along both [m]
+        reach_m = np.where(np.isfinite(reach_m), reach_m, 0.0)
+        apart_m = np.linalg.norm(origin - origin[other] + reach_m[:, None] * (along - along[other]), axis=1)
         sloped_m = STEEPER * apart_m * (1 + tangent + tangent[other])
         edge = (body != body[other]) | (met & met[other] & (np.abs(range_m - range_m[other]) > sloped_m))
         further = np.maximum(aside_m, aside_m[other])
         share = np.minimum(safe_divide(further, apart_m, 1.0), 1.0)
         chance = np.maximum(chance, np.where(edge & (further > 0), share, 0.0))
     return chance
-
-
-def _apart_m(first_hits: FirstHits, other: np.ndarray, reach_m: np.ndarray) -> np.ndarray:
-    """How far rays are from others (N,) at ranges (N,) along both, shape (N,) [m]."""
-    origin, direction = first_hits.rays.origin_m, first_hits.rays.direction
-    return np.linalg.norm(origin - origin[other] + reach_m[:, None] * (direction - direction[other]), axis=1)

@@ -101,8 +101,9 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     squared = np.minimum(spread_m, first_hits.width_m) ** 2 + edge * first_hits.resolution_m**2
     lost = np.maximum(edge, (first_hits.gate_edge_m <= spread_m) | stray_rims(first_hits))
     wide_m = float(np.median(2 * radius_m[first_hits.returned])) if first_hits.returned.any() else 0.0
-    reason = f"beams of {1000 * wide_rad:.3g} mrad are {1000 * wide_m:.3g} mm wide where they return"
-    return EffectBound(squared, lost, reason)
+    return EffectBound(
+        squared, lost, f"beams of {1000 * wide_rad:.3g} mrad are {1000 * wide_m:.3g} mm wide where they return"
+    )
 
 
 def stray_rims(first_hits: FirstHits) -> np.ndarray:

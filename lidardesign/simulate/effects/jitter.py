@@ -56,5 +56,8 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     squared = squared + ((both_m - pulse_m) * blind.early) ** 2
     lost = counts.more_missed(Echo(signal, pulse_m), Echo(signal, both_m))
     spilled = -np.expm1(-np.maximum(counts.leaked(both_m) - counts.leaked(pulse_m), 0.0))
-    reason = f"a photon is {timed}; a return has about {counts.typical} of them"
-    return EffectBound(squared, np.where(first_hits.returned, lost, spilled), reason)
+    return EffectBound(
+        squared,
+        np.where(first_hits.returned, lost, spilled),
+        f"a photon is {timed}; a return has about {counts.typical} of them",
+    )

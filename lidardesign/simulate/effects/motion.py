@@ -68,10 +68,8 @@ class Screw:
         axis = _cross_matrix(self.turn_rad_s / speed if speed else self.turn_rad_s)
         angle = (speed * time_s)[:, None, None]
         # 1 - cos written without its cancellation
-        turned, moved = (
-            (np.eye(3) + np.sin(angle) * axis + 2 * np.sin(angle / 2) ** 2 * (axis @ axis)),
-            _translations(self.turn_rad_s, time_s) @ self.drift_m_s,
-        )
+        turned = np.eye(3) + np.sin(angle) * axis + 2 * np.sin(angle / 2) ** 2 * (axis @ axis)
+        moved = _translations(self.turn_rad_s, time_s) @ self.drift_m_s
         return turned @ self.pose[:3, :3], turned @ self.pose[:3, 3] + moved
 
     def speed_m_s(self, point: np.ndarray) -> float:
@@ -100,12 +98,10 @@ def path_of(body: Body, frame: int, rate_hz: float) -> Screw:
     """How a body moves during a frame."""
     if body.poses.ndim == 2:
         return Screw(body.poses, np.zeros(3), np.asarray(body.velocity_m_s))
-    last = len(body.poses) - 1
-    if last == 0:
+    if len(body.poses) == 1:
         return Screw(body.poses[0], np.zeros(3), np.zeros(3))
-    start = min(frame, last - 1)
-    joined = Screw.between(body.poses[start], body.poses[start + 1], rate_hz)
-    return replace(joined, pose=body.poses[frame])
+    start = min(frame, len(body.poses) - 2)
+    return replace(Screw.between(body.poses[start], body.poses[start + 1], rate_hz), pose=body.poses[frame])
 
 
 class _MovingBody:
@@ -128,8 +124,7 @@ class _MovingBody:
             range_m, normal = self._trace(local_origins, local_directions, hits.range_m[rows])
             hit = np.flatnonzero(np.isfinite(range_m))
             won, turned = rows[hit], np.einsum("nij,nj->ni", rotation[hit], normal[hit])
-            facing = np.einsum("nk,nk->n", turned, directions[won]) > 0
-            turned[facing] *= -1
+            turned[np.einsum("nk,nk->n", turned, directions[won]) > 0] *= -1
             hits.range_m[won], hits.body[won], hits.normal[won] = range_m[hit], self._index, turned
 
     def _pieces(self, time_s: np.ndarray) -> Iterator[tuple[Screw, np.ndarray, np.ndarray]]:
@@ -209,10 +204,9 @@ def moving_tracer(scene: Scene, frame: int) -> Tracer:
             hits = Hits.none(len(origins))
         else:
             found = caster.first_hit(origins, directions)
-            body = np.where(found.body >= 0, indices[found.body], -1)
-            hits = Hits(found.range_m, body, found.normal)
-        for one in moving:
-            one.keep_nearer(hits, origins, directions, time_s)
+            hits = Hits(found.range_m, np.where(found.body >= 0, indices[found.body], -1), found.normal)
+        for body in moving:
+            body.keep_nearer(hits, origins, directions, time_s)
         return hits
 
     return trace
@@ -234,8 +228,7 @@ def is_instant(detector: Detector) -> bool:
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of moving bodies."""
-    velocity = point_velocities(first_hits)
-    step_m = np.linalg.norm(velocity, axis=1) * first_hits.rays.time_s
+    step_m = np.linalg.norm(point_velocities(first_hits), axis=1) * first_hits.rays.time_s
     moved_m = step_m / first_hits.cosine
     edge = edge_probability(first_hits, step_m)
     squared = np.minimum(moved_m, first_hits.width_m) ** 2 + edge * first_hits.resolution_m**2
@@ -297,9 +290,8 @@ def _velocity(scene: Scene, body: Body, frame: int, points: np.ndarray) -> np.nd
     """Of points fixed to a body that goes on to its next pose, or, in the last frame, on from the one before."""
     if body.poses.ndim == 2:
         return np.broadcast_to(np.asarray(body.velocity_m_s), points.shape)
-    last = len(body.poses) - 1
-    first, then = (frame, frame + 1) if frame < last else (last - 1, last)
-    step = body.poses[then] @ inverse_rigid(body.poses[first])
+    start = min(frame, len(body.poses) - 2)
+    step = body.poses[start + 1] @ inverse_rigid(body.poses[start])
     return (points @ step[:3, :3].T + step[:3, 3] - points) * scene.frame_rate_hz
 
 

@@ -98,8 +98,7 @@ def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> 
     found = view.of_a_flood() if flood else view.of_a_pixel() if by_pixel else view.of_a_receiver()
     received_sr = view.solid_angles() if flood else np.full(len(view.rays), view.pixel_sr if by_pixel else 1.0)
     gain = found.radiance * received_sr[found.ray]
-    together = np.bincount(found.ray, gain, len(view.rays))
-    kept = (together > FAINTEST_SHARE * view.direct.gain)[found.ray]
+    kept = (np.bincount(found.ray, gain, len(view.rays)) > FAINTEST_SHARE * view.direct.gain)[found.ray]
     ray, cell = found.ray[kept], found.cell[kept]
     path_m = (view.start_m[ray] + view.bins.centres_m[cell]) / 2
     return Echoes(view.number[ray], path_m, gain[kept], view.hits.body[ray])
@@ -136,8 +135,7 @@ class _View:
         hits = shared_caster(scene, frame).first_hit(rays.origin_m, rays.direction)
         echoes = direct_echoes(scene, Beams.of(rays), hits)
         windows_m = path_windows(rays, scene.receiver)
-        in_time = echoes.path_m < windows_m[echoes.ray, 1]
-        direct = echoes.subset(in_time)
+        direct = echoes.subset(echoes.path_m < windows_m[echoes.ray, 1])
         number = direct.ray
         apart_m = float(np.linalg.norm(np.ptp(rays.origin_m[number], axis=0))) if len(number) else 0.0
         earliest_m = np.maximum(windows_m[number, 0], direct.path_m - apart_m)
@@ -148,6 +146,9 @@ class _View:
         width_m = 10 ** (math.ceil(math.log10(finest_m) * WIDTHS_PER_DECADE) / WIDTHS_PER_DECADE)
         count = math.ceil(2 * reach_m / width_m) + 1
         bins = PathBins(width_m, 1 << (count - 1).bit_length())
+        # a pixel without a solid angle of its own sees that of its beam
+        photons, beam_sr = physics.detector.photons, math.pi * (physics.detector.divergence_rad / 2) ** 2
+        pixel_sr = beam_sr if photons is None else photons.field_of_view_sr
         return cls(
             scene,
             frame,
@@ -159,7 +160,7 @@ class _View:
             # the direct path lies in the middle of a bin, not on the edge of one
             2 * earliest_m - bins.width_m / 2,
             bins,
-            _pixel_sr(physics.detector),
+            pixel_sr,
             int(np.clip(PATHS // max(len(number), 1), FEWEST_SAMPLES, MOST_SAMPLES)),
             physics.stream("multipath", scene, frame),
         )
@@ -175,8 +176,7 @@ class _View:
 
     def of_a_receiver(self) -> Transients:
         """Radiance of spots in the light of the receiver, less what comes from there directly."""
-        lights = Lights.receiver(self.scene.receiver)
-        return self._rendered(lights, bounces=MOST_SURFACES, direct=False)
+        return self._rendered(Lights.receiver(self.scene.receiver), bounces=MOST_SURFACES, direct=False)
 
     def solid_angles(self) -> np.ndarray:
         """The solid angle that each pixel of a flood sees, or that its ray's part of the flood fills if less, (K,)."""
@@ -222,13 +222,6 @@ class _View:
         origin_m = np.tile(np.asarray(receiver.origin_m, dtype=float), (len(away), 1))
         direction = away / np.linalg.norm(away, axis=1, keepdims=True)
         return Rays(origin_m, direction, self.rays.gate_m, self.rays.sensor, self.rays.time_s)
-
-
-def _pixel_sr(detector: Detector) -> float:
-    """The solid angle of a ray's pixel; without one of its own, that of its beam [sr]."""
-    if detector.photons is not None:
-        return detector.photons.field_of_view_sr
-    return math.pi * (detector.divergence_rad / 2) ** 2
 
 
 MOST_POINTS, AT_ONCE = 64, 8
@@ -278,9 +271,7 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
         return "one convex body lights nothing else"
     if not detector.bin_s and not detector.pulse_sigma_s:
         return "later light is told apart from the first echo"
-    if max(body.reflectance for body in scene.bodies) == 0:
-        return "nothing reflects"
-    return None
+    return None if any(body.reflectance > 0 for body in scene.bodies) else "nothing reflects"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
@@ -289,8 +280,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     if not len(rows):
         return first_hits.nothing("no ray returns")
     found = _detours(first_hits, rows)
-    moved_m = np.minimum(found.shift_m, first_hits.width_m[rows][found.chosen])
-    squared_m2 = np.mean(moved_m**2)
+    squared_m2 = np.mean(np.minimum(found.shift_m, first_hits.width_m[rows][found.chosen]) ** 2)
     by_spots_m2 = np.mean(moved_by_spots_m(first_hits) ** 2) if _is_flood(first_hits) else 0.0
     alone = _hidden(first_hits, rows[found.chosen]) & (found.seen > 0)
     outweighed = np.mean((found.apart > 1) | alone)
@@ -341,7 +331,6 @@ def _detours(first_hits: FirstHits, rows: np.ndarray) -> Detours:
 
 
 def _convex_from(body: Body, lists: Sequence[Rays]) -> bool:
-    """Whether a body is convex as all rays see it: from outside."""
     if isinstance(body.shape, Mesh):
         return False
     poses = body.poses if body.poses.ndim == 3 else body.poses[None]

@@ -35,5 +35,8 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """bin^2 / 12 for every ray."""
     bin_m = first_hits.detector.bin_m
-    reason = f"bins are {1000 * bin_m:.3g} mm wide"
-    return EffectBound(np.full(len(first_hits), (bin_m / math.sqrt(12)) ** 2), np.zeros(len(first_hits)), reason)
+    return EffectBound(
+        np.full(len(first_hits), (bin_m / math.sqrt(12)) ** 2),
+        np.zeros(len(first_hits)),
+        f"bins are {1000 * bin_m:.3g} mm wide",
+    )

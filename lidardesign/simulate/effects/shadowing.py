@@ -130,5 +130,8 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     points = rays.origin_m + first_hits.range_m[:, None] * rays.direction
     lost = np.where(together, ~in_view(receiver, points), True) & first_hits.returned
     away, hidden = (f"{100 * share.mean():.3g} %" for share in (~together, lost))
-    reason = f"{away} of rays start away from the receiver, {hidden} may not be seen by it"
-    return EffectBound(np.zeros(len(first_hits)), lost.astype(float), reason)
+    return EffectBound(
+        np.zeros(len(first_hits)),
+        lost.astype(float),
+        f"{away} of rays start away from the receiver, {hidden} may not be seen by it",
+    )

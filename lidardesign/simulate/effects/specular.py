@@ -59,7 +59,6 @@ class _Front:
     hits: Hits
 
     def subset(self, chosen: np.ndarray | slice) -> _Front:
-        """The beams at an index or mask."""
         hits = self.hits.subset(chosen)
         return _Front(self.beams.subset(chosen), self.number[chosen], self.passed[chosen], hits)
 
@@ -85,7 +84,6 @@ def _groups(beams: Beams) -> Iterator[slice]:
 
 
 def _detours_of(scene: Scene, beams: Beams, hits: Hits, rows: slice, tracer: Tracer) -> Echoes:
-    """The detours of some of the beams."""
     mirrored = np.array([body.specular for body in scene.bodies])
     passing = np.array([body.transmission for body in scene.bodies])
     front = _Front(beams, np.arange(len(beams)), np.ones(len(beams)), hits).subset(rows)
@@ -129,7 +127,6 @@ def _followed(scene: Scene, front: _Front, shares: np.ndarray, direction: np.nda
 
 
 def _received(scene: Scene, beams: Beams, front: _Front, tracer: Tracer) -> Echoes:
-    """The echoes of what beams meet, where they are received."""
     front = front.subset(front.hits.body >= 0)
     if scene.receiver is None:
         return _received_back(scene, front)
@@ -142,7 +139,6 @@ def _received(scene: Scene, beams: Beams, front: _Front, tracer: Tracer) -> Echo
 
 
 def _received_back(scene: Scene, front: _Front) -> Echoes:
-    """The way that the light came."""
     return direct_echoes(scene, replace(front.beams, share=front.beams.share * front.passed), front.hits)
 
 
@@ -169,8 +165,9 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     met = np.where(first_hits.hits.body >= 0, leading[first_hits.hits.body], False)
     names = ", ".join(dict.fromkeys(body.name for body in first_hits.scene.bodies if _leads(body)))
     moved_m = np.minimum(first_hits.resolution_m, first_hits.width_m) * met
-    reason = f"{100 * met.mean():.3g} % of rays meet mirrors or glass: {names}"
-    return EffectBound(moved_m**2, met.astype(float), reason)
+    return EffectBound(
+        moved_m**2, met.astype(float), f"{100 * met.mean():.3g} % of rays meet mirrors or glass: {names}"
+    )
 
 
 def _leads(body: object) -> bool:

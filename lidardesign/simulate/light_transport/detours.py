@@ -195,8 +195,7 @@ def _next(scene: Scene, caster: SceneCaster, ends: _Ends, directions: int) -> _E
     number = np.arange(directions)
     radius = np.sqrt((number + 0.5) / directions)
     angle = GOLDEN_ANGLE_RAD * (number + directions * np.arange(len(ends.normal))[:, None])
-    other = np.eye(3)[np.abs(ends.normal).argmin(axis=1)]
-    left = np.cross(other, ends.normal)
+    left = np.cross(np.eye(3)[np.abs(ends.normal).argmin(axis=1)], ends.normal)
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     up = np.cross(ends.normal, left)
     x, y = radius * np.cos(angle), radius * np.sin(angle)

@@ -75,8 +75,7 @@ def llvm_library() -> str | None:
     named = os.environ.get(LLVM_VARIABLE)
     if named:
         version = llvm_version(Path(named).name)
-        usable = Path(named).is_file() and (version is None or version >= OLDEST_LLVM)
-        return named if usable else None
+        return named if Path(named).is_file() and (version is None or version >= OLDEST_LLVM) else None
     return _newest_installed()
 
 
@@ -126,8 +125,8 @@ def ask(
             _running[0].ask(folder, limit_s)
         failure = folder / "error.txt"
         if failure.exists():
-            lines = failure.read_text(encoding="utf-8").strip().splitlines()
-            raise NumericalError(f"the light-transport simulator failed: {lines[-1]}", hint="report it with the scene")
+            said = failure.read_text(encoding="utf-8").strip().splitlines()[-1]
+            raise NumericalError(f"the light-transport simulator failed: {said}", hint="report it with the scene")
         with np.load(folder / "result.npz", allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}
 

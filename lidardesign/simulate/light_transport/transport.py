@@ -31,6 +31,7 @@ from lidardesign.simulate.light_transport.process import ask
 # Half sizes of a plane's nested squares, in reaches. What lies further sends back less than 1e-4 of its light.
 PLANE_REACHES = (2.0, 10.0, 100.0)
 _SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 _BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 
 
@@ -71,17 +72,15 @@ def _shape(
         nearest = rotation[:, 2] * (rotation[:, 2] @ place)
         vertices, faces = _plane(max(reach_m, float(np.linalg.norm(nearest))))
         return {"kind": "mesh"}, {"vertices": vertices @ rotation.T + nearest, "faces": faces}
-    vertices, faces = _box(shape) if isinstance(shape, Box) else (shape.vertices, shape.faces)
+    if isinstance(shape, Box):
+        vertices, faces = _CORNERS * np.array(shape.half_extents_m), _split(_BOX_QUADS)
+    else:
+        vertices, faces = shape.vertices, shape.faces
     return {"kind": "mesh"}, {"vertices": vertices @ rotation.T + place, "faces": faces}
 
 
 def _round(ends: list[np.ndarray], radius_m: float) -> dict[str, Any]:
     return {"kind": "round", "ends": [end.tolist() for end in ends], "radius": float(radius_m)}
-
-
-def _box(box: Box) -> tuple[np.ndarray, np.ndarray]:
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-    return signs * np.array(box.half_extents_m), _split(_BOX_QUADS)
 
 
 def _plane(reach_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -159,10 +158,8 @@ class Lights:
             watts: The power of each beam.
             radius_m: The size of each patch [m], shape (M,).
         """
-        points = rays.origin_m + hits.range_m[:, None] * rays.direction
-        made = cls._of(points, hits.normal, 1.0)
         return replace(
-            made,
+            cls._of(rays.origin_m + hits.range_m[:, None] * rays.direction, hits.normal, 1.0),
             intensity=watts * reflectance / math.pi,
             least_cosine=np.zeros(len(rays)),
             lambertian=np.ones(len(rays), dtype=bool),
@@ -290,9 +287,15 @@ def render_transient(
     first = shared_caster(scene, frame).first_hit(rays.origin_m, rays.direction)
     centre_m, reach_m = _neighbourhood(first, rays, lights)
     shapes, arrays = scene_shapes(scene, frame, centre_m, reach_m, matt=matt)
-    columns = _ray_columns(rays, first, centre_m, cone_sr)
-    columns["baseline"] = np.zeros(count) + bins.start_m
-    columns["dark_radius"] = np.full(count, 0.0 if direct else SAME_PLACE * reach_m)
+    origin = rays.origin_m - centre_m
+    columns = {
+        "origin": origin,
+        "direction": rays.direction,
+        "dark_place": origin + np.where(np.isfinite(first.range_m), first.range_m, 0.0)[:, None] * rays.direction,
+        "cone_cosine_m1": np.zeros(count) if cone_sr is None else np.asarray(cone_sr) / (2 * math.pi),
+        "baseline": np.zeros(count) + bins.start_m,
+        "dark_radius": np.full(count, 0.0 if direct else SAME_PLACE * reach_m),
+    }
     request = {"shapes": shapes, "samples": samples, "bins": bins.count, "width_m": bins.width_m}
     request |= {"bounces": bounces, "own": own_light}
     arrays |= (light_columns := _light_columns(lights, centre_m, reach_m))
@@ -322,17 +325,6 @@ def _neighbourhood(first: Hits, rays: Rays, lights: Lights) -> tuple[np.ndarray,
     points = np.concatenate([points, rays.origin_m, lights.origin_m])
     centre_m = (points.min(axis=0) + points.max(axis=0)) / 2
     return centre_m, float(np.linalg.norm(points - centre_m, axis=1).max())
-
-
-def _ray_columns(rays: Rays, first: Hits, centre_m: np.ndarray, cone_sr: np.ndarray | None) -> dict[str, np.ndarray]:
-    met_m = np.where(np.isfinite(first.range_m), first.range_m, 0.0)
-    origin = rays.origin_m - centre_m
-    return {
-        "origin": origin,
-        "direction": rays.direction,
-        "dark_place": origin + met_m[:, None] * rays.direction,
-        "cone_cosine_m1": np.zeros(len(rays)) if cone_sr is None else np.asarray(cone_sr) / (2 * math.pi),
-    }
 
 
 def _light_columns(lights: Lights, centre_m: np.ndarray, reach_m: float) -> dict[str, np.ndarray]:
@@ -366,7 +358,6 @@ def _axes(forward: np.ndarray) -> np.ndarray:
     """Forward, left and up as rows for forward directions (M, 3), shape (M, 3, 3)."""
     forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
     # the coordinate axis that is furthest from forward cannot be parallel to it
-    other = np.eye(3)[np.abs(forward).argmin(axis=1)]
-    left = np.cross(other, forward)
+    left = np.cross(np.eye(3)[np.abs(forward).argmin(axis=1)], forward)
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     return np.stack([forward, left, np.cross(forward, left)], axis=1)

@@ -129,8 +129,7 @@ def _lights(mi: Any, dr: Any) -> type:
             distance = dr.norm(offset)
             toward = offset / dr.maximum(distance, dr.smallest(mi.Float))
             # The irradiance of lights at a distance in a direction away from them, on a surface that faces them
-            away = -toward
-            forward, left, up = (dr.dot(away, job.at(f"light_{name}", index)) for name in ("forward", "left", "up"))
+            forward, left, up = (dr.dot(-toward, job.at(f"light_{name}", index)) for name in ("forward", "left", "up"))
             inside = (forward >= job.at("light_cosine", index)) & (distance > job.at("light_itself", index))
             inside &= dr.abs(left) <= job.at("light_left_tan", index) * dr.abs(forward)
             inside &= dr.abs(up) <= job.at("light_up_tan", index) * dr.abs(forward)
@@ -183,16 +182,15 @@ def _shapes(mi: Any, request: dict[str, Any], arrays: dict[str, np.ndarray]) -> 
         material = {"type": "twosided", "inner": material}
         if clear > 0:
             material = {"type": "mask", "opacity": 1.0 - clear, "inner": material}
-        surface = material
         name = f"body{number}"
         if shape["kind"] == "mesh":
-            made[name] = _mesh(mi, name, surface, arrays[f"vertices{number}"], arrays[f"faces{number}"])
+            made[name] = _mesh(mi, name, material, arrays[f"vertices{number}"], arrays[f"faces{number}"])
             continue
         ends, radius = shape["ends"], shape["radius"]
         for end, centre in enumerate(ends[: 1 if ends[0] == ends[1] else 2]):
-            made[f"{name}_{end}"] = {"type": "sphere", "center": centre, "radius": radius, "bsdf": surface}
+            made[f"{name}_{end}"] = {"type": "sphere", "center": centre, "radius": radius, "bsdf": material}
         if ends[0] != ends[1]:
-            made[name] = {"type": "cylinder", "p0": ends[0], "p1": ends[1], "radius": radius, "bsdf": surface}
+            made[name] = {"type": "cylinder", "p0": ends[0], "p1": ends[1], "radius": radius, "bsdf": material}
     return made
 
 
