@@ -70,11 +70,6 @@ def test_the_angles_of_a_ray_list_give_its_directions():
     np.testing.assert_allclose(again, rays.direction, atol=1e-14)
 
 
-def test_the_names_of_the_sensors_travel_in_the_npz(tmp_path):
-    EXPORTERS["npz"].write(design(), lay_out(design()), tmp_path / "x.npz")
-    assert read_npz(tmp_path / "x.npz")["sensor_names"].tolist() == ["s0, größe", "s1, größe"]
-
-
 def test_the_sensor_table_is_a_design_again(tmp_path):
     path = tmp_path / "two.csv"
     notes = EXPORTERS["sensors-csv"].write(design(), lay_out(design()), path)
