@@ -152,10 +152,9 @@ def _outcomes(
     for rays, (length_m, outcome) in zip(every, found, strict=True):
         for place in range(len(rays)):
             returns = next(measured)
-            for step, frame in enumerate(frames):
-                outcome[place, step] = returns[frame].outcome
-                returned = returns[frame].returned
-                length_m[place, step][returned] = returns[frame].range_m[returned]
+            for step, seen in enumerate(returns[frame] for frame in frames):
+                outcome[place, step] = seen.outcome
+                length_m[place, step][seen.returned] = seen.range_m[seen.returned]
     return found
 
 

@@ -217,11 +217,17 @@ OF_SOLID = ("up", "down", "above")
 
 def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndarray | None) -> str:
     """Everything of the view; `looks` are the designs' colours and dashes, `density_m` (K, 3) observed points."""
+    # a world in a plane is always seen from above
+    left_out = OF_SOLID if is_flat(shown.directions) else ()
+    buttons = "".join(
+        f'<button type="button" data-camera="{how}">{word}</button>' for how, word in CAMERA if how not in left_out
+    )
     stage = (
         f'<div class="stage"><div id="view-scene" tabindex="0" role="application" aria-label="3D view of the scene. '
         'Arrow keys turn it, plus and minus go closer and farther, Home shows the first view."></div>'
         '<img id="view-printed" alt="The 3D view as it stood when the page was printed">'
-        f"{_camera_buttons(is_flat(shown.directions))}</div>"
+        f'<div class="buttons" role="group" aria-label="Camera">{buttons}'
+        '<button type="button" id="view-save">Save picture</button></div></div>'
     )
     # one switch per outcome that any ray has, with the look of its rays and how many are drawn
     there = {int(code) for one in shown.designs for code in np.unique(one.outcome)} | {int(Outcome.RETURN)}
@@ -271,17 +277,6 @@ def view_notes(shown: SceneFigure) -> list[str]:
         left_out.append("the detector's effects decide what returns")
     further = "; ".join(left_out)
     return [how, *([further[0].upper() + further[1:] + "."] if further else [])]
-
-
-def _camera_buttons(flat: bool) -> str:
-    """What moves the camera; a world in a plane is always seen from above."""
-    buttons = "".join(
-        f'<button type="button" data-camera="{how}">{word}</button>'
-        for how, word in CAMERA
-        if not (flat and how in OF_SOLID)
-    )
-    save = '<button type="button" id="view-save">Save picture</button>'
-    return f'<div class="buttons" role="group" aria-label="Camera">{buttons}{save}</div>'
 
 
 def _sliders(shown: SceneFigure) -> str:
