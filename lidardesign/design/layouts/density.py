@@ -56,10 +56,7 @@ class DensityLayout(Layout):
     name = "density"
     fitted_as = "density"
     follows_from_sensors = False
-
-    def needs_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
-        """See `Layout`."""
-        return True
+    follows_from_samples = True
 
     def fit(self, request: FitProblem) -> FittedDesign:
         """See `Layout`."""

@@ -190,14 +190,7 @@ class DistributedLayout(Layout):
     usual_gates = "ray"
     starts_at_sensors = False
     extends_origins = True
-
-    def needs_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
-        """See `Layout`: the sensors alone will do."""
-        return False
-
-    def uses_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
-        """See `Layout`."""
-        return True
+    follows_from_samples = False
 
     def lay_out(self, spec: DesignSpec, count: int, samples: Samples | None, gates: Gates, seed: int) -> Rays:
         """See `Layout`: by the Gaussian of a sensor that has fewer samples than rays."""

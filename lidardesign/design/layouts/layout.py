@@ -234,6 +234,7 @@ class Layout(ABC):
         usual_gates: Whether rays have their sensor's gate or their own, where nothing else is said.
         one_sensor_per_ray: Whether every ray is a sensor of its own: another number of rays is another fit.
         follows_from_sensors: Whether the sensors alone say where rays go.
+        follows_from_samples: Whether rays follow from samples of the density alone; None where only gates per ray do.
         starts_at_sensors: Whether rays start where their sensor stands.
         extends_origins: Whether rays start across their sensor's origins; then they have gates of their own, without
             samples too.
@@ -244,6 +245,7 @@ class Layout(ABC):
     usual_gates: ClassVar[Gates] = "sensor"
     one_sensor_per_ray: ClassVar[bool] = False
     follows_from_sensors: ClassVar[bool] = True
+    follows_from_samples: ClassVar[bool | None] = None
     starts_at_sensors: ClassVar[bool] = True
     extends_origins: ClassVar[bool] = False
 
@@ -302,11 +304,11 @@ class Layout(ABC):
 
     def needs_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
         """Whether a number of rays, None for any but its own, follows from samples of the density alone."""
-        return gates == "ray"
+        return gates == "ray" if self.follows_from_samples is None else self.follows_from_samples
 
     def uses_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
         """Whether that number of rays follows from samples where there are some."""
-        return self.needs_samples(spec, count, gates)
+        return self.extends_origins or self.needs_samples(spec, count, gates)
 
     def leaves_rays_open(self, gates: Gates | None) -> bool:
         """Whether a fit may leave the number of rays open, and keeps no table of them."""
@@ -316,6 +318,8 @@ class Layout(ABC):
         """The number of rays that a design was made for; None where it leaves it open."""
         if spec.rays is not None:
             return spec.rays
+        if spec.track is not None:
+            return len(spec.track.sensor)
         if spec.ray_table is not None:
             return len(spec.ray_table)
         counts = [sensor.rays for sensor in spec.sensors]

@@ -40,7 +40,9 @@ class Nearest:
             centres: Shape (K, F).
         """
         if len(centres) == 1 or centres.shape != self._centres.shape:
-            distance = self._search(centres)
+            found, labels = cKDTree(centres).query(self._points, k=min(2, len(centres)))
+            found, labels = found.reshape(len(found), -1), labels.reshape(len(labels), -1)
+            distance, self._labels, self._others = found[:, 0], labels[:, 0].copy(), found[:, -1].copy()
         else:
             moved = np.sqrt(np.square(centres - self._centres).sum(axis=1))
             farthest = int(moved.argmax())
@@ -56,12 +58,6 @@ class Nearest:
                 self._labels[doubtful] = labels[:, 0]
         self._centres = centres.copy()
         return distance, self._labels.copy()
-
-    def _search(self, centres: np.ndarray) -> np.ndarray:
-        found, labels = cKDTree(centres).query(self._points, k=min(2, len(centres)))
-        found, labels = found.reshape(len(found), -1), labels.reshape(len(labels), -1)
-        self._labels, self._others = labels[:, 0].copy(), found[:, -1].copy()
-        return found[:, 0]
 
 
 # The iteration stops when no centre moves by more than this share of the features' extent: far below the

@@ -17,7 +17,7 @@ from lidardesign.design.layouts.density import DensityLayout
 from lidardesign.design.layouts.distributed import DistributedLayout
 from lidardesign.design.layouts.gates import GridLayout
 from lidardesign.design.layouts.layout import Layout
-from lidardesign.design.layouts.scan import ScanLayout, TrackLayout
+from lidardesign.design.layouts.scan import ScanLayout
 from lidardesign.design.layouts.track import moved, placed
 from lidardesign.design.mixture.support import Retarget, conditioned
 from lidardesign.design.sensor import DesignSpec, Gates
@@ -33,14 +33,11 @@ class FixedLayout(Layout):
     # fixed rays are what they are: sensors like those of parts have even rays
     fitted_as = "grid"
     follows_from_sensors = False
+    follows_from_samples = False
 
     def check_constraints(self, constraints: Constraints) -> None:
         """See `Layout`."""
         raise ConfigError("the rays of real parts cannot be fitted", where="--layout fixed", hint="--layout grid")
-
-    def needs_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
-        """See `Layout`."""
-        return False
 
     def most_count(self, spec: DesignSpec) -> int | None:
         """See `Layout`."""
@@ -69,12 +66,11 @@ class FixedLayout(Layout):
 LAYOUTS: Mapping[str, Layout] = {
     layout.name: layout for layout in (GridLayout(), DensityLayout(), ScanLayout(), DistributedLayout(), FixedLayout())
 }
-TRACK = TrackLayout()
 
 
 def layout_of(design: DesignSpec) -> Layout:
-    """The layout of a design's rays."""
-    return LAYOUTS[design.layout] if design.track is None else TRACK
+    """The layout of a design's rays; those of a track are a scan at every value of its condition."""
+    return LAYOUTS[design.layout if design.track is None else "scan"]
 
 
 def gates_of(design: DesignSpec) -> Gates:

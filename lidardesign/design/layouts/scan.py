@@ -148,14 +148,6 @@ class ScanLayout(Layout):
         return rays_with_gates(spec, [np.zeros((int(n), 2)) for n in shares_of(spec, count)], samples, gates)
 
 
-class TrackLayout(ScanLayout):
-    """A scan whose rays vary along a condition; at one value of it, it is a scan with a table of rays."""
-
-    def own_count(self, spec: DesignSpec) -> int | None:
-        """See `Layout`."""
-        return len(spec.track.sensor) if spec.rays is None and spec.track is not None else super().own_count(spec)
-
-
 @phase("scan")
 def _fit_cells(samples: GroupSamples, count: int, request: FitProblem) -> Ensemble:
     """One component per ray, of the cells of what rays look at.
