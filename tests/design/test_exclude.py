@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.aisles import AISLE
 from support.command_line import caller, make_run
 from support.tables import each_row
 
@@ -319,11 +320,6 @@ def test_a_ray_that_starts_in_a_box_is_seen(document):
 
 
 # --- tracks
-
-AISLE = DesignSpace(
-    (-0.5, 0.0, 0.0, -math.pi / 2, 0.0, 0.1), (4.0, 0.0, 0.0, -math.pi / 2, math.pi / 2, 5.0), condition=("x_m",),
-    measure="angles",
-)  # fmt: skip
 
 
 def shelf(count=6000):

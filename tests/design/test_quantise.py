@@ -20,14 +20,6 @@ def cloud(seed, count=400, dimensions=2):
     return generator.normal(size=(count, dimensions)), generator.uniform(0.1, 3.0, count)
 
 
-def naive_lloyd(features, weights, centres, iterations=2000):
-    for _ in range(iterations):
-        labels = np.square(features[:, None] - centres[None]).sum(-1).argmin(axis=1)
-        cells = [labels == k for k in range(len(centres))]
-        centres = np.array([np.average(features[cell], axis=0, weights=weights[cell]) for cell in cells])
-    return centres
-
-
 @each_row("count", [1, 2, 7, 40])
 @each_row("dimensions", [1, 2, 5])
 def test_every_centre_is_the_weighted_mean_of_its_cell_and_every_label_the_nearest_centre(count, dimensions):
@@ -39,12 +31,6 @@ def test_every_centre_is_the_weighted_mean_of_its_cell_and_every_label_the_neare
     for k in range(count):
         mean = np.average(features[labels == k], axis=0, weights=weights[labels == k])
         np.testing.assert_allclose(centres[k], mean, atol=1e-5)
-
-
-def test_a_naive_lloyd_started_at_the_result_stays_there():
-    features, weights = cloud(3)
-    centres, _ = lloyd(features, weights, 12, np.random.default_rng(1), iterations=2000)
-    np.testing.assert_allclose(naive_lloyd(features, weights, centres, 50), centres, atol=1e-4)
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,4 +1,4 @@
-"""Mixtures at random and their density by plain loops."""
+"""Mixtures at random, and draws of them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,9 @@ import math
 import numpy as np
 
 from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.mixture.mixture import (
-    Mixture,
-)
-from lidardesign.design.sensor import boresight_frame, interval_factor, tangent_coordinates, tangent_directions
-from lidardesign.numerics import logsumexp
-from lidardesign.space import DesignSpace, angles, direction
+from lidardesign.design.mixture.mixture import Mixture
+from lidardesign.design.sensor import interval_factor, tangent_directions
+from lidardesign.space import DesignSpace, angles
 
 Z = interval_factor(0.95)
 
@@ -55,30 +52,3 @@ def drawn(mixture, count, generator, space=WHOLE):
 
 def features_of(points, space=WHOLE, weights=None):
     return Features.of(points, np.ones(len(points)) if weights is None else weights, Axes.of(space), space)
-
-
-def naive_log_density(mixture, points, free_origin=True):
-    """Plain loops over samples and components with the sensor module's own tangent map."""
-    result = np.empty(len(points))
-    for n, point in enumerate(points):
-        terms = []
-        for k in range(len(mixture)):
-            total = math.log(mixture.weights[k])
-            if free_origin:
-                away = point[:3] - mixture.origin_m[k]
-                covariance = mixture.origin_covariance_m2[k]
-                total -= 0.5 * away @ np.linalg.solve(covariance, away)
-                total -= 0.5 * math.log((2 * math.pi) ** 3 * np.linalg.det(covariance))
-            frame = boresight_frame(mixture.azimuth_rad[k], mixture.elevation_rad[k], mixture.roll_rad[k])
-            ray = direction(point[3], point[4])
-            u = tangent_coordinates(frame, ray[None])[0]
-            angle = math.atan2(np.linalg.norm(np.cross(frame[0], ray)), frame[0] @ ray)
-            for axis in range(2):
-                spread = mixture.spread_rad[k, axis]
-                total -= 0.5 * (u[axis] / spread) ** 2 + math.log(spread * math.sqrt(2 * math.pi))
-            total += math.log(angle / math.sin(angle)) if angle > 0 else 0.0
-            z = (point[5] - mixture.range_m[k]) / mixture.spread_range_m[k]
-            total -= 0.5 * z * z + math.log(mixture.spread_range_m[k] * math.sqrt(2 * math.pi))
-            terms.append(total)
-        result[n] = logsumexp(terms)
-    return result

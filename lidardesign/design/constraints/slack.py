@@ -102,20 +102,18 @@ def room_of(check: ConstraintCheck) -> Room:
     bound, value = _numbers(check.bound), _numbers(check.value)
     # room and what it is a share of, at every end
     ends: list[tuple[float, float]] = []
-    if not bound or not value:
-        return Room(None, None)
     if check.name.endswith(UPPER_ENDS) and len(bound) == len(value):
         ends = [(limit - found, abs(limit)) for limit, found in zip(bound, value, strict=True)]
     elif check.name.endswith(LOWER_ENDS) and len(bound) == len(value):
         ends = [(found - limit, abs(limit)) for limit, found in zip(bound, value, strict=True)]
-    elif check.name.endswith(".boresight.azimuth_deg"):
+    elif check.name.endswith(".boresight.azimuth_deg") and bound and value:
         low, high = bound
         width = high - low if high - low >= FULL_TURN_DEG else (high - low) % FULL_TURN_DEG
         past = (value[0] - low) % FULL_TURN_DEG
         inside = min(past, width - past)
         # outside, the nearer end counts
         ends = [(inside if inside >= 0 else -min(past - width, FULL_TURN_DEG - past), width)]
-    elif f".{SPACE_MARK}" in check.name and len(bound) == 2:
+    elif f".{SPACE_MARK}" in check.name and len(bound) == 2 and value:
         low, high = bound
         ends = [(value[0] - low, high - low), (high - value[-1], high - low)]
     if not ends:

@@ -121,8 +121,10 @@ class ScanLayout(Layout):
         request = replace(request, em_samples=max(request.em_samples, SAMPLES_PER_RAY * count))
         supports = admitted_samples(request, 1)
         ensemble = _fit_cells(group_samples(request, supports, 1)[0], count, request)
-        sensors = sensors_of(ensemble, request.samples.space, request.level)
-        order = sorted(sensors, key=lambda s: (round(s.elevation_rad, 9), s.azimuth_rad, s.range_m))
+        order = sorted(
+            sensors_of(ensemble, request.samples.space, request.level),
+            key=lambda sensor: (round(sensor.elevation_rad, 9), sensor.azimuth_rad, sensor.range_m),
+        )
         design = DesignSpec(
             name=request.name,
             sensors=tuple(replace(sensor, name=f"s{index}", rays=1) for index, sensor in enumerate(order)),
