@@ -76,7 +76,6 @@ class FitResult:
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON keys; the path of the design is for the caller to fill."""
-        snap = {} if self.snap is None else {"snap": dict(self.snap)}
         return {
             "design": self.design.name,
             "sensors": [sensor.as_dict() for sensor in self.design.sensors],
@@ -87,7 +86,7 @@ class FitResult:
             "constraints": [check.as_dict() for check in self.constraints],
             "seconds": self.seconds,
             "error_estimates": as_documents(self.error_estimates),
-            **snap,
+            **({} if self.snap is None else {"snap": dict(self.snap)}),
         }
 
 

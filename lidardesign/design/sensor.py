@@ -177,10 +177,9 @@ class Sensor:
         horizontal, vertical = self.field_of_view_rad
         start, end = self.gate_m
         length, along = self.travel_m
-        part = {} if self.part is None else {"part": self.part}
         return {
             "name": self.name,
-            **part,
+            **({} if self.part is None else {"part": self.part}),
             "weight": float(self.weight),
             "origin_m": {
                 "mean": [float(v) for v in self.origin_m],

@@ -12,8 +12,6 @@ from support.tables import each_row
 
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
-from lidardesign.design.mixture.bounds import Group
-from lidardesign.design.mixture.support import restrict_samples
 from lidardesign.errors import ConfigError
 from lidardesign.samples import Samples
 from lidardesign.space import aim
@@ -141,13 +139,6 @@ def test_a_thin_box_pins_one_coordinate():
     assert sensor.origin_m[2] == 0.01
     assert sensor.origin_covariance_m2[0, 0] > 1e-5
     np.testing.assert_array_equal(sensor.origin_covariance_m2[2], 0.0)
-
-
-def test_the_support_outside_the_gate_is_left_out():
-    rules = constrained(gate={"end_m": {"max": 0.6}}).rules
-    support = restrict_samples(FIXED, rules, Group((None, None, None), (0,)))
-    assert support.points[:, 5].max() <= 0.6
-    assert support.total == pytest.approx(FIXED.weights[FIXED.points[:, 5] <= 0.6].sum())
 
 
 def slanted(space, count=12000, seed=3):

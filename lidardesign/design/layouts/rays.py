@@ -59,8 +59,7 @@ class FixedLayout(Layout):
         from lidardesign.design.catalog.part import even_subset
 
         chosen = [rows[even_subset(table.direction[rows], int(n))] for rows, n in zip(of_sensor, shares, strict=True)]
-        rays = table.subset(np.sort(np.concatenate(chosen)))
-        return replace(rays, time_s=fire_times(count, DEFAULT_RATE_HZ))
+        return replace(table.subset(np.sort(np.concatenate(chosen))), time_s=fire_times(count, DEFAULT_RATE_HZ))
 
 
 LAYOUTS: Mapping[str, Layout] = {

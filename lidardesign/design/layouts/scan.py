@@ -344,9 +344,11 @@ def _with_gates(
         wider = np.maximum(width[:-1], width[1:])
         return wider[read_out.model.bins(wider).sum(axis=1).argmax()]
 
-    even = np.full(count, 1.0 / count)
     return fit_within_budget(
-        track(bounds), lambda _, width_m: track(bounds.narrowed(width_m)), lambda t: (worst_widths(t), even), read_out
+        track(bounds),
+        lambda _, width_m: track(bounds.narrowed(width_m)),
+        lambda fitted: (worst_widths(fitted), np.full(count, 1.0 / count)),
+        read_out,
     )[0]
 
 
