@@ -105,9 +105,6 @@ PRESET_LEARNING: dict[str, dict[str, Any]] = {
 }
 
 
-STRUCTURE_MARKS = ("[", "{", '"', "'")
-
-
 @dataclass(frozen=True)
 class Override:
     """One `--set`.
@@ -135,11 +132,12 @@ def parse_override(text: str, option: str = "--set") -> Override:
     if not equals or not all(parts):
         raise ConfigError("is not of the form KEY=VALUE", where=where, allowed="a dotted key, as density.sigma_m=0.005")
     value = value.strip()
+    if value.startswith(("[", "{", '"', "'")):
+        return Override(tuple(parts), parse_yaml(value, where=where).value, where)
     try:
-        meant = parse_yaml(value, where=where).value if value.startswith(STRUCTURE_MARKS) else resolve_scalar(value)
+        return Override(tuple(parts), resolve_scalar(value), where)
     except ValueError as error:
         raise ConfigError(str(error), where=where, allowed="a finite number") from None
-    return Override(tuple(parts), meant, where)
 
 
 def apply_override(values: dict[str, Any], override: Override) -> KeyPath:

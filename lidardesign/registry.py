@@ -172,21 +172,24 @@ def probed(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:
             process.end()
 
 
-def answer(result: Any, document: dict[str, Any]) -> None:
-    """Write a probe's answer and end the probing process: threads and exit handlers of the plugin end with it."""
+def write_line(result: Any, document: dict[str, Any]) -> None:
+    """Write a line of a probe's answer; a process that cannot is ended."""
     try:
         result.write(json.dumps(document).encode() + b"\n")
         result.flush()
     except OSError:
         os._exit(UNANSWERED)
+
+
+def answer(result: Any, document: dict[str, Any]) -> None:
+    """Write a probe's answer and end the probing process: threads and exit handlers of the plugin end with it."""
+    write_line(result, document)
     os._exit(0)
 
 
 GROUP = "lidardesign.tasks"
 IMPORT_SECONDS = 30.0
-LIST_HINT = "lidardesign tasks list"
 AUTHOR_HINT = "tell its author"
-OWN_DISTRIBUTION = "lidardesign"
 # Plugins that are imported elsewhere at the same time.
 SIDE_BY_SIDE = 8
 
@@ -248,7 +251,7 @@ def _known(name: str) -> list[EntryPoint]:
             f"unknown task {name!r}",
             where="TASK",
             allowed=", ".join(sorted(offers)),
-            hint=f"did you mean {close[0]!r}?" if close else LIST_HINT,
+            hint=f"did you mean {close[0]!r}?" if close else "lidardesign tasks list",
         )
     return offers[name]
 
@@ -332,7 +335,7 @@ def import_task(offer: EntryPoint, seconds: float) -> Task:
 
 def _is_foreign(offer: EntryPoint) -> bool:
     """Whether a plugin is none of this package's own, and this is not the process that finds out about it."""
-    return PROBING not in os.environ and (offer.dist is None or offer.dist.name != OWN_DISTRIBUTION)
+    return PROBING not in os.environ and (offer.dist is None or offer.dist.name != "lidardesign")
 
 
 @functools.cache

@@ -20,7 +20,6 @@ from lidardesign.space import RANGE, DesignSpace
 FILE_NAME = "samples.npz"
 NUMBERS = ("points", "log_prob", "log_target")
 DAMAGED_HINT = "learn the run again"
-NOT_FINITE = "holds values that are not finite"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +44,7 @@ class Samples:
     def __post_init__(self) -> None:
         numbers = np.isfinite(self.points).all() and np.isfinite(self.log_prob).all()
         if not (numbers and (self.log_target < np.inf).all()):
-            raise DataError(NOT_FINITE, where="samples", hint=DAMAGED_HINT)
+            raise DataError("holds values that are not finite", where="samples", hint=DAMAGED_HINT)
 
     def __len__(self) -> int:
         return len(self.points)

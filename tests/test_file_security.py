@@ -54,11 +54,13 @@ def unsafe(tree):
         else:
             named = []
         yield from (f"{node.lineno}: imports {name}" for name in named if name.split(".")[0] in UNSAFE_PACKAGES)
+        if isinstance(node, ast.Attribute) and dotted(node) in UNSAFE_CALLS:
+            yield f"{node.lineno}: uses {dotted(node)}"
         if not isinstance(node, ast.Call):
             continue
         name = dotted(node.func)
         keywords = {keyword.arg: keyword.value for keyword in node.keywords}
-        if name in UNSAFE_NAMES | UNSAFE_CALLS:
+        if name in UNSAFE_NAMES:
             yield f"{node.lineno}: calls {name}"
         if name in ("np.load", "np.lib.format.read_array", "np.save"):
             allowed = keywords.get("allow_pickle")

@@ -204,23 +204,6 @@ def test_nothing_imports_the_shipped_tasks():
     assert not [name for name, tree in package().items() if "lidardesign_tasks" in str(imported(tree))]
 
 
-# what it reads back it has written itself a line before
-UNPICKLES_ITS_OWN = ("lidardesign.testing.scenes",)
-
-
-def test_no_code_unpickles_files_or_loads_unsafe_yaml():
-    unsafe = []
-    for name, tree in trees().items():
-        forbidden = {"dill", "joblib", "cloudpickle", "shelve", "marshal"}
-        forbidden |= set() if name in UNPICKLES_ITS_OWN else {"pickle"}
-        unsafe += [f"{name}:{line}" for target, line in imported(tree) if target.split(".")[0] in forbidden]
-        for node in ast.walk(tree):
-            of_yaml = isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "yaml"
-            if of_yaml and node.attr in {"load", "load_all", "unsafe_load", "full_load"}:
-                unsafe.append(f"{name}:{node.lineno}")
-    assert not unsafe
-
-
 def test_exported_names_exist():
     missing = []
     for name, tree in package().items():

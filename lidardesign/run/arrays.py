@@ -23,11 +23,12 @@ from lidardesign.errors import DataError, LidardesignError
 NUMERIC_KINDS = "buif"
 LARGEST_BYTES = 1 << 30
 LARGEST_HEADER_BYTES = 10_000
-SAVE_HINT = "write it with numpy.savez"
 Result = TypeVar("Result")
 
 
-def read_npz(path: Path, *, kinds: str = NUMERIC_KINDS, hint: str = SAVE_HINT) -> dict[str, np.ndarray]:
+def read_npz(
+    path: Path, *, kinds: str = NUMERIC_KINDS, hint: str = "write it with numpy.savez"
+) -> dict[str, np.ndarray]:
     """All arrays of a file by name.
 
     Arguments:

@@ -74,15 +74,7 @@ def _wrong_values(admitted: list[Any], value: Any, path: KeyPath) -> Iterator[tu
 Model = TypeVar("Model", bound=BaseModel)
 
 
-class Locate(typing.Protocol):
-    """Where a value or its key stands, as `Document.locate`."""
-
-    def __call__(self, path: KeyPath, *, key: bool = False) -> str:
-        """The position, for messages."""
-        ...
-
-
-def check_model(model: type[Model], values: Any, locate: typing.Callable[[KeyPath], str], section: str = "") -> Model:
+def check_model(model: type[Model], values: Any, locate: Callable[..., str], section: str = "") -> Model:
     """Validate values with a pydantic model; the first error becomes a ConfigError at its position.
 
     Arguments:
@@ -129,7 +121,7 @@ def _explain(
     model: type[BaseModel],
     values: Any,
     error: ValidationError,
-    locate: Locate,
+    locate: Callable[..., str],
     section: str,
 ) -> ConfigError:
     """The ConfigError of a pydantic error: unknown keys first, since they often explain the others."""

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.registry import BEGUN, GRACE_SECONDS, START_SECONDS, UNANSWERED, PluginProcess, answer
+from lidardesign.registry import BEGUN, GRACE_SECONDS, START_SECONDS, PluginProcess, answer, write_line
 from lidardesign.testing.law import LOADS, Finding, Law, Limits, error_words, place_of
 from lidardesign.testing.watch import Watch
 
@@ -192,7 +192,7 @@ def answer_check(request: dict[str, Any]) -> None:
     contract.subject.watch.empty_folder = Path(_make_folder(request, "work"))
     os.chdir(contract.subject.watch.empty_folder)
     for finding in contract.findings():
-        _write_finding(result, finding)
+        write_line(result, finding.as_dict())
     answer(result, {})
 
 
@@ -222,27 +222,26 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     try:
         task, config = _loaded(request, watch)
     except registry.PluginError as error:
-        _write_finding(result, Finding(*LOADS, "fail", f"{error_words(error)}{place_of(error)}"))
+        write_line(result, Finding(*LOADS, "fail", f"{error_words(error)}{place_of(error)}").as_dict())
         return None
     except LidardesignError as error:
         if str(error.where).startswith("defaults of task"):
-            _write_finding(result, Finding(*LOADS, "fail", f"{error.where}: {error_words(error)}"))
+            write_line(result, Finding(*LOADS, "fail", f"{error.where}: {error_words(error)}").as_dict())
         else:
-            _write(result, {"refused": error.as_dict()})
+            write_line(result, {"refused": error.as_dict()})
         return None
     except BaseException as error:
-        _write_finding(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}"))
+        write_line(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}").as_dict())
         return None
     # not before: a plugin that fails to load is named without the libraries that the laws need
     from lidardesign.testing.contract import Contract
     from lidardesign.testing.law import Subject
 
     version = f"version {task.api_version} of the task interface"
-    _write_finding(
-        result, Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started)
-    )
+    loaded = Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started)
+    write_line(result, loaded.as_dict())
     limits = Limits(request["seconds"], request["memory_bytes"])
-    return Contract(Subject(task, config, limits, watch, lambda what: _write(result, {CALLED: what})))
+    return Contract(Subject(task, config, limits, watch, lambda what: write_line(result, {CALLED: what})))
 
 
 def _loaded(request: dict[str, Any], watch: Watch) -> tuple[Task, RunConfig]:
@@ -254,15 +253,3 @@ def _loaded(request: dict[str, Any], watch: Watch) -> tuple[Task, RunConfig]:
         return task, resolve(
             task, preset="draft", config_file=config_file, overrides=request["overrides"], seed=request["seed"]
         )
-
-
-def _write_finding(result: BinaryIO, finding: Finding) -> None:
-    _write(result, finding.as_dict())
-
-
-def _write(result: BinaryIO, document: dict[str, Any]) -> None:
-    try:
-        result.write(json.dumps(document).encode() + b"\n")
-        result.flush()
-    except OSError:
-        os._exit(UNANSWERED)

@@ -18,8 +18,6 @@ from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run import files
-from lidardesign.run import files as lock
-from lidardesign.run import files as processes
 from lidardesign.run import manifest as manifest_module
 from lidardesign.run.files import remove_stray_temporaries, run_lock, sha256_file, write_atomic
 from lidardesign.run.manifest import (
@@ -108,7 +106,7 @@ def test_the_next_writer_of_a_file_removes_what_a_killed_one_left(tmp_path, name
     left = files.temporary_beside(tmp_path / name)
     abandoned = left.with_name(left.name.replace(f"-{os.getpid()}.", f"-{GONE}."))
     at_work, of_another_file = left, abandoned.with_name(f".other{abandoned.name}")
-    of_another_computer = abandoned.with_name(abandoned.name.replace(processes.host_mark(), "0" * 8))
+    of_another_computer = abandoned.with_name(abandoned.name.replace(files.host_mark(), "0" * 8))
     for path in (abandoned, at_work, of_another_file, of_another_computer):
         path.write_bytes(b"half")
     write_atomic(tmp_path / name, b"whole")
@@ -200,8 +198,8 @@ def test_a_second_writer_is_told_who_holds_the_run(tmp_path):
     with run_lock(tmp_path):
         with pytest.raises(ConfigError, match=f"process {os.getpid()}"), run_lock(tmp_path):
             pass
-        assert (tmp_path / lock.FILE_NAME).exists()
-    assert not (tmp_path / lock.FILE_NAME).exists()
+        assert (tmp_path / files.FILE_NAME).exists()
+    assert not (tmp_path / files.FILE_NAME).exists()
 
 
 HOLDER = """
@@ -217,26 +215,26 @@ def test_the_lock_of_a_killed_process_is_free(tmp_path):
     holder = subprocess.Popen([sys.executable, "-c", HOLDER, tmp_path], stdout=subprocess.PIPE, text=True)
     assert holder.stdout.readline() == "held\n"
     name = f"process {holder.pid} on {socket.gethostname()}"
-    assert lock.writer(tmp_path) == name
+    assert files.writer(tmp_path) == name
     with pytest.raises(ConfigError, match=f"{name} is writing this run"), run_lock(tmp_path):
         pass
     holder.kill()
     holder.wait()
     holder.stdout.close()
     (tmp_path / ".flow.1.aa.tmp").write_bytes(b"half")
-    assert lock.writer(tmp_path) is None
+    assert files.writer(tmp_path) is None
     with run_lock(tmp_path):
-        assert os.listdir(tmp_path) == [lock.FILE_NAME]
+        assert os.listdir(tmp_path) == [files.FILE_NAME]
     assert os.listdir(tmp_path) == []
 
 
 @each_row("content", ["", "{}", "[]", json.dumps({"pid": 1, "host": "elsewhere"})])
 def test_a_lock_file_that_nobody_holds_is_no_obstacle(tmp_path, content):
-    (tmp_path / lock.FILE_NAME).write_text(content)
-    assert lock.writer(tmp_path) == ("process 1 on elsewhere" if "host" in content else "another process")
+    (tmp_path / files.FILE_NAME).write_text(content)
+    assert files.writer(tmp_path) == ("process 1 on elsewhere" if "host" in content else "another process")
     with run_lock(tmp_path):
-        assert lock.writer(tmp_path) == f"process {os.getpid()} on {socket.gethostname()}"
-    assert lock.writer(tmp_path) is None
+        assert files.writer(tmp_path) == f"process {os.getpid()} on {socket.gethostname()}"
+    assert files.writer(tmp_path) is None
 
 
 def test_a_writer_waits_for_one_that_holds_the_run_for_an_instant(tmp_path):
@@ -251,9 +249,9 @@ def test_a_writer_waits_for_one_that_holds_the_run_for_an_instant(tmp_path):
     thread.start()
     held.wait()
     with run_lock(tmp_path, wait_s=30):
-        assert (tmp_path / lock.FILE_NAME).exists()
+        assert (tmp_path / files.FILE_NAME).exists()
     thread.join()
-    assert not (tmp_path / lock.FILE_NAME).exists()
+    assert not (tmp_path / files.FILE_NAME).exists()
 
 
 def test_a_file_verifies_before_and_after_the_write_that_was_announced(run):

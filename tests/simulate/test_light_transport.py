@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.tables import each_row
-from support.transients import needs_simulator, pixel_rays, rays_from, spiral
+from support.transients import binned, flood, needs_simulator, pixel_rays, rays_from, spiral, spot
 
 from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.geometry.raycast import shared_caster
@@ -90,7 +90,7 @@ def test_every_ray_has_the_gain_and_the_time_of_the_direct_component(name, recei
     rays = rays_from((0, 0, 0), spiral(4000, 0.3))
     echoes = single_bounces(scene, rays)
     # light is sent from the receiver: what is then seen along a beam is its gain
-    lights = Lights.flood(np.zeros((1, 3))) if receiver is None else Lights.receiver(receiver)
+    lights = flood(np.zeros((1, 3))) if receiver is None else Lights.receiver(receiver)
     found = render_transient(scene, 0, rays, lights, PathBins(BIN_M, 400))
     gain, path_m = np.zeros(len(rays)), np.zeros(len(rays))
     gain[echoes.ray], path_m[echoes.ray] = echoes.gain, 2 * echoes.path_m
@@ -103,7 +103,7 @@ def test_every_ray_has_the_gain_and_the_time_of_the_direct_component(name, recei
     assert abs(ratio.mean() - 1) < ENERGY
     assert np.quantile(np.abs(ratio - 1), 0.99) < 10 * ENERGY
     assert np.abs(ratio - 1).max() < MOST_ENERGY
-    peak = found.bins.centres_m[found.binned[both].argmax(axis=1)]
+    peak = found.bins.centres_m[binned(found)[both].argmax(axis=1)]
     # within its bin; paths that end on a bin's edge may round to the next
     assert np.abs(peak - path_m[both]).max() < BIN_M / 2 + 1e-6
 
@@ -122,7 +122,7 @@ def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitte
     ours = histogram(2 * echoes.path_m, echoes.gain / count, bins)
     pixels, solid_sr = pixel_rays(receiver, 240, 240)
     solid_angle = 2 * math.pi * (1 - math.cos(half_rad))
-    lights = Lights.spot(np.array([emitter_m]), axis[None], half_rad, 1 / solid_angle)
+    lights = spot(np.array([emitter_m]), axis[None], half_rad, 1 / solid_angle)
     found = render_transient(scene, 0, pixels, lights, bins)
     seen = np.bincount(found.cell, found.radiance * solid_sr[found.ray], bins.count)
     theirs = histogram(bins.centres_m, seen, bins)
@@ -140,7 +140,7 @@ def test_every_shape_is_exported_where_it_is(shape, offset_m):
     scene = Scene((Body(shape, reflectance=0.6, poses=rigid(turned(2), place)),))
     rays = rays_from((offset_m, 0.0, 0.0), spiral(500, 0.3), far_m=100.0)
     echoes = single_bounces(scene, rays)
-    found = render_transient(scene, 0, rays, Lights.flood(rays.origin_m[:1]), PathBins(0.01, 1))
+    found = render_transient(scene, 0, rays, flood(rays.origin_m[:1]), PathBins(0.01, 1))
     assert (np.flatnonzero(found.steady > 0) == echoes.ray).mean() == 1
     np.testing.assert_allclose(found.steady[echoes.ray], echoes.gain, rtol=MOST_ENERGY)
 
@@ -155,12 +155,12 @@ def test_meshes_are_shaded_on_both_sides_and_follow_their_poses():
     # not onto the edge that both triangles share
     rays = rays_from((0, 0.3, 0.1), np.array([[1.0, 0, 0]]))
     for frame, distance_m in ((0, 5.0), (1, 2.0)):
-        found = render_transient(scene, frame, rays, Lights.flood(rays.origin_m), PathBins(0.1, 200, -0.05))
+        found = render_transient(scene, frame, rays, flood(rays.origin_m), PathBins(0.1, 200, -0.05))
         assert found.steady[0] == pytest.approx(0.5 / (math.pi * distance_m**2), rel=1e-5)
         assert found.cell.tolist() == [round(2 * distance_m / 0.1)]
     behind = replace(scene, bodies=(replace(scene.bodies[0], poses=away),))
     back = rays_from((7, 0.3, 0.1), np.array([[-1.0, 0, 0]]))
-    found = render_transient(behind, 0, back, Lights.flood(back.origin_m), PathBins(0.1, 200))
+    found = render_transient(behind, 0, back, flood(back.origin_m), PathBins(0.1, 200))
     assert found.steady[0] == pytest.approx(0.5 / (math.pi * 4), rel=1e-5)
 
 
@@ -171,14 +171,14 @@ def test_light_within_a_ball_adds_up_to_the_geometric_series(bounces):
     radius_m, reflectance = 1.5, 0.6
     scene = Scene((Body(Sphere(radius_m), reflectance=reflectance),))
     rays = rays_from((0, 0, 0), spiral(200, math.pi))
-    lights = Lights.flood(np.zeros((1, 3)), 1 / (4 * math.pi))
+    lights = flood(np.zeros((1, 3)), 1 / (4 * math.pi))
     found = render_transient(scene, 0, rays, lights, PathBins(0.1, 400, -0.05), bounces=bounces, samples=256, seed=5)
     once = reflectance / (math.pi * 4 * math.pi * radius_m**2)
     series = once * sum(reflectance**k for k in range(bounces))
     spread = found.steady.std() / math.sqrt(len(rays))
     assert found.steady.mean() == pytest.approx(series, abs=4 * spread + 1e-5 * series)
     # a chord is 4 R / 3 long on average
-    late_m = found.binned.mean(axis=0) @ found.bins.centres_m / found.steady.mean()
+    late_m = binned(found).mean(axis=0) @ found.bins.centres_m / found.steady.mean()
     share = np.array([reflectance**k for k in range(bounces)]) / sum(reflectance**k for k in range(bounces))
     assert late_m == pytest.approx(2 * radius_m + share @ np.arange(bounces) * 4 * radius_m / 3, rel=0.01)
 
@@ -189,7 +189,7 @@ def test_mirrors_and_glass_take_their_shares_of_matt_light():
     for shares in ({}, {"specular": 0.4}, {"transmission": 0.4}, {"specular": 0.3, "transmission": 0.4}):
         wall = Body(Box((0.1, 1, 1)), reflectance=0.3, poses=rigid(translation_m=(2.1, 0.02, 0.03)), **shares)
         found = render_transient(
-            Scene((wall,)), 0, rays, Lights.flood(np.zeros((1, 3))), PathBins(0.1, 100), samples=4096
+            Scene((wall,)), 0, rays, flood(np.zeros((1, 3))), PathBins(0.1, 100), samples=4096
         )
         assert found.steady[0] == pytest.approx(0.3 / (math.pi * 4), rel=0.08)
 
@@ -198,13 +198,13 @@ def test_mirrors_and_glass_take_their_shares_of_matt_light():
 def test_what_a_ray_sees_does_not_depend_on_the_rays_after_it():
     scene = Scene((Body(Box((1, 1, 1)), reflectance=0.5),))
     many = rays_from((0.1, 0, 0), spiral(40, 1.0))
-    lights, bins = Lights.flood(np.array([[0.2, 0.1, 0.3]])), PathBins(0.05, 200)
+    lights, bins = flood(np.array([[0.2, 0.1, 0.3]])), PathBins(0.05, 200)
     whole, part = (
         render_transient(scene, 0, rays, lights, bins, bounces=4, samples=64, seed=3)
         for rays in (many, many.subset(np.arange(20)))
     )
     # sums are made in any order
-    np.testing.assert_allclose(whole.binned[:20], part.binned, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(binned(whole)[:20], binned(part), rtol=1e-4, atol=1e-9)
     other = render_transient(scene, 0, many, lights, bins, bounces=4, samples=64, seed=4)
     assert np.abs(other.steady - whole.steady).max() > 1e-4 * whole.steady.max()
 
@@ -213,9 +213,9 @@ def test_what_a_ray_sees_does_not_depend_on_the_rays_after_it():
 def test_no_rays_or_no_lights_give_no_light():
     scene, bins = sphere_scene(), PathBins(0.1, 10)
     none = rays_from((0, 0, 0), np.zeros((0, 3)))
-    assert render_transient(scene, 0, none, Lights.flood(np.zeros((1, 3))), bins).binned.shape == (0, 10)
+    assert binned(render_transient(scene, 0, none, flood(np.zeros((1, 3))), bins)).shape == (0, 10)
     rays = rays_from((0, 0, 0), spiral(3, 0.1))
-    assert not render_transient(scene, 0, rays, Lights.flood(np.zeros((0, 3))), bins).binned.any()
+    assert not binned(render_transient(scene, 0, rays, flood(np.zeros((0, 3))), bins)).any()
 
 
 def test_a_camera_fills_its_field_of_view():
@@ -234,7 +234,7 @@ def test_a_camera_fills_its_field_of_view():
 def test_impossible_requests_are_refused_before_anything_runs(numbers):
     rays = rays_from((0, 0, 0), spiral(3, 0.1))
     with pytest.raises(ConfigError, match="allowed"):
-        render_transient(sphere_scene(), 0, rays, Lights.flood(np.zeros((1, 3))), PathBins(0.1, 10), **numbers)
+        render_transient(sphere_scene(), 0, rays, flood(np.zeros((1, 3))), PathBins(0.1, 10), **numbers)
 
 
 @each_row("numbers", [(0.0, 10), (math.nan, 10), (0.1, 0), (0.1, 10, math.inf)])
@@ -312,11 +312,11 @@ def test_the_simulator_runs_from_any_folder_and_is_imported_in_its_own_process_a
         f"sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
         "import numpy as np\n"
         "from lidardesign.scene import Body, Scene, Sphere, rigid\n"
-        "from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient\n"
-        "from support.transients import rays_from, spiral\n"
+        "from lidardesign.simulate.light_transport.transport import PathBins, render_transient\n"
+        "from support.transients import flood, rays_from, spiral\n"
         "ball = Scene((Body(Sphere(0.12), poses=rigid(translation_m=(0.45, 0.01, 0.02))),))\n"
         "rays = rays_from((0, 0, 0), spiral(4, 0.1))\n"
-        "found = render_transient(ball, 0, rays, Lights.flood(rays.origin_m[:1]), PathBins(0.1, 9))\n"
+        "found = render_transient(ball, 0, rays, flood(rays.origin_m[:1]), PathBins(0.1, 9))\n"
         "assert found.steady.all()\n"
         "assert not {'mitsuba', 'drjit', 'mitransient'} & set(sys.modules)\n"
     )
@@ -332,4 +332,4 @@ def test_a_request_that_fails_is_reported_and_the_next_one_is_answered():
     with pytest.raises(NumericalError, match="KeyError"):
         process.ask({}, {})
     rays = rays_from((0, 0, 0), spiral(10, 0.1))
-    assert render_transient(sphere_scene(), 0, rays, Lights.flood(np.zeros((1, 3))), PathBins(0.1, 10)).steady.all()
+    assert render_transient(sphere_scene(), 0, rays, flood(np.zeros((1, 3))), PathBins(0.1, 10)).steady.all()

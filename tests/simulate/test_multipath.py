@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.tables import each_row
-from support.transients import needs_simulator, rays_from, spiral
+from support.transients import binned, needs_simulator, rays_from, spiral, spot
 
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Rays
@@ -112,7 +112,7 @@ def test_a_flood_of_rays_hears_what_a_lamp_of_the_same_cone_shows(count):
     """The spots of rays, even in solid angle, stand for a lamp that lights the cone evenly."""
     rays = into_the_corner(count)
     share, late_m = shares(corner(), rays, FLOOD)
-    lights = Lights.spot(rays.origin_m[:1], np.array([[1.0, 0, -0.5]]), 0.5, 1.0)
+    lights = spot(rays.origin_m[:1], np.array([[1.0, 0, -0.5]]), 0.5, 1.0)
     bins = PathBins(0.02, 1024)
     indirect = render_transient(corner(), 0, rays, lights, bins, bounces=6, samples=512, direct=False, seed=1)
     direct = render_transient(corner(), 0, rays, lights, bins)
@@ -121,7 +121,7 @@ def test_a_flood_of_rays_hears_what_a_lamp_of_the_same_cone_shows(count):
     # how densely rays lie is told from six neighbours, worst at the edge of the field
     assert share @ weight == pytest.approx(lamp @ weight, rel=0.15)
     assert np.median(share / lamp) == pytest.approx(1, abs=0.12)
-    lamp_late_m = (indirect.binned @ bins.centres_m / indirect.steady - 2 * direct_range(rays)) / 2
+    lamp_late_m = (binned(indirect) @ bins.centres_m / indirect.steady - 2 * direct_range(rays)) / 2
     assert np.average(late_m, weights=share * weight) == pytest.approx(
         np.average(lamp_late_m, weights=lamp * weight), rel=0.15
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from lidardesign.geometry.frames import receiver_axes
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Receiver
 from lidardesign.simulate.light_transport import process
+from lidardesign.simulate.light_transport.transport import Lights, Transients
 from support.rays import rays_along
 
 needs_simulator = pytest.mark.skipif(
@@ -32,6 +34,24 @@ def spiral(count: int, half_angle_rad: float, axis: tuple[float, ...] = (1.0, 0.
 
 def rays_from(origin_m: tuple[float, ...], direction: np.ndarray, far_m: float = 10.0) -> Rays:
     return rays_along(direction, (0.0, far_m), origin_m)
+
+
+def flood(origin_m: np.ndarray, intensity: float = 1.0) -> Lights:
+    """Lights at points (M, 3) that shine everywhere alike; 1 W has the intensity 1 / (4 pi)."""
+    return Lights.everywhere(origin_m, np.tile([0.0, 0.0, 1.0], (len(origin_m), 1)), intensity)
+
+
+def spot(origin_m: np.ndarray, direction: np.ndarray, half_angle_rad: float, intensity: float) -> Lights:
+    """Lights at points (M, 3) that shine evenly into a cone; 1 W has the intensity 1 / (2 pi (1 - cos))."""
+    least_cosine = np.full(len(origin_m), math.cos(half_angle_rad))
+    return replace(Lights.everywhere(origin_m, direction, intensity), least_cosine=least_cosine)
+
+
+def binned(found: Transients) -> np.ndarray:
+    """The radiance of every ray in every bin, shape (N, count)."""
+    table = np.zeros((len(found.steady), found.bins.count))
+    table[found.ray, found.cell] = found.radiance
+    return table
 
 
 def pixel_rays(receiver: Receiver, columns: int, rows: int) -> tuple[Rays, np.ndarray]:

@@ -29,10 +29,7 @@ PLANCK_J_S = 6.62607015e-34
 # Full width at half maximum over standard deviation of a Gaussian.
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
-Emission = Literal["scanned", "flood"]
 Estimator = Literal["peak", "matched"]
-HistogramStart = Literal["gate", "pulse"]
-Correction = Literal["none", "coates"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,7 @@ class Photons:
     wavelength_m: float
     pulse_energy_j: float
     pulses_per_frame: float
-    emission: Emission
+    emission: Literal["scanned", "flood"]
     repetition_hz: float
     aperture_m2: float
     field_of_view_sr: float
@@ -108,8 +105,8 @@ class Detector:
     estimator: Estimator = "peak"
     false_alarm: float = 0.01
     bins: int | None = None
-    histogram_start: HistogramStart = "gate"
-    correction: Correction = "none"
+    histogram_start: Literal["gate", "pulse"] = "gate"
+    correction: Literal["none", "coates"] = "none"
 
     @property
     def timing_sigma_s(self) -> float:

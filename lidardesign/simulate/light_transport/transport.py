@@ -134,18 +134,6 @@ class Lights:
         return len(self.origin_m)
 
     @classmethod
-    def flood(cls, origin_m: np.ndarray, intensity: float = 1.0) -> Lights:
-        """Lights at points (M, 3) that shine everywhere alike; 1 W has the intensity 1 / (4 pi)."""
-        return cls._of(origin_m, np.tile([0.0, 0.0, 1.0], (len(origin_m), 1)), intensity)
-
-    @classmethod
-    def spot(cls, origin_m: np.ndarray, direction: np.ndarray, half_angle_rad: float, intensity: float) -> Lights:
-        """Lights at points (M, 3) that shine evenly into a cone; 1 W has the intensity 1 / (2 pi (1 - cos))."""
-        return replace(
-            cls._of(origin_m, direction, intensity), least_cosine=np.full(len(origin_m), math.cos(half_angle_rad))
-        )
-
-    @classmethod
     def beams(
         cls, hits: Hits, rays: Rays, reflectance: np.ndarray, *, watts: float = 1.0, radius_m: np.ndarray | None = None
     ) -> Lights:
@@ -159,7 +147,7 @@ class Lights:
             radius_m: The size of each patch [m], shape (M,).
         """
         return replace(
-            cls._of(rays.origin_m + hits.range_m[:, None] * rays.direction, hits.normal, 1.0),
+            cls.everywhere(rays.origin_m + hits.range_m[:, None] * rays.direction, hits.normal, 1.0),
             intensity=watts * reflectance / math.pi,
             least_cosine=np.zeros(len(rays)),
             lambertian=np.ones(len(rays), dtype=bool),
@@ -171,12 +159,13 @@ class Lights:
     def receiver(cls, receiver: Receiver) -> Lights:
         """A fixed receiver's aperture, sent backwards: 1 W/sr within its field of view."""
         axes = receiver_axes(receiver)
-        made = cls._of(np.asarray(receiver.origin_m)[None], axes[:1], 1.0)
+        made = cls.everywhere(np.asarray(receiver.origin_m)[None], axes[:1], 1.0)
         tangents = np.tan([[receiver.horizontal_rad / 2, receiver.vertical_rad / 2]])
         return replace(made, axes=axes[None], least_cosine=np.zeros(1), tangents=tangents)
 
     @classmethod
-    def _of(cls, origin_m: np.ndarray, forward: np.ndarray, intensity: float) -> Lights:
+    def everywhere(cls, origin_m: np.ndarray, forward: np.ndarray, intensity: float) -> Lights:
+        """Lights at points (M, 3) that look along `forward` and shine everywhere alike [W/sr]."""
         count = len(origin_m)
         zeros = np.zeros(count)
         return cls(
@@ -232,13 +221,6 @@ class Transients:
     cell: np.ndarray
     radiance: np.ndarray
     steady: np.ndarray
-
-    @property
-    def binned(self) -> np.ndarray:
-        """The radiance of every ray in every bin, shape (N, count)."""
-        table = np.zeros((len(self.steady), self.bins.count))
-        table[self.ray, self.cell] = self.radiance
-        return table
 
 
 def render_transient(

@@ -22,8 +22,6 @@ import numpy as np
 
 from lidardesign.numerics import TINY_FLOAT32
 
-# Plain float32 on the CPU, one channel: light of one wavelength.
-VARIANT = "llvm_ad_mono"
 RAY_COLUMNS = ("origin", "direction", "cone_cosine_m1", "baseline", "dark_place", "dark_radius")
 LIGHT_COLUMNS = (
     "light",
@@ -254,7 +252,8 @@ def main() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    mi.set_variant(VARIANT)
+    # plain float32 on the CPU, one channel: light of one wavelength
+    mi.set_variant("llvm_ad_mono")
     import mitransient  # noqa: F401 (registers its integrator and film)
 
     register(mi, dr)
