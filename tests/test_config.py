@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import pytest
@@ -245,12 +244,6 @@ def test_a_saved_configuration_that_was_edited_is_noticed(tmp_path):
     path.write_text(path.read_text().replace("0.01", "0.02"))
     with pytest.raises(DataError, match="changed"):
         load_run_config(tmp_path)
-
-
-def test_no_validation_warns(write):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        resolve(TASK, config_file=write("task: {model: a}"), overrides=["count=2"]).as_document()
 
 
 def test_a_run_is_judged_by_other_values_of_its_task_and_keeps_the_rest():

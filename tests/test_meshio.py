@@ -74,12 +74,6 @@ def test_the_parts_of_a_scene_stay_in_their_places(tmp_path):
     assert len(mesh.faces) == 24
 
 
-def test_a_mesh_without_shared_vertices_is_still_closed():
-    mesh = check_mesh(BOX_VERTICES[BOX_FACES].reshape(-1, 3), np.arange(36).reshape(-1, 3))
-    assert mesh.sign == "solid"
-    assert len(mesh.vertices) == 8
-
-
 def test_two_boxes_that_share_an_edge_are_closed():
     faces = np.vstack([BOX_FACES, BOX_FACES + 8])
     mesh = check_mesh(np.vstack([BOX_VERTICES, BOX_VERTICES + np.array([1.0, 1.0, 0.0])]), faces)

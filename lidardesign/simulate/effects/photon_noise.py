@@ -54,8 +54,7 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of few photons."""
-    sigma_m = first_hits.sigma_m()
-    blind = Blindness.of(counts)
+    sigma_m, blind = first_hits.sigma_m(), Blindness.of(counts)
     missed = missed_behind(counts, blind, sigma_m)
     invented = -np.expm1(-counts.leaked(sigma_m))
     reason = f"a return has about {counts.typical} photons"

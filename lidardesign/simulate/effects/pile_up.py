@@ -64,8 +64,7 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of counts that blind it."""
-    sigma_m = first_hits.sigma_m()
-    blind = Blindness.of(counts)
+    sigma_m, blind = first_hits.sigma_m(), Blindness.of(counts)
     squared = (sigma_m * blind.early) ** 2 + variance_of_missing(counts, counts.in_air, blind.left, sigma_m)
     # How much more often what is left of an echo is missed or mistaken
     per_bin, haze = counts.per_bin, [counts.pulses * part for part in counts.haze_per_pulse]
