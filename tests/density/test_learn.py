@@ -135,7 +135,7 @@ def test_progress_rows_are_valid_and_complete(finished):
 
 
 def test_an_analytic_scene_is_learned_well(tmp_path):
-    settings = {"steps": 250, "batch": 256, "layers": 2, "hidden": 32, "samples": 10_000, "checkpoint_seconds": 100.0}
+    settings = {"steps": 600, "batch": 512, "layers": 3, "hidden": 32, "samples": 10_000, "checkpoint_seconds": 100.0}
     # the ball fills the space: with an angle fixed, no proposal meets the rim of a silhouette
     space = replace(SPACE, low=(0, 0, 0, -0.25, 0, 0.2), high=(0, 0, 0, 0.25, 0, 2.5))
     config = config_of(space, **settings)
