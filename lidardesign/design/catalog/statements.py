@@ -106,6 +106,7 @@ class PartFieldOfView(Statement):
 class _Cells(Statement):
     """Rows and columns of rays."""
 
+    kind: str
     columns: Count
     rows: Count
 
