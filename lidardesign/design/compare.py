@@ -89,7 +89,7 @@ def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[SensorPair]:
 
 
 @dataclass(frozen=True)
-class Readout:
+class BandwidthUse:
     """The bandwidth of a design.
 
     Arguments:
@@ -111,7 +111,7 @@ class Readout:
         return {"low_mbps": self.low_mbps, "high_mbps": self.high_mbps, **rays, **model}
 
 
-def readout_of(design: DesignSpec) -> Readout:
+def readout_of(design: DesignSpec) -> BandwidthUse:
     """What a design's gates cost, by the read-out of its own constraints or the usual one."""
     budget = design.constraints.get("budget") or {}
     model = Bandwidth(**{name: float(budget[name]) for name in MODEL_KEYS if budget.get(name) is not None})
@@ -119,17 +119,17 @@ def readout_of(design: DesignSpec) -> Readout:
     if track is not None:
         widths = track.gate_m[..., 1] - track.gate_m[..., 0]
         found = [model.mbps_of_widths(row) for row in widths]
-        return Readout(model, min(found), max(found), len(track.sensor))
+        return BandwidthUse(model, min(found), max(found), len(track.sensor))
     if design.ray_table is not None:
         once = model.mbps(design.ray_table)
-        return Readout(model, once, once, len(design.ray_table))
+        return BandwidthUse(model, once, once, len(design.ray_table))
     widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in design.sensors])
     count = layout_of(design).own_count(design)
     if count is None:
         once = float(design.weights @ np.array([model.mbps_of_widths(width) for width in widths]))
     else:
         once = model.mbps_of_widths(widths, shares_of(design, count))
-    return Readout(model, once, once, count)
+    return BandwidthUse(model, once, once, count)
 
 
 def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:

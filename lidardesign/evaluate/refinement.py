@@ -27,7 +27,7 @@ from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.sensor import DesignSpec, interval_factor
 from lidardesign.errors import InfeasibleError, NumericalError
-from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.reweighting import Attention, Reweighting
 from lidardesign.evaluate.scene_scores import checked_residuals, checked_score
 from lidardesign.geometry.raycast import SceneCaster
@@ -78,7 +78,7 @@ class Trial:
     """
 
     result: FitResult
-    positions: Positions
+    positions: RaysPerCondition
     bandwidth_mbps: float
 
 
@@ -310,7 +310,7 @@ class Refiner:
             self.progress(self.rounds[-1])
 
 
-def _returns(scene: Scene, casters: Sequence[SceneCaster], positions: Positions) -> list[Returns]:
+def _returns(scene: Scene, casters: Sequence[SceneCaster], positions: RaysPerCondition) -> list[Returns]:
     """One list of returns per condition value and frame."""
     return [frame for rays in positions for frame in simulate(scene, rays, casters=casters)]
 

@@ -15,7 +15,7 @@ from lidardesign.design.fit import rays_at
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, PluginError
-from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.baselines.catalog import Density
 from lidardesign.evaluate.baselines.simple import LayOut, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import CmaSettings
@@ -97,7 +97,7 @@ class EvaluationRequest:
             raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
 
     def scene_pass(
-        self, fired: Callable[[int], Sequence[Positions]], planner: Planner, plans: Sequence[EffectPlan] = ()
+        self, fired: Callable[[int], Sequence[RaysPerCondition]], planner: Planner, plans: Sequence[EffectPlan] = ()
     ) -> ScenePass:
         """Sets of rays in the held-out scenes: see `ScenePass`."""
         return ScenePass(self.task, self.config, self.space, self.seed, self.test, fired, planner, plans)

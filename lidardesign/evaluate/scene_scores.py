@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import PluginError
-from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Returns
 from lidardesign.geometry.triangles import SecondCasts
@@ -38,7 +38,7 @@ MOST_RETURNS = 4_000_000
 def score_lists(
     task: Task,
     scene: Scene,
-    jobs: Sequence[Positions],
+    jobs: Sequence[RaysPerCondition],
     casters: Sequence[SceneCaster],
     physics: Physics | None = None,
 ) -> Iterator[tuple[Score, float]]:
@@ -75,12 +75,12 @@ def score_lists(
             yield score, time.perf_counter() - started + per_ray * _count(positions)
 
 
-def _count(positions: Positions) -> int:
+def _count(positions: RaysPerCondition) -> int:
     return sum(len(rays) for rays in positions)
 
 
-def _groups(jobs: Sequence[Positions], frames: int) -> Iterator[list[Positions]]:
-    group: list[Positions] = []
+def _groups(jobs: Sequence[RaysPerCondition], frames: int) -> Iterator[list[RaysPerCondition]]:
+    group: list[RaysPerCondition] = []
     size = 0
     for positions in jobs:
         returns = _count(positions) * frames
@@ -183,7 +183,7 @@ class ScenePass:
     space: DesignSpace
     seed: int
     scenes: Sequence[Scene]
-    fired: Callable[[int], Sequence[Positions]]
+    fired: Callable[[int], Sequence[RaysPerCondition]]
     planner: Planner
     plans: Sequence[EffectPlan] = ()
 
@@ -233,7 +233,7 @@ def score_here(scenes: ScenePass, progress: Progress | None) -> list[SceneScores
 
 
 def score_in_scene(
-    task: Task, scene: Scene, lists: Sequence[Positions], planner: Planner, known: EffectPlan | None, seed: int
+    task: Task, scene: Scene, lists: Sequence[RaysPerCondition], planner: Planner, known: EffectPlan | None, seed: int
 ) -> SceneScores:
     """Score sets of rays in one scene.
 

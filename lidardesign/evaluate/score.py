@@ -21,7 +21,7 @@ from lidardesign.design.compare import outside_notes
 from lidardesign.design.layouts.track import travels
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.candidates import Candidate, Positions, TrainingViews, mean_mbps
+from lidardesign.evaluate.baselines.candidates import Candidate, RaysPerCondition, TrainingViews, mean_mbps
 from lidardesign.evaluate.baselines.catalog import part_notes
 from lidardesign.evaluate.baselines.simple import CMA, Baselines, Option, TwinCandidate
 from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
@@ -63,9 +63,9 @@ class Entry:
     """
 
     name: str
-    positions: Positions
+    positions: RaysPerCondition
     baseline: bool
-    redraw: Callable[[int], Positions] | None = None
+    redraw: Callable[[int], RaysPerCondition] | None = None
     matched_to: str | None = None
     matched_rays: int | None = None
     search: SearchRecord | None = None
@@ -79,7 +79,7 @@ class Entry:
         """What its rays cost to read out, averaged over condition values [Mbit/s]."""
         return mean_mbps(self.positions, bandwidth)
 
-    def drawn(self, scene: int) -> Positions:
+    def drawn(self, scene: int) -> RaysPerCondition:
         """The rays that it fires in a held-out scene."""
         return self.positions if self.redraw is None else self.redraw(scene)
 
@@ -173,7 +173,7 @@ def ordered_conditions(request: EvaluationRequest) -> list[dict[str, float]]:
 
 def _laid_out(
     request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], design: DesignSpec, count: int
-) -> Positions:
+) -> RaysPerCondition:
     samples = request.samples.get(design.name)
     return tuple(request.lay_out(design, count, samples, at=condition) for condition in conditions)
 
@@ -196,7 +196,7 @@ def _optimised(
     )
 
 
-def _judge(request: EvaluationRequest, lists: Sequence[Positions]) -> list[float]:
+def _judge(request: EvaluationRequest, lists: Sequence[RaysPerCondition]) -> list[float]:
     """The mean score of sets of rays on a few training scenes, turned so that lower is better."""
     objective = TrainingObjective(request.task, request.train[:JUDGED_SCENES], request.planner, request.seed)
     if not objective.scenes:

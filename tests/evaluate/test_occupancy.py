@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidardesign.evaluate.baselines.candidates import RAY_AXES, Spot
+from lidardesign.evaluate.baselines.candidates import RAY_AXES, LayoutSite
 from lidardesign.evaluate.baselines.occupancy import AimedPoints, occupancy, occupancy_grid
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, direction, observed_point
@@ -52,7 +52,7 @@ def test_every_ray_passes_through_an_occupied_cell_inside_the_space(case):
     space, train = CASES[case]
     layout = occupancy(space, train, seed=2)
     grid = occupancy_grid(train, space, seed=2)
-    points = layout.place(200, Spot(space))
+    points = layout.place(200, LayoutSite(space))
     assert points.shape[0] == 200
     looking = direction(points[:, 3], points[:, 4])
     assert distance_to_cells(grid, points[:, :3], looking, space.high[5]).mean() > 0.99
@@ -68,13 +68,13 @@ def test_with_conditions_rays_start_at_the_position_and_end_in_its_cells():
     layout, grid = occupancy(AISLE, train, seed=2), occupancy_grid(train, AISLE, seed=2)
     for number, x in enumerate((0.5, 2.4)):
         space = AISLE.at({"x_m": x})
-        points = layout.place(100, Spot(space, number))
+        points = layout.place(100, LayoutSite(space, number))
         assert (points[:, 0] == x).all()
         np.testing.assert_allclose(points[:, 3], -math.pi / 2)
         looking = direction(points[:, 3], points[:, 4])
         assert distance_to_cells(grid, points[:, :3], looking, 5.0).all()
     # beyond the last box nothing is occupied: rays are uniform there
-    nowhere = layout.place(2000, Spot(AISLE.at({"x_m": 3.9}), 2))
+    nowhere = layout.place(2000, LayoutSite(AISLE.at({"x_m": 3.9}), 2))
     assert np.sin(nowhere[:, 4]).mean() == pytest.approx(0.5, abs=0.03)
 
 
@@ -110,11 +110,11 @@ def test_aiming_and_weighting_draw_the_same_rays():
 def test_what_was_asked_for_before_changes_no_draw():
     train = balls()
     fresh, used = (occupancy(CEILING, train, seed=5) for _ in range(2))
-    used.place(1500, Spot(CEILING))
-    used.place(10, Spot(CEILING, scene=4))
+    used.place(1500, LayoutSite(CEILING))
+    used.place(10, LayoutSite(CEILING, scene=4))
     for count in (0, 1, 30):
-        np.testing.assert_array_equal(fresh.place(count, Spot(CEILING)), used.place(count, Spot(CEILING)))
-    assert not np.array_equal(fresh.place(30, Spot(CEILING)), fresh.place(30, Spot(CEILING, scene=1)))
+        np.testing.assert_array_equal(fresh.place(count, LayoutSite(CEILING)), used.place(count, LayoutSite(CEILING)))
+    assert not np.array_equal(fresh.place(30, LayoutSite(CEILING)), fresh.place(30, LayoutSite(CEILING, scene=1)))
 
 
 def test_targets_out_of_reach_and_no_scenes_leave_nothing_to_aim_at():

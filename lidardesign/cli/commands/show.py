@@ -15,7 +15,7 @@ from lidardesign.errors import LidardesignError
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
-    from lidardesign.design.compare import Readout
+    from lidardesign.design.compare import BandwidthUse
 
 
 def show(
@@ -80,7 +80,7 @@ def show(
         output.result(document, show_all, show_costs=False)
 
 
-def _show_readout(readout: Readout, rich: RichConsole) -> None:
+def _show_readout(readout: BandwidthUse, rich: RichConsole) -> None:
     model, low, high = readout.model, number(readout.low_mbps), number(readout.high_mbps)
     span = low if low == high else f"{low} .. {high}"
     rays = "each ray in a frame" if readout.rays is None else f"{readout.rays} rays per frame"

@@ -14,7 +14,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed, with_memory
-from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.geometry.frames import path_windows
@@ -54,7 +54,7 @@ class Bench:
 
     request: EvaluationRequest
     planner: Planner
-    positions: Positions
+    positions: RaysPerCondition
     scenes: Sequence[Scene]
 
     @property
@@ -114,7 +114,7 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     return [*footprint, *_effects(bench, note, own)]
 
 
-def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, Positions]:
+def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, RaysPerCondition]:
     counts = sorted(set(asked.rays))
     with plugin_guard(asked.task.name):
         conditions = conditions_of(asked.task, asked.config, asked.space)

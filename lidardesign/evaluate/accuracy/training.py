@@ -22,7 +22,7 @@ from lidardesign.errors import LidardesignError
 from lidardesign.estimates import Estimate
 from lidardesign.evaluate.accuracy.probes import ERROR_OF, AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
-from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.registry import plugin_guard
 from lidardesign.run.manifest import read_manifest, verify
@@ -195,7 +195,7 @@ class _Judge:
         name = f"score_{unit}" if unit else "score"
         return {name: float(scores.mean()), f"{name}_difference_error": error}
 
-    def _laid_out(self, design: DesignSpec, samples: Samples) -> Positions | None:
+    def _laid_out(self, design: DesignSpec, samples: Samples) -> RaysPerCondition | None:
         """The rays of a quick fit; None where its constraints fix other rays, or the samples are too few for it."""
         try:
             is_open = design.ray_table is None and layout_of(design).leaves_rays_open(design.gates)

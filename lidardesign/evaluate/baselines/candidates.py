@@ -81,10 +81,10 @@ def opened_gate(start_m: float, end_m: float) -> np.ndarray:
     return np.array([start, start + SMALLEST_GATE_M])
 
 
-Positions = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
+RaysPerCondition = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
 
 
-class Spot(NamedTuple):
+class LayoutSite(NamedTuple):
     """Where and for which scene rays are laid out.
 
     Arguments:
@@ -104,10 +104,12 @@ class Candidate(Protocol):
     name: str
     drawn_anew: bool
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """Exactly `count` rays in each of the spaces."""
 
-    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition:
         """As many rays as fit in a bandwidth [Mbit/s], the same number in each space; none where not one fits."""
 
 
@@ -117,22 +119,24 @@ class BaselineLayout:
 
     Arguments:
         name: For messages.
-        place: Even or random points (x, y, z, azimuth, elevation) of any number, (count, spot) to (count, 5).
+        place: Even or random points (x, y, z, azimuth, elevation) of any number, (count, site) to (count, 5).
         gate_m: The gate of all its rays, shape (2,).
         drawn_anew: Whether the points differ from scene to scene.
     """
 
     name: str
-    place: Callable[[int, Spot], np.ndarray]
+    place: Callable[[int, LayoutSite], np.ndarray]
     gate_m: np.ndarray
     drawn_anew: bool = False
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """See `Candidate`."""
-        spots = (Spot(space, number, scene) for number, space in enumerate(spaces))
-        return tuple(rays_at(self.place(count, spot), self.gate_m) for spot in spots)
+        sites = (LayoutSite(space, number, scene) for number, space in enumerate(spaces))
+        return tuple(rays_at(self.place(count, site), self.gate_m) for site in sites)
 
-    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition:
         """See `Candidate`.
 
         Raises:
@@ -177,7 +181,7 @@ def rays_within(
     return count
 
 
-def mean_mbps(positions: Positions, bandwidth: Bandwidth) -> float:
+def mean_mbps(positions: RaysPerCondition, bandwidth: Bandwidth) -> float:
     """What reading rays out costs, averaged over condition values [Mbit/s]."""
     return math.fsum(bandwidth.mbps(rays) for rays in positions) / len(positions)
 
@@ -243,11 +247,11 @@ class TrainingViews:
             design[:, AZIMUTH] = unrolled(design[:, AZIMUTH])
         return Observed(design, hits_m)
 
-    def missing_returns(self, lists: Sequence[Positions]) -> list[float]:
+    def missing_returns(self, lists: Sequence[RaysPerCondition]) -> list[float]:
         """The share of rays without a return inside their gate, over all views."""
         return [self._missing(positions) for positions in lists]
 
-    def _missing(self, positions: Positions) -> float:
+    def _missing(self, positions: RaysPerCondition) -> float:
         returned = fired = 0
         for rays in positions:
             for _, caster in self.casters:

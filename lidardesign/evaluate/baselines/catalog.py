@@ -46,7 +46,7 @@ from lidardesign.design.snap.parts import (
 )
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import (
-    Positions,
+    RaysPerCondition,
     TrainingViews,
     dense_points,
     rays_within,
@@ -338,7 +338,7 @@ def part_candidates(
     ]
 
 
-def part_notes(rows: Sequence[tuple[str, Positions]]) -> list[str]:
+def part_notes(rows: Sequence[tuple[str, RaysPerCondition]]) -> list[str]:
     """How many parts the rows of `catalog:NAME` took, by their names and rays; silent where one was enough."""
     parts: dict[str, dict[int, int]] = {}
     for name, positions in rows:
@@ -385,13 +385,15 @@ class PartCandidate:
         self.name, self.part, self.scene, self._poses = name, part, scene, poses
         self._known: dict[int, Rays] = {}
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`."""
         if count not in self._known:
             self._known[count] = self._fired(count)
         return tuple(_carried(self._known[count], space, self.scene.travelled) for space in spaces)
 
-    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`.
 
         Raises:

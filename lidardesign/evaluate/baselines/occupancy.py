@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.evaluate.baselines.candidates import BaselineLayout, Spot, central, opened_gate, spread_frames
+from lidardesign.evaluate.baselines.candidates import BaselineLayout, LayoutSite, central, opened_gate, spread_frames
 from lidardesign.geometry.surface import sample_body
 from lidardesign.numerics import TINY
 from lidardesign.scene import Scene
@@ -142,12 +142,12 @@ def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> Baseline
     nearest, furthest = central(points[drawn, RANGE])
     known: dict[int, AimedPoints] = {}
 
-    def place(count: int, spot: Spot) -> np.ndarray:
-        aimed = known.setdefault(spot.number, AimedPoints(grid, spot.space, seed, 1 + spot.number))
-        generator = random_generator(seed, "occupancy baseline", count, spot.scene, spot.number)
+    def place(count: int, site: LayoutSite) -> np.ndarray:
+        aimed = known.setdefault(site.number, AimedPoints(grid, site.space, seed, 1 + site.number))
+        generator = random_generator(seed, "occupancy baseline", count, site.scene, site.number)
         found, weights = aimed.first(POINTS_PER_RAY * count)
         if not len(found):
-            return spot.space.sample(count, generator)
+            return site.space.sample(count, generator)
         return found[generator.choice(len(found), count, p=weights / weights.sum())]
 
     return BaselineLayout("occupancy", place, opened_gate(float(nearest), float(furthest)), drawn_anew=True)

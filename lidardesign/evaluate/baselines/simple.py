@@ -48,9 +48,9 @@ from lidardesign.evaluate.baselines.candidates import (
     RAY_AXES,
     BaselineLayout,
     Candidate,
+    LayoutSite,
     Observed,
-    Positions,
-    Spot,
+    RaysPerCondition,
     TrainingViews,
     central,
     dense_points,
@@ -94,13 +94,13 @@ def bounding(views: TrainingViews) -> list[BaselineLayout]:
 
 
 def _boxed(name: str, space: DesignSpace, low: np.ndarray, high: np.ndarray, gate_m: np.ndarray) -> BaselineLayout:
-    """Even rays in a box whose conditions take the values of the spot."""
+    """Even rays in a box whose conditions take the values of the site."""
     conditions = [axis for axis in space.conditioned if axis < RAY_AXES]
 
-    def place(count: int, spot: Spot) -> np.ndarray:
+    def place(count: int, site: LayoutSite) -> np.ndarray:
         lowest, highest = (np.array(end[:RAY_AXES], dtype=np.float64) for end in (low, high))
-        lowest[conditions] = np.array(spot.space.low)[conditions]
-        highest[conditions] = np.array(spot.space.high)[conditions]
+        lowest[conditions] = np.array(site.space.low)[conditions]
+        highest[conditions] = np.array(site.space.high)[conditions]
         return even_placement(lowest, highest, count)
 
     return BaselineLayout(name, place, gate_m)
@@ -133,7 +133,7 @@ def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, floa
     return float(middle), vertical[0] if vertical else float(np.median(observed.points[:, ELEVATION]))
 
 
-Judge = Callable[[Sequence[Positions]], Sequence[float]]
+Judge = Callable[[Sequence[RaysPerCondition]], Sequence[float]]
 NO_VISIBILITY = "no-visibility"
 CMA = "cma"
 
@@ -142,7 +142,7 @@ class Option(NamedTuple):
     """A candidate at a number of rays."""
 
     candidate: Candidate
-    positions: Positions
+    positions: RaysPerCondition
 
 
 class Baselines:
@@ -231,10 +231,10 @@ def _uniform(source: Baselines, argument: str) -> list[Candidate]:
 
 
 def _random(source: Baselines, argument: str) -> list[Candidate]:
-    def place(count: int, spot: Spot) -> np.ndarray:
+    def place(count: int, site: LayoutSite) -> np.ndarray:
         # the first position draws what a space without conditions draws
-        later = [spot.number] if spot.number else []
-        return spot.space.sample(count, random_generator(source.seed, "random baseline", count, spot.scene, *later))
+        later = [site.number] if site.number else []
+        return site.space.sample(count, random_generator(source.seed, "random baseline", count, site.scene, *later))
 
     return [BaselineLayout("random", place, whole_range(source.space), drawn_anew=True)]
 
@@ -372,9 +372,9 @@ class TwinCandidate:
     ) -> None:
         self.name = design.name
         self._design, self._samples, self._conditions, self._lay_out = design, samples, conditions, lay_out
-        self._known: dict[int, Positions] = {}
+        self._known: dict[int, RaysPerCondition] = {}
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`."""
         if count not in self._known:
             self._known[count] = tuple(
@@ -382,7 +382,9 @@ class TwinCandidate:
             )
         return self._known[count]
 
-    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition:
         """The most rays that a few steps in proportion to the bandwidth find; never more than fit."""
         low, high = 0, math.inf
         count = self._design.rays or max(len(self._design.sensors), 1)

@@ -21,7 +21,13 @@ from lidardesign.design.constraints.document import Constraints, Gate
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec
-from lidardesign.evaluate.baselines.candidates import Positions, TrainingViews, dense_points, opened_gate, whole_range
+from lidardesign.evaluate.baselines.candidates import (
+    RaysPerCondition,
+    TrainingViews,
+    dense_points,
+    opened_gate,
+    whole_range,
+)
 from lidardesign.evaluate.baselines.simple import CMA
 from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, Way
 from lidardesign.evaluate.cma.parameters import SearchRules
@@ -137,18 +143,20 @@ class CmaCandidate:
     seed: int
     name: str = CMA
     drawn_anew: bool = False
-    _known: dict[tuple[int | None, float | None], tuple[Positions, SearchRecord]] = field(default_factory=dict)
+    _known: dict[tuple[int | None, float | None], tuple[RaysPerCondition, SearchRecord]] = field(default_factory=dict)
 
-    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`."""
         return self._searched(RayAllowance(count))
 
-    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`: the number of rays is part of what is searched."""
         return self._searched(RayAllowance(None, limit_mbps, bandwidth))
 
     @phase("cma")
-    def _searched(self, rays: RayAllowance) -> Positions:
+    def _searched(self, rays: RayAllowance) -> RaysPerCondition:
         key = rays.count, rays.limit_mbps
         if key not in self._known:
             budget, show_search = self.settings.budget, self.settings.show
@@ -162,7 +170,7 @@ class CmaCandidate:
             self._known[key] = found.model.positions(found.vector, rays), self._record(found, rays)
         return self._known[key][0]
 
-    def record_of(self, positions: Positions) -> SearchRecord | None:
+    def record_of(self, positions: RaysPerCondition) -> SearchRecord | None:
         """How these rays were found."""
         return next((record for known, record in self._known.values() if known is positions), None)
 

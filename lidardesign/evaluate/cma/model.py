@@ -23,7 +23,7 @@ from lidardesign.design.constraints.feasibility import BIN_MARGIN, BandwidthBudg
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.track import boresight_azimuth
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec, Sensor, Track, interval_factor
-from lidardesign.evaluate.baselines.candidates import Positions, mean_mbps
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition, mean_mbps
 from lidardesign.evaluate.cma.parameters import NARROWEST_RAD, SearchRules, SensorParameters, exp_matrix, log_matrix
 from lidardesign.numerics import TINY, safe_divide, sphere_exp, sphere_log
 from lidardesign.space import DIMENSIONS, angles
@@ -242,11 +242,11 @@ class DesignModel:
             design = more
         return design
 
-    def positions(self, vector: np.ndarray, budget: RayAllowance) -> Positions:
+    def positions(self, vector: np.ndarray, budget: RayAllowance) -> RaysPerCondition:
         """The rays of that design at every condition value."""
         return self.laid_out(self.design(vector, budget))
 
-    def laid_out(self, design: DesignSpec) -> Positions:
+    def laid_out(self, design: DesignSpec) -> RaysPerCondition:
         """The rays of a design at every condition value."""
         return tuple(lay_out(design, design.rays, None, at=condition) for condition in self.conditions)
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.cma.model import DesignModel, RayAllowance
 from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.geometry.raycast import SceneCaster
@@ -78,7 +78,7 @@ class TrainingObjective:
         return 1.0 if self.task.metric.better == "lower" else -1.0
 
     def values(
-        self, lists: Sequence[Positions], scenes: Sequence[int], stop: Callable[[], bool] = lambda: False
+        self, lists: Sequence[RaysPerCondition], scenes: Sequence[int], stop: Callable[[], bool] = lambda: False
     ) -> np.ndarray:
         """The score of every set of rays in some scenes, lower is better, shape (sets, scenes).
 
@@ -99,7 +99,7 @@ class TrainingObjective:
                 raise OutOfTimeError
         return found
 
-    def returned(self, positions: Positions, scenes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    def returned(self, positions: RaysPerCondition, scenes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """The sensor (R,) and the range (R,) [m] of every return of a set of rays in some scenes."""
         sensors, ranges_m = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
         for number in scenes:
@@ -112,7 +112,7 @@ class TrainingObjective:
                 ranges_m.append(returns.range_m[returns.returned])
         return np.concatenate(sensors), np.concatenate(ranges_m)
 
-    def _of_scene(self, number: int, lists: Sequence[Positions]) -> tuple[list[SceneCaster], Physics | None]:
+    def _of_scene(self, number: int, lists: Sequence[RaysPerCondition]) -> tuple[list[SceneCaster], Physics | None]:
         """Casters and effects of a scene; the rays that are fired first say which effects it calls for."""
         if number not in self._prepared:
             scene = self.scenes[number]

@@ -22,8 +22,8 @@ from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.sensor import Coupling, Sensor, boresight_frame
 from lidardesign.evaluate.baselines.candidates import (
     RAY_AXES,
+    LayoutSite,
     Observed,
-    Spot,
     TrainingViews,
     central,
     dense_points,
@@ -307,7 +307,7 @@ def scan_layouts(
     space: DesignSpace, views: TrainingViews, observed: Observed, count: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Points (N, 5) and one gate (2,) each: those of `bounding`, at equal shares of the returns, and of `uniform`."""
-    found = [(layout.place(count, Spot(space)), layout.gate_m) for layout in bounding(views)]
+    found = [(layout.place(count, LayoutSite(space)), layout.gate_m) for layout in bounding(views)]
     angular = [axis for axis in (AZIMUTH, ELEVATION) if axis in space.free]
     if len(angular) == 1 and len(observed.points) and found:
         points = found[0][0].copy()

@@ -53,7 +53,7 @@ def pictures(evaluation: Evaluation, pictured: FigureData) -> dict[str, Callable
         "score_against_rays": lambda: curve_picture(evaluation, "rays"),
         "score_against_bandwidth": lambda: curve_picture(evaluation, "bandwidth"),
         "paired_differences": lambda: differences_picture(evaluation) if evaluation.paired else None,
-        "constraints": lambda: constraints_picture(pictured.tightness),
+        "constraints": lambda: constraints_picture(pictured.slacks),
         "effects": lambda: effects_picture(evaluation.effects),
         "accuracy": lambda: pareto_picture(sweeps),
         "times": lambda: times_picture(pictured.times),

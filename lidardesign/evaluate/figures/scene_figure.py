@@ -177,13 +177,13 @@ class FigureData:
     Arguments:
         shown: The designs in a scene.
         density: The learned density, where the run has its samples.
-        tightness: How tight each design's constraints are, by its name.
+        slacks: How tight each design's constraints are, by its name.
         times: Where the time of each command went, as a clock tells it.
     """
 
     shown: SceneFigure | None = None
     density: DensityView | None = None
-    tightness: Mapping[str, Sequence[ConstraintSlack]] = field(default_factory=dict)
+    slacks: Mapping[str, Sequence[ConstraintSlack]] = field(default_factory=dict)
     times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
@@ -203,8 +203,8 @@ def figure_data(
     shown = scene_figure(scene, request.designs, places, laid_out, planner=planner, seed=request.seed)
     density = request.density() if request.density is not None else None
     view = None if density is None else density_view(density.samples, scene, request.designs)
-    tightness = {design.name: constraint_slack_of(design, request.space) for design in request.designs}
-    return FigureData(shown, view, tightness, times)
+    slacks = {design.name: constraint_slack_of(design, request.space) for design in request.designs}
+    return FigureData(shown, view, slacks, times)
 
 
 def constraint_slack_of(design: DesignSpec, space: DesignSpace) -> list[ConstraintSlack]:

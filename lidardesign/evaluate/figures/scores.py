@@ -218,15 +218,15 @@ ON, OFF = "#0072B2", "#6b7280"
 LEAST_TOLERANCE_SHARE = 1e-4
 
 
-def constraints_picture(tightness: Mapping[str, Sequence[ConstraintSlack]]) -> Figure | None:
+def constraints_picture(slacks: Mapping[str, Sequence[ConstraintSlack]]) -> Figure | None:
     """The room that designs leave under each bound, a page wide; None where nothing was asked for.
 
     Arguments:
-        tightness: How tight each bound is, by the design's name.
+        slacks: How tight each bound is, by the design's name.
     """
     # what holds for every design of the space is no constraint of anybody's
     designs = {
-        name: rows for name, rows in tightness.items() if not all(row.name.startswith(SPACE_MARK) for row in rows)
+        name: rows for name, rows in slacks.items() if not all(row.name.startswith(SPACE_MARK) for row in rows)
     }
     if not designs:
         return None

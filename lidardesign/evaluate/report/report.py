@@ -249,7 +249,7 @@ def evaluation_report(
         title=f"{config.task_name}: {evaluation.metric.name} on {held_out_scenes(evaluation.scenes)}",
         density=pictured.density,
         density_m=points,
-        constraints=pictured.tightness,
+        constraints=pictured.slacks,
         times=times,
         reproduce=Reproduction(commands, facts, settings.read_text(encoding="utf-8") if settings.is_file() else ""),
     )

@@ -18,7 +18,7 @@ import numpy as np
 
 from lidardesign import __version__
 from lidardesign.errors import ConfigError, LidardesignError, PluginError
-from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scene_scores import ScenePass, SceneScores, score_in_scene
 from lidardesign.numerics import COARSE_SLACK
@@ -73,7 +73,7 @@ class SceneJob:
     source: SceneSource
     number: int
     outline: dict[str, Any]
-    sets: Sequence[Positions]
+    sets: Sequence[RaysPerCondition]
     planner: Planner
     plan: EffectPlan | None
 
