@@ -1,0 +1,217 @@
+"""Rays and gates chosen out of many: lazy greedy, then swaps, within a count per sensor and a bandwidth.
+
+Greedy on F - price * bits - harm picks the ray and gate that add most (Nemhauser, Wolsey and Fisher 1978); what a ray
+would add only shrinks as others are taken, so few have to be asked again (Minoux 1978). Then one ray at a time leaves
+and the best that is left comes in, until no swap gains. No constant is promised: `certificate` bounds what is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.design.selection import kernels
+from lidardesign.design.selection.coverage import Coverage
+
+SMALLEST_GAIN = 1e-9  # of F, relative: what a swap must gain, so that rounding cannot make two rays take turns
+BISECTIONS = 12  # of the price of bandwidth
+DEAREST = 1e6  # times what a mean bit is worth: the dearest that bandwidth is made
+MOST_PASSES = 10  # of swaps
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Which rays fire, and through which gate.
+
+    Arguments:
+        gate: The gate of each candidate ray, -1 for those that do not fire, (N,).
+        worth: F of the choice.
+        bits: What reading it out costs [Mbit/s].
+        harm: What it spoils, in the unit of worth.
+        price: What one Mbit/s was weighed with.
+    """
+
+    gate: np.ndarray
+    worth: float
+    bits: float
+    harm: float
+    price: float
+
+    @property
+    def rays(self) -> np.ndarray:
+        """Which candidates fire, in their order."""
+        return np.flatnonzero(self.gate >= 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """How many rays each sensor fires.
+
+    Arguments:
+        sensor: The sensor of each candidate ray, (N,).
+        most: The number of rays of each sensor, (S,).
+    """
+
+    sensor: np.ndarray
+    most: np.ndarray
+
+    @staticmethod
+    def of_one(rays: int, count: int) -> Counts:
+        """One sensor that fires `count` of all rays."""
+        return Counts(np.zeros(rays, dtype=np.intp), np.array([count]))
+
+
+class _Search:
+    """A choice under way: what it knows, what each ray would add, and what is left of each sensor's count."""
+
+    def __init__(self, coverage: Coverage, counts: Counts) -> None:
+        self.coverage, self.sensor, self.left = coverage, counts.sensor, counts.most.copy()
+        self.cost = coverage.harm
+        self.limit_mbps, self.spent_mbps = np.inf, 0.0
+        rays, gates = coverage.shape
+        self.gate = np.full(rays, -1)
+        self.known = np.zeros(len(coverage.weight))
+        self.gains = np.zeros((rays, gates))
+        coverage.gains(np.arange(rays), self.known, self.gains)
+
+    def improve(
+        self, price: float, limit_mbps: float, *, full: bool, passes: int, progress: Callable[[float], None] | None
+    ) -> None:
+        """Takes rays at a price and within a bandwidth, then swaps them."""
+        coverage = self.coverage
+        self.cost = coverage.harm + price * np.where(np.isfinite(coverage.bits), coverage.bits, 0.0)
+        self.limit_mbps = limit_mbps
+        self.fill(full)
+        for _ in range(passes):
+            worth = float(coverage.weight @ coverage.counted(self.known))
+            changed = self.swap(SMALLEST_GAIN * worth)
+            if progress is not None:
+                progress(worth)
+            if not changed:
+                return
+
+    def choice(self, price: float) -> Choice:
+        """What was chosen so far."""
+        return Choice(self.gate.copy(), self.coverage.worth_of(self.gate), *self.coverage.charge(self.gate), price)
+
+    def net(self, rays: np.ndarray | slice) -> np.ndarray:
+        """What each gate of rays would add at the least price that is known, -inf where it may not be taken."""
+        open_rays = (self.gate[rays] < 0) & (self.left[self.sensor[rays]] > 0)
+        affordable = self.spent_mbps + self.coverage.bits[rays] <= self.limit_mbps
+        return np.where(open_rays[:, None] & affordable, self.gains[rays] - self.cost[rays], -np.inf)
+
+    def best(self) -> tuple[int, int, float]:
+        """The ray and gate that add most now, and what they add; -inf where none may be taken."""
+        bound = self.net(slice(None)).max(axis=1)
+        while True:
+            ray = int(np.argmax(bound))
+            if bound[ray] == -np.inf:
+                return ray, -1, -np.inf
+            self.coverage.gains(np.array([ray]), self.known, self.gains)
+            nets = self.net(np.array([ray]))[0]
+            gate = int(np.argmax(nets))
+            bound[ray] = -np.inf
+            if nets[gate] >= bound.max():
+                return ray, gate, float(nets[gate])
+            bound[ray] = nets[gate]
+
+    def take(self, ray: int, gate: int) -> None:
+        """Fires a ray through a gate."""
+        self.coverage.learn_of(ray, gate, self.known)
+        self.gate[ray] = gate
+        self.left[self.sensor[ray]] -= 1
+        self.spent_mbps += self.coverage.bits[ray, gate]
+
+    def drop(self, ray: int) -> None:
+        """Takes a ray out; what rays beside it would add is asked anew."""
+        coverage, gate = self.coverage, int(self.gate[ray])
+        self.gate[ray] = -1
+        touched = np.zeros(len(self.gate), dtype=np.bool_)
+        touched[ray] = True
+        kernels.forget(
+            ray, coverage.start, coverage.item, coverage.worth, coverage.gates, *coverage.by_item,
+            self.gate, len(coverage.table) == 0, self.known, touched,
+        )  # fmt: skip
+        coverage.gains(np.flatnonzero(touched), self.known, self.gains)
+        self.left[self.sensor[ray]] += 1
+        self.spent_mbps -= coverage.bits[ray, gate]
+
+    def fill(self, full: bool) -> None:
+        """Takes rays greedily until counts or bandwidth are used up or, unless `full`, none gains."""
+        while True:
+            ray, gate, net = self.best()
+            if gate < 0 or (net <= 0 and not full):
+                return
+            self.take(ray, gate)
+
+    def swap(self, smallest: float) -> bool:
+        """Every chosen ray leaves once and the best comes in, where that gains; says whether any did."""
+        changed = False
+        for ray in np.flatnonzero(self.gate >= 0):
+            gate = int(self.gate[ray])
+            self.drop(int(ray))
+            own = float(self.gains[ray, gate] - self.cost[ray, gate])
+            other, new_gate, net = self.best()
+            if net > own + smallest:
+                self.take(other, new_gate)
+                changed = True
+            else:
+                self.take(int(ray), gate)
+        return changed
+
+
+def choose(
+    coverage: Coverage,
+    counts: Counts,
+    *,
+    price: float = 0.0,
+    full: bool = True,
+    passes: int = MOST_PASSES,
+    progress: Callable[[float], None] | None = None,
+) -> Choice:
+    """Rays and gates of large F - price * bits - harm.
+
+    Arguments:
+        coverage: What the candidates tell.
+        counts: How many rays each sensor fires.
+        price: What 1 Mbit/s costs, in the unit of worth.
+        full: Whether each sensor fires all its rays, also those that gain nothing.
+        passes: How often each ray may be swapped.
+        progress: Told the objective after every pass.
+    """
+    search = _Search(coverage, counts)
+    search.improve(price, np.inf, full=full, passes=passes, progress=progress)
+    return search.choice(price)
+
+
+def choose_within(
+    coverage: Coverage,
+    counts: Counts,
+    budget_mbps: float,
+    *,
+    full: bool = True,
+    progress: Callable[[float], None] | None = None,
+) -> Choice:
+    """The best choice found that a bandwidth allows; as `choose`, with a budget [Mbit/s] for a price.
+
+    A price reaches only the convex hull of what choices cost and are worth. So the price is bisected, and what the
+    least price that keeps to the budget leaves over is spent at the next lower price, then at none.
+    """
+    free = choose(coverage, counts, full=full, progress=progress)
+    if free.bits <= budget_mbps:
+        return free
+    low, high = 0.0, free.worth / free.bits
+    while choose(coverage, counts, price=high, full=full, passes=0).bits > budget_mbps:
+        if high > DEAREST * free.worth / free.bits:
+            break
+        low, high = high, 2 * high
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        fits = choose(coverage, counts, price=middle, full=full, passes=0).bits <= budget_mbps
+        low, high = (low, middle) if fits else (middle, high)
+    search = _Search(coverage, counts)
+    for price in (high, low, 0.0):
+        search.improve(price, budget_mbps, full=full, passes=MOST_PASSES, progress=progress)
+    return search.choice(high)

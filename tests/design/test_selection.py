@@ -1,0 +1,180 @@
+"""Choosing rays: greedy with swaps against every choice, and certificates that no choice exceeds."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import coo_array
+
+from lidardesign.design.selection.certificate import certify
+from lidardesign.design.selection.choice import Counts, choose, choose_within
+from lidardesign.design.selection.coverage import LARGEST, Coverage, Information, gather
+from lidardesign.errors import DataError
+
+SUMS = np.array([0.0, 1.0, 1.6, 1.9, 2.0])
+seeds = st.integers(0, 10_000)
+
+
+def scene_of(generator, rays, items, pairs):
+    """What a random scene's returns tell; no ray tells of an item twice."""
+    pair = generator.choice(rays * items, size=min(pairs, rays * items), replace=False)
+    ray, item = np.divmod(pair, items)
+    range_m = generator.uniform(1, 2, (rays,))[ray]
+    worth = generator.uniform(0, 1, len(pair))
+    return Information(ray, item, range_m, worth, generator.uniform(0.5, 1, items), np.zeros(rays))
+
+
+def small(seed, rays=7, gates=2, items=12, scenes=3, table=LARGEST, harm=0.0):
+    """A random table of candidates: the first gate of each ray is open, others are narrower and cheaper."""
+    generator = np.random.default_rng(seed)
+    gates_m = np.sort(generator.uniform(1, 2, (rays, gates, 2)), axis=2)
+    gates_m[:, 0] = (0.0, 3.0)
+    informed = [scene_of(generator, rays, items, 30) for _ in range(scenes)]
+    coverage = gather(informed, gates_m, gates_m[:, :, 1] - gates_m[:, :, 0], table)
+    return Coverage(**{**vars(coverage), "harm": harm * generator.uniform(0, 1, coverage.shape)})
+
+
+def naive_worth(coverage, gate):
+    """F of a choice, item by item."""
+    total = 0.0
+    for item, weight in enumerate(coverage.weight):
+        told = [
+            float(coverage.worth[entry])
+            for ray in np.flatnonzero(gate >= 0)
+            for entry in range(coverage.start[ray], coverage.start[ray + 1])
+            if coverage.item[entry] == item and coverage.gates[entry] >> gate[ray] & 1
+        ]
+        known = sum(told) if len(coverage.table) else max(told, default=0.0)
+        total += weight * float(np.interp(known, np.arange(len(coverage.table)), coverage.table) if len(coverage.table) else known)
+    return total
+
+
+def every_choice(coverage, counts):
+    """All gates of all admissible choices."""
+    rays, gates = coverage.shape
+    for gate in itertools.product(range(-1, gates), repeat=rays):
+        gate = np.array(gate)
+        if (np.bincount(counts.sensor[gate >= 0], minlength=len(counts.most)) <= counts.most).all():
+            yield gate
+
+
+def best_of_all(coverage, counts, price=0.0, budget_mbps=np.inf):
+    def objective(gate):
+        bits, harm = coverage.charge(gate)
+        return coverage.worth_of(gate) - harm - price * bits if bits <= budget_mbps else -np.inf
+
+    return max(objective(gate) for gate in every_choice(coverage, counts))
+
+
+@pytest.mark.parametrize("table", [LARGEST, SUMS], ids=["largest", "sums"])
+class TestAChoice:
+    @given(seed=seeds)
+    def test_counts_what_a_naive_sum_over_items_counts(self, table, seed):
+        coverage = small(seed, table=table)
+        gate = np.random.default_rng(seed).integers(-1, 2, coverage.shape[0])
+        assert coverage.worth_of(gate) == pytest.approx(naive_worth(coverage, gate), rel=1e-12)
+
+    @given(seed=seeds)
+    def test_gains_are_the_differences_of_worth_and_shrink_as_others_are_taken(self, table, seed):
+        coverage = small(seed, table=table)
+        rays, gates = coverage.shape
+        few = np.full(rays, -1)
+        few[0] = 0
+        more = few.copy()
+        more[1] = 1
+        gains = {}
+        for name, gate in (("few", few), ("more", more)):
+            gains[name] = np.zeros((rays, gates))
+            coverage.gains(np.arange(rays), coverage.known(gate), gains[name])
+            for ray, choice in itertools.product(range(2, rays), range(gates)):
+                added = gate.copy()
+                added[ray] = choice
+                gain = coverage.worth_of(added) - coverage.worth_of(gate)
+                assert gains[name][ray, choice] == pytest.approx(gain, abs=1e-12)
+        assert (gains["more"][2:] <= gains["few"][2:] + 1e-12).all()
+
+    @given(seed=seeds, price=st.sampled_from([0.0, 0.05, 0.3]), most=st.integers(1, 3))
+    def test_is_near_the_best_of_all_and_its_certificate_above_it(self, table, seed, price, most):
+        coverage, counts = small(seed, table=table, harm=0.05), Counts(np.arange(7) % 2, np.array([most, 1]))
+        choice = choose(coverage, counts, price=price, full=False)
+        best = best_of_all(coverage, counts, price)
+        certificate = certify(coverage, counts, choice)
+        assert certificate.value <= best + 1e-12
+        assert certificate.value >= 0.9 * best
+        assert certificate.bound >= best - 1e-12
+        assert (np.bincount(counts.sensor[choice.rays], minlength=2) <= counts.most).all()
+
+    @given(seed=seeds, share=st.floats(0.1, 1.2))
+    def test_within_a_budget_is_near_the_best_of_all_and_its_certificate_above_it(self, table, seed, share):
+        coverage, counts = small(seed, table=table), Counts.of_one(7, 3)
+        budget = share * choose(coverage, counts).bits
+        choice = choose_within(coverage, counts, budget, full=False)
+        best = best_of_all(coverage, counts, budget_mbps=budget)
+        certificate = certify(coverage, counts, choice, budget_mbps=budget)
+        assert choice.bits <= budget
+        assert choice.worth >= 0.75 * best
+        assert certificate.bound >= best - 1e-12
+
+    @given(seed=seeds)
+    def test_fires_all_rays_of_every_sensor_where_it_is_asked_to(self, table, seed):
+        coverage, counts = small(seed, table=table), Counts(np.arange(7) % 2, np.array([2, 3]))
+        choice = choose(coverage, counts, price=10.0)
+        assert np.bincount(counts.sensor[choice.rays]).tolist() == [2, 3]
+
+
+def relaxed_by_highs(coverage, count, price, integral):
+    """The facility location problem of one sensor as a program: rays' gates x, and who serves each item y <= x."""
+    rays, gates = coverage.shape
+    ray_of = coverage.by_item[2]
+    pairs = [(e, g) for e in range(len(coverage.item)) for g in range(gates) if coverage.gates[e] >> g & 1]
+    chosen, served = rays * gates, len(pairs)
+    gain = [-float(coverage.weight[coverage.item[e]] * coverage.worth[e]) for e, _ in pairs]
+    cost = np.concatenate([(price * coverage.bits).ravel(), gain])
+    rows, columns, values = [], [], []
+    for n, (e, g) in enumerate(pairs):
+        rows += [n, n]
+        columns += [chosen + n, ray_of[e] * gates + g]
+        values += [1.0, -1.0]
+    for n, (e, _) in enumerate(pairs):
+        rows.append(served + coverage.item[e])
+        columns.append(chosen + n)
+        values.append(1.0)
+    items = len(coverage.weight)
+    for ray in range(rays):
+        rows += [served + items + ray] * gates
+        columns += [ray * gates + g for g in range(gates)]
+        values += [1.0] * gates
+    last = served + items + rays
+    rows += [last] * chosen
+    columns += list(range(chosen))
+    values += [1.0] * chosen
+    most = np.concatenate([np.zeros(served), np.ones(items + rays), [count]])
+    matrix = coo_array((values, (rows, columns)), shape=(last + 1, chosen + served)).tocsr()
+    whole = np.concatenate([np.full(chosen, int(integral)), np.zeros(served)])
+    result = milp(cost, constraints=LinearConstraint(matrix, -np.inf, most), bounds=Bounds(0, 1), integrality=whole)
+    return -float(result.fun)
+
+
+@pytest.mark.parametrize("price", [0.0, 0.002])
+def test_certificates_are_near_the_linear_program_that_they_relax(price):
+    coverage, counts = small(3, rays=40, items=30, scenes=4), Counts.of_one(40, 8)
+    choice = choose(coverage, counts, price=price, full=False)
+    certificate = certify(coverage, counts, choice, rounds=3000)
+    linear, best = (relaxed_by_highs(coverage, 8, price, integral) for integral in (False, True))
+    assert certificate.value <= best + 1e-6
+    assert certificate.value >= 0.98 * best
+    assert linear - 1e-6 <= certificate.bound <= 1.02 * linear
+
+
+@pytest.mark.parametrize(
+    ("table", "says"), [([1.0, 2.0], "0 at 0"), ([0.0, 1.0, 0.5], "never falling"), ([0.0, 1.0, 3.0], "faster")]
+)
+def test_tables_of_sums_that_are_not_concave_are_refused(table, says):
+    with pytest.raises(DataError, match="informs") as refusal:
+        small(0, table=np.array(table))
+    assert says in str(refusal.value)
