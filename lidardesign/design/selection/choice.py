@@ -17,7 +17,7 @@ from lidardesign.design.selection.coverage import Coverage
 
 SMALLEST_GAIN = 1e-9  # of F, relative: what a swap must gain, so that rounding cannot make two rays take turns
 BISECTIONS = 12  # of the price of bandwidth
-DEAREST = 1e6  # times what a mean bit is worth: the dearest that bandwidth is made
+NEAR_BUDGET = 0.98  # what spends this share of a budget is near enough: swaps within the budget spend the rest
 MOST_PASSES = 10  # of swaps
 
 
@@ -203,14 +203,20 @@ def choose_within(
     if free.bits <= budget_mbps:
         return free
     low, high = 0.0, free.worth / free.bits
-    while choose(coverage, counts, price=high, full=full, passes=0).bits > budget_mbps:
-        if high > DEAREST * free.worth / free.bits:
-            break
-        low, high = high, 2 * high
     for _ in range(BISECTIONS):
+        tried = choose(coverage, counts, price=high, full=full, passes=0).bits
+        if tried <= budget_mbps:
+            break
+        low, high = high, 4 * high
+    for _ in range(BISECTIONS):
+        if tried >= NEAR_BUDGET * budget_mbps and tried <= budget_mbps:
+            break
         middle = (low + high) / 2
-        fits = choose(coverage, counts, price=middle, full=full, passes=0).bits <= budget_mbps
-        low, high = (low, middle) if fits else (middle, high)
+        bits = choose(coverage, counts, price=middle, full=full, passes=0).bits
+        if bits <= budget_mbps:
+            high, tried = middle, bits
+        else:
+            low = middle
     search = _Search(coverage, counts)
     for price in (high, low, 0.0):
         search.improve(price, budget_mbps, full=full, passes=MOST_PASSES, progress=progress)
