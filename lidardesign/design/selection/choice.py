@@ -86,7 +86,8 @@ class _Search:
         self.fill(full)
         for _ in range(passes):
             worth = float(coverage.weight @ coverage.counted(self.known))
-            changed = self.swap(SMALLEST_GAIN * worth)
+            changed = self.swap(full, SMALLEST_GAIN * worth)
+            self.fill(full)
             if progress is not None:
                 progress(worth)
             if not changed:
@@ -146,8 +147,8 @@ class _Search:
                 return
             self.take(ray, gate)
 
-    def swap(self, smallest: float) -> bool:
-        """Every chosen ray leaves once and the best comes in, where that gains; says whether any did."""
+    def swap(self, full: bool, smallest: float) -> bool:
+        """Every chosen ray leaves once and the best comes in, where that gains; says whether anything changed."""
         changed = False
         for ray in np.flatnonzero(self.gate >= 0):
             gate = int(self.gate[ray])
@@ -157,8 +158,10 @@ class _Search:
             if net > own + smallest:
                 self.take(other, new_gate)
                 changed = True
-            else:
+            elif full or own >= 0:
                 self.take(int(ray), gate)
+            else:
+                changed = True
         return changed
 
 
