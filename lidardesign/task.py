@@ -89,6 +89,33 @@ class Residuals:
             raise ValueError("residuals or their places are negative, NaN or infinite")
 
 
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What returns tell about a scene: pairs of a ray and an item, as a point of the surface, a frame or a body.
+
+    A task states it for choosing rays: what is chosen is worth the weighted mean, over items, of the largest worth of
+    its returns, or of what the sum of their worths counts.
+
+    Arguments:
+        ray: The ray of each pair, int (E,).
+        item: The item of each pair, int (E,); no pair comes twice.
+        worth: How much the return tells about the item, 0 or more, (E,).
+        frame: Which of the `Returns` shows each item, int (U,).
+        weight: What items count, 0 or more, (U,); None: all alike.
+        harm: What each return spoils, as one of an occluder that is taken for a target, in the unit of worth,
+            (frames, N); None: nothing.
+        sums: None, or what sums of worths 0, 1, 2, ... count, linear in between: 0 at first, rising ever less.
+    """
+
+    ray: np.ndarray
+    item: np.ndarray
+    worth: np.ndarray
+    frame: np.ndarray
+    weight: np.ndarray | None = None
+    harm: np.ndarray | None = None
+    sums: Sequence[float] | None = None
+
+
 @dataclass(frozen=True)
 class Defaults:
     """What a task suggests where the user says nothing.
@@ -127,6 +154,9 @@ class Task(Protocol):
 
     A task may also give `residuals(scene, returns) -> Residuals`, where the error of what `score` judges is; designs
     of a task without them cannot be refined.
+
+    A task may also give `informs(scene, returns) -> Information`, what returns tell about a scene, for choosing rays;
+    `returns` are as in `score`, of all candidate rays through open gates. Rays of a task without it are not chosen.
 
     A task may also give `notes(config, space) -> Sequence[str]`, what a user should know of a configuration before
     anything is learned of it: lengths that look like another unit, splits that share their objects.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,20 +14,23 @@ from scipy.sparse import coo_array
 
 from lidardesign.design.selection.certificate import certify
 from lidardesign.design.selection.choice import Counts, choose, choose_within
-from lidardesign.design.selection.coverage import LARGEST, Coverage, Information, gather
-from lidardesign.errors import DataError
+from lidardesign.design.selection.coverage import LARGEST, Coverage, gather
+from lidardesign.errors import PluginError
+from lidardesign.task import Information
 
 SUMS = np.array([0.0, 1.0, 1.6, 1.9, 2.0])
 seeds = st.integers(0, 10_000)
 
 
-def scene_of(generator, rays, items, pairs):
+def scene_of(generator, rays, items, pairs, table):
     """What a random scene's returns tell; no ray tells of an item twice."""
     pair = generator.choice(rays * items, size=min(pairs, rays * items), replace=False)
     ray, item = np.divmod(pair, items)
-    range_m = generator.uniform(1, 2, (rays,))[ray]
     worth = generator.uniform(0, 1, len(pair))
-    return Information(ray, item, range_m, worth, generator.uniform(0.5, 1, items), np.zeros(rays))
+    weight, frame = generator.uniform(0.5, 1, items), np.zeros(items, dtype=int)
+    sums = None if len(table) == 0 else table
+    returns = SimpleNamespace(range_m=generator.uniform(1, 2, rays))
+    return Information(ray, item, worth, frame, weight, sums=sums), [returns]
 
 
 def small(seed, rays=7, gates=2, items=12, scenes=3, table=LARGEST, harm=0.0):
@@ -34,8 +38,8 @@ def small(seed, rays=7, gates=2, items=12, scenes=3, table=LARGEST, harm=0.0):
     generator = np.random.default_rng(seed)
     gates_m = np.sort(generator.uniform(1, 2, (rays, gates, 2)), axis=2)
     gates_m[:, 0] = (0.0, 3.0)
-    informed = [scene_of(generator, rays, items, 30) for _ in range(scenes)]
-    coverage = gather(informed, gates_m, gates_m[:, :, 1] - gates_m[:, :, 0], table)
+    informed = [scene_of(generator, rays, items, 30, table) for _ in range(scenes)]
+    coverage = gather(informed, gates_m, gates_m[:, :, 1] - gates_m[:, :, 0])
     return Coverage(**{**vars(coverage), "harm": harm * generator.uniform(0, 1, coverage.shape)})
 
 
@@ -189,6 +193,6 @@ def test_certificates_are_near_the_linear_program_that_they_relax(price):
     ("table", "says"), [([1.0, 2.0], "0 at 0"), ([0.0, 1.0, 0.5], "never falling"), ([0.0, 1.0, 3.0], "faster")]
 )
 def test_tables_of_sums_that_are_not_concave_are_refused(table, says):
-    with pytest.raises(DataError, match="informs") as refusal:
+    with pytest.raises(PluginError, match="informs") as refusal:
         small(0, table=np.array(table))
     assert says in str(refusal.value)

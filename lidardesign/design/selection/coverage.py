@@ -8,38 +8,19 @@ that S hears of item u (facility location), or a concave table of their sum. Bot
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from lidardesign.design.selection import kernels
-from lidardesign.errors import DataError
+from lidardesign.errors import ConfigError, PluginError
+from lidardesign.geometry.rays import Returns
+from lidardesign.task import Information
 
 MOST_GATES = 8  # of a ray: an entry keeps one bit for each
 LARGEST = np.zeros(0)  # the table of items that count the largest worth
-
-
-@dataclass(frozen=True, eq=False)
-class Information:
-    """What the returns of a scene tell, as a task's `informs` says it: E pairs of a ray and an item.
-
-    Arguments:
-        ray: Which ray, int (E,).
-        item: Which of the scene's items, int (E,).
-        range_m: The range of the return that tells it, (E,).
-        worth: How much it tells, at least 0, (E,).
-        weight: What each of the items counts, at least 0, (U,).
-        harm: What each ray's returns spoil, at least 0, in the unit of worth, (N,).
-    """
-
-    ray: np.ndarray
-    item: np.ndarray
-    range_m: np.ndarray
-    worth: np.ndarray
-    weight: np.ndarray
-    harm: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,10 +48,10 @@ class Coverage:
     table: np.ndarray = field(default_factory=lambda: LARGEST)
 
     def __post_init__(self) -> None:
-        """Raises `DataError` where the table of sums is not concave, nondecreasing and 0 at 0."""
+        """Raises `PluginError` where the table of sums is not concave, nondecreasing and 0 at 0."""
         rises = np.diff(self.table)
         if len(self.table) and (self.table[0] != 0 or (rises < 0).any() or (np.diff(rises) > 0).any()):
-            raise DataError(
+            raise PluginError(
                 f"the table of sums is {np.array2string(self.table)}",
                 where="informs",
                 allowed="0 at 0, never falling, and never rising faster than before",
@@ -118,61 +99,75 @@ class Coverage:
 
 
 def gather(
-    scenes: Sequence[Information],
-    gates_m: np.ndarray,
-    bits: np.ndarray,
-    table: np.ndarray = LARGEST,
+    informed: Iterable[tuple[Information, Sequence[Returns]]], gates_m: np.ndarray, bits: np.ndarray
 ) -> Coverage:
     """The table over scenes, each of which counts as much as any other.
 
     Arguments:
-        scenes: What the returns of each scene tell about its items.
+        informed: What a task says of each scene, and the returns that it says it of: of all rays, through open gates.
         gates_m: The gates of each ray, each from a start to before an end, shape (N, G, 2).
-        bits: What reading out costs, shape (N, G) [Mbit/s].
-        table: See `Coverage`.
+        bits: What reading a ray out through each gate costs, inf for gates that are not allowed, (N, G) [Mbit/s].
 
     Raises:
-        DataError: No scene; more gates than an entry has bits; worths or weights that are negative or no numbers.
+        PluginError: Pairs, weights or harm that cannot be.
+        ConfigError: No scene, or more gates than an entry has bits.
     """
-    count, choices = bits.shape
-    if not scenes or choices > MOST_GATES:
-        raise DataError(
-            f"{len(scenes)} scenes and {choices} gates per ray",
-            where="selection",
-            allowed=f"1 scene or more, at most {MOST_GATES} gates",
-        )
-    for scene in scenes:
-        _require_valid(scene, count)
-    first_item = np.cumsum([0, *(len(scene.weight) for scene in scenes)])
-    ray = np.concatenate([scene.ray for scene in scenes])
-    item = np.concatenate([scene.item + first for scene, first in zip(scenes, first_item, strict=False)])
-    range_m = np.concatenate([scene.range_m for scene in scenes])
-    worth = np.concatenate([scene.worth for scene in scenes])
-    heard = (range_m[:, None] >= gates_m[ray, :, 0]) & (range_m[:, None] < gates_m[ray, :, 1])
-    passes = np.packbits(heard, axis=1, bitorder="little")[:, 0]
-    tells = np.flatnonzero((passes > 0) & (worth > 0))
-    tells = tells[np.argsort(ray[tells], kind="stable")]
-    weight = np.concatenate([scene.weight / max(scene.weight.sum(), np.finfo(float).tiny) for scene in scenes])
-    harm = np.mean([scene.harm for scene in scenes], axis=0)
+    rays, gates = bits.shape
+    if gates > MOST_GATES:
+        raise ConfigError(f"{gates} gates per ray", where="selection", allowed=f"at most {MOST_GATES}")
+    parts, weights, items, sums = [], [], 0, LARGEST
+    harm = np.zeros((rays, gates))
+    for information, returns in informed:
+        _require_valid(information, rays, len(returns))
+        range_m = np.stack([frame.range_m for frame in returns])
+        opened = (range_m[..., None] >= gates_m[..., 0]) & (range_m[..., None] < gates_m[..., 1])
+        passes = np.packbits(opened, axis=2, bitorder="little")[..., 0][
+            information.frame[information.item], information.ray
+        ]
+        tells = np.flatnonzero((passes > 0) & (information.worth > 0))
+        parts.append((information.ray[tells], items + information.item[tells], information.worth[tells], passes[tells]))
+        count = len(information.frame)
+        weight = np.ones(count) if information.weight is None else np.asarray(information.weight, dtype=np.float64)
+        weights.append(weight / weight.sum())
+        if information.harm is not None:
+            harm += np.einsum("fn,fng->ng", information.harm, opened)
+        items += count
+        sums = LARGEST if information.sums is None else np.asarray(information.sums, dtype=np.float64)
+    if not parts:
+        raise ConfigError("no scene", where="selection", allowed="at least one training scene")
+    ray, item, worth, passes = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(ray, kind="stable")
     return Coverage(
-        start=np.searchsorted(ray[tells], np.arange(count + 1)),
-        item=item[tells].astype(np.int32),
-        worth=worth[tells].astype(np.float32),
-        gates=passes[tells],
-        weight=weight / len(scenes),
+        start=np.searchsorted(ray[order], np.arange(rays + 1)),
+        item=item[order].astype(np.int32),
+        worth=worth[order].astype(np.float32),
+        gates=passes[order],
+        weight=np.concatenate(weights) / len(parts),
         bits=bits,
-        harm=np.repeat(harm[:, None], choices, axis=1),
-        table=table,
+        harm=harm / len(parts),
+        table=sums,
     )
 
 
-def _require_valid(scene: Information, rays: int) -> None:
-    numbers = (scene.worth, scene.weight, scene.harm)
-    if not all(np.isfinite(values).all() and (values >= 0).all() for values in numbers):
-        raise DataError("worths, weights and harm must be finite and not negative", where="informs")
-    pairs = len(scene.ray)
-    if not (len(scene.item) == len(scene.worth) == len(scene.range_m) == pairs and len(scene.harm) == rays):
-        raise DataError("arrays of pairs must have one length, and harm one number per ray", where="informs")
-    names = ((scene.ray, rays), (scene.item, len(scene.weight)))
-    if pairs and not all(index.min() >= 0 and index.max() < count for index, count in names):
-        raise DataError("pairs name rays and items that there are not", where="informs")
+def _require_valid(information: Information, rays: int, frames: int) -> None:
+    """Raises `PluginError` for pairs of rays and items that there are not, and for numbers that cannot be."""
+    pairs, items = len(information.ray), len(information.frame)
+    weight = np.ones(items) if information.weight is None else np.asarray(information.weight)
+    harm = np.zeros((frames, rays)) if information.harm is None else np.asarray(information.harm)
+    faults = {
+        "ray, item and worth of other lengths": not len(information.item) == len(information.worth) == pairs,
+        "weight of another length than frame": weight.shape != (items,),
+        f"harm of shape {harm.shape}, not {(frames, rays)}": harm.shape != (frames, rays),
+        "weights that do not count": not weight.sum() > 0,
+    }
+    for name, index, count in (
+        ("ray", information.ray, rays),
+        ("item", information.item, items),
+        ("frame", information.frame, frames),
+    ):
+        faults[f"a {name} outside 0 to {count - 1}"] = bool(((index < 0) | (index >= count)).any())
+    for name, values in (("worth", information.worth), ("weight", weight), ("harm", harm)):
+        faults[f"{name} that is negative or no number"] = not (np.isfinite(values) & (values >= 0)).all()
+    for fault, found in faults.items():
+        if found:
+            raise PluginError(f"informs gave {fault}", where="task", allowed="see lidardesign.task.Information")
