@@ -17,9 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.design.selection import kernels
-from lidardesign.design.selection.choice import Choice, Counts
-from lidardesign.design.selection.coverage import Coverage
+from lidardesign.numerics import COARSE_SLACK, ROUNDING
+from lidardesign.selection import kernels
+from lidardesign.selection.choice import Choice, RayCounts
+from lidardesign.selection.coverage import Coverage
 
 ROUNDS = 300  # of subgradients, at most
 PRICE_BISECTIONS = 12
@@ -47,7 +48,7 @@ class Certificate:
 
 
 def certify(
-    coverage: Coverage, counts: Counts, choice: Choice, *, budget_mbps: float | None = None, rounds: int = ROUNDS
+    coverage: Coverage, counts: RayCounts, choice: Choice, *, budget_mbps: float | None = None, rounds: int = ROUNDS
 ) -> Certificate:
     """The bound for choices of the same candidates, counts, and price or budget.
 
@@ -64,7 +65,7 @@ def certify(
     bound, made = np.inf, 0
     while made < rounds:
         bound, made = min(bound, search.step(value)), made + 1
-        if bound - value <= 1e-6 * abs(value):
+        if bound - value <= COARSE_SLACK * abs(value):
             break
     return Certificate(value, max(bound, value), made)
 
@@ -72,7 +73,7 @@ def certify(
 class _Admissible:
     """The choices that are admissible: so many rays of each sensor, at a price or within a budget."""
 
-    def __init__(self, coverage: Coverage, counts: Counts, price: float, budget_mbps: float | None) -> None:
+    def __init__(self, coverage: Coverage, counts: RayCounts, price: float, budget_mbps: float | None) -> None:
         self.coverage, self.counts, self.budget_mbps = coverage, counts, budget_mbps
         self.price = price
         self.allowed = np.isfinite(coverage.bits)
@@ -90,7 +91,7 @@ class _Admissible:
         if self._spent(free[1]) <= self.budget_mbps:
             return free
         while self._spent(self._at(high, excess)[1]) > self.budget_mbps:
-            low, high = high, max(2 * high, 1e-12)
+            low, high = high, max(2 * high, ROUNDING)
         least = min(self._with_budget(low, excess), self._with_budget(high, excess), key=lambda found: found[0])
         for _ in range(PRICE_BISECTIONS):
             middle = (low + high) / 2

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lidardesign.design.selection import kernels
+from lidardesign.selection import kernels
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.geometry.rays import Returns
 from lidardesign.task import Information
@@ -84,7 +84,7 @@ class Coverage:
         """Fills the rows `rays` of `gains` (N, G) with what each gate of these rays would add to F."""
         kernels.gate_gains(rays, self.start, self.item, self.worth, self.gates, self.weight, self.table, known, gains)
 
-    def worth_of(self, gate: np.ndarray) -> float:
+    def value_of(self, gate: np.ndarray) -> float:
         """F of a choice of one gate per ray, -1 for none, (N,)."""
         return float(self.weight @ self.counted(self.known(gate)))
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from lidardesign.design.selection.certificate import certify
-from lidardesign.design.selection.choice import Counts, choose, choose_within
-from lidardesign.design.selection.coverage import LARGEST, Coverage, gather
+from lidardesign.selection.certificate import certify
+from lidardesign.selection.choice import RayCounts, choose, choose_within
+from lidardesign.selection.coverage import LARGEST, Coverage, gather
 from lidardesign.errors import PluginError
 from lidardesign.task import Information
 
@@ -70,7 +70,7 @@ def every_choice(coverage, counts):
 def best_of_all(coverage, counts, price=0.0, budget_mbps=np.inf):
     def objective(gate):
         bits, harm = coverage.charge(gate)
-        return coverage.worth_of(gate) - harm - price * bits if bits <= budget_mbps else -np.inf
+        return coverage.value_of(gate) - harm - price * bits if bits <= budget_mbps else -np.inf
 
     return max(objective(gate) for gate in every_choice(coverage, counts))
 
@@ -81,7 +81,7 @@ class TestAChoice:
     def test_counts_what_a_naive_sum_over_items_counts(self, table, seed):
         coverage = small(seed, table=table)
         gate = np.random.default_rng(seed).integers(-1, 2, coverage.shape[0])
-        assert coverage.worth_of(gate) == pytest.approx(naive_worth(coverage, gate), rel=1e-12)
+        assert coverage.value_of(gate) == pytest.approx(naive_worth(coverage, gate), rel=1e-12)
 
     @given(seed=seeds)
     def test_gains_are_the_differences_of_worth_and_shrink_as_others_are_taken(self, table, seed):
@@ -98,13 +98,13 @@ class TestAChoice:
             for ray, choice in itertools.product(range(2, rays), range(gates)):
                 added = gate.copy()
                 added[ray] = choice
-                gain = coverage.worth_of(added) - coverage.worth_of(gate)
+                gain = coverage.value_of(added) - coverage.value_of(gate)
                 assert gains[name][ray, choice] == pytest.approx(gain, abs=1e-12)
         assert (gains["more"][2:] <= gains["few"][2:] + 1e-12).all()
 
     @given(seed=seeds, price=st.sampled_from([0.0, 0.05, 0.3]), most=st.integers(1, 3))
     def test_is_near_the_best_of_all_and_its_certificate_above_it(self, table, seed, price, most):
-        coverage, counts = small(seed, table=table, harm=0.05), Counts(np.arange(7) % 2, np.array([most, 1]))
+        coverage, counts = small(seed, table=table, harm=0.05), RayCounts(np.arange(7) % 2, np.array([most, 1]))
         choice = choose(coverage, counts, price=price, full=False)
         best = best_of_all(coverage, counts, price)
         certificate = certify(coverage, counts, choice)
@@ -114,7 +114,7 @@ class TestAChoice:
 
     @given(seed=seeds, share=st.floats(0.1, 1.2))
     def test_within_a_budget_is_near_the_best_of_all_and_its_certificate_above_it(self, table, seed, share):
-        coverage, counts = small(seed, table=table), Counts.of_one(7, 3)
+        coverage, counts = small(seed, table=table), RayCounts.of_one(7, 3)
         budget = share * choose(coverage, counts).bits
         choice = choose_within(coverage, counts, budget, full=False)
         best = best_of_all(coverage, counts, budget_mbps=budget)
@@ -127,7 +127,7 @@ class TestAChoice:
     def test_loses_little_against_the_best_of_all(self, table, price, share):
         ratios = []
         for seed in range(30):
-            coverage, counts = small(seed, table=table), Counts.of_one(7, 3)
+            coverage, counts = small(seed, table=table), RayCounts.of_one(7, 3)
             budget = np.inf if share is None else share * choose(coverage, counts).bits
             choice = (
                 choose_within(coverage, counts, budget, full=False)
@@ -140,7 +140,7 @@ class TestAChoice:
 
     @given(seed=seeds)
     def test_fires_all_rays_of_every_sensor_where_it_is_asked_to(self, table, seed):
-        coverage, counts = small(seed, table=table), Counts(np.arange(7) % 2, np.array([2, 3]))
+        coverage, counts = small(seed, table=table), RayCounts(np.arange(7) % 2, np.array([2, 3]))
         choice = choose(coverage, counts, price=10.0)
         assert np.bincount(counts.sensor[choice.rays]).tolist() == [2, 3]
 
@@ -180,7 +180,7 @@ def relaxed_by_highs(coverage, count, price, integral):
 
 @pytest.mark.parametrize("price", [0.0, 0.002])
 def test_certificates_are_near_the_linear_program_that_they_relax(price):
-    coverage, counts = small(3, rays=40, items=30, scenes=4), Counts.of_one(40, 8)
+    coverage, counts = small(3, rays=40, items=30, scenes=4), RayCounts.of_one(40, 8)
     choice = choose(coverage, counts, price=price, full=False)
     certificate = certify(coverage, counts, choice, rounds=3000)
     linear, best = (relaxed_by_highs(coverage, 8, price, integral) for integral in (False, True))

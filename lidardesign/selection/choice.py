@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.design.selection import kernels
-from lidardesign.design.selection.coverage import Coverage
+from lidardesign.numerics import SLACK
+from lidardesign.selection import kernels
+from lidardesign.selection.coverage import Coverage
 
-SMALLEST_GAIN = 1e-9  # of F, relative: what a swap must gain, so that rounding cannot make two rays take turns
+SMALLEST_GAIN = SLACK  # of F, relative: what a swap must gain, so that rounding cannot make two rays take turns
 BISECTIONS = 12  # of the price of bandwidth
 NEAR_BUDGET = 0.98  # what spends this share of a budget is near enough: swaps within the budget spend the rest
 MOST_PASSES = 10  # of swaps
@@ -46,7 +47,7 @@ class Choice:
 
 
 @dataclass(frozen=True, eq=False)
-class Counts:
+class RayCounts:
     """How many rays each sensor fires.
 
     Arguments:
@@ -58,15 +59,15 @@ class Counts:
     most: np.ndarray
 
     @staticmethod
-    def of_one(rays: int, count: int) -> Counts:
+    def of_one(rays: int, count: int) -> RayCounts:
         """One sensor that fires `count` of all rays."""
-        return Counts(np.zeros(rays, dtype=np.intp), np.array([count]))
+        return RayCounts(np.zeros(rays, dtype=np.intp), np.array([count]))
 
 
 class _Search:
     """A choice under way: what it knows, what each ray would add, and what is left of each sensor's count."""
 
-    def __init__(self, coverage: Coverage, counts: Counts) -> None:
+    def __init__(self, coverage: Coverage, counts: RayCounts) -> None:
         self.coverage, self.sensor, self.left = coverage, counts.sensor, counts.most.copy()
         self.cost = coverage.harm
         self.limit_mbps, self.spent_mbps = np.inf, 0.0
@@ -95,7 +96,7 @@ class _Search:
 
     def choice(self, price: float) -> Choice:
         """What was chosen so far."""
-        return Choice(self.gate.copy(), self.coverage.worth_of(self.gate), *self.coverage.charge(self.gate), price)
+        return Choice(self.gate.copy(), self.coverage.value_of(self.gate), *self.coverage.charge(self.gate), price)
 
     def net(self, rays: np.ndarray | slice) -> np.ndarray:
         """What each gate of rays would add at the least price that is known, -inf where it may not be taken."""
@@ -167,7 +168,7 @@ class _Search:
 
 def choose(
     coverage: Coverage,
-    counts: Counts,
+    counts: RayCounts,
     *,
     price: float = 0.0,
     full: bool = True,
@@ -191,7 +192,7 @@ def choose(
 
 def choose_within(
     coverage: Coverage,
-    counts: Counts,
+    counts: RayCounts,
     budget_mbps: float,
     *,
     full: bool = True,
