@@ -14,9 +14,9 @@ from functools import cached_property
 
 import numpy as np
 
-from lidardesign.selection import kernels
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.geometry.rays import Returns
+from lidardesign.selection import kernels
 from lidardesign.task import Information
 
 MOST_GATES = 8  # of a ray: an entry keeps one bit for each

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
+from lidardesign.errors import PluginError
 from lidardesign.selection.certificate import certify
 from lidardesign.selection.choice import RayCounts, choose, choose_within
 from lidardesign.selection.coverage import LARGEST, Coverage, gather
-from lidardesign.errors import PluginError
 from lidardesign.task import Information
 
 SUMS = np.array([0.0, 1.0, 1.6, 1.9, 2.0])
