@@ -105,6 +105,7 @@ class Information:
         harm: What each return spoils, as one of an occluder that is taken for a target, in the unit of worth,
             (frames, N); None: nothing.
         sums: None, or what sums of worths 0, 1, 2, ... count, linear in between: 0 at first, rising ever less.
+        complete: What an item counts of which nothing is left to know; the loss of a choice is what lacks of it.
     """
 
     ray: np.ndarray
@@ -114,6 +115,7 @@ class Information:
     weight: np.ndarray | None = None
     harm: np.ndarray | None = None
     sums: Sequence[float] | None = None
+    complete: float = 1.0
 
 
 @dataclass(frozen=True)

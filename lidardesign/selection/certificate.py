@@ -41,9 +41,9 @@ class Certificate:
     bound: float
     rounds: int
 
-    def gap(self, whole: float) -> float:
-        """How much smaller the loss could be, relative: the loss is `whole` minus the objective."""
-        loss = whole - self.value
+    def gap(self, complete: float) -> float:
+        """How much smaller the loss could be at most, relative; the loss is what the objective lacks of `complete`."""
+        loss = complete - self.value
         return (self.bound - self.value) / loss if loss > 0 else 0.0
 
 

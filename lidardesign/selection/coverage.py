@@ -36,6 +36,7 @@ class Coverage:
         bits: What reading a ray out through each gate costs [Mbit/s], inf for a gate that is not allowed, (N, G).
         harm: What a ray spoils through each gate, in the unit of worth, (N, G).
         table: The concave table of sums, 0 at 0, or `LARGEST`.
+        complete: F where nothing is left to know: the loss of a choice is what it lacks of that.
     """
 
     start: np.ndarray
@@ -46,6 +47,7 @@ class Coverage:
     bits: np.ndarray
     harm: np.ndarray
     table: np.ndarray = field(default_factory=lambda: LARGEST)
+    complete: float = 1.0
 
     def __post_init__(self) -> None:
         """Raises `PluginError` where the table of sums is not concave, nondecreasing and 0 at 0."""
@@ -116,7 +118,7 @@ def gather(
     if gates > MOST_GATES:
         raise ConfigError(f"{gates} gates per ray", where="selection", allowed=f"at most {MOST_GATES}")
     parts, weights, items, sums = [], [], 0, LARGEST
-    harm = np.zeros((rays, gates))
+    harm, complete = np.zeros((rays, gates)), 0.0
     for information, returns in informed:
         _require_valid(information, rays, len(returns))
         range_m = np.stack([frame.range_m for frame in returns])
@@ -131,7 +133,7 @@ def gather(
         weights.append(weight / weight.sum())
         if information.harm is not None:
             harm += np.einsum("fn,fng->ng", information.harm, opened)
-        items += count
+        items, complete = items + count, complete + information.complete
         sums = LARGEST if information.sums is None else np.asarray(information.sums, dtype=np.float64)
     if not parts:
         raise ConfigError("no scene", where="selection", allowed="at least one training scene")
@@ -146,6 +148,7 @@ def gather(
         bits=bits,
         harm=harm / len(parts),
         table=sums,
+        complete=complete / len(parts),
     )
 
 
