@@ -17,6 +17,7 @@ import numpy as np
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.geometry.rays import Returns
 from lidardesign.selection import kernels
+from lidardesign.selection.information import require_valid
 from lidardesign.task import Information
 
 MOST_GATES = 8  # of a ray: an entry keeps one bit for each
@@ -120,7 +121,7 @@ def gather(
     parts, weights, items, sums = [], [], 0, LARGEST
     harm, complete = np.zeros((rays, gates)), 0.0
     for information, returns in informed:
-        _require_valid(information, rays, len(returns))
+        require_valid(information, rays, len(returns))
         range_m = np.stack([frame.range_m for frame in returns])
         opened = (range_m[..., None] >= gates_m[..., 0]) & (range_m[..., None] < gates_m[..., 1])
         passes = np.packbits(opened, axis=2, bitorder="little")[..., 0][
@@ -150,27 +151,3 @@ def gather(
         table=sums,
         complete=complete / len(parts),
     )
-
-
-def _require_valid(information: Information, rays: int, frames: int) -> None:
-    """Raises `PluginError` for pairs of rays and items that there are not, and for numbers that cannot be."""
-    pairs, items = len(information.ray), len(information.frame)
-    weight = np.ones(items) if information.weight is None else np.asarray(information.weight)
-    harm = np.zeros((frames, rays)) if information.harm is None else np.asarray(information.harm)
-    faults = {
-        "ray, item and worth of other lengths": not len(information.item) == len(information.worth) == pairs,
-        "weight of another length than frame": weight.shape != (items,),
-        f"harm of shape {harm.shape}, not {(frames, rays)}": harm.shape != (frames, rays),
-        "weights that do not count": not weight.sum() > 0,
-    }
-    for name, index, count in (
-        ("ray", information.ray, rays),
-        ("item", information.item, items),
-        ("frame", information.frame, frames),
-    ):
-        faults[f"a {name} outside 0 to {count - 1}"] = bool(((index < 0) | (index >= count)).any())
-    for name, values in (("worth", information.worth), ("weight", weight), ("harm", harm)):
-        faults[f"{name} that is negative or no number"] = not (np.isfinite(values) & (values >= 0)).all()
-    for fault, found in faults.items():
-        if found:
-            raise PluginError(f"informs gave {fault}", where="task", allowed="see lidardesign.task.Information")

@@ -92,11 +92,13 @@ def with_noise(returns: Sequence[Returns], share: float, generator: np.random.Ge
 
 def shuffled(returns: Sequence[Returns], generator: np.random.Generator) -> list[Returns]:
     """The same returns with their rays in another order, each list in one of its own."""
-    orders = [generator.permutation(len(one.rays)) for one in returns]
-    return [
-        Returns(one.rays.subset(order), one.outcome[order], one.range_m[order], one.body[order], one.frame)
-        for one, order in zip(returns, orders, strict=True)
-    ]
+    return [returns_of_rays(one, generator.permutation(len(one.rays))) for one in returns]
+
+
+def returns_of_rays(returns: Returns, chosen: np.ndarray) -> Returns:
+    """The returns of the rays at an index or mask."""
+    columns = (returns.outcome[chosen], returns.range_m[chosen], returns.body[chosen])
+    return Returns(returns.rays.subset(chosen), *columns, returns.frame)
 
 
 def without_returns(returns: Sequence[Returns]) -> list[Returns]:

@@ -6,10 +6,13 @@ import numpy as np
 
 from lidardesign.evaluate.scene_scores import checked_residuals, gives_residuals
 from lidardesign.geometry.rays import Returns
+from lidardesign.numerics import SLACK
 from lidardesign.scene import Scene
+from lidardesign.selection.information import checked_information, informs_rays
+from lidardesign.task import Information
 from lidardesign.testing.fingerprint import fingerprint
 from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
-from lidardesign.testing.probing import full_rays, shuffled, with_noise, without_returns
+from lidardesign.testing.probing import full_rays, returns_of_rays, shuffled, with_noise, without_returns
 
 DENSE, SPARSE = 400, 12
 SEED = 20_253
@@ -161,6 +164,44 @@ def check_residuals(subject: Subject) -> LawHolds | NotApplicable:
     return LawHolds(f"{count} places", {"places": count})
 
 
+def check_information(subject: Subject) -> LawHolds | NotApplicable:
+    """Rays tell about items by their own returns alone: once, alike in any order, and nothing without a return."""
+    if not informs_rays(subject.task):
+        return NotApplicable("the task does not say what returns tell: rays of its designs cannot be chosen")
+    pairs, rays = 0, 0
+    for number, scene in _scenes(subject):
+        dense = _dense(subject, number)
+        # one list of candidates is fired everywhere, also where fewer rays see something
+        order = np.random.default_rng([SEED, number]).permutation(min(len(one.rays) for one in dense))
+        first, other = ([returns_of_rays(one, chosen) for one in dense] for chosen in (np.sort(order), order))
+        with subject.calling("informs"):
+            found, reordered, silent = (
+                checked_information(subject.task, scene, returns) for returns in (first, other, without_returns(first))
+            )
+        said = f"informs in scene {scene.name!r}"
+        if len(silent.ray) or (silent.harm is not None and np.any(silent.harm)):
+            raise BrokenLawError(f"{said}: rays without a return tell or spoil something")
+        if not np.stack([one.returned for one in first])[found.frame[found.item], found.ray].all():
+            raise BrokenLawError(f"{said}: a ray tells about an item of a frame in which it has no return")
+        one, two = _pairs(found, np.sort(order)), _pairs(reordered, order)
+        if len(np.unique(one[:, :2], axis=0)) < len(one):
+            raise BrokenLawError(f"{said}: a pair of an item and a ray comes twice")
+        if one.shape != two.shape or not np.allclose(one, two, rtol=SLACK, atol=0):
+            raise BrokenLawError(f"{said}: rays in another order tell something else")
+        pairs, rays = pairs + len(one), rays + len(order)
+    if not rays:
+        return NotApplicable("no candidate rays see a target under every condition")
+    if not pairs:
+        raise BrokenLawError(f"informs: {rays} rays at targets tell nothing")
+    return LawHolds(f"{rays} rays and their items are {pairs} pairs", {"pairs": pairs})
+
+
+def _pairs(found: Information, rays: np.ndarray) -> np.ndarray:
+    """Item, ray and worth of all pairs, sorted, (E, 3); rays have the numbers (N,)."""
+    columns = [found.item, rays[found.ray], found.worth]
+    return np.column_stack(columns)[np.lexsort(columns[1::-1])]
+
+
 LAWS = (
     Law(
         "scores are numbers",
@@ -210,6 +251,13 @@ LAWS = (
         "score",
         "residuals are places and values of 0 or more",
         check_residuals,
+        needs=("scores are numbers",),
+    ),
+    Law(
+        "returns inform",
+        "score",
+        "rays tell about items by their own returns alone, in any order",
+        check_information,
         needs=("scores are numbers",),
     ),
 )

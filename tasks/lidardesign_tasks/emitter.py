@@ -19,10 +19,10 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Mesh, Receiver, Scene, inverse_rigid
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Metric, Residuals, Score, Split
+from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split
 from lidardesign_tasks.face import FaceTask, HeadConfig, Vector, head_scenes
 from lidardesign_tasks.importance import WEIGHING_KEYS
-from lidardesign_tasks.surface import surface_residuals, surface_score
+from lidardesign_tasks.surface import surface_informs, surface_residuals, surface_score
 
 
 class EmitterConfig(HeadConfig):
@@ -130,6 +130,10 @@ class EmitterTask:
     def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
         """Where the Chamfer distance is [mm]."""
         return surface_residuals(self.metric, scene, returns)
+
+    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+        """What returns tell about points of the visible face, the more the nearer they are."""
+        return surface_informs(scene, returns)
 
 
 def winding_number(mesh: Mesh, point: np.ndarray) -> float:

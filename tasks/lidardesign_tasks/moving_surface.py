@@ -15,11 +15,13 @@ from lidardesign.errors import DataError
 from lidardesign.evaluate.metrics import SurfaceCloud, visible_surface
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
+from lidardesign.selection.information import scattered_area_m2, surface_information
 from lidardesign.space import DesignSpace
-from lidardesign.task import Metric, Residuals, Score, random_generator
-from lidardesign_tasks.surface import LazyTruth, surface_residuals, surface_score
+from lidardesign.task import Information, Metric, Residuals, Score, random_generator
+from lidardesign_tasks.surface import ITEMS, LazyTruth, fewer_points, surface_residuals, surface_score
 
 SURFACES = "surfaces"
+FEWEST_ITEMS = 25  # of a frame: so few tell its area to a tenth or two
 
 
 class MovingTruth(LazyTruth):
@@ -72,6 +74,19 @@ def moving_residuals(metric: Metric, scene: Scene, returns: Sequence[Returns]) -
     found = [surface_residuals(metric, still, seen) for still, seen in _frames(scene, returns)]
     values = np.concatenate([residuals.values for residuals in found]) / len(found)
     return Residuals(np.concatenate([residuals.points_m for residuals in found]), values)
+
+
+def moving_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
+    """What returns tell about points of the visible surface of their own frame, see `surface_information`.
+
+    A frame in which nothing is to be seen has no points, and returns there are not judged.
+    """
+    count = max(ITEMS // scene.frames, FEWEST_ITEMS)
+    surfaces = fewer_points(scene.truth, count)[SURFACES]
+    points = [np.zeros((0, 3)) if surface is None else surface.points for surface in surfaces]
+    shown = [points[one.frame] for one in returns]
+    area_m2 = sum(scattered_area_m2(points[one.frame]) for one in returns)
+    return surface_information(shown, returns, [body.is_target for body in scene.bodies], area_m2)
 
 
 def _frames(scene: Scene, returns: Sequence[Returns]) -> list[tuple[Scene, list[Returns]]]:

@@ -18,7 +18,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Body, Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
-from lidardesign.task import Metric, Residuals, Score
+from lidardesign.task import Information, Metric, Residuals, Score
 
 PERCENT = 100.0
 # No step between neighbouring elevations is wider: the ends of the design space's range cut faces to this angle.
@@ -188,19 +188,27 @@ class BoxTruth(Mapping[str, list[np.ndarray]]):
 def seen_boxes(cut: PlaneCut, points_m: np.ndarray, origin_m: np.ndarray, azimuth_rad: float) -> np.ndarray:
     """The bodies of the boxes that measured points (N, 3) [m] lie on, ascending.
 
+    See `boxes_of`.
+    """
+    boxes = np.unique(boxes_of(cut, points_m, origin_m, azimuth_rad))
+    return boxes[boxes >= 0]
+
+
+def boxes_of(cut: PlaneCut, points_m: np.ndarray, origin_m: np.ndarray, azimuth_rad: float) -> np.ndarray:
+    """The body of the box that each measured point (N, 3) [m] lies on, -1 for none, shape (N,).
+
     A point belongs to the nearest outline in the plane, box or not, and to none beyond `ON_FACE_M`; one that is
     further than that from the plane itself belongs to none.
     """
-    if not len(cut.body) or not len(points_m):
-        return np.empty(0, dtype=int)
+    if not len(cut.body):
+        return np.full(len(points_m), -1)
     offset = points_m - origin_m
     forward = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad)])
     aside = np.abs(offset[:, 0] * forward[1] - offset[:, 1] * forward[0])
     distance = cut.distance_m(np.stack([offset[:, :2] @ forward, offset[:, 2]], axis=-1))
     nearest = distance.argmin(axis=1)
     on_face = np.maximum(distance.min(axis=1), aside) <= ON_FACE_M
-    rows = np.unique(nearest[on_face])
-    return cut.body[rows[cut.is_box[rows]]]
+    return np.where(on_face & cut.is_box[nearest], cut.body[nearest], -1)
 
 
 def miss_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
@@ -234,15 +242,42 @@ def missed_boxes(scene: Scene, returns: Sequence[Returns]) -> list[np.ndarray]:
         ConfigError: The number of returns is not the number of evaluated positions.
     """
     truth = scene.truth
-    if len(returns) != len(truth.origins_m):
-        raise ConfigError(
-            f"{len(returns)} lists of returns", where=f"scene {scene.name}", allowed=f"{len(truth.origins_m)} positions"
-        )
+    _require_positions(scene, returns)
     azimuth = truth.space.low[AZIMUTH]
     return [
         np.setdiff1d(visible, seen_boxes(cut, one.points_m, origin, azimuth))
         for one, cut, origin, visible in zip(returns, truth.cuts, truth.origins_m, truth.visible, strict=True)
     ]
+
+
+def _require_positions(scene: Scene, returns: Sequence[Returns]) -> None:
+    """Refuse another number of returns than there are evaluated positions."""
+    positions = len(scene.truth.origins_m)
+    if len(returns) != positions:
+        raise ConfigError(
+            f"{len(returns)} lists of returns", where=f"scene {scene.name}", allowed=f"{positions} positions"
+        )
+
+
+def box_information(scene: Scene, returns: Sequence[Returns]) -> Information:
+    """Which returns lie on which boxes that could be seen: a single one tells all about a box and a position.
+
+    Raises:
+        ConfigError: The number of returns is not the number of evaluated positions.
+    """
+    truth = scene.truth
+    _require_positions(scene, returns)
+    rays, items, frames, known = [], [], [], 0
+    for one, cut, origin, visible in zip(returns, truth.cuts, truth.origins_m, truth.visible, strict=True):
+        item = np.full(len(scene.bodies) + 1, -1)  # the last is that of no box
+        item[visible] = known + np.arange(len(visible))
+        of_ray = item[boxes_of(cut, one.points_m, origin, truth.space.low[AZIMUTH])]
+        rays.append(np.flatnonzero(one.returned)[of_ray >= 0])
+        items.append(of_ray[of_ray >= 0])
+        frames.append(np.full(len(visible), len(frames)))
+        known += len(visible)
+    ray = np.concatenate(rays)
+    return Information(ray, np.concatenate(items), np.ones(len(ray)), np.concatenate(frames))
 
 
 def miss_residuals(scene: Scene, returns: Sequence[Returns]) -> Residuals:

@@ -29,6 +29,13 @@ VALUE = "        return Score(min(1000 * off + 50 / len(points), 100.0))\n"
 CENTRE = "        centre = np.array([generator.uniform(2.0, 3.0), generator.uniform(-0.5, 0.5), 0.0])\n"
 CONFIG = "    Config = TaskConfig\n"
 RESIDUALS = "    def residuals(self, scene, returns):\n        return "
+# All returns tell about the one thing that there is.
+INFORMS = """    def informs(self, scene, returns):
+        from lidardesign.task import Information
+        ray = np.flatnonzero(returns[0].returned)
+        return Information(ray, 0 * ray, np.ones(len(ray)), np.zeros(1, dtype=int))
+
+"""
 # What a task is changed into, by the law that it then breaks: words that are replaced, and what is said of it.
 BROKEN = {
     "configuration is strict": [
@@ -106,6 +113,17 @@ BROKEN = {
         (SCORE, RESIDUALS + "None\n\n" + SCORE, "residuals returned NoneType"),
         (SCORE, RESIDUALS + "__import__('lidardesign.task').task.Residuals([[0, 0, 0]], [-1])\n\n" + SCORE, "negative"),
     ],
+    "returns inform": [
+        (SCORE, INFORMS.replace("Information(", "print(").replace("import print", "import Information") + SCORE,
+         "informs returned NoneType"),
+        (SCORE, INFORMS.replace("0 * ray", "1 + ray") + SCORE, "informs gave item outside 0 to 0"),
+        (SCORE, INFORMS.replace("np.ones", "-np.ones") + SCORE, "informs gave worth that is negative"),
+        (SCORE, INFORMS.replace("returns[0].returned", "returns[0].range_m") + SCORE, "rays without a return tell"),
+        (SCORE, INFORMS.replace("np.flatnonzero(", "np.repeat(*np.where(").replace("turned)", "turned), 2)") + SCORE,
+         "comes twice"),
+        (SCORE, INFORMS.replace("np.ones(len(ray))", "1.0 + ray") + SCORE, "in another order tell something else"),
+        (SCORE, INFORMS.replace("returns[0].returned", "[]") + SCORE, "rays at targets tell nothing"),
+    ],
     "no global random state": [
         (VALUE, "        np.random.uniform()\n" + VALUE, "numpy's random in score"),
         (VALUE, "        import random; random.random()\n" + VALUE, "Python's random in score"),
@@ -179,11 +197,17 @@ def kept():
     return {finding.law: finding for finding in contract_of(task_of(GOOD)).findings()}
 
 
+def test_a_task_that_says_what_returns_tell_keeps_the_law():
+    finding = contract_of(task_of(GOOD.replace(SCORE, INFORMS + SCORE))).finding("returns inform")
+    assert finding.outcome == "pass", finding
+
+
 def test_a_good_task_keeps_every_law_that_applies(kept):
     assert {finding.law for finding in kept.values() if finding.outcome == "skip"} == {
         "conditions lie in the space",
         "scenes repeat elsewhere",
         "residuals are places",
+        "returns inform",
     }
     assert not [finding for finding in kept.values() if finding.outcome == "fail"]
     assert kept["best on the truth"].figures["dense"] < kept["best on the truth"].figures["none"]
