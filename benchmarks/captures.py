@@ -73,7 +73,7 @@ def figure_rows(figures: Figures, seed: int) -> list[list[object]]:
     """Means over heads with 95 % intervals, and the difference to uniform rays head by head."""
     import numpy as np
 
-    from lidardesign.evaluate.statistics import bootstrap_interval, paired_difference
+    from lidardesign.evaluate.statistics import mean_interval, paired_difference
 
     rows = []
     for (estimator, name, gate), values in sorted(figures.items(), key=_place):
@@ -81,7 +81,7 @@ def figure_rows(figures: Figures, seed: int) -> list[list[object]]:
         uniform = np.array(figures[estimator, "uniform", "whole"], dtype=np.float64)
         cells: list[object] = [estimator, name, KINDS[gate]]
         for column in (0, 1):
-            mean, low, high = bootstrap_interval(mine[:, column], seed)
+            mean, low, high = mean_interval(mine[:, column], seed)
             apart = paired_difference(mine[:, column], uniform[:, column], seed)
             against = "-" if name == "uniform" else f"{apart.mean:.3g} ({apart.low:.3g} to {apart.high:.3g})"
             cells += [f"{mean:.3g} ({low:.3g} to {high:.3g})", against]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -334,6 +334,7 @@ class Scene:
         medium: What fills the air; None: nothing.
         ambient: Light that the emitter did not send; None: darkness.
         receiver: A fixed detector that all rays' light is heard by; None: every ray is heard at its own origin.
+        group: What was drawn independently, as the mesh that several scenes show; None: this scene alone.
 
     Example:
         >>> scene = run.scenes("test", seed=0)[0]
@@ -349,6 +350,7 @@ class Scene:
     medium: Medium | None = None
     ambient: Ambient | None = None
     receiver: Receiver | None = None
+    group: str | None = None
 
     def __post_init__(self) -> None:
         if not any(body.is_target for body in self.bodies):
@@ -360,6 +362,8 @@ class Scene:
             if not isinstance(getattr(self, name), kind | None):
                 found = repr(getattr(self, name))
                 raise DataError(f"scene {self.name!r}: {name} is {found}", allowed=f"{kind.__name__}(...) or None")
+        if not isinstance(self.group, str | None):
+            raise DataError(f"scene {self.name!r}: group is {self.group!r}", allowed="a text or None")
         if not (math.isfinite(self.frame_rate_hz) and self.frame_rate_hz > 0):
             raise DataError(f"scene {self.name!r}: frame_rate_hz is {self.frame_rate_hz}", allowed="finite, above 0")
 
@@ -367,6 +371,13 @@ class Scene:
     def frames(self) -> int:
         """The number of time frames; 1 for a scene at rest."""
         return max((len(body.poses) for body in self.bodies if body.poses.ndim == 3), default=1)
+
+
+def group_numbers(scenes: Sequence[Scene]) -> np.ndarray:
+    """The number of each scene's group, shape (S,): 0, 1, ... as they first appear."""
+    numbers: dict[object, int] = {}
+    keys = (number if scene.group is None else scene.group for number, scene in enumerate(scenes))
+    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)
 
 
 def rigid(rotation: np.ndarray | None = None, translation_m: Any = (0.0, 0.0, 0.0)) -> np.ndarray:

@@ -28,6 +28,14 @@ if TYPE_CHECKING:
     from lidardesign.evaluate.cma.candidate import SearchRecord
 
 
+def _half(low: float | None, high: float | None) -> float | None:
+    return None if low is None or high is None else (high - low) / 2
+
+
+def _drawn(middle: float, low: float | None, high: float | None) -> tuple[float, float]:
+    return (middle, middle) if low is None or high is None else (low, high)
+
+
 @dataclass(frozen=True, eq=False)
 class Row:
     """One design or baseline at one number of rays.
@@ -36,7 +44,7 @@ class Row:
         design: Its name.
         rays: Rays per frame; with conditions, per condition value.
         value: Mean score over the held-out scenes, failures at the metric's worst value.
-        ci_low, ci_high: Ends of the 95 % bootstrap interval of the mean.
+        ci_low, ci_high: Ends of the 95 % interval of the mean over groups of scenes; None where all are of one group.
         failures: Scenes with too few returns to score.
         bandwidth_mbps: What its gates cost to read out, averaged over condition values [Mbit/s].
         seconds: Time to simulate and score all scenes [s]; measured once where rows share their rays.
@@ -45,13 +53,14 @@ class Row:
         matched_to, matched_rays: The design and its number of rays whose bandwidth this baseline was given;
             None outside the comparison at equal bandwidth.
         details: The task's further figures by name, each a mean over the scenes that give it.
+        groups: The number of every scene's group, shape (S,); None: every scene is its own.
     """
 
     design: str
     rays: int
     value: float
-    ci_low: float
-    ci_high: float
+    ci_low: float | None
+    ci_high: float | None
     failures: int
     bandwidth_mbps: float
     seconds: float
@@ -60,11 +69,17 @@ class Row:
     matched_to: str | None = None
     matched_rays: int | None = None
     details: Mapping[str, float] = field(default_factory=dict)
+    groups: np.ndarray | None = None
 
     @property
-    def half_width(self) -> float:
+    def half_width(self) -> float | None:
         """Half of the interval: how far the value may be off over other scenes, in the metric's unit."""
-        return (self.ci_high - self.ci_low) / 2
+        return _half(self.ci_low, self.ci_high)
+
+    @property
+    def drawn_interval(self) -> tuple[float, float]:
+        """What pictures show: the interval, without width where there is none."""
+        return _drawn(self.value, self.ci_low, self.ci_high)
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's keys, `half_width`, `details`, and at equal bandwidth the design that it was matched to."""
@@ -87,13 +102,13 @@ class Row:
 
 @dataclass(frozen=True)
 class Paired:
-    """The mean over scenes of a's score minus b's, in the metric's unit, with its 95 % bootstrap interval.
+    """The mean over scenes of a's score minus b's, in the metric's unit, with its 95 % interval.
 
     Arguments:
         a, b: Names of the two.
         rays: Rays per frame of both; of a alone at equal bandwidth.
         difference: Negative where a is lower.
-        ci_low, ci_high: Ends of the interval.
+        ci_low, ci_high: Ends of the interval; None where all scenes are of one group.
         rays_b: Rays per frame of b, where they differ: the comparison at equal bandwidth.
     """
 
@@ -101,14 +116,19 @@ class Paired:
     b: str
     rays: int
     difference: float
-    ci_low: float
-    ci_high: float
+    ci_low: float | None
+    ci_high: float | None
     rays_b: int | None = None
 
     @property
-    def half_width(self) -> float:
+    def half_width(self) -> float | None:
         """Half of the interval, in the metric's unit."""
-        return (self.ci_high - self.ci_low) / 2
+        return _half(self.ci_low, self.ci_high)
+
+    @property
+    def drawn_interval(self) -> tuple[float, float]:
+        """What pictures show: the interval, without width where there is none."""
+        return _drawn(self.difference, self.ci_low, self.ci_high)
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's keys and `half_width`, with `rays_b` at equal bandwidth."""
@@ -151,6 +171,12 @@ class Evaluation:
     accuracy: Accuracy | None = None
     searches: Sequence[SearchRecord] = ()
 
+    @property
+    def groups(self) -> int:
+        """The number of groups of held-out scenes that were drawn independently: what intervals are over."""
+        known = next((row.groups for row in self.rows if row.groups is not None), None)
+        return self.scenes if known is None else int(known.max()) + 1
+
     def estimates(self) -> dict[str, Estimate]:
         """The designs' values and their differences to the baselines with half of their intervals, by what they are."""
         unit, rows = self.metric.unit, [row for row in self.rows if not row.baseline]
@@ -166,9 +192,9 @@ class Evaluation:
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form of `evaluate`.
 
-        Beyond the contract: `equal_bandwidth` rows name the design and rays that they are `matched_to`,
-        `paired_equal_bandwidth` compares each design with them (`rays_b` are the baseline's), `notes`, `detector`,
-        `planning_seconds`, and `audit` where that was asked for.
+        Beyond the contract: `groups` of scenes, `equal_bandwidth` rows name the design and rays that they are
+        `matched_to`, `paired_equal_bandwidth` compares each design with them (`rays_b` are the baseline's), `notes`,
+        `detector`, `planning_seconds`, and `audit` where that was asked for.
         """
         metric = self.metric
         values = {
@@ -179,6 +205,7 @@ class Evaluation:
                 "worst": float(metric.worst),
             },
             "scenes": self.scenes,
+            "groups": self.groups,
             "rows": [row.as_dict() for row in self.rows],
             "paired": [pair.as_dict() for pair in self.paired],
             "equal_bandwidth": [row.as_dict() for row in self.equal_bandwidth],
@@ -210,7 +237,9 @@ def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:
 
 
 def verdict(evaluation: Evaluation, pair: Paired) -> str:
-    """`better` or `worse` where the paired interval of a excludes zero, `open` where it does not."""
+    """`better` or `worse` where the paired interval of a excludes zero, `open` where it does not or there is none."""
+    if pair.ci_low is None or pair.ci_high is None:
+        return "open"
     sign = 1.0 if evaluation.metric.better == "lower" else -1.0
     low, high = sorted((sign * pair.ci_low, sign * pair.ci_high))
     return "better" if high < 0 else "worse" if low > 0 else "open"
@@ -225,7 +254,7 @@ class AuditRow:
         rays: Rays per frame.
         planned, everything: Mean score under the planned effects, and under all.
         difference: Mean over scenes of planned minus all, in the metric's unit.
-        ci_low, ci_high: Ends of its 95 % bootstrap interval.
+        ci_low, ci_high: Ends of its 95 % interval; None where all scenes are of one group.
         seconds, seconds_everything: Time to simulate and score all scenes [s].
         matched_to, matched_rays: As in the row at equal bandwidth.
     """
@@ -235,8 +264,8 @@ class AuditRow:
     planned: float
     everything: float
     difference: float
-    ci_low: float
-    ci_high: float
+    ci_low: float | None
+    ci_high: float | None
     seconds: float
     seconds_everything: float
     matched_to: str | None = None
@@ -307,7 +336,7 @@ def audit_rows(planned: Sequence[Row], everything: Sequence[Row], seed: int) -> 
             row.rays,
             row.value,
             other.value,
-            *paired_difference(row.per_scene, other.per_scene, seed),
+            *paired_difference(row.per_scene, other.per_scene, seed, row.groups),
             row.seconds,
             other.seconds,
             row.matched_to,

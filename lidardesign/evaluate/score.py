@@ -37,10 +37,11 @@ from lidardesign.evaluate.results import (
     summaries,
 )
 from lidardesign.evaluate.scene_scores import Progress
-from lidardesign.evaluate.statistics import bootstrap_interval, paired_difference
+from lidardesign.evaluate.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
+from lidardesign.scene import Scene, group_numbers
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.task import Score, conditions_of, notes_of
 
@@ -320,7 +321,8 @@ def _rows(request: EvaluationRequest, entries: Sequence[Entry], scored: _Scored)
 
 def _row(request: EvaluationRequest, entry: Entry, scores: Sequence[tuple[Score, float]]) -> Row:
     values = np.array([score.value for score, _ in scores])
-    mean, low, high = bootstrap_interval(values, request.seed)
+    groups = group_numbers(request.test)
+    mean, low, high = mean_interval(values, request.seed, groups)
     # the mean of each further figure over the scenes that give it; figures that are not finite are left out
     finite: dict[str, list[float]] = {}
     for name, value in (item for score, _ in scores for item in score.details.items()):
@@ -339,11 +341,12 @@ def _row(request: EvaluationRequest, entry: Entry, scores: Sequence[tuple[Score,
         baseline=entry.baseline,
         matched_to=entry.matched_to,
         matched_rays=entry.matched_rays,
+        groups=groups,
     )
 
 
 def _pair(first: Row, second: Row, seed: int, rays_b: int | None = None) -> Paired:
-    mean, low, high = paired_difference(first.per_scene, second.per_scene, seed)
+    mean, low, high = paired_difference(first.per_scene, second.per_scene, seed, first.groups)
     return Paired(first.design, second.design, first.rays, mean, low, high, rays_b)
 
 
@@ -369,8 +372,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
     notes, positions = left_out(request.designs, request.rays), max(len(entry.positions) for entry in entries)
     if positions > 1:
         notes.append(f"rays and bandwidth count per position; every scene is seen from {positions} positions")
-    if len(request.test) == 1:
-        notes.append("one held-out scene: intervals have no width and say nothing about other scenes")
+    notes += group_notes(request.test)
     with plugin_guard(request.task.name):
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:
@@ -380,6 +382,19 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
         names = ", ".join(sorted({row.design for row in empty}))
         notes.append(f"at equal bandwidth not one ray of {names} fits in {len(empty)} rows, which fail in every scene")
     return notes
+
+
+def group_notes(scenes: Sequence[Scene]) -> list[str]:
+    """What intervals are over, where that are not just the held-out scenes."""
+    groups = int(group_numbers(scenes).max()) + 1
+    if len(scenes) == 1:
+        return ["one held-out scene: it says nothing about others, so there are no intervals"]
+    if groups == 1:
+        return [f"all {len(scenes)} held-out scenes are of one group, {scenes[0].group!r}: there are no intervals"]
+    if groups == len(scenes):
+        return []
+    kind = "intervals" if groups >= FEWEST_RESAMPLED else "Student's t intervals"
+    return [f"the {len(scenes)} held-out scenes are of {groups} groups, and {kind} are over groups"]
 
 
 def slipped_notes(casts: SecondCasts) -> list[str]:

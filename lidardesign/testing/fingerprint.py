@@ -16,7 +16,7 @@ from lidardesign.scene import Body, Scene
 
 DEEPEST = 40
 # What of scenes and bodies no ray meets, or what is told apart otherwise.
-UNSEEN = ("name", "notes", "truth", "bodies", "poses", "importance")
+UNSEEN = ("name", "group", "notes", "truth", "bodies", "poses", "importance")
 
 
 def fingerprint(value: Any) -> str:

@@ -103,7 +103,7 @@ def _scores(
             evaluate(replace(request, designs=[design], rays=[int(count or 0)])).rows[0]
             for design, count in zip(request.designs, own, strict=True)
         )
-        difference = paired_difference(first.per_scene, second.per_scene, request.seed)
+        difference = paired_difference(first.per_scene, second.per_scene, request.seed, first.groups)
         paired.insert(0, Paired(first.design, second.design, first.rays, *difference, rays_b=second.rays))
         own_rows = {(row.design, row.rays): row for row in (first, second)}
         rows = [first, second, *(row for row in rows if (row.design, row.rays) not in own_rows)]

@@ -403,7 +403,7 @@ class Scores:
                 row.design,
                 row.rays,
                 f"{row.value:.4g}",
-                f"{row.ci_low:.4g} - {row.ci_high:.4g}",
+                "-" if row.ci_low is None else f"{row.ci_low:.4g} - {row.ci_high:.4g}",
                 row.failures,
                 f"{row.bandwidth_mbps:.4g}",
             )

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from lidardesign.run.clock import phase
 from lidardesign.run.manifest import versions
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples, load_samples
-from lidardesign.scene import Scene
+from lidardesign.scene import Scene, group_numbers
 from lidardesign.space import observed_point
 from lidardesign.task import conditions_of, random_generator
 from lidardesign.workflow.fit import FitRequest
@@ -292,7 +293,7 @@ def _trial(fitter: Fitter, weighting: Weighting, shape: Shape, gating: Callable[
 
 
 def refinement_scenes(request: FitRequest) -> tuple[list[Scene], list[Scene]]:
-    """Training scenes that nothing was learned from: some to look at, others to judge by.
+    """Training scenes that nothing was learned from: some to look at, others to judge by, of other groups if it can be.
 
     Raises:
         ConfigError: There are too few.
@@ -304,5 +305,9 @@ def refinement_scenes(request: FitRequest) -> tuple[list[Scene], list[Scene]]:
             f"{len(scenes)} training scene", where="--refine", allowed=f"at least {FEWEST_SCENES}",
             hint="some are looked at, the others judge: learn with more training scenes",
         )  # fmt: skip
-    looked = min(max(round(LOOK_SHARE * len(scenes)), 1), len(scenes) - 1)
-    return scenes[:looked], scenes[looked:]
+    groups = group_numbers(scenes)
+    if not groups.any():
+        groups = np.arange(len(scenes))
+    count = int(groups.max()) + 1
+    looked = groups < min(max(round(LOOK_SHARE * count), 1), count - 1)
+    return list(compress(scenes, looked)), list(compress(scenes, ~looked))

@@ -123,7 +123,7 @@ class MeshesTask:
     def scenes(
         self, config: MeshesConfig, split: Split, seed: int, space: DesignSpace | None = None
     ) -> Sequence[Scene]:
-        """Each mesh of the split in `poses` poses; the occluders stand in every scene.
+        """Each mesh of the split in `poses` poses, its group; the occluders stand in every scene.
 
         Raises:
             DataError: The folder or a file in it cannot be used, or no ray can reach a mesh.
@@ -149,7 +149,8 @@ class MeshesTask:
             jitter = jittered_pose(generator, config.jitter_rotation_deg, shift, centre)
             path = None if motion is None else motion.of_object(name)
             placed = Body(mesh, name, "both", jitter if path is None else path @ jitter)
-            scene = Scene((placed, *occluders), f"{split} {name} pose {pose}", frame_rate_hz=config.frame_rate_hz)
+            title = f"{split} {name} pose {pose}"
+            scene = Scene((placed, *occluders), title, frame_rate_hz=config.frame_rate_hz, group=name)
             judge = with_visible_truth if motion is None else with_moving_truth
             judged = judge(scene, space, config.truth_points, generator)
             if motion is not None:

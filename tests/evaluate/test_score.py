@@ -1,15 +1,23 @@
 """Scoring on held-out scenes, with a task of a few lines: the share of rays without a return."""
 
 from dataclasses import replace
+from io import StringIO
 
+import numpy as np
 import pytest
+from rich.console import Console
 from support.scoring import RAYS, HitTask, MissTask, design, make_request, rows_by_key, scenes
 from support.tables import each_row
 
+from lidardesign.cli.tables.scores import show_evaluation
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError, DataError, PluginError
-from lidardesign.evaluate.results import worse_than_threshold
+from lidardesign.evaluate.figures.scores import curve_picture, differences_picture
+from lidardesign.evaluate.report.figures import scores_figure
+from lidardesign.evaluate.report.tables import paired_table
+from lidardesign.evaluate.results import csv_text, verdict, worse_than_threshold
 from lidardesign.evaluate.score import evaluate
+from lidardesign.evaluate.statistics import mean_interval, paired_difference
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score
 
@@ -100,6 +108,46 @@ def test_a_judged_baseline_of_free_origins_is_scored_too():
 def test_one_held_out_scene_is_noted():
     evaluation = evaluate(make_request(test=scenes(2, 1)))
     assert any("one held-out scene" in note for note in evaluation.notes)
+
+
+def grouped(count, *groups):
+    return [replace(scene, group=groups[i % len(groups)]) for i, scene in enumerate(scenes(2, count))]
+
+
+def test_intervals_are_over_groups_of_scenes():
+    alone, grouping = (evaluate(make_request(test=test)) for test in (scenes(2, 12), grouped(12, "a", "b", "c")))
+    assert (alone.groups, grouping.groups) == (12, 3)
+    assert any("12 held-out scenes are of 3 groups, and Student's t intervals" in note for note in grouping.notes)
+    assert not any("groups" in note for note in alone.notes)
+    for row in grouping.rows:
+        np.testing.assert_array_equal(row.groups, np.arange(12) % 3)
+        assert (row.value, row.ci_low, row.ci_high) == mean_interval(row.per_scene, 0, np.arange(12) % 3)
+    rows = rows_by_key(grouping)
+    for pair in (*grouping.paired, *grouping.paired_bandwidth):
+        if pair.rays_b is None:
+            first, second = rows[pair.a, pair.rays], rows[pair.b, pair.rays]
+            apart = paired_difference(first.per_scene, second.per_scene, 0, np.arange(12) % 3)
+            assert (pair.difference, pair.ci_low, pair.ci_high) == apart
+
+
+def test_scenes_of_one_group_give_no_interval_and_no_verdict():
+    evaluation = evaluate(make_request(test=grouped(4, "a"), audit=True))
+    assert any("all 4 held-out scenes are of one group, 'a'" in note for note in evaluation.notes)
+    document = evaluation.as_dict()
+    for entry in (*document["rows"], *document["paired"], *document["equal_bandwidth"], *document["audit"]["rows"]):
+        assert entry["ci_low"] is None
+        assert entry["ci_high"] is None
+    assert {verdict(evaluation, pair) for pair in evaluation.paired} == {"open"}
+    assert all(estimate["error"] is None for estimate in document["error_estimates"].values())
+    assert ",,,0,4," in csv_text(evaluation)
+    console = Console(file=StringIO(), width=200)
+    show_evaluation(document, [], console)
+    assert "None" not in console.file.getvalue()
+    assert "over other scenes" not in console.file.getvalue()
+    assert paired_table(evaluation)
+    assert curve_picture(evaluation, "rays")
+    assert differences_picture(evaluation)
+    assert scores_figure(evaluation, "rays")
 
 
 def test_rows_that_fire_the_same_rays_are_scored_once():

@@ -39,7 +39,7 @@ from lidardesign.design.fit import fit
 from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.errors import LidardesignError
 from lidardesign.evaluate.scene_scores import checked_score
-from lidardesign.evaluate.statistics import bootstrap_interval
+from lidardesign.evaluate.statistics import mean_interval
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import load_yaml
@@ -215,7 +215,7 @@ GIVEN = {
     "split_budget": lambda x: split_budget([1.0, x], 10),
     "lloyd": lambda x: lloyd(np.array([[0.0], [x], [1.0]]), np.ones(3), 2, np.random.default_rng(0)),
     "Constraints": lambda x: Constraints.from_mapping({"gate": {"width_m": {"max": x}}}),
-    "bootstrap_interval": lambda x: bootstrap_interval([1.0, x], 0),
+    "mean_interval": lambda x: mean_interval([1.0, x], 0),
     "checked_score": lambda x: checked_score(scoring(x), BALL, simulate(BALL, rays_with(0.0, "origin_m"))),
 }
 

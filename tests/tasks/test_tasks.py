@@ -22,7 +22,7 @@ from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Outcome, Rays, Returns
-from lidardesign.scene import Scene
+from lidardesign.scene import Scene, group_numbers
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim
 from lidardesign.task import Task, conditions_of, scenes_of
@@ -381,3 +381,15 @@ def test_jitter_is_rigid_about_its_centre_and_bounded():
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
         angle = np.rad2deg(np.arccos((np.trace(pose[:3, :3]) - 1) / 2))
         assert angle <= 4.0 * 2.5 * np.sqrt(3) + 1e-9
+
+
+def test_poses_of_one_mesh_are_one_group_and_other_scenes_are_their_own(tmp_path):
+    for number in range(4):
+        write_ball(tmp_path / "balls" / f"ball{number}.stl", 0.1 + 0.01 * number)
+    config = MeshesTask.Config(folder=tmp_path / "balls", poses=3, truth_points=200)
+    scenes = MeshesTask().scenes(config, "train", 0)
+    assert [scene.group for scene in scenes] == [scene.bodies[0].name for scene in scenes]
+    assert len(scenes) == 3 * (group_numbers(scenes).max() + 1)
+    for task in (FlatlandTask(), WarehouseTask(), ArmTask()):
+        scenes = task.scenes(task.Config(train=2), "train", 0)
+        np.testing.assert_array_equal(group_numbers(scenes), [0, 1])

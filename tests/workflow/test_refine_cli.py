@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from lidardesign.space import RANGE, direction
 from lidardesign.task import Residuals, scenes_of
 from lidardesign.workflow.fit import FitRequest
 from lidardesign.workflow.fit_design import refinement_scenes
+from lidardesign.workflow.run_folder import RunFolder
 from lidardesign.workflow.run_samples import RunTarget, Weighting
 
 SEED = 3
@@ -179,6 +181,18 @@ def test_scenes_that_judge_are_neither_held_out_nor_learned_from_nor_looked_at(f
     assert len(curves(judge)) == 2
     assert not curves(look) & curves(judge)
     assert not (curves(look) | curves(judge)) & other
+
+
+def test_scenes_of_one_group_never_look_and_judge(flat, monkeypatch):
+    plain = RunFolder.scenes
+
+    def grouped(run, split, seed):
+        return [replace(scene, group="ab"[i % 2]) for i, scene in enumerate(plain(run, split, seed))]
+
+    monkeypatch.setattr(RunFolder, "scenes", grouped)
+    look, judge = refinement_scenes(FitRequest(open_run(flat), "r", SEED))
+    assert {scene.group for scene in look} == {"a"}
+    assert {scene.group for scene in judge} == {"b"}
 
 
 def test_two_scenes_are_the_least(lidardesign, tmp_path):

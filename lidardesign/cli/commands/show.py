@@ -10,7 +10,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.output import command
 from lidardesign.cli.tables.designs import show_constraints, show_design
-from lidardesign.cli.tables.grids import RichConsole, number, print_table
+from lidardesign.cli.tables.grids import RichConsole, interval_text, number, print_table
 from lidardesign.errors import LidardesignError
 from lidardesign.run.clock import phase
 
@@ -154,7 +154,7 @@ def _show(document: dict[str, Any], rich: RichConsole) -> None:
         [
             row["design"],
             *(number(row[name]) for name in ("rays", "value")),
-            f"{number(row['ci_low'])} - {number(row['ci_high'])}",
+            interval_text(row),
             *(number(row[name]) for name in ("failures", "bandwidth_mbps")),
         ]
         for row in document["rows"]
@@ -171,9 +171,9 @@ def _signed(value: float, decimals: int = 2) -> str:
 def _verdict(pair: dict[str, Any], metric: dict[str, Any]) -> str:
     rays = f"{pair['rays']}" if pair.get("rays_b") in (None, pair["rays"]) else f"{pair['rays']} and {pair['rays_b']}"
     low, high, unit = pair["ci_low"], pair["ci_high"], metric["unit"]
-    span = f"{pair['a']} minus {pair['b']}: {number(pair['difference'], 3)} {unit}, 95 % interval {number(low, 3)} to "
-    span += f"{number(high, 3)}, with {rays} rays"
-    if low <= 0 <= high:
+    span = f"{pair['a']} minus {pair['b']}: {number(pair['difference'], 3)} {unit}, 95 % interval "
+    span += f"{interval_text(pair, ' to ', 3)}, with {rays} rays"
+    if low is None or low <= 0 <= high:
         return f"{span}: no difference is shown"
     first_is_better = (pair["difference"] < 0) == (metric["better"] == "lower")
     return f"{span}: {pair['a'] if first_is_better else pair['b']} is better"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
@@ -25,6 +25,12 @@ def number(value: Any, digits: int = 4) -> str:
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def interval_text(entry: Mapping[str, Any], between: str = " - ", digits: int = 4) -> str:
+    """The interval of a row or pair; a dash where there is none."""
+    ends = [entry[name] for name in ("ci_low", "ci_high")]
+    return "-" if None in ends else between.join(number(end, digits) for end in ends)
 
 
 def text_table(

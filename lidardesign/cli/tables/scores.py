@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.cli.tables.grids import RichConsole, number, print_table
+from lidardesign.cli.tables.grids import RichConsole, interval_text, number, print_table
 from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
     against = [pair for pair in document["paired"] if pair["b"] not in designs]
     title = f"difference to each baseline [{metric['unit']}], scene by scene, with its 95 % interval"
     cells = [
-        f"{number(pair['difference'], 3)} ({number(pair['ci_low'], 3)} to {number(pair['ci_high'], 3)})"
+        f"{number(pair['difference'], 3)} ({interval_text(pair, ' to ', 3)})"
         for pair in against
     ]
     _show_grid(title, [(pair["a"], pair["rays"], pair["b"]) for pair in against], cells, rich)
@@ -55,9 +55,8 @@ def _show_rows(document: Entry, rich: RichConsole) -> None:
     headings = ("design", "rays", "value", "95 % interval", "failures", *further, "Mbit/s", "seconds")
     lines = []
     for row in rows:
-        interval = f"{number(row['ci_low'])} - {number(row['ci_high'])}"
         extra = [row["details"].get(name) for name in details]
-        cells = (row["rays"], row["value"], interval, row["failures"], *extra, row["bandwidth_mbps"])
+        cells = (row["rays"], row["value"], interval_text(row), row["failures"], *extra, row["bandwidth_mbps"])
         lines.append([row["design"], *(number(cell) for cell in cells), number(row["seconds"], 2)])
     print_table(title, headings, lines, rich)
 
@@ -75,8 +74,8 @@ def _show_audit(audit: Entry, effects: Sequence[Entry], rich: RichConsole) -> No
     lines = []
     for row in audit["rows"]:
         # adding zero takes the sign from a rounded -0
-        figures = (round(row[name], decimals) + 0.0 for name in ("difference", "ci_low", "ci_high"))
-        moved, low, high = (f"{value:.{decimals}f}" for value in figures)
+        figures = (row[name] for name in ("difference", "ci_low", "ci_high"))
+        moved, low, high = ("-" if one is None else f"{round(one, decimals) + 0.0:.{decimals}f}" for one in figures)
         cells = (str(row["rays"]), number(row["planned"]), number(row["everything"]), f"{moved} ({low} to {high})")
         times = f"{number(row['seconds'], 2)}, {number(row['seconds_everything'], 2)}"
         lines.append([row["design"], row.get("matched_to", "-"), *cells, times])
@@ -85,7 +84,7 @@ def _show_audit(audit: Entry, effects: Sequence[Entry], rich: RichConsole) -> No
 
 def _show_errors(document: Entry, rich: RichConsole) -> None:
     designs, unit = {pair["a"] for pair in document["paired"]}, document["metric"]["unit"]
-    if designs:
+    if designs and all(row["half_width"] is not None for row in document["rows"]):
         value = max(row["half_width"] for row in document["rows"] if row["design"] in designs)
         difference = max(pair["half_width"] for pair in document["paired"])
         rich.print(

@@ -10,7 +10,7 @@ import numpy as np
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
 from lidardesign.evaluate.results import Row
-from lidardesign.evaluate.statistics import bootstrap_interval
+from lidardesign.evaluate.statistics import mean_interval
 from lidardesign.task import random_generator
 
 RIVAL = "bounding"
@@ -34,10 +34,10 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
         return []
     # where designs are closest
     design, rival = max(pairs, key=lambda pair: pair[0].rays)
-    if len(design.per_scene) < 2:
-        return []
     differences = np.asarray(design.per_scene, dtype=np.float64) - np.asarray(rival.per_scene, dtype=np.float64)
-    return [_sweep(differences, design, request)]
+    if design.groups is not None:  # scenes of one group stand for each other
+        differences = np.bincount(design.groups, differences) / np.bincount(design.groups)
+    return [_sweep(differences, design, request)] if len(differences) > 1 else []
 
 
 def _sweep(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Sweep:
@@ -45,6 +45,7 @@ def _sweep(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Sw
     # of all rows in all scenes [s]; rows that fire the same rays have one time, to the last bit
     row_seconds = {row.seconds for row in (*request.evaluation.rows, *request.evaluation.equal_bandwidth)}
     seconds = (request.evaluation.planning_seconds + sum(row_seconds)) / total
+    units = "scenes" if total == len(design.per_scene) else "groups of scenes"
     counts = [*(count for count in COUNTS if count < total), total]
     measurements = [_measure(differences, count, seconds, request.request.seed) for count in counts]
     # half-widths fall with the root of the number of scenes
@@ -52,15 +53,15 @@ def _sweep(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Sw
     note = ""
     if half_width > tolerance > 0:
         needed = math.ceil(total * (half_width / tolerance) ** 2)
-        note = f"{needed:,} scenes would tell differences of {tolerance:g} {metric.unit} apart"
+        note = f"{needed:,} {units} would tell differences of {tolerance:g} {metric.unit} apart"
     return Sweep(
-        knob="held-out scenes",
+        knob=f"held-out {units}",
         error_of=f"half-width of the 95 % interval of {design.design} minus {RIVAL} at {design.rays} rays",
         unit=metric.unit,
-        against="all scenes that there could be",
+        against=f"all {units} that there could be",
         tolerance=tolerance,
         because="the task's own tolerance: smaller differences do not matter to it",
-        work="simulating and scoring all rows in so many scenes",
+        work=f"simulating and scoring all rows in so many {units}",
         measurements=measurements,
         note=note,
     )
@@ -72,7 +73,7 @@ def _measure(differences: np.ndarray, count: int, seconds: float, seed: int) -> 
     generator = random_generator(seed, "held-out ladder", count)
     draws = DRAWS if count < total else 1
     sets = [generator.permutation(total)[:count] for _ in range(draws)] if count < total else [np.arange(total)]
-    intervals = [bootstrap_interval(differences[chosen], seed, resamples=1000) for chosen in sets]
+    intervals = [mean_interval(differences[chosen], seed, resamples=1000) for chosen in sets]
     halves = np.array([(one.high - one.low) / 2 for one in intervals])
     sign = np.sign(differences.mean())
     agree = np.mean([sign * one.low > 0 and sign * one.high > 0 for one in intervals])

@@ -60,7 +60,7 @@ def curve_picture(evaluation: Evaluation, against: Against) -> Figure:
     axes = figure.add_subplot()
     for curve in curves:
         across = [position(row, against) for row in curve.rows]
-        low, high = [row.ci_low for row in curve.rows], [row.ci_high for row in curve.rows]
+        low, high = zip(*(row.drawn_interval for row in curve.rows), strict=True)
         axes.fill_between(across, low, high, color=curve.colour, alpha=BAND_OPACITY, linewidth=0)
         axes.plot(
             across,
@@ -74,7 +74,7 @@ def curve_picture(evaluation: Evaluation, against: Against) -> Figure:
         if len(curve.rows) == 1:  # there is no band of a single point
             (row,) = curve.rows
             # an interval of a bootstrap may leave its mean out
-            lengths = [[max(row.value - row.ci_low, 0.0)], [max(row.ci_high - row.value, 0.0)]]
+            lengths = [[max(row.value - low[0], 0.0)], [max(high[0] - row.value, 0.0)]]
             axes.errorbar(across, [row.value], lengths, color=curve.colour, capsize=2.0)
     _dress_curves(axes, evaluation, curves, against)
     figure.legend(loc="outside lower center", ncols=LEGEND_COLUMNS, frameon=False, handlelength=2.6, borderaxespad=0.2)
@@ -116,7 +116,7 @@ def differences_picture(evaluation: Evaluation) -> Figure:
     for place, pair in enumerate(pairs):
         colour, marker, filled = VERDICT_LOOKS[verdict(evaluation, pair)]
         face = colour if filled else "white"
-        axes.plot([pair.ci_low, pair.ci_high], [place, place], color=colour, linewidth=1.2, solid_capstyle="butt")
+        axes.plot(pair.drawn_interval, [place, place], color=colour, linewidth=1.2, solid_capstyle="butt")
         axes.plot(pair.difference, place, marker=marker, color=colour, markerfacecolor=face, linestyle="none", zorder=3)
         if place and pair.a != pairs[place - 1].a:
             axes.axhline(place - 0.5, color=SOFT, linewidth=0.5)
@@ -138,7 +138,7 @@ def drawn_pairs(evaluation: Evaluation) -> tuple[list[Paired], str]:
     """The pairs that a picture holds, by design, and a line that says which they are."""
     order = {name: place for place, name in enumerate(dict.fromkeys(row.design for row in evaluation.rows))}
     pairs = sorted(evaluation.paired, key=lambda pair: (order.get(pair.a, -1), order.get(pair.b, -1), pair.rays))
-    title = f"paired over {evaluation.scenes} held-out scenes, 95 % bootstrap intervals"
+    title = f"paired over {evaluation.scenes} held-out scenes, 95 % intervals"
     if len(pairs) <= MOST_ROWS:
         return pairs, title
     most = {name: max(pair.rays for pair in pairs if pair.a == name) for name in {pair.a for pair in pairs}}

@@ -95,7 +95,7 @@ def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
     band = {
         "type": "scatter",
         "x": [*across, *across[::-1]],
-        "y": [*(row.ci_high for row in curve.rows), *(row.ci_low for row in reversed(curve.rows))],
+        "y": [*(row.drawn_interval[1] for row in curve.rows), *(row.drawn_interval[0] for row in reversed(curve.rows))],
         "fill": "toself",
         "fillcolor": f"rgba({red},{green},{blue},0.13)",
         "line": {"width": 0},

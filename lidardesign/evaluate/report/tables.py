@@ -151,6 +151,8 @@ def _comparison(evaluation: Evaluation, pair: Paired, other: float) -> str:
 
 
 def _interval(item: Row | Paired) -> str:
+    if item.ci_low is None or item.ci_high is None:
+        return "-"
     return f"{four_digits(item.ci_low)} to {four_digits(item.ci_high)}"
 
 
@@ -400,5 +402,6 @@ def _effect_cells(effect: EffectSummary) -> list[str]:
 def _audit_cells(row: AuditRow) -> list[str]:
     name = row.design if row.matched_to is None else f"{row.design} (bandwidth of {row.matched_to})"
     cells = [name, str(row.rays), four_digits(row.planned), four_digits(row.everything), f"{row.difference:.2g}"]
-    interval = f"{row.ci_low:.2g} to {row.ci_high:.2g}"
+    known = row.ci_low is not None and row.ci_high is not None
+    interval = f"{row.ci_low:.2g} to {row.ci_high:.2g}" if known else "-"
     return [*cells, interval, f"{row.seconds:.2f}", f"{row.seconds_everything:.2f}", ""]
