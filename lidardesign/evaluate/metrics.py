@@ -23,7 +23,7 @@ from lidardesign.scene import Receiver, Scene
 from lidardesign.space import RANGE, DesignSpace, aim
 
 if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
+    from lidardesign.geometry.closest import TriangleTree
 
 # Embree works in float32: its ranges are good to 4e-7 of the scene's size, and worse at grazing incidence
 HIT_TOLERANCE = 1e-4
@@ -89,15 +89,14 @@ def discrete_frechet_m(first: np.ndarray, second: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceCloud:
-    r"""A surface as points that each know the triangle they lie on.
+    r"""A surface as its triangles, and points on them that stand for its area.
 
     Between two clouds of density n the nearest *points* are :math:`0.5 / \sqrt{n}` apart even if the
-    surfaces agree (1.6 mm for 5000 points on a head). Distances to the nearest point's triangle do not have
-    that floor.
+    surfaces agree (1.6 mm for 5000 points on a head). Distances to the nearest triangle do not have that floor.
 
     Arguments:
         points: Area-uniform points [m], shape (K, 3).
-        triangles: Corners of each point's triangle [m], shape (K, 3, 3).
+        triangles: Corners of the triangles [m], each once, shape (T, 3, 3).
 
     Raises:
         ValueError: There are no points.
@@ -111,11 +110,10 @@ class SurfaceCloud:
             raise ValueError("a surface without points has no distance")
 
     @cached_property
-    def tree(self) -> cKDTree:
-        """The search tree of the points, built once."""
-        from scipy.spatial import cKDTree
+    def _tree(self) -> TriangleTree:
+        from lidardesign.geometry.closest import TriangleTree
 
-        return cKDTree(self.points)
+        return TriangleTree(self.triangles)
 
     @cached_property
     def gap_m(self) -> float:
@@ -123,48 +121,15 @@ class SurfaceCloud:
 
         Beyond r there is no point with the probability exp(-pi n r^2), and neighbours are 0.5 / sqrt(n) apart.
         """
+        from scipy.spatial import cKDTree
+
         if len(self.points) < 2:
             return 0.0
-        return GAP_SPACINGS * float(self.tree.query(self.points, k=2)[0][:, 1].mean())
+        return GAP_SPACINGS * float(cKDTree(self.points).query(self.points, k=2)[0][:, 1].mean())
 
     def distance_m(self, queries: np.ndarray) -> np.ndarray:
-        """Distances to the surface [m], (N, 3) to (N,): exact for the triangle of the nearest point."""
-        _, nearest = self.tree.query(queries)
-        return triangle_distance_m(queries, self.triangles[nearest])
-
-
-def triangle_distance_m(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The distance of each point to its own triangle [m], (N, 3) and (N, 3, 3) to (N,).
-
-    Over the inside it is the distance to the plane, elsewhere the least of the three edges' distances; a
-    triangle without area has no inside.
-    """
-    # one row per axis: a fifth of the time of rows of three
-    at, corners = np.ascontiguousarray(points.T), np.ascontiguousarray(triangles.transpose(1, 2, 0))
-    normal = _cross(corners[1] - corners[0], corners[2] - corners[0])
-    area = _dot(normal, normal)
-    inside, squared = area > 0, np.full(len(points), np.inf)
-    for start, end in itertools.pairwise([*corners, corners[0]]):
-        along, offset = end - start, at - start
-        inside &= _dot(_cross(along, offset), normal) >= 0
-        # squared distances to segments of points offset from their starts, (3, N) and (3, N) to (N,)
-        length = _dot(along, along)
-        share = np.divide(_dot(offset, along), length, out=np.zeros(len(length)), where=length > 0)
-        away = offset - np.clip(share, 0.0, 1.0) * along
-        squared = np.minimum(squared, _dot(away, away))
-    return np.sqrt(
-        np.minimum(
-            squared, np.divide(_dot(at - corners[0], normal) ** 2, area, out=np.full(len(points), np.inf), where=inside)
-        )
-    )
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+        """Exact distances to the nearest triangle [m], (N, 3) to (N,)."""
+        return self._tree.distance_m(queries)
 
 
 def ray_spacing(directions: np.ndarray) -> np.ndarray:
@@ -269,9 +234,9 @@ def _stereographic(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def surface_cloud(vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator) -> SurfaceCloud:
-    """A triangle mesh as area-uniform points with their triangles."""
-    points, chosen = sample_triangles(vertices, faces, count, generator)
-    return SurfaceCloud(points, vertices[faces[chosen]])
+    """A triangle mesh with area-uniform points on it."""
+    points, _ = sample_triangles(vertices, faces, count, generator)
+    return SurfaceCloud(points, vertices[faces])
 
 
 def visible_surface(
@@ -306,7 +271,8 @@ def visible_surface(
             hint="move the sensors, or widen angles and range of the design space, to reach the targets",
         )
     keep = np.sort(generator.choice(found, count, replace=found < count))
-    return SurfaceCloud(np.concatenate(points)[keep], np.concatenate(triangles)[keep])
+    corners = np.concatenate(triangles)[keep].reshape(-1, 9)
+    return SurfaceCloud(np.concatenate(points)[keep], np.unique(corners, axis=0).reshape(-1, 3, 3))
 
 
 def trial_origins(space: DesignSpace, generator: np.random.Generator) -> np.ndarray:

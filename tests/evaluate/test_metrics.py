@@ -8,14 +8,15 @@ import math
 import numpy as np
 import pytest
 from support.tables import each_row
+from support.triangles import naive_triangle_distance_m
 
 from lidardesign.errors import DataError
 from lidardesign.evaluate.metrics import (
     chamfer_m,
     delaunay_surface,
+    nearest_m,
     ray_spacing,
     surface_cloud,
-    triangle_distance_m,
     visible_surface,
 )
 from lidardesign.geometry.surface import sample_triangles
@@ -54,21 +55,25 @@ def test_chamfer_equals_all_pairs_and_is_symmetric(dimension):
     assert chamfer_m(1000 * first, 1000 * second) == pytest.approx(1000 * chamfer_m(first, second), rel=1e-12)
 
 
-def test_distances_to_triangles_equal_the_least_over_a_dense_grid_on_them():
-    random = generator(3)
-    triangles, points = random.normal(size=(30, 3, 3)), 2 * random.normal(size=(30, 3))
-    steps = 120
-    shares = np.array([(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]) / steps
-    naive = np.linalg.norm(np.einsum("sk,nkd->nsd", shares, triangles) - points[:, None], axis=2).min(axis=1)
-    found = triangle_distance_m(points, triangles)
-    assert (found <= naive + 1e-12).all()
-    np.testing.assert_allclose(found, naive, atol=0.03)  # half a grid step of the largest triangle
+def test_a_surface_is_all_of_its_triangles_not_only_those_that_points_lie_on():
+    corners = generator(3).normal(size=(40, 3, 3))
+    cloud = surface_cloud(corners.reshape(-1, 3), np.arange(120).reshape(-1, 3), 10, generator())
+    assert cloud.triangles.shape == (40, 3, 3)
+    queries = 2 * generator(4).normal(size=(200, 3))
+    np.testing.assert_allclose(cloud.distance_m(queries), naive_triangle_distance_m(queries, corners), atol=1e-12)
 
 
-def test_distances_to_triangles_without_area_are_those_to_points_and_segments():
-    point, start, end = np.array([[1.0, 2.0, 2.0]]), np.zeros(3), np.array([3.0, 0.0, 0.0])
-    assert triangle_distance_m(point, np.array([[start, start, start]])) == pytest.approx(3.0)
-    assert triangle_distance_m(point, np.array([[start, end, end]])) == pytest.approx(math.sqrt(8))
+def test_a_visible_surface_has_each_triangle_with_a_visible_point_once():
+    steps = np.linspace(-0.5, 0.5, 5)
+    y, z = (values.ravel() for values in np.meshgrid(steps, steps, indexing="ij"))
+    first = (np.arange(4)[:, None] * 5 + np.arange(4)).ravel()
+    faces = np.concatenate([first[:, None] + [0, 5, 1], first[:, None] + [6, 1, 5]])
+    wall = Mesh(np.column_stack([np.zeros(25), y, z]), faces, "unsigned")
+    half = Body(Box((0.01, 0.5, 1.0)), "plate", "occluder", rigid(translation_m=(1.0, 0.5, 0.0)))
+    seen = visible_surface(Scene((Body(wall), half)), looking_along_minus_x(), 2000, generator())
+    assert len(np.unique(seen.triangles.reshape(-1, 9), axis=0)) == len(seen.triangles) == 16
+    assert seen.triangles[:, :, 1].max() == pytest.approx(0.0)
+    np.testing.assert_allclose(seen.distance_m(seen.points), 0.0, atol=1e-12)
 
 
 def test_two_samplings_of_one_surface_have_no_distance():
@@ -77,8 +82,8 @@ def test_two_samplings_of_one_surface_have_no_distance():
         np.array([[0, 1, 2], [0, 2, 3]]),
     )
     first, second = (surface_cloud(vertices, faces, 300, generator(seed)) for seed in (1, 2))
-    assert first.distance_m(second.points).mean() < 1e-3
-    assert first.distance_m(second.points + np.array([0, 0, 0.1])) == pytest.approx(0.1, abs=1e-3)
+    np.testing.assert_allclose(first.distance_m(second.points), 0.0, atol=1e-12)
+    np.testing.assert_allclose(first.distance_m(second.points + np.array([0, 0, 0.1])), 0.1, atol=1e-12)
 
 
 def directions_around_x(count, spread=0.5):
@@ -90,7 +95,7 @@ def test_one_place_in_a_thousand_is_further_from_all_points_than_their_gap():
     corners = 2 * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     cloud = surface_cloud(corners, np.array([[0, 1, 2], [0, 2, 3]]), 5000, generator(3))
     places = np.column_stack([generator(4).uniform(0.2, 1.8, (40_000, 2)), np.zeros(40_000)])
-    beyond = (cloud.tree.query(places)[0] > cloud.gap_m).mean()
+    beyond = (nearest_m(cloud.points, places) > cloud.gap_m).mean()
     # some 20 places of one gap are beyond together, so that the share has a standard error of about 0.0003
     assert beyond == pytest.approx(0.001, abs=0.001)
 
