@@ -98,7 +98,7 @@ class Information:
 
     Arguments:
         ray: The ray of each pair, int (E,).
-        item: The item of each pair, int (E,); no pair comes twice.
+        item: The item of each pair, int (E,); without `seen_in` no pair comes twice.
         worth: How much the return tells about the item, 0 or more, (E,).
         frame: Which of the `Returns` shows each item, int (U,).
         weight: What items count, 0 or more, (U,); None: all alike.
@@ -106,6 +106,9 @@ class Information:
             (frames, N); None: nothing.
         sums: None, or what sums of worths 0, 1, 2, ... count, linear in between: 0 at first, rising ever less.
         complete: What an item counts of which nothing is left to know; the loss of a choice is what lacks of it.
+        seen_in: Which of the `Returns` each pair is from, int (E,), where returns of one frame tell about another, as
+            about where a path goes on; a pair then comes once per frame, and its largest worth counts. None: those that
+            show the item.
     """
 
     ray: np.ndarray
@@ -116,6 +119,12 @@ class Information:
     harm: np.ndarray | None = None
     sums: Sequence[float] | None = None
     complete: float = 1.0
+    seen_in: np.ndarray | None = None
+
+    @property
+    def source(self) -> np.ndarray:
+        """Which of the `Returns` each pair is from, int (E,)."""
+        return self.frame[self.item] if self.seen_in is None else self.seen_in
 
 
 @dataclass(frozen=True)

@@ -125,8 +125,10 @@ def gather(
         range_m = np.stack([frame.range_m for frame in returns])
         opened = (range_m[..., None] >= gates_m[..., 0]) & (range_m[..., None] < gates_m[..., 1])
         passes = np.packbits(opened, axis=2, bitorder="little")[..., 0][
-            information.frame[information.item], information.ray
+            information.source, information.ray
         ]
+        if information.seen_in is not None:
+            passes = _largest_alone(information, passes, gates)
         tells = np.flatnonzero((passes > 0) & (information.worth > 0))
         parts.append((information.ray[tells], items + information.item[tells], information.worth[tells], passes[tells]))
         count = len(information.frame)
@@ -151,3 +153,14 @@ def gather(
         table=sums,
         complete=complete / len(parts),
     )
+
+
+def _largest_alone(information: Information, passes: np.ndarray, gates: int) -> np.ndarray:
+    """The gates (E,) without those through which a ray tells more about the same item in another frame."""
+    pair = information.ray * len(information.frame) + information.item
+    order = np.lexsort((-information.worth, pair))
+    kept = np.zeros_like(passes)
+    for gate in range(gates):
+        through = order[passes[order] >> gate & 1 > 0]
+        kept[through[np.unique(pair[through], return_index=True)[1]]] |= 1 << gate
+    return kept

@@ -55,8 +55,10 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
     pairs, items = len(information.ray), len(information.frame)
     weight = np.ones(items) if information.weight is None else np.asarray(information.weight)
     harm = np.zeros((frames, rays)) if information.harm is None else np.asarray(information.harm)
+    seen_in = np.zeros(0, dtype=int) if information.seen_in is None else information.seen_in
     faults = {
         "ray, item and worth of other lengths": not len(information.item) == len(information.worth) == pairs,
+        "seen_in of another length than item": information.seen_in is not None and len(seen_in) != pairs,
         "weight of another length than frame": weight.shape != (items,),
         f"harm of shape {harm.shape}, not {(frames, rays)}": harm.shape != (frames, rays),
         "weights that do not count": not weight.sum() > 0,
@@ -65,6 +67,7 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
         ("ray", information.ray, rays),
         ("item", information.item, items),
         ("frame", information.frame, frames),
+        ("seen_in", seen_in, frames),
     ):
         faults[f"{name} outside 0 to {count - 1}"] = bool(((index < 0) | (index >= count)).any())
     for name, values in (("worth", information.worth), ("weight", weight), ("harm", harm)):

@@ -181,10 +181,10 @@ def check_information(subject: Subject) -> LawHolds | NotApplicable:
         said = f"informs in scene {scene.name!r}"
         if len(silent.ray) or (silent.harm is not None and np.any(silent.harm)):
             raise BrokenLawError(f"{said}: rays without a return tell or spoil something")
-        if not np.stack([one.returned for one in first])[found.frame[found.item], found.ray].all():
-            raise BrokenLawError(f"{said}: a ray tells about an item of a frame in which it has no return")
+        if not np.stack([one.returned for one in first])[found.source, found.ray].all():
+            raise BrokenLawError(f"{said}: a ray tells something by a frame in which it has no return")
         one, two = _pairs(found, np.sort(order)), _pairs(reordered, order)
-        if len(np.unique(one[:, :2], axis=0)) < len(one):
+        if len(np.unique(one[:, :3], axis=0)) < len(one):
             raise BrokenLawError(f"{said}: a pair of an item and a ray comes twice")
         if one.shape != two.shape or not np.allclose(one, two, rtol=SLACK, atol=0):
             raise BrokenLawError(f"{said}: rays in another order tell something else")
@@ -197,9 +197,9 @@ def check_information(subject: Subject) -> LawHolds | NotApplicable:
 
 
 def _pairs(found: Information, rays: np.ndarray) -> np.ndarray:
-    """Item, ray and worth of all pairs, sorted, (E, 3); rays have the numbers (N,)."""
-    columns = [found.item, rays[found.ray], found.worth]
-    return np.column_stack(columns)[np.lexsort(columns[1::-1])]
+    """Item, ray, frame and worth of all pairs, sorted, (E, 4); rays have the numbers (N,)."""
+    columns = [found.item, rays[found.ray], found.source, found.worth]
+    return np.column_stack(columns)[np.lexsort(columns[2::-1])]
 
 
 LAWS = (

@@ -21,10 +21,10 @@ from lidardesign.geometry.rays import Returns
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.arm_motion import Arm, Motion
 from lidardesign_tasks.arm_robot import BALL_RADIUS_M, Robot, load_robot
-from lidardesign_tasks.arm_tracking import FEWEST_FRAMES, filled_path, tracked_places
+from lidardesign_tasks.arm_tracking import FEWEST_FRAMES, filled_path, path_information, tracked_places
 from lidardesign_tasks.surroundings import Surroundings
 
 CEILING_M = 1.0
@@ -131,11 +131,19 @@ class ArmTask:
         squares = np.square(path - ball).sum(axis=1)
         return Residuals(ball, discrete_frechet_m(path, ball) * safe_divide(squares, squares.sum()))
 
+    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+        """What returns on the ball tell about its place in their own and in neighbouring frames."""
+        return path_information(returns, _target(scene), scene.truth["ball_m"])
+
 
 def _tracked(scene: Scene, returns: Sequence[Returns]) -> tuple[np.ndarray, np.ndarray]:
     """Frames in which the ball was seen, and its place in each [m], see `tracked_places`."""
-    target = next(index for index, body in enumerate(scene.bodies) if body.is_target)
+    target = _target(scene)
     return tracked_places(returns, target, scene.bodies[target].shape.radius_m)
+
+
+def _target(scene: Scene) -> int:
+    return next(index for index, body in enumerate(scene.bodies) if body.is_target)
 
 
 def rejection_notes(motions: Sequence[Motion], split: str) -> tuple[str, ...]:

@@ -19,14 +19,16 @@ from lidardesign.evaluate.metrics import chamfer_m, nearest_m
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Body, Capsule, Scene, Sphere, rigid
+from lidardesign.selection.information import surface_information
 from lidardesign.space import DesignSpace, aim
-from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.surroundings import Surroundings
 
 MILLIMETRES = 1000.0
 BUMP_VERTICES = np.array([-1.5, -0.9, -0.4, 0.0, 0.4, 0.9, 1.5])  # in widths: the curve bends only there
 LARGEST_GAP_M = 0.15  # neighbouring returns further apart than this belong to different curves
 TRUTH_STEP_M = 0.004  # a fifth of the density's sigma
+ITEMS = 200  # points of the curve that rays are chosen for
 TRUTH_ORIGINS = 17  # positions on the sensor line that the truth is looked at from
 # closed forms of primitives are exact to rounding; neighbouring truth points are 40 times further apart
 SAME_POINT_M = 1e-4
@@ -98,6 +100,14 @@ class FlatlandTask:
             return Residuals(in_space(truth), np.full(len(truth), self.metric.worst / len(truth)))
         missed, wrong = nearest_m(curve, truth) / len(truth), nearest_m(truth, curve) / len(curve)
         return Residuals(in_space(np.concatenate([truth, curve])), MILLIMETRES * np.concatenate([missed, wrong]))
+
+    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+        """What returns tell about points of the visible curve, the more the nearer they are."""
+        curve = in_space(scene.truth["curve_m"])
+        points = curve[np.linspace(0, len(curve) - 1, min(ITEMS, len(curve))).astype(int)]
+        is_target = [body.is_target for body in scene.bodies]
+        length_m = TRUTH_STEP_M * len(curve) * len(returns)
+        return surface_information([points] * len(returns), returns, is_target, length_m, dimensions=1)
 
 
 def measured_points(returns: Sequence[Returns]) -> np.ndarray:

@@ -189,6 +189,31 @@ def test_certificates_are_near_the_linear_program_that_they_relax(price):
     assert linear - 1e-6 <= certificate.bound <= 1.02 * linear
 
 
+@given(seed=seeds)
+def test_of_what_a_ray_tells_in_several_frames_the_largest_counts_that_a_gate_lets_through(seed):
+    generator = np.random.default_rng(seed)
+    rays, gates, frames, items = 4, 3, 3, 5
+    pair = generator.choice(rays * items * frames, size=40, replace=False)
+    ray, item, seen_in = pair // (items * frames), pair // frames % items, pair % frames
+    worth = generator.uniform(0, 1, 40)
+    returns = [SimpleNamespace(range_m=generator.uniform(1, 2, rays)) for _ in range(frames)]
+    gates_m = np.sort(generator.uniform(1, 2, (rays, gates, 2)), axis=2)
+    information = Information(ray, item, worth, np.arange(items) % frames, seen_in=seen_in)
+    coverage = gather([(information, returns)], gates_m, np.zeros((rays, gates)))
+    for one, gate in itertools.product(range(rays), range(gates)):
+        most = np.zeros(items)
+        for e in np.flatnonzero(ray == one):
+            low, high = gates_m[one, gate]
+            if low <= returns[seen_in[e]].range_m[one] < high:
+                most[item[e]] = max(most[item[e]], worth[e])
+        chosen = np.full(rays, -1)
+        chosen[one] = gate
+        np.testing.assert_allclose(coverage.known(chosen), most, rtol=1e-6)
+        gains = np.zeros((rays, gates))
+        coverage.gains(np.array([one]), np.zeros(items), gains)
+        assert gains[one, gate] == pytest.approx(most.mean(), rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("table", "says"), [([1.0, 2.0], "0 at 0"), ([0.0, 1.0, 0.5], "never falling"), ([0.0, 1.0, 3.0], "faster")]
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from lidardesign_tasks.arm_motion import (
     phase_shares,
 )
 from lidardesign_tasks.arm_robot import load_robot
-from lidardesign_tasks.arm_tracking import filled_path, tracked_places
+from lidardesign_tasks.arm_tracking import REACH_FRAMES, filled_path, tracked_places
 from support.rays import rays_along, rays_of_points
 from support.references import recursive_frechet
 from support.tables import each_row
@@ -36,6 +37,7 @@ from lidardesign.evaluate.metrics import discrete_frechet_m
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Returns
 from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
+from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import ELEVATION, aim
 from lidardesign.task import Task
@@ -276,6 +278,24 @@ def test_a_frame_that_was_not_seen_is_where_the_error_is(scenes):
     found = TASK.residuals(scene, exact_returns(scene, scene.truth["ball_m"], frames=seen))
     assert set(np.argsort(found.values)[-2:]) == {5, 6}
     assert found.values[[5, 6]].sum() == pytest.approx(found.values.sum())
+
+
+def test_returns_on_the_ball_tell_of_frames_by_the_way_in_between(scenes):
+    scene = scenes["test"][0]
+    ball, hit = scene.truth["ball_m"], [2, 5]
+    empty = simulate(scene, exact_returns(scene, ball)[0].rays.subset(np.zeros(1, dtype=int)))
+    silent = [replace(one, outcome=np.full(1, Outcome.MISS), body=np.full(1, -1)) for one in empty]
+    seen = {one.frame: one for one in exact_returns(scene, ball, frames=hit)}
+    found = checked_information(TASK, scene, [seen.get(one.frame, one) for one in silent])
+    steps = np.linalg.norm(np.diff(ball, axis=0), axis=1)
+    assert found.complete == pytest.approx(REACH_FRAMES * steps.mean())
+    naive = {
+        (frame, other): found.complete - steps[min(frame, other) : max(frame, other)].sum()
+        for frame in hit
+        for other in range(scene.frames)
+    }
+    told = dict(zip(zip(found.seen_in.tolist(), found.item.tolist(), strict=True), found.worth, strict=True))
+    assert told == pytest.approx({pair: worth for pair, worth in naive.items() if worth > 0})
 
 
 def test_returns_from_the_arm_are_no_returns_from_the_ball(scenes):

@@ -23,6 +23,7 @@ from support.tables import each_row
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.frames import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.scene import rigid
+from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim
 
@@ -210,7 +211,12 @@ def test_an_object_out_of_view_is_not_judged(folder):
     space = task.space(configured(folder, motion=None))
     (scene,) = task.scenes(configured(folder, motion=way), "test", 0, space)
     assert [surface is None for surface in scene.truth[SURFACES]] == [False, False, True]
-    assert not task.score(scene, simulate(scene, rays_at(scene, 1))).failed
+    returns = simulate(scene, rays_at(scene, 1))
+    assert not task.score(scene, returns).failed
+    information = checked_information(task, scene, returns)
+    assert np.unique(information.frame).tolist() == [0, 1]
+    assert set(information.source.tolist()) <= {0, 1}
+    assert len(information.ray)
 
 
 def test_occluders_and_single_objects_move_by_their_names(folder):

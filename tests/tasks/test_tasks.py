@@ -22,7 +22,10 @@ from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Outcome, Rays, Returns
+from lidardesign.numerics import COARSE_SLACK
 from lidardesign.scene import Scene, group_numbers
+from lidardesign.selection.coverage import gather
+from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim
 from lidardesign.task import Task, conditions_of, scenes_of
@@ -31,6 +34,7 @@ REAL_MODEL = Path(__file__).parents[3] / "shared" / "data" / "ict_face.h5"
 SMALL = {"train": 2, "test": 2, "truth_points": 800}
 NOISE_M = 0.03
 HALF_GATE_M = 0.02
+MOST_ITEMS = 200
 
 CASES = {
     "flatland surface": (FlatlandTask, {"train": 3, "test": 2}),
@@ -241,6 +245,34 @@ def test_residuals_are_where_no_ray_was_fired(case, name):
         assert left_out[1] - left_out[0] > 5 * abs(seen[1] - seen[0])
 
 
+def told_by(information, returns, rays):
+    """What a choice of the candidates, at these indices, knows of what there is to know, from 0 to 1."""
+    count = len(returns[0].rays)
+    coverage = gather([(information, returns)], np.tile([0.0, np.inf], (count, 1, 1)), np.zeros((count, 1)))
+    gate = np.full(count, -1)
+    gate[rays] = 0
+    return coverage.value_of(gate) / coverage.complete
+
+
+@each_case
+def test_rays_that_tell_more_score_better_and_more_rays_never_tell_less(case, name):
+    task, config, scenes = case(name)
+    for scene in scenes["train"]:
+        rays = rays_at_truth(task, config, scene, 300)
+        returns = simulate(scene, rays)
+        information = checked_information(task, scene, returns)
+        assert 0 < len(information.frame) <= MOST_ITEMS
+        # every tenth ray, and as many that look at one end of the truth's longest axis
+        aimed = rays.origin_m + rays.direction * rays.gate_m.mean(axis=1, keepdims=True)
+        order = np.argsort(aimed[:, np.ptp(truth_points(scene), axis=0).argmax()])
+        choices = {"spread": order[::10], "crowded": order[:30], "more": order[:150], "all": order}
+        told = {what: told_by(information, returns, chosen) for what, chosen in choices.items()}
+        assert 0 < told["crowded"] <= told["more"] <= told["all"] <= 1
+        assert told["crowded"] < told["spread"] < told["all"]
+        values = {what: score(task, scene, rays.subset(np.sort(chosen))).value for what, chosen in choices.items()}
+        assert values["all"] < values["spread"] < values["crowded"]
+
+
 UNIFORM_RAYS = 20_000
 # Tasks whose scenes move, or are seen from several places, have no single surface as their truth.
 SEEN_OFTEN = {
@@ -292,6 +324,22 @@ def test_residuals_of_many_frames_or_positions_add_up_to_the_score(name):
         assert found.values.sum() == pytest.approx(judged.value, rel=1e-9)
         blind = [replace(one, outcome=np.full_like(one.outcome, Outcome.MISS)) for one in returns]
         assert task.residuals(scene, blind).values.sum() == pytest.approx(task.metric.worst, rel=1e-9)
+
+
+@each_row("name", SEEN_OFTEN)
+def test_returns_tell_about_the_frames_and_positions_that_they_are_of(name):
+    task, _, lists, scenes = often(name)
+    for scene in scenes["train"]:
+        returns = [one for rays in lists for one in simulate(scene, rays)]
+        information = checked_information(task, scene, returns)
+        assert len(information.ray)
+        targets = np.array([body.is_target for body in scene.bodies])
+        for frame, one in enumerate(returns):
+            ray = information.ray[information.source == frame]
+            assert targets[one.body[ray]].all()
+        told = [told_by(information, returns, np.arange(count)) for count in (0, 200, len(lists[0]))]
+        assert 0 == told[0] <= told[1] <= told[2] <= 1 + COARSE_SLACK  # worths are float32
+        assert told[2] > 0
 
 
 @each_row("kind", [ArmTask, EmitterTask, FaceTask, FlatlandTask, MeshesTask, WarehouseTask])

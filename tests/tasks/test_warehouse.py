@@ -16,6 +16,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.scene import Body, Box, Scene, rigid
+from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import ELEVATION, RANGE, DesignSpace, direction
 from lidardesign.task import conditions_of, scenes_of
@@ -187,6 +188,16 @@ def test_without_rays_or_returns_all_boxes_are_missed_and_the_design_fails(shelv
     for returns in (returns_of(scene, []), returns_of(scene, [0.2, 0.3], gate_m=(0.1, 0.2))):
         result = TASK.score(scene, returns)
         assert (result.value, result.failed) == (100.0, True)
+
+
+@each_row("rays", [2, 6, 40])
+def test_what_is_not_told_about_is_the_miss_rate(shelves, rays):
+    elevation = np.linspace(0.05, 1.5, rays)
+    for scene in shelves:
+        returns = returns_of(scene, elevation)
+        found = checked_information(TASK, scene, returns)
+        told = len(np.unique(found.item)) / len(found.frame)
+        assert 100 * (1 - told) == pytest.approx(TASK.score(scene, returns).value, abs=1e-9)
 
 
 def test_residuals_are_where_rays_would_have_met_the_boxes_that_are_missed(shelves):

@@ -40,10 +40,16 @@ class Seen(NamedTuple):
 def seen(scene: Scene, points_m: np.ndarray, frame: int) -> Seen:
     """What points (N, 3) [m] show of a scene in a frame; the estimate is the raised ones among them."""
     raised = points_m[points_m[:, 2] > RAISED_M]
-    hazards = [body for body in scene.bodies if body.is_target]
-    near = np.stack([_is_near(body.pose(frame), body.shape.half_extents_m, raised) for body in hazards])
-    centres = np.stack([body.pose(frame)[:3, 3] for body in hazards])
+    near = on_hazards(scene, raised, frame)
+    centres = np.stack([body.pose(frame)[:3, 3] for body in scene.bodies if body.is_target])
     return Seen(centres, near.sum(axis=1) < FEWEST_RETURNS, raised[~near.any(axis=0)], len(raised))
+
+
+def on_hazards(scene: Scene, points_m: np.ndarray, frame: int) -> np.ndarray:
+    """Which raised points (N, 3) [m] are of which hazards of a scene in a frame, shape (H, N)."""
+    hazards = [body for body in scene.bodies if body.is_target]
+    near = np.stack([_is_near(body.pose(frame), body.shape.half_extents_m, points_m) for body in hazards])
+    return near & (points_m[:, 2] > RAISED_M)
 
 
 def _is_near(pose: np.ndarray, half_extents_m: tuple[float, float, float], points_m: np.ndarray) -> np.ndarray:

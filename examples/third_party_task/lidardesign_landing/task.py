@@ -1,7 +1,7 @@
 """The task landing: a drone descends to a landing place and must see the boxes that stand around it.
 
 The drone's height is a condition: its sensors fire other rays from 6 m than from 2 m, and the score is a mean over
-heights. The task shows conditions, bodies that only block rays, optional motion, and residuals.
+heights. The task shows conditions, bodies that only block rays, optional motion, residuals, and what returns tell.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split, random_generator
 
 from lidardesign_landing.config import LandingConfig
-from lidardesign_landing.hazards import Seen, seen
+from lidardesign_landing.hazards import FEWEST_RETURNS, Seen, on_hazards, seen
 from lidardesign_landing.scenes import build_scene
 
 PERCENT = 100.0
@@ -79,6 +79,19 @@ class LandingTask:
             hidden = (1.0 - missed) / max(one.raised, 1)
             values += [scale * one.missed / len(one.missed), np.full(len(one.phantoms_m), scale * hidden)]
         return Residuals(np.concatenate(places), np.concatenate(values))
+
+    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+        """Which returns are of which hazards, for choosing rays: items are hazards, anew at each height and frame."""
+        shown = [on_hazards(scene, one.points_m, one.frame) for one in returns]
+        found = [np.nonzero(near) for near in shown]
+        hazards = len(shown[0])
+        item = np.concatenate([look * hazards + hazard for look, (hazard, _) in enumerate(found)])
+        ray = np.concatenate(
+            [np.flatnonzero(one.returned)[point] for one, (_, point) in zip(returns, found, strict=True)]
+        )
+        frame = np.repeat(np.arange(len(returns)), hazards)
+        counts = np.arange(FEWEST_RETURNS + 1.0)
+        return Information(ray, item, np.ones(len(ray)), frame, sums=counts, complete=FEWEST_RETURNS)
 
 
 def looks(scene: Scene, returns: Sequence[Returns]) -> Iterator[Seen]:

@@ -57,6 +57,14 @@ def test_residuals_add_up_to_the_score(scene):
     assert found.values.tolist() == [50.0, 0.0]
 
 
+def test_the_second_return_of_a_box_tells_as_much_as_the_first_and_the_third_nothing(scene):
+    returns = simulate(scene, rays_at(np.concatenate([on_top(2.0, 3), np.zeros((1, 3))])))
+    found = LandingTask().informs(scene, returns)
+    assert found.ray.tolist() == [0, 1, 2]
+    assert found.item.tolist() == [1, 1, 1]
+    assert np.interp([0, 1, 2, 3], np.arange(3), found.sums).tolist() == [0, 1, 2, 2]
+
+
 def test_more_scenes_keep_the_first_ones():
     task = LandingTask()
     few, more = (task.scenes(task.Config(train=n), "train", 3) for n in (2, 5))
