@@ -22,6 +22,7 @@ _HOMES = {
     "Scene": "lidardesign.scene",
     "Scores": "lidardesign.workflow.evaluate",
     "Task": "lidardesign.task",
+    "evaluate_seeds": "lidardesign.workflow.seeds",
     "learn": "lidardesign.workflow.runs",
     "load_design": "lidardesign.workflow.runs",
     "open_run": "lidardesign.workflow.runs",

@@ -150,6 +150,7 @@ def source_of(command: str, parameter: Any) -> Any:
     by_option = {
         "--format": _formats,
         "--baseline": _baselines,
+        "--designs": _design_names,
         "--detector": _detectors,
         "--effects": _effects,
         "--at": _conditions,
@@ -193,6 +194,11 @@ def _baselines(context: Any, current: str) -> Items:
     if current.startswith("catalog:"):
         return [(f"catalog:{name}", words) for name, words in _parts(context, current)]
     return list(BASELINES.items())
+
+
+def _design_names(context: Any, current: str) -> Items:
+    files = [file for run in _given(context, "RUN|DESIGN") for file in sorted(Path(run).glob("designs/*.yaml"))]
+    return [(name, "a design") for name in dict.fromkeys(file.stem for file in files)]
 
 
 def _effects(context: Any, current: str) -> Items:

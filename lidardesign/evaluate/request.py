@@ -52,6 +52,7 @@ class EvaluationRequest:
         planner: The detector, and how the effects that are simulated are chosen.
         audit: Whether all rows are scored under all effects too.
         scorer: What scores the held-out scenes: this process, or workers (`evaluate.workers`) to the same numbers.
+        scenes_seed: Root of the held-out scenes; None: `seed`.
     """
 
     task: Task
@@ -73,6 +74,12 @@ class EvaluationRequest:
     planner: Planner = field(default_factory=Planner)
     audit: bool = False
     scorer: Scorer = score_here
+    scenes_seed: int | None = None
+
+    @property
+    def held_out_seed(self) -> int:
+        """Root of the held-out scenes."""
+        return self.seed if self.scenes_seed is None else self.scenes_seed
 
     def check(self) -> None:
         """Refuse what makes no sense.
@@ -100,7 +107,8 @@ class EvaluationRequest:
         self, fired: Callable[[int], Sequence[RaysPerCondition]], planner: Planner, plans: Sequence[EffectPlan] = ()
     ) -> ScenePass:
         """Sets of rays in the held-out scenes: see `ScenePass`."""
-        return ScenePass(self.task, self.config, self.space, self.seed, self.test, fired, planner, plans)
+        seeds = (self.seed, self.held_out_seed)
+        return ScenePass(self.task, self.config, self.space, *seeds, self.test, fired, planner, plans)
 
 
 def pattern_size(design: DesignSpec) -> int | None:

@@ -54,6 +54,7 @@ class Row:
             None outside the comparison at equal bandwidth.
         details: The task's further figures by name, each a mean over the scenes that give it.
         groups: The number of every scene's group, shape (S,); None: every scene is its own.
+        per_seed: Over several seeds the mean of each, to which `value` and `per_scene` are means.
     """
 
     design: str
@@ -70,6 +71,7 @@ class Row:
     matched_rays: int | None = None
     details: Mapping[str, float] = field(default_factory=dict)
     groups: np.ndarray | None = None
+    per_seed: tuple[float, ...] = ()
 
     @property
     def half_width(self) -> float | None:
@@ -97,6 +99,8 @@ class Row:
         }
         if self.matched_to is not None:
             values |= {"matched_to": self.matched_to, "matched_rays": self.matched_rays}
+        if self.per_seed:
+            values["per_seed"] = list(self.per_seed)
         return values
 
 
@@ -155,6 +159,7 @@ class Evaluation:
         audit: The same rows under all effects, where that was asked for.
         accuracy: What accuracy costs in time, where that was asked for.
         searches: How the rows of `cma` were found, where they were asked for.
+        seeds: Of learning and fitting, where rows and differences are means over several.
     """
 
     metric: Metric
@@ -170,6 +175,7 @@ class Evaluation:
     audit: Audit | None = None
     accuracy: Accuracy | None = None
     searches: Sequence[SearchRecord] = ()
+    seeds: Sequence[int] = ()
 
     @property
     def groups(self) -> int:
@@ -192,7 +198,7 @@ class Evaluation:
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form of `evaluate`.
 
-        Beyond the contract: `groups` of scenes, `equal_bandwidth` rows name the design and rays that they are
+        Beyond the contract: `groups` of scenes, `seeds`, `equal_bandwidth` rows name the design and rays that they are
         `matched_to`, `paired_equal_bandwidth` compares each design with them (`rays_b` are the baseline's), `notes`,
         `detector`, `planning_seconds`, and `audit` where that was asked for.
         """
@@ -206,6 +212,7 @@ class Evaluation:
             },
             "scenes": self.scenes,
             "groups": self.groups,
+            "seeds": list(self.seeds),
             "rows": [row.as_dict() for row in self.rows],
             "paired": [pair.as_dict() for pair in self.paired],
             "equal_bandwidth": [row.as_dict() for row in self.equal_bandwidth],

@@ -170,8 +170,9 @@ class ScenePass:
 
     Arguments:
         task: Whose score is taken.
-        config, space: The task's configuration and the design space: with the seed, they make the scenes.
-        seed: Root of the scenes and of the effects' random streams.
+        config, space: The task's configuration and the design space: with `held_out_seed`, they make the scenes.
+        seed: Root of the effects' random streams.
+        held_out_seed: Root of the scenes.
         scenes: The held-out scenes.
         fired: The sets of rays that are fired in a scene, by its number.
         planner: How their effects are chosen.
@@ -182,6 +183,7 @@ class ScenePass:
     config: Any
     space: DesignSpace
     seed: int
+    held_out_seed: int
     scenes: Sequence[Scene]
     fired: Callable[[int], Sequence[RaysPerCondition]]
     planner: Planner

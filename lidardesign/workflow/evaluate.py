@@ -74,6 +74,8 @@ class ScoreOptions:
         workers: Processes that score scenes, or the address of a scheduler.
         cma_seconds: Wall time of each search of the baseline cma [s].
         accuracy: Whether what accuracy costs will be measured, too.
+        scenes_seed: Root of the held-out scenes; `seed` by default.
+        designs: Names of the designs that are scored; all by default.
 
     Raises:
         ConfigError: One of them says nothing that can be done.
@@ -90,6 +92,8 @@ class ScoreOptions:
     workers: int | str = 1
     cma_seconds: float | None = None
     accuracy: bool = False
+    scenes_seed: int | None = None
+    designs: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         check_workers(str(self.workers))
@@ -174,6 +178,7 @@ class ScoreRequest:
         """
         planner, audit = options.planner()
         designs, opened = collect_designs(targets, runs, notes)
+        designs = _named(designs, options.designs)
         run = learned = common_run(name_apart(designs), opened)
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
         if options.accuracy:
@@ -256,7 +261,9 @@ class ScoreRequest:
         Arguments:
             searching: Called with how the searches of the baseline cma stand.
         """
-        request = evaluation_request(self.run, self.designs, self.rays, self.baselines, self.seed)
+        request = evaluation_request(
+            self.run, self.designs, self.rays, self.baselines, self.seed, self.options.scenes_seed
+        )
         cma = CmaSettings(SearchBudget(self.cma_seconds), searching)
         return replace(request, planner=self.planner, audit=self.audit, cma=cma)
 
@@ -446,6 +453,14 @@ def collect_designs(
     return list(seen.values()), runs
 
 
+def _named(designs: list[Design], names: Sequence[str]) -> list[Design]:
+    known = {design.name for design in designs}
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"no design {name!r}", where="--designs", allowed=", ".join(sorted(known)) or "none")
+    return [design for design in designs if not names or design.name in names]
+
+
 def name_apart(designs: list[Design]) -> list[Design]:
     """Designs that share a name take in front their run's name, or behind their file's ending, as tells them apart.
 
@@ -500,7 +515,12 @@ def common_run(designs: Sequence[Design], runs: Sequence[RunFolder]) -> RunFolde
 
 
 def evaluation_request(
-    run: RunFolder, designs: Sequence[Design], rays: Iterable[int], baselines: Sequence[str], seed: int | None = None
+    run: RunFolder,
+    designs: Sequence[Design],
+    rays: Iterable[int],
+    baselines: Sequence[str],
+    seed: int | None = None,
+    scenes_seed: int | None = None,
 ) -> EvaluationRequest:
     """The request that scores designs in a run's scenes.
 
@@ -510,6 +530,7 @@ def evaluation_request(
         rays: Numbers of rays.
         baselines: By name.
         seed: Root of the random streams; None: the run's.
+        scenes_seed: Root of the held-out scenes; None: `seed`.
     """
     config = run.config
     seed = config.seed if seed is None else seed
@@ -525,7 +546,8 @@ def evaluation_request(
         baselines=tuple(dict.fromkeys(baselines)),
         samples=layouts.samples(from_runs),
         train=run.scenes("train", seed),
-        test=run.scenes("test", seed),
+        test=run.scenes("test", seed if scenes_seed is None else scenes_seed),
+        scenes_seed=scenes_seed,
         lay_out=layouts,
         without_visibility=(lambda: twin_without_visibility(*from_runs[0], layouts)) if from_runs else None,
         density=cache(lambda: learned_density(from_runs[0][1] if from_runs else run)),

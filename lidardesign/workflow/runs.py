@@ -178,7 +178,8 @@ class Run(RunFolder):
             settings: Settings of the task, to judge by other scenes than were learned.
             progress: Called with the scenes done, all scenes, and the name of the scene.
             notes: Called with every note.
-            further: range_tolerance_mm, return_tolerance, workers, cma_seconds and accuracy, as of `ScoreOptions`.
+            further: range_tolerance_mm, return_tolerance, workers, cma_seconds, accuracy and scenes_seed, as of
+                `ScoreOptions`.
 
         Raises:
             ConfigError: Choices that cannot be, or designs of runs that differ.

@@ -140,6 +140,7 @@ def test_keys_of_a_run_are_those_of_its_task(root, place, monkeypatch):
     monkeypatch.chdir(place)
     assert "variation=" in completed(root, "evaluate flat --set ")
     assert "variation=" in completed(root, "evaluate flat/designs/free.yaml --set ")
+    assert completed(root, "evaluate flat --designs ") == ["free"]
     assert "density.sigma_m=" not in completed(root, "evaluate flat --set ")
     assert completed(root, "evaluate absent --set ") == []
     assert completed(root, "fit flat --at ") == []

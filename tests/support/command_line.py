@@ -41,10 +41,10 @@ def caller(capsys, tmp_path, monkeypatch):
     return call
 
 
-def make_run(folder: Path, count: int = 4000, task: str = "flatland") -> Path:
+def make_run(folder: Path, count: int = 4000, task: str = "flatland", seed: int = 3) -> Path:
     """A run as `learn` leaves it, with samples around two spots of its space instead of a learned density."""
     task = load_task(task)
-    config = resolve(task, preset="draft", seed=3)
+    config = resolve(task, preset="draft", seed=seed)
     generator = np.random.default_rng(0)
     points = config.space.sample(count, generator)
     low, high = np.array(config.space.low), np.array(config.space.high)
@@ -52,7 +52,7 @@ def make_run(folder: Path, count: int = 4000, task: str = "flatland") -> Path:
     spots = np.array([[0.3, 0, 0, 0.4, 0, 0.6], [0.7, 0, 0, 0.6, 0, 0.5]])
     distance = ((scaled[:, None] - spots) ** 2).sum(-1)
     log_target = np.logaddexp(*(-distance.T / (2 * 0.1**2)))
-    start_manifest(folder, command=["lidardesign", "learn"], seed=3)
+    start_manifest(folder, command=["lidardesign", "learn"], seed=seed)
     save_run_config(config, folder)
     log_prob = np.full(count, -config.space.log_volume)
     save_samples(Samples(points, log_prob, log_target, config.space), folder)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from lidardesign.evaluate.cma.search import Progress
     from lidardesign.evaluate.results import Evaluation
     from lidardesign.workflow.evaluate import ScoreRequest, Scores
+    from lidardesign.workflow.seeds import SeedsRequest
 
 BASELINE_HELP = (
     "A further baseline beside uniform, random and bounding: occupancy (rays towards cells that targets occupy) or "
@@ -45,8 +46,17 @@ BASELINE_HELP = (
 def evaluate(
     targets: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN|DESIGN", readable=False, help="Run folders (all their designs) and design files."),
+        typer.Argument(
+            metavar="RUN|DESIGN",
+            readable=False,
+            help="Run folders (all their designs) and design files. Of runs that differ in their seed alone, designs "
+            "of one name are one row, with intervals over seeds and scenes.",
+        ),
     ],
+    designs: Annotated[
+        list[str] | None,
+        typer.Option("--designs", metavar="NAME", help="Only designs of this name; repeatable.", show_default="all"),
+    ] = None,
     rays: Annotated[
         list[int] | None,
         typer.Option(
@@ -164,6 +174,16 @@ def evaluate(
     ] = False,
     dry_run: options.DryRun = False,
     seed: options.Seed = None,
+    scenes_seed: Annotated[
+        int | None,
+        typer.Option(
+            "--scenes-seed",
+            metavar="N",
+            min=0,
+            help="Root of the held-out scenes.",
+            show_default="--seed, or the (first) run's",
+        ),
+    ] = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
     debug: options.Debug = False,
@@ -175,6 +195,7 @@ def evaluate(
             raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
         with phase("libraries"):
             from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
+            from lidardesign.workflow.seeds import SeedsRequest, differing_seeds
 
         chosen = ScoreOptions(
             rays=rays,
@@ -188,8 +209,15 @@ def evaluate(
             workers=workers,
             cma_seconds=cma_seconds,
             accuracy=accuracy,
+            scenes_seed=scenes_seed,
+            designs=designs or (),
         )
-        request = ScoreRequest.resolve(targets, chosen, notes=output.remark)
+        runs = differing_seeds(targets, output.remark)
+        request: ScoreRequest | SeedsRequest = (
+            SeedsRequest.resolve(runs, chosen, output.remark)
+            if runs
+            else ScoreRequest.resolve(targets, chosen, notes=output.remark)
+        )
         files = (report, plots, csv)
         if dry_run:
             return show_plan(request.plan({"--report": report, "--plots": plots, "--csv": csv}), output)
@@ -213,7 +241,7 @@ def evaluate(
         _check_audit(scores.evaluation)
 
 
-def _score(request: ScoreRequest, output: Output) -> Scores:
+def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
     with output.progress("evaluating", "row") as bar:
 
         def show(done: int, total: int, row: str = "") -> None:
@@ -223,7 +251,7 @@ def _score(request: ScoreRequest, output: Output) -> Scores:
         return request.score(show, search_display(request, output, bar))
 
 
-def search_display(request: ScoreRequest, output: Output, bar: RichProgress | None) -> Show:
+def search_display(request: ScoreRequest | SeedsRequest, output: Output, bar: RichProgress | None) -> Show:
     """What shows the best score of each search in a bar; without one, a note when it begins."""
     lines: dict[str, Any] = {}
 

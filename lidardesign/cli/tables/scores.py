@@ -49,7 +49,9 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
 def _show_rows(document: Entry, rich: RichConsole) -> None:
     metric, rows = document["metric"], document["rows"]
     title = f"{metric['name']} [{metric['unit']}], {metric['better']} is better, over {document['scenes']} held-out "
-    title += ", ".join(["scenes", *document.get("set", [])])
+    seeds = document.get("seeds", [])
+    scenes = f"scenes and {len(seeds)} seeds" if seeds else "scenes"
+    title += ", ".join([scenes, *document.get("set", [])])
     details = [name for row in rows for name in row["details"]][:1]
     further = [name.replace("_", " ") for name in details]
     headings = ("design", "rays", "value", "95 % interval", "failures", *further, "Mbit/s", "seconds")
@@ -59,6 +61,9 @@ def _show_rows(document: Entry, rich: RichConsole) -> None:
         cells = (row["rays"], row["value"], interval_text(row), row["failures"], *extra, row["bandwidth_mbps"])
         lines.append([row["design"], *(number(cell) for cell in cells), number(row["seconds"], 2)])
     print_table(title, headings, lines, rich)
+    places = [(row["design"], row["rays"], f"seed {seed}") for row in rows for seed in seeds]
+    cells = [number(value) for row in rows for value in row.get("per_seed", [])]
+    _show_grid(f"value of each seed [{metric['unit']}]", places, cells, rich)
 
 
 def _show_audit(audit: Entry, effects: Sequence[Entry], rich: RichConsole) -> None:

@@ -228,7 +228,7 @@ def evaluation_report(
     commands.append(("The scores and this page", _line(command)))
     facts = [
         ("task", config.task_name),
-        ("seed of the scenes", str(request.seed)),
+        ("seed of the scenes", str(request.held_out_seed)),
         ("seed of the run", str(config.seed)),
         *((f"design {design.name}", _origin(design.provenance)) for design in request.designs),
         *((f"version of {name}", version) for name, version in versions().items()),

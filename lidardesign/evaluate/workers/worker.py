@@ -41,7 +41,8 @@ class SceneSource:
         task: The name of an installed task.
         config: Its configuration as JSON.
         space: The design space as JSON.
-        seed: Of the run.
+        seed: Root of the effects' random streams.
+        held_out_seed: Root of the scenes.
     """
 
     version: str
@@ -49,12 +50,13 @@ class SceneSource:
     config: str
     space: str
     seed: int
+    held_out_seed: int
 
     @classmethod
     def of(cls, request: EvaluationRequest | ScenePass) -> SceneSource:
         """What makes the scenes of a request, or of a pass over them."""
         config, space = json.dumps(request.config.model_dump(mode="json")), json.dumps(request.space.as_dict())
-        return cls(__version__, request.task.name, config, space, request.seed)
+        return cls(__version__, request.task.name, config, space, request.seed, request.held_out_seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +155,7 @@ def make_scenes(source: SceneSource) -> tuple[Task, Sequence[Scene]]:
     task = load_task(source.task)
     config, space = task.Config.model_validate(json.loads(source.config)), json.loads(source.space)
     with plugin_guard(task.name):
-        return task, list(scenes_of(task, config, "test", source.seed, DesignSpace.from_dict(space)))
+        return task, list(scenes_of(task, config, "test", source.held_out_seed, DesignSpace.from_dict(space)))
 
 
 def scene_outline(scene: Scene) -> dict[str, Any]:

@@ -1,0 +1,145 @@
+"""Means over seeds of learning and fitting, with intervals over seeds and scenes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import t, ttest_1samp
+from support.scoring import design, make_request, rows_by_key
+
+from lidardesign.errors import NumericalError
+from lidardesign.evaluate.score import evaluate
+from lidardesign.evaluate.seeds import over_seeds, two_way_interval
+
+TRIALS = 1500
+# Four standard errors of a share of 95 % over so many trials.
+SLACK = 4 * np.sqrt(0.95 * 0.05 / TRIALS)
+
+
+def naive_variance(table):
+    """The variance of a table's mean by sums over its cells."""
+    (seeds, groups), mean = table.shape, table.mean()
+    rows, columns = table.mean(axis=1), table.mean(axis=0)
+    of_seeds = sum(groups * (row - mean) ** 2 for row in rows) / (seeds - 1)
+    of_groups = sum(seeds * (column - mean) ** 2 for column in columns) / (groups - 1)
+    errors = sum(
+        (table[s, g] - rows[s] - columns[g] + mean) ** 2 for s in range(seeds) for g in range(groups)
+    ) / ((seeds - 1) * (groups - 1))
+    return (of_seeds + of_groups - errors) / (seeds * groups), (of_seeds, of_groups, errors)
+
+
+def drawn(generator, seeds, groups, of_seeds, of_groups, error):
+    rows, columns = generator.normal(size=(seeds, 1)), generator.normal(size=(1, groups))
+    return of_seeds * rows + of_groups * columns + error * generator.normal(size=(seeds, groups))
+
+
+def test_the_estimated_variance_is_that_of_the_mean():
+    generator, sizes = np.random.default_rng(0), (1.5, 2.0, 0.7)
+    tables = [drawn(generator, 5, 12, *sizes) for _ in range(4000)]
+    expected = sizes[0] ** 2 / 5 + sizes[1] ** 2 / 12 + sizes[2] ** 2 / 60
+    assert np.mean([naive_variance(table)[0] for table in tables]) == pytest.approx(expected, rel=0.05)
+    assert np.var([table.mean() for table in tables]) == pytest.approx(expected, rel=0.1)
+
+
+def test_intervals_have_the_variance_of_a_naive_sum_and_the_degrees_of_satterthwaite():
+    table = drawn(np.random.default_rng(1), 4, 9, 1.0, 1.0, 0.5)
+    variance, squares = naive_variance(table)
+    freedom = (variance * 36) ** 2 / sum(s**2 / d for s, d in zip(squares, (3, 8, 24), strict=True))
+    interval = two_way_interval(table)
+    assert interval.high - interval.mean == pytest.approx(t.ppf(0.975, freedom) * np.sqrt(variance))
+    np.testing.assert_allclose(two_way_interval(table.T), interval)
+
+
+@pytest.mark.parametrize("seeds", [3, 5])
+@pytest.mark.parametrize(
+    "effects", [(1.0, 0.0, 0.0), (1.0, 0.0, 0.3), (0.0, 1.0, 0.0), (0.0, 1.0, 0.3), (1.0, 1.0, 0.3), (0.3, 1.0, 1.0)]
+)
+def test_intervals_cover_the_truth_at_their_level(seeds, effects):
+    generator = np.random.default_rng(2)
+    intervals = [two_way_interval(drawn(generator, seeds, 30, *effects)) for _ in range(TRIALS)]
+    covered = np.mean([one.low <= 0.0 <= one.high for one in intervals])
+    # the mean squares of few seeds and of many groups add up to no exact chi-square
+    assert 0.95 - SLACK - 0.02 <= covered <= 0.95 + SLACK + 0.02
+
+
+def test_without_any_effect_intervals_are_wide_rather_than_narrow():
+    generator = np.random.default_rng(3)
+    intervals = [two_way_interval(drawn(generator, 5, 12, 0.0, 0.0, 1.0)) for _ in range(TRIALS)]
+    assert np.mean([one.low <= 0.0 <= one.high for one in intervals]) >= 0.95 - SLACK
+
+
+def test_one_effect_alone_has_the_interval_of_student():
+    values = np.random.default_rng(4).normal(size=7)
+    expected = ttest_1samp(values, 0.0).confidence_interval(0.95)
+    for table in (np.tile(values, (3, 1)), np.tile(values[:, None], (1, 20))):
+        np.testing.assert_allclose(two_way_interval(table)[1:], (expected.low, expected.high), rtol=1e-9)
+
+
+def test_a_single_group_or_seed_has_no_interval_and_equal_values_no_width():
+    assert two_way_interval([[1.0], [3.0]]) == (2.0, None, None)
+    assert two_way_interval([[1.0, 3.0]]) == (2.0, None, None)
+    assert two_way_interval(np.full((3, 4), 0.1)) == (0.1, 0.1, 0.1)
+
+
+@pytest.mark.parametrize("table", [[], [1.0, 2.0], [[np.nan, 1.0], [0.0, 1.0]], [[np.inf, 1.0], [0.0, 1.0]]])
+def test_what_is_no_table_of_numbers_is_refused(table):
+    with pytest.raises(NumericalError):
+        two_way_interval(table)
+
+
+def three_seeds(groups=None):
+    requests = [make_request([design("own", azimuth=0.02 * seed)], seed=seed) for seed in range(3)]
+    if groups is not None:
+        test = [replace(scene, group=group) for scene, group in zip(requests[0].test, groups, strict=True)]
+        requests = [replace(request, test=test) for request in requests]
+    return [evaluate(request) for request in requests]
+
+
+def test_rows_and_differences_are_means_over_seeds():
+    single = three_seeds()
+    joint = over_seeds(single, (0, 1, 2), 7)
+    assert list(joint.seeds) == joint.as_dict()["seeds"] == [0, 1, 2]
+    by_seed = [rows_by_key(each) for each in single]
+    assert [(row.design, row.rays) for row in joint.rows] == [(row.design, row.rays) for row in single[0].rows]
+    for row in joint.rows:
+        table = np.stack([rows[row.design, row.rays].per_scene for rows in by_seed])
+        assert (row.value, row.ci_low, row.ci_high) == two_way_interval(table)
+        assert row.per_seed == pytest.approx(table.mean(axis=1))
+        assert row.failures == sum(rows[row.design, row.rays].failures for rows in by_seed)
+    for pair in joint.paired:
+        apart = [rows[pair.a, pair.rays].per_scene - rows[pair.b, pair.rays].per_scene for rows in by_seed]
+        assert (pair.difference, pair.ci_low, pair.ci_high) == two_way_interval(np.stack(apart))
+    assert len(joint.paired_bandwidth) == len(joint.equal_bandwidth) == len(single[0].equal_bandwidth)
+    assert any("seeds 0, 1, 2" in note and "seed 7" in note for note in joint.notes)
+
+
+def test_what_is_alike_in_all_seeds_leaves_the_scenes_interval():
+    single = evaluate(make_request())
+    joint = over_seeds([single] * 3, (0, 1, 2), 0)
+    for row, alone in zip(joint.rows, single.rows, strict=True):
+        if np.ptp(alone.per_scene) > 1e-9:
+            expected = ttest_1samp(alone.per_scene, 0.0).confidence_interval(0.95)
+            np.testing.assert_allclose((row.ci_low, row.ci_high), (expected.low, expected.high), rtol=1e-9)
+    assert list(joint.notes[1:]) == list(single.notes)
+
+
+def test_scenes_of_one_group_count_once():
+    # six scenes: three groups of two
+    joint = over_seeds(three_seeds(["a", "b", "c", "a", "b", "c"]), (0, 1, 2), 0)
+    single = [rows_by_key(each) for each in three_seeds()]
+    for row in joint.rows:
+        table = np.stack([rows[row.design, row.rays].per_scene.reshape(2, 3).mean(axis=0) for rows in single])
+        np.testing.assert_allclose((row.value, row.ci_low, row.ci_high), two_way_interval(table), rtol=1e-9)
+    assert over_seeds(three_seeds(["a"] * 6), (0, 1, 2), 0).paired[0].ci_low is None
+    # of unequal groups the mean is still that over scenes
+    uneven = over_seeds(three_seeds(["a", "a", "a", "b", "b", "c"]), (0, 1, 2), 0)
+    assert uneven.rows[0].value == pytest.approx(joint.rows[0].value)
+
+
+def test_rows_that_a_seed_lacks_are_left_out_with_a_note():
+    first, second = three_seeds()[:2]
+    lacking = replace(second, rows=[row for row in second.rows if row.design != "random"])
+    joint = over_seeds([first, lacking], (0, 1), 0)
+    assert {row.design for row in joint.rows} == {"own", "uniform", "bounding"}
+    assert {pair.b for pair in joint.paired} == {"uniform", "bounding"}
+    assert any("left out: random" in note for note in joint.notes)

@@ -1,0 +1,151 @@
+"""Runs that differ in their seed, evaluated together: by the command and from Python."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.command_line import make_run
+from support.tables import each_row
+
+import lidardesign as package
+from lidardesign.config import load_run_config, save_run_config, with_task_settings
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.evaluate.seeds import two_way_interval
+
+SMALL = ("--rays", 8, "--set", "test=5")
+OPTIONS = {"rays": [8], "settings": {"test": 5}}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Three runs, each with the design `two`, the first with another one, too."""
+    folder = tmp_path_factory.mktemp("seeds")
+    for seed in (1, 2, 3):
+        run = package.open_run(make_run(folder / f"flat-{seed}", seed=seed))
+        run.fit(sensors=2, rays=8, name="two").save()
+    package.open_run(folder / "flat-1").fit(sensors=1, rays=8, name="one").save()
+    return folder
+
+
+@pytest.fixture
+def runs(made, tmp_path):
+    return [shutil.copytree(made / f"flat-{seed}", tmp_path / f"flat-{seed}") for seed in (1, 2, 3)]
+
+
+def test_designs_of_one_name_are_one_row_over_seeds_and_scenes(lidardesign, runs, tmp_path):
+    files = {"--csv": tmp_path / "scores.csv", "--report": tmp_path / "report.html"}
+    written = [word for option in files.items() for word in option]
+    found = json.loads(lidardesign("evaluate", *runs, *SMALL, *written, "--json").out)
+    assert found["seeds"] == [1, 2, 3]
+    assert [row["design"] for row in found["rows"]] == ["two", "uniform", "random", "bounding"]
+    assert any("in the held-out scenes of seed 1" in note for note in found["notes"])
+    assert all(path.exists() for path in files.values())
+    alone = [
+        package.open_run(run).evaluate([run / "designs" / "two.yaml"], scenes_seed=1, **OPTIONS) for run in runs
+    ]
+    for number, row in enumerate(found["rows"]):
+        table = np.stack([scores.rows[number].per_scene for scores in alone])
+        assert (row["value"], row["ci_low"], row["ci_high"]) == pytest.approx(two_way_interval(table))
+        assert row["per_seed"] == pytest.approx(table.mean(axis=1))
+
+
+def test_people_see_every_seed(lidardesign, runs):
+    result = lidardesign("evaluate", *runs, *SMALL)
+    assert "over 5 held-out scenes and 3 seeds, test=5" in " ".join(result.out.split())
+    assert "value of each seed" in result.out
+    assert "seed 3" in result.out
+
+
+def test_python_and_the_command_find_the_same(lidardesign, runs):
+    scores = package.evaluate_seeds(runs, **OPTIONS)
+    found = json.loads(lidardesign("evaluate", *runs, *SMALL, "--json").out)
+    assert [row.value for row in scores.rows] == [row["value"] for row in found["rows"]]
+    opened = package.evaluate_seeds([package.open_run(run) for run in runs], designs=["two"], **OPTIONS)
+    assert [row.per_seed for row in opened.rows] == [row.per_seed for row in scores.rows]
+    two, other = (package.evaluate_seeds(runs, scenes_seed=seed, **OPTIONS).rows[0] for seed in (1, 9))
+    assert two.value == scores.rows[0].value
+    assert two.value != other.value
+
+
+def test_all_seeds_are_scored_in_the_same_scenes_by_workers_too(runs):
+    here, there = (package.evaluate_seeds(runs[:2], workers=workers, **OPTIONS) for workers in (1, 2))
+    assert [row.per_scene.tolist() for row in here.rows] == [row.per_scene.tolist() for row in there.rows]
+
+
+def test_a_dry_run_says_which_seeds(lidardesign, runs):
+    found = json.loads(lidardesign("evaluate", *runs, *SMALL, "--dry-run", "--json").out)
+    assert found["steps"][0] == "for each of the seeds 1, 2, 3, in the scenes of seed 1:"
+    assert {str(run / "designs" / "two.yaml") for run in runs} <= {entry["path"] for entry in found["reads"]}
+
+
+def test_names_choose_among_designs_of_one_run_too(lidardesign, runs):
+    found = json.loads(lidardesign("evaluate", runs[0], *SMALL, "--designs", "one", "--json").out)
+    assert [row["design"] for row in found["rows"]][:2] == ["one", "uniform"]
+    assert found["seeds"] == []
+    refused = lidardesign("evaluate", runs[0], *SMALL, "--designs", "none")
+    assert refused.code == 2
+    assert "allowed: one, two" in refused.err
+
+
+@each_row(
+    ("arguments", "message"),
+    [
+        ("1 2 1", "flat-1 is named twice"),
+        ("1 2 --designs one", "not every run has a design 'one'"),
+        ("1 2 --seed 4", "--scenes-seed"),
+        ("1 2 --effects audit", "it looks at one run"),
+    ],
+)
+def test_bad_choices_are_refused(lidardesign, runs, arguments, message):
+    words = [runs[int(word) - 1] if word in "1 2 3" and position < 3 else word
+             for position, word in enumerate(arguments.split())]  # fmt: skip
+    result = lidardesign("evaluate", *words, *SMALL)
+    assert result.code == 2
+    assert message in " ".join(result.err.split())
+
+
+def reseeded(run, seed, **settings):
+    """A run with another seed, and other settings of the task, in its configuration."""
+    task, config = load_run_config(run)
+    config = with_task_settings(task, config, [f"{name}={value}" for name, value in settings.items()])
+    (run / "config.yaml").unlink()
+    save_run_config(replace(config, seed=seed), run)
+    return run
+
+
+def test_runs_of_other_settings_or_of_one_seed_are_refused(runs):
+    reseeded(runs[1], 2, variation=0.5)
+    with pytest.raises(ConfigError, match=r"differ in task\.variation"):
+        package.evaluate_seeds(runs, **OPTIONS)
+    reseeded(runs[2], 1)
+    with pytest.raises(ConfigError, match="have the same seed, 1"):
+        package.evaluate_seeds([runs[0], runs[2]], **OPTIONS)
+    with pytest.raises(ConfigError, match="1 run"):
+        package.evaluate_seeds(runs[:1], **OPTIONS)
+
+
+def test_runs_of_another_task_are_refused(runs, tmp_path):
+    other = make_run(tmp_path / "face", task="face", seed=9)
+    with pytest.raises(ConfigError, match="differ in task"):
+        package.evaluate_seeds([runs[0], other], **OPTIONS)
+
+
+def test_designs_that_are_missing_are_named(runs):
+    (runs[1] / "designs" / "two.yaml").rename(runs[1] / "designs" / "other.yaml")
+    with pytest.raises(ConfigError, match="no design bears the same name") as refused:
+        package.evaluate_seeds(runs, **OPTIONS)
+    assert "flat-2: other" in refused.value.allowed
+    shutil.rmtree(runs[2] / "designs")
+    with pytest.raises(DataError, match="no designs yet"):
+        package.evaluate_seeds(runs, **OPTIONS)
+
+
+def test_runs_that_share_their_seed_stand_side_by_side(lidardesign, runs):
+    reseeded(runs[1], 1)
+    found = json.loads(lidardesign("evaluate", *runs[:2], *SMALL, "--json").out)
+    assert {"flat-1/two", "flat-2/two"} <= {row["design"] for row in found["rows"]}
+    assert found["seeds"] == []
