@@ -83,6 +83,7 @@ def surface_information(
     is_target: Sequence[bool],
     size: float,
     *,
+    weight: Sequence[np.ndarray] | None = None,
     dimensions: int = 2,
 ) -> Information:
     """What returns tell about a surface: max(0, D - distance) of each of its points, D the reach of a return.
@@ -96,6 +97,7 @@ def surface_information(
         returns: Of all candidate rays, through open gates.
         is_target: Which bodies of the scene are of the surface.
         size: The area of the surface [m^2], the length of a curve [m]; over all of the returns.
+        weight: How much each of the points counts, (U,) each; None: all alike.
         dimensions: 2 for a surface, 1 for a curve.
     """
     from scipy.spatial import cKDTree
@@ -124,6 +126,7 @@ def surface_information(
         np.concatenate([np.zeros(0, dtype=np.int64), *items]),
         np.concatenate([np.zeros(0), *worths]),
         np.concatenate(frames),
+        weight=None if weight is None else np.concatenate(weight),
         harm=harm,
         complete=reach_m,
     )

@@ -15,10 +15,9 @@ from lidardesign.errors import DataError
 from lidardesign.evaluate.metrics import SurfaceCloud, visible_surface
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
-from lidardesign.selection.information import scattered_area_m2, surface_information
 from lidardesign.space import DesignSpace
 from lidardesign.task import Information, Metric, Residuals, Score, random_generator
-from lidardesign_tasks.surface import ITEMS, LazyTruth, fewer_points, surface_residuals, surface_score
+from lidardesign_tasks.surface import ITEMS, LazyTruth, fewer_points, information_of, surface_residuals, surface_score
 
 SURFACES = "surfaces"
 FEWEST_ITEMS = 25  # of a frame: so few tell its area to a tenth or two
@@ -82,11 +81,7 @@ def moving_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
     A frame in which nothing is to be seen has no points, and returns there are not judged.
     """
     count = max(ITEMS // scene.frames, FEWEST_ITEMS)
-    surfaces = fewer_points(scene.truth, count)[SURFACES]
-    points = [np.zeros((0, 3)) if surface is None else surface.points for surface in surfaces]
-    shown = [points[one.frame] for one in returns]
-    area_m2 = sum(scattered_area_m2(points[one.frame]) for one in returns)
-    return surface_information(shown, returns, [body.is_target for body in scene.bodies], area_m2)
+    return information_of(fewer_points(scene.truth, count)[SURFACES], scene, returns)
 
 
 def _frames(scene: Scene, returns: Sequence[Returns]) -> list[tuple[Scene, list[Returns]]]:

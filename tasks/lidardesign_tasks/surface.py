@@ -9,10 +9,11 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from lidardesign.evaluate.metrics import SurfaceCloud, delaunay_surface, ray_spacing, surface_cloud, visible_surface
 from lidardesign.geometry.rays import Returns
-from lidardesign.scene import Scene
+from lidardesign.scene import Mesh, Scene
 from lidardesign.selection.information import scattered_area_m2, surface_information
 from lidardesign.space import DesignSpace
 from lidardesign.task import Information, Metric, Residuals, Score, random_generator
@@ -162,9 +163,36 @@ def surface_residuals(metric: Metric, scene: Scene, returns: Sequence[Returns]) 
 
 def surface_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
     """What returns tell about points of the visible surface, see `surface_information`."""
-    points = fewer_points(scene.truth, ITEMS)["surface"].points
-    is_target = [body.is_target for body in scene.bodies]
-    return surface_information([points] * len(returns), returns, is_target, scattered_area_m2(points) * len(returns))
+    return information_of([fewer_points(scene.truth, ITEMS)["surface"]] * scene.frames, scene, returns)
+
+
+def information_of(
+    surfaces: Sequence[SurfaceCloud | None], scene: Scene, returns: Sequence[Returns]
+) -> Information:
+    """What returns tell about points of the visible surface of each frame, None where nothing is to be seen."""
+    points = [np.zeros((0, 3)) if surface is None else surface.points for surface in surfaces]
+    counts = [importance_at(scene, places, frame) for frame, places in enumerate(points)]
+    area_m2 = [scattered_area_m2(places) for places in points]
+    return surface_information(
+        [points[one.frame] for one in returns],
+        returns,
+        [body.is_target for body in scene.bodies],
+        sum(area_m2[one.frame] for one in returns),
+        weight=[counts[one.frame] for one in returns],
+    )
+
+
+def importance_at(scene: Scene, points_m: np.ndarray, frame: int) -> np.ndarray:
+    """How much the targets' meshes count at points (K, 3) on them, as at the nearest vertex, (K,); others count 1."""
+    meshes = [body for body in scene.bodies if body.is_target and isinstance(body.shape, Mesh)]
+    if all(body.shape.importance is None for body in meshes):
+        return np.ones(len(points_m))
+    vertices = [body.shape.vertices @ body.pose(frame)[:3, :3].T + body.pose(frame)[:3, 3] for body in meshes]
+    counts = [
+        np.ones(len(mesh.vertices)) if mesh.importance is None else mesh.importance
+        for mesh in (body.shape for body in meshes)
+    ]
+    return np.concatenate(counts)[cKDTree(np.concatenate(vertices)).query(points_m)[1]]
 
 
 def _reconstructed(scene: Scene, returns: Sequence[Returns]) -> SurfaceCloud | None:

@@ -15,6 +15,7 @@ from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.pose import jittered_pose
+from lidardesign_tasks.surface import fewer_points
 from lidardesign_tasks.warehouse import WarehouseTask
 from support.meshes import write_ball
 from support.rays import rays_of_points
@@ -271,6 +272,22 @@ def test_rays_that_tell_more_score_better_and_more_rays_never_tell_less(case, na
         assert told["crowded"] < told["spread"] < told["all"]
         values = {what: score(task, scene, rays.subset(np.sort(chosen))).value for what, chosen in choices.items()}
         assert values["all"] < values["spread"] < values["crowded"]
+
+
+def test_points_of_a_region_count_as_much_as_it_does():
+    centre, radius_m, edge_m, weight = np.array([-0.02, 0.0, 0.0]), 0.03, 0.01, 8.0
+    region = {"region_radius_m": radius_m, "region_edge_m": edge_m, "region_weight": weight}
+    # heads that stand still are where their region is
+    still = {"jitter_rotation_deg": 0, "jitter_translation_m": 0}
+    task, config = FaceTask(), FaceTask.Config(**SMALL, **still, region_centre_m=tuple(centre), **region)
+    scene = task.scenes(config, "train", 0)[0]
+    points = fewer_points(scene.truth, MOST_ITEMS)["surface"].points
+    found = checked_information(task, scene, simulate(scene, rays_at_truth(task, config, scene, 60)))
+    away = np.linalg.norm(points - centre, axis=1)
+    spacing_m = 0.01  # of vertices, and of heads from their mean
+    assert (found.weight[away < radius_m - spacing_m] == weight).all()
+    assert (found.weight[away > radius_m + edge_m + spacing_m] == 1).all()
+    assert 3 < (found.weight > 1).sum() < len(points) / 2
 
 
 UNIFORM_RAYS = 20_000
