@@ -26,8 +26,8 @@ RowKey: TypeAlias = tuple[str, int | None, str | None, int | None]
 def two_way_interval(table: Any, level: float = LEVEL) -> Interval:
     """The mean of a table of seeds by groups with its interval over other seeds and other groups.
 
-    The variance is no less than what the errors alone make of it: the mean squares of seeds and groups may by chance
-    lie below theirs.
+    The variance is no less than what the errors alone make of it, and its degrees of freedom are no fewer than those of
+    the smaller factor: by chance the mean squares of seeds and groups lie below that of errors, or close to it.
 
     Arguments:
         table: One value per seed and group, shape (R, G).
@@ -53,7 +53,7 @@ def two_way_interval(table: Any, level: float = LEVEL) -> Interval:
     if variance <= mean_squares[2]:
         variance, freedom = mean_squares[2], degrees[2]
     else:
-        freedom = variance**2 / np.sum(np.square(mean_squares) / degrees)
+        freedom = max(variance**2 / np.sum(np.square(mean_squares) / degrees), degrees[:2].min())
     return student_interval(mean, math.sqrt(variance / table.size), float(freedom), level)
 
 

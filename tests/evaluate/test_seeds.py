@@ -62,6 +62,16 @@ def test_intervals_cover_the_truth_at_their_level(seeds, effects):
     assert 0.95 - SLACK - 0.02 <= covered <= 0.95 + SLACK + 0.02
 
 
+def test_intervals_have_no_fewer_degrees_than_the_smaller_factor():
+    table = np.array([[-0.9, 1.6, -1.3], [-0.4, -0.4, -1.2]])
+    variance, squares = naive_variance(table)
+    assert variance * 6 > squares[2]
+    # the variance is a difference of uncertain mean squares
+    assert (variance * 6) ** 2 / sum(s**2 / d for s, d in zip(squares, (1, 2, 2), strict=True)) < 0.7
+    interval = two_way_interval(table)
+    assert interval.high - interval.mean == pytest.approx(t.ppf(0.975, 1) * np.sqrt(variance))
+
+
 def test_without_any_effect_intervals_are_wide_rather_than_narrow():
     generator = np.random.default_rng(3)
     intervals = [two_way_interval(drawn(generator, 5, 12, 0.0, 0.0, 1.0)) for _ in range(TRIALS)]
