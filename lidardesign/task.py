@@ -169,6 +169,9 @@ class Task(Protocol):
     A task may also give `informs(scene, returns) -> Information`, what returns tell about a scene, for choosing rays;
     `returns` are as in `score`, of all candidate rays through open gates. Rays of a task without it are not chosen.
 
+    A task may also give `metric_of(config) -> Metric`, where the worst value or the tolerance follow from its
+    configuration; `metric` then has those that are usual, and both have the same name, unit and direction.
+
     A task may also give `notes(config, space) -> Sequence[str]`, what a user should know of a configuration before
     anything is learned of it: lengths that look like another unit, splits that share their objects.
 
@@ -224,6 +227,28 @@ def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpa
                 f"scenes gave one {type(scene).__name__}", where=f"task {task.name}", allowed="lidardesign.scene.Scene"
             )
     return scenes
+
+
+def metric_of(task: Task, config: Any) -> Metric:
+    """What a task's scores mean with a configuration; that of every configuration where it has no `metric_of`.
+
+    Raises:
+        PluginError: The task gave something else, or another quantity than its `metric`.
+    """
+    if not hasattr(task, "metric_of"):
+        return task.metric
+    found = task.metric_of(config)
+    where = f"task {task.name}, metric_of"
+    if not isinstance(found, Metric):
+        raise PluginError(f"it gave {type(found).__name__}", where=where, allowed="lidardesign.task.Metric")
+    usual = task.metric
+    if (found.name, found.unit, found.better) != (usual.name, usual.unit, usual.better):
+        raise PluginError(
+            f"it gave {found.name} [{found.unit}], {found.better} is better",
+            where=where,
+            allowed=f"{usual.name} [{usual.unit}], {usual.better} is better, as in its metric",
+        )
+    return found
 
 
 def notes_of(task: Task, config: Any, space: DesignSpace) -> list[str]:

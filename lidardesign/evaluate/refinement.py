@@ -36,7 +36,7 @@ from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.space import RANGE, DesignSpace
-from lidardesign.task import Task
+from lidardesign.task import Metric, Task
 
 # Every return stands for so many, spread about it: scenes that were not traced are elsewhere.
 QUANTILES = 5
@@ -163,6 +163,7 @@ class Refiner:
 
     Arguments:
         task: A task that gives residuals.
+        metric: What its scores mean.
         refit: How designs are fitted.
         look: Training scenes whose residuals move the density.
         judge: Other training scenes, which say what is kept.
@@ -175,6 +176,7 @@ class Refiner:
     def __init__(
         self,
         task: Task,
+        metric: Metric,
         refit: Refit,
         look: Sequence[Scene],
         judge: Sequence[Scene],
@@ -184,11 +186,11 @@ class Refiner:
         spreads: bool = True,
         progress: Callable[[Round], None] | None = None,
     ) -> None:
-        self.task, self.refit, self.attention = task, refit, attention
+        self.task, self.metric, self.refit, self.attention = task, metric, refit, attention
         self.look, self.judge = [(s, build_casters(s)) for s in look], [(s, build_casters(s)) for s in judge]
         self.spreads = tuple(sigma_m * one for one in SPREADS) if spreads else (0.0,)
         self.progress = progress
-        self.sign = 1.0 if task.metric.better == "lower" else -1.0
+        self.sign = 1.0 if metric.better == "lower" else -1.0
         self.rounds: list[Round] = []
         self._tested: set[tuple[bytes, Shape]] = set()
         self._favoured = ""
@@ -298,7 +300,7 @@ class Refiner:
     def _score(self, trial: Trial) -> float:
         """The mean score on the held-back scenes, turned so that lower is better."""
         values = [
-            checked_score(self.task, scene, _returns(scene, casters, trial.positions)).value
+            checked_score(self.task, self.metric, scene, _returns(scene, casters, trial.positions)).value
             for scene, casters in self.judge
         ]
         return self.sign * float(np.mean(values))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 from lidardesign.design.bandwidth import Bandwidth
@@ -20,11 +21,12 @@ from lidardesign.evaluate.baselines.catalog import Density
 from lidardesign.evaluate.baselines.simple import LayOut, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import CmaSettings
 from lidardesign.evaluate.scene_scores import ScenePass, Scorer, score_here
+from lidardesign.registry import plugin_guard
 from lidardesign.samples import Samples
 from lidardesign.scene import Scene
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.space import DesignSpace
-from lidardesign.task import Task
+from lidardesign.task import Metric, Task, metric_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,12 @@ class EvaluationRequest:
         """Root of the held-out scenes."""
         return self.seed if self.scenes_seed is None else self.scenes_seed
 
+    @cached_property
+    def metric(self) -> Metric:
+        """What scores mean."""
+        with plugin_guard(self.task.name):
+            return metric_of(self.task, self.config)
+
     def check(self) -> None:
         """Refuse what makes no sense.
 
@@ -91,8 +99,8 @@ class EvaluationRequest:
         where = f"task {self.task.name}"
         if not self.test:
             raise ConfigError("there are no held-out scenes", where=where, allowed="1 or more")
-        if not math.isfinite(self.task.metric.worst):
-            raise PluginError(f"the worst value is {self.task.metric.worst}", where=where, allowed="finite")
+        if not math.isfinite(self.metric.worst):
+            raise PluginError(f"the worst value is {self.metric.worst}", where=where, allowed="finite")
         names = [design.name for design in self.designs]
         for name in names:
             if names.count(name) > 1 or is_baseline(name):
@@ -108,7 +116,7 @@ class EvaluationRequest:
     ) -> ScenePass:
         """Sets of rays in the held-out scenes: see `ScenePass`."""
         seeds = (self.seed, self.held_out_seed)
-        return ScenePass(self.task, self.config, self.space, *seeds, self.test, fired, planner, plans)
+        return ScenePass(self.task, self.metric, self.config, self.space, *seeds, self.test, fired, planner, plans)
 
 
 def pattern_size(design: DesignSpec) -> int | None:

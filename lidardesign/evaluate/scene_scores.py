@@ -29,7 +29,7 @@ from lidardesign.simulate.detector.detector import Physics
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.simulate import build_casters, simulate_many
 from lidardesign.space import DesignSpace
-from lidardesign.task import Residuals, Score, Task
+from lidardesign.task import Metric, Residuals, Score, Task
 
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000
@@ -37,6 +37,7 @@ MOST_RETURNS = 4_000_000
 
 def score_lists(
     task: Task,
+    metric: Metric,
     scene: Scene,
     jobs: Sequence[RaysPerCondition],
     casters: Sequence[SceneCaster],
@@ -49,6 +50,7 @@ def score_lists(
 
     Arguments:
         task: Whose score is taken.
+        metric: What it means.
         scene: The scene.
         jobs: The sets of rays.
         casters: One per frame.
@@ -71,7 +73,7 @@ def score_lists(
         for positions in group:
             returns = [frame for _ in positions for frame in next(found)]
             started = time.perf_counter()
-            score = checked_score(task, scene, returns)
+            score = checked_score(task, metric, scene, returns)
             yield score, time.perf_counter() - started + per_ray * _count(positions)
 
 
@@ -94,7 +96,7 @@ def _groups(jobs: Sequence[RaysPerCondition], frames: int) -> Iterator[list[Rays
 
 
 @phase("metric")
-def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score:
+def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
     """What a task makes of returns in a scene; a failure has the metric's worst value.
 
     A value beyond the worst one counts as the worst, so that failing is never the better choice.
@@ -102,7 +104,7 @@ def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score
     Raises:
         PluginError: The task's score raised, or returned something that is no finite score.
     """
-    where = f"task {task.name}, metric {task.metric.name}, scene {scene.name}"
+    where = f"task {task.name}, metric {metric.name}, scene {scene.name}"
     try:
         with plugin_guard(task.name):
             score = task.score(scene, returns)
@@ -120,7 +122,7 @@ def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score
             f"score returned the detail {bad[0]!r}: {score.details[bad[0]]!r}", where=where, allowed="a number"
         )
     if score.failed:
-        return Score(float(task.metric.worst), failed=True, details=score.details)
+        return Score(float(metric.worst), failed=True, details=score.details)
     if not _is_number(score.value) or not math.isfinite(score.value):
         raise PluginError(
             f"score returned {score.value!r}",
@@ -128,8 +130,8 @@ def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score
             allowed="a finite number",
             hint="where there are too few returns, return Score(metric.worst, failed=True)",
         )
-    clip = min if task.metric.better == "lower" else max
-    return Score(clip(float(score.value), float(task.metric.worst)), details=score.details)
+    clip = min if metric.better == "lower" else max
+    return Score(clip(float(score.value), float(metric.worst)), details=score.details)
 
 
 def gives_residuals(task: Task) -> bool:
@@ -170,6 +172,7 @@ class ScenePass:
 
     Arguments:
         task: Whose score is taken.
+        metric: What it means.
         config, space: The task's configuration and the design space: with `held_out_seed`, they make the scenes.
         seed: Root of the effects' random streams.
         held_out_seed: Root of the scenes.
@@ -180,6 +183,7 @@ class ScenePass:
     """
 
     task: Task
+    metric: Metric
     config: Any
     space: DesignSpace
     seed: int
@@ -228,19 +232,26 @@ def score_here(scenes: ScenePass, progress: Progress | None) -> list[SceneScores
         if progress:
             progress(number, total, scene.name)
         sets, known = scenes.fired(number), scenes.known(number)
-        found.append(score_in_scene(scenes.task, scene, sets, scenes.planner, known, scenes.seed))
+        found.append(score_in_scene(scenes.task, scenes.metric, scene, sets, scenes.planner, known, scenes.seed))
     if progress:
         progress(total, total, "")
     return found
 
 
 def score_in_scene(
-    task: Task, scene: Scene, lists: Sequence[RaysPerCondition], planner: Planner, known: EffectPlan | None, seed: int
+    task: Task,
+    metric: Metric,
+    scene: Scene,
+    lists: Sequence[RaysPerCondition],
+    planner: Planner,
+    known: EffectPlan | None,
+    seed: int,
 ) -> SceneScores:
     """Score sets of rays in one scene.
 
     Arguments:
         task: Whose score is taken.
+        metric: What it means.
         scene: The scene.
         lists: The sets of rays.
         planner: How effects are chosen.
@@ -258,6 +269,6 @@ def score_in_scene(
     return SceneScores(
         plan,
         seconds,
-        list(score_lists(task, scene, lists, casters, planner.physics(plan, seed))),
+        list(score_lists(task, metric, scene, lists, casters, planner.physics(plan, seed))),
         sum((caster.second_casts for caster in casters), SecondCasts()),
     )

@@ -39,11 +39,12 @@ from lidardesign.evaluate.results import (
 from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.geometry.triangles import SecondCasts
+from lidardesign.numerics import ROUNDING
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene, group_numbers
 from lidardesign.simulate.plan import EffectPlan, Planner
-from lidardesign.task import Score, conditions_of, notes_of
+from lidardesign.task import Metric, Score, conditions_of, notes_of
 
 # Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
 # at a fraction of the held-out scenes' cost.
@@ -191,7 +192,7 @@ def _optimised(
         space=request.space,
         conditions=conditions,
         views=views,
-        objective=TrainingObjective(request.task, request.train, request.planner, request.seed),
+        objective=TrainingObjective(request.task, request.metric, request.train, request.planner, request.seed),
         settings=request.cma,
         seed=request.seed,
     )
@@ -199,7 +200,8 @@ def _optimised(
 
 def _judge(request: EvaluationRequest, lists: Sequence[RaysPerCondition]) -> list[float]:
     """The mean score of sets of rays on a few training scenes, turned so that lower is better."""
-    objective = TrainingObjective(request.task, request.train[:JUDGED_SCENES], request.planner, request.seed)
+    scenes = request.train[:JUDGED_SCENES]
+    objective = TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed)
     if not objective.scenes:
         return [0.0] * len(lists)
     # one row per scene, whose rows are added one after the other
@@ -244,7 +246,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     plain = [row for row in rows if row.matched_to is None]
     matched = [row for row in rows if row.matched_to is not None]
     return Evaluation(
-        metric=request.task.metric,
+        metric=request.metric,
         scenes=len(request.test),
         rows=plain,
         paired=_pairs(plain, request.seed),
@@ -252,7 +254,8 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         paired_bandwidth=_bandwidth_pairs(plain, matched, request.seed),
         notes=[
             *_notes(request, entries, matched),
-            *(search.note(request.designs[0].name, request.task.metric) for search in searches),
+            *worst_notes([*plain, *matched], request.metric),
+            *(search.note(request.designs[0].name, request.metric) for search in searches),
             *part_notes([(entry.name, entry.positions) for entry in entries if entry.matched_to is None]),
             *slipped_notes(scored.second_casts),
             *effect_notes(effects, request.planner.choice),
@@ -283,7 +286,7 @@ def _audit(
     planner = replace(request.planner, choice="all")
     scored = _score_all(request, entries, planner, progress, [planner.chosen_from(plan) for plan in plans])
     paired = list(zip(summaries(plans), summaries(scored.plans), strict=True))
-    metric = request.task.metric
+    metric = request.metric
     return Audit(
         metric.tolerance,
         metric.unit,
@@ -395,6 +398,26 @@ def group_notes(scenes: Sequence[Scene]) -> list[str]:
         return []
     kind = "intervals" if groups >= FEWEST_RESAMPLED else "Student's t intervals"
     return [f"the {len(scenes)} held-out scenes are of {groups} groups, and {kind} are over groups"]
+
+
+def worst_notes(rows: Sequence[Row], metric: Metric) -> list[str]:
+    """How many scenes score the worst value: what they differ in beyond it is not seen.
+
+    The row that is named is a design's, if one of them has such scenes, and has the most of them; rows without rays
+    have a note of their own.
+    """
+    counts = [int(np.isclose(row.per_scene, metric.worst, rtol=ROUNDING, atol=0.0).sum()) for row in rows]
+    some = [(row, count) for row, count in zip(rows, counts, strict=True) if count and row.rays]
+    if not some:
+        return []
+    row, count = max(some, key=lambda one: (not one[0].baseline, one[1]))
+    note = f"{count} of {len(row.per_scene)} scenes of {row.design!r} at {row.rays} rays score the worst value, "
+    note += f"{metric.worst:g} {metric.unit}".rstrip()
+    if row.failures:
+        note += f" ({row.failures} failed)"
+    others = len(some) - 1
+    further = f"{others} other rows" if others > 1 else "another row"
+    return [f"{note}; so do some of {further}" if others else note]
 
 
 def slipped_notes(casts: SecondCasts) -> list[str]:

@@ -45,7 +45,7 @@ def _takes(kind: type, values: dict[str, object]) -> bool:
 
 def check_metric(subject: Subject) -> LawHolds:
     """The metric has a name, a direction, a finite worst value and a tolerance above 0."""
-    metric = subject.task.metric
+    metric = subject.metric
     wrong = {
         "name": not isinstance(metric.name, str) or not metric.name.strip(),
         "unit": not isinstance(metric.unit, str),

@@ -19,7 +19,7 @@ from lidardesign.geometry.rays import Rays, Returns
 from lidardesign.registry import AUTHOR_HINT, plugin_guard
 from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import build_casters, simulate
-from lidardesign.task import Score, Split, Task, conditions_of, scenes_of
+from lidardesign.task import Metric, Score, Split, Task, conditions_of, metric_of, scenes_of
 from lidardesign.testing.fingerprint import fingerprint
 from lidardesign.testing.probing import rays_at_targets
 from lidardesign.testing.watch import Watch
@@ -231,6 +231,14 @@ class Subject:
         ]
 
     @cached_property
+    def metric(self) -> Metric:
+        """What scores mean."""
+        if not hasattr(self.task, "metric_of"):
+            return self.task.metric
+        with self.calling("metric_of"):
+            return metric_of(self.task, self.config.task)
+
+    @cached_property
     def conditions(self) -> list[dict[str, float]]:
         """The condition values that designs are evaluated at; one empty mapping where there are no conditions."""
         if not self.config.space.conditioned:
@@ -261,4 +269,4 @@ class Subject:
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """The checked score of returns."""
         with self.calling("score"):
-            return checked_score(self.task, scene, returns)
+            return checked_score(self.task, self.metric, scene, returns)

@@ -29,7 +29,7 @@ def _dense(subject: Subject, number: int) -> list[Returns]:
 
 def _worse(subject: Subject, value: float, than: float) -> float:
     """By how much a value is worse than another, in the metric's unit; negative where it is better."""
-    return value - than if subject.task.metric.better == "lower" else than - value
+    return value - than if subject.metric.better == "lower" else than - value
 
 
 def _scenes(subject: Subject) -> list[tuple[int, Scene]]:
@@ -44,7 +44,7 @@ def check_number(subject: Subject) -> LawHolds:
         anywhere = [full_rays(space.at(one).sample(DENSE, generator), space) for one in subject.conditions]
         for lists in (subject.rays(number, DENSE), subject.rays(number, SPARSE), anywhere):
             values.append(subject.score(scene, subject.returns(number, lists)).value)
-    unit = subject.task.metric.unit
+    unit = subject.metric.unit
     return LawHolds(
         f"{len(values)} scores from {min(values):.4g} to {max(values):.4g} {unit}",
         {"least": min(values), "most": max(values)},
@@ -60,7 +60,7 @@ def check_nothing(subject: Subject) -> LawHolds:
         dense = subject.score(scene, _dense(subject, number))
         for what, returns in (("no rays", subject.returns(number, none)), ("rays without a return", silent)):
             score = subject.score(scene, returns)
-            if _worse(subject, dense.value, score.value) > subject.task.metric.tolerance:
+            if _worse(subject, dense.value, score.value) > subject.metric.tolerance:
                 raise BrokenLawError(
                     f"scene {scene.name!r}: {what} score {score.value:.4g}, better than {dense.value:.4g} of "
                     f"{DENSE} returns from targets",
@@ -82,7 +82,7 @@ def check_best(subject: Subject) -> LawHolds:
         sparse.append(subject.score(scene, subject.returns(number, subject.rays(number, SPARSE))).value)
         none.append(subject.score(scene, without_returns(returns)).value)
     best, few, nothing = (float(np.mean(values)) for values in (dense, sparse, none))
-    metric = subject.task.metric
+    metric = subject.metric
     figures = {"dense": best, "sparse": few, "none": nothing}
     said = f"{best:.4g} of {DENSE} rays at targets, {few:.4g} of {SPARSE}, {nothing:.4g} of none [{metric.unit}]"
     if _worse(subject, best, few) > metric.tolerance or not _worse(subject, nothing, best) > 0:
@@ -103,7 +103,7 @@ def check_noise(subject: Subject) -> LawHolds:
         disturbed = [with_noise(returns, share, np.random.default_rng([SEED, number])) for share in NOISE_SHARES]
         noisy.append([subject.score(scene, one).value for one in disturbed])
     value, found = float(np.mean(exact)), np.mean(noisy, axis=0)
-    metric, losses = subject.task.metric, [_worse(subject, float(mean), value) for mean in found]
+    metric, losses = subject.metric, [_worse(subject, float(mean), value) for mean in found]
     steps = ", ".join(f"{mean:.4g} with {share:.0%} noise" for share, mean in zip(NOISE_SHARES, found, strict=True))
     said = f"{value:.4g} exact, {steps} [{metric.unit}]"
     if min(losses) < -metric.tolerance:
@@ -120,11 +120,11 @@ def check_order(subject: Subject) -> LawHolds:
         value = subject.score(scene, returns).value
         other = subject.score(scene, shuffled(returns, np.random.default_rng([SEED, number]))).value
         worst = max(worst, abs(other - value))
-    limit = ORDER_SHARE * subject.task.metric.tolerance
+    limit = ORDER_SHARE * subject.metric.tolerance
     if worst > limit:
-        unit = subject.task.metric.unit
+        unit = subject.metric.unit
         raise BrokenLawError(f"rays in another order change the score by {worst:.3g} {unit}", allowed=f"{limit:.3g}")
-    return LawHolds(f"changes by at most {worst:.1g} {subject.task.metric.unit}", {"difference": worst})
+    return LawHolds(f"changes by at most {worst:.1g} {subject.metric.unit}", {"difference": worst})
 
 
 def check_repeats(subject: Subject) -> LawHolds:

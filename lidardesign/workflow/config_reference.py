@@ -58,11 +58,14 @@ DIMENSION_WORDS = {"condition": "dimensions that are given, not designed", "meas
 
 def describe_task(task: Task) -> dict[str, Any]:
     """A task's metric, design space, defaults and the keys of its configuration, as plain values."""
+    from lidardesign.task import metric_of
+
     metric, defaults = task.metric, task.defaults
     space = None  # where the user must set something first
     if not any(info.is_required() for info in task.Config.model_fields.values()):
         with contextlib.suppress(ConfigError), plugin_guard(task.name):
             space = task.space(task.Config()).as_dict()
+            metric = metric_of(task, task.Config())
     return {
         "name": task.name,
         "summary": task.summary,

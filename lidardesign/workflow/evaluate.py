@@ -191,7 +191,7 @@ class ScoreRequest:
         if overrides:
             run = replace(run, config=with_task_settings(run.task, run.config, overrides))
         if options.range_tolerance_mm is None:
-            planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
+            planner = replace(planner, tolerance=planner.tolerated.within(run.metric))
         return cls(
             run,
             learned,

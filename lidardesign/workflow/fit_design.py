@@ -151,7 +151,7 @@ def fit_design(
         document = {
             "start": refinement.start,
             "end": refinement.end,
-            "unit": run.task.metric.unit,
+            "unit": run.metric.unit,
             "level": refinement.shape.level,
             "range_spread_m": refinement.shape.range_spread_m,
             "traced_gates": refinement.shape.traced_gates,
@@ -231,6 +231,7 @@ def _refined(request: FitRequest, rounds: int, progress: Callable[[Round], None]
     gating = cache(lambda: _gating(run, look))
     refiner = Refiner(
         run.task,
+        run.metric,
         lambda factor, shape: _trial(fitter, replace(weighting, reweighting=factor), shape, gating),
         look,
         judge,

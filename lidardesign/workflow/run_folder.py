@@ -24,7 +24,7 @@ from lidardesign.run.files import STDIO, is_input, is_there, readable
 from lidardesign.run.manifest import changed_since_recorded, read_manifest
 from lidardesign.scene import Scene
 from lidardesign.space import RANGE
-from lidardesign.task import Split, Task, scenes_of
+from lidardesign.task import Metric, Split, Task, metric_of, scenes_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -61,6 +61,12 @@ class RunFolder:
     def design_path(self, name: str) -> Path:
         """Where a design of this run is written."""
         return self.folder / DESIGN_FOLDER / f"{name}.yaml"
+
+    @property
+    def metric(self) -> Metric:
+        """What scores mean."""
+        with plugin_guard(self.task.name):
+            return metric_of(self.task, self.config.task)
 
     @phase("scenes")
     def scenes(self, split: Split, seed: int) -> list[Scene]:

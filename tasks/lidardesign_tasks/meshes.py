@@ -30,7 +30,14 @@ from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_or
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_residuals, moving_score, with_moving_truth
 from lidardesign_tasks.pose import jittered_pose
-from lidardesign_tasks.surface import surface_informs, surface_residuals, surface_score, with_visible_truth
+from lidardesign_tasks.surface import (
+    METRIC,
+    MILLIMETRES,
+    surface_informs,
+    surface_residuals,
+    surface_score,
+    with_visible_truth,
+)
 from lidardesign_tasks.surroundings import any_direction, moving
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 
@@ -40,6 +47,7 @@ Axis = Literal["x", "y", "z"]
 WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 RELATIVE_JITTER = 0.02  # of the largest extent, where no shift is given
 SENSOR_DISTANCE = 2.0  # extents
+TOLERATED_SHARE = 4e-4  # of the longest extent: 0.1 mm of a head of 0.25 m
 SPLIT_SEED = 0  # of which meshes are held out, whatever the seed of a run
 SAME_MESH = (
     "training and held-out scenes show the same one in other poses, so scores say nothing of other objects"
@@ -110,7 +118,10 @@ class MeshesTask:
     api_version: ClassVar[int] = 1
     weighing_keys: ClassVar[tuple[str, ...]] = (*WEIGHING_KEYS, "importance", "colour_contrast")
     Config: ClassVar[type[MeshesConfig]] = MeshesConfig
-    metric: ClassVar[Metric] = Metric("Chamfer distance", "mm", "lower", worst=1000.0, tolerance=0.1)
+    # of meshes of a metre; `metric_of` has those of a configuration
+    metric: ClassVar[Metric] = Metric(
+        "Chamfer distance", "mm", "lower", worst=MILLIMETRES, tolerance=MILLIMETRES * TOLERATED_SHARE
+    )
     defaults: ClassVar[Defaults] = Defaults(
         sensors=4, rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005}
     )
@@ -133,7 +144,7 @@ class MeshesTask:
         motion = motion_of(config, meshes)
         space = space or derived_space(config, meshes, motion)
         occluders = tuple(_occluder(name, mesh, motion) for name, mesh in load_occluders(config))
-        shift = jitter_m(config, [mesh for _, mesh in meshes])
+        shift, metric = jitter_m(config, [mesh for _, mesh in meshes]), self.metric_of(config)
         if len(meshes) == 1 and config.jitter_rotation_deg == 0 and shift == 0:
             raise ConfigError(
                 "one mesh without pose jitter makes training and held-out scenes the same",
@@ -152,13 +163,18 @@ class MeshesTask:
             title = f"{split} {name} pose {pose}"
             scene = Scene((placed, *occluders), title, frame_rate_hz=config.frame_rate_hz, group=name)
             judge = with_visible_truth if motion is None else with_moving_truth
-            judged = judge(scene, space, config.truth_points, generator)
+            judged = judge(scene, space, config.truth_points, generator, metric)
             if motion is not None:
                 scenes.append(config.around(judged))
                 continue
             velocity = config.speed_m_s * any_direction(random_generator(seed, "meshes", split, name, pose, "velocity"))
             scenes.append(config.around(replace(judged, bodies=(moving(placed, velocity), *occluders))))
         return scenes
+
+    def metric_of(self, config: MeshesConfig) -> Metric:
+        """At worst a scene is off by the longest extent of any of the meshes; a share of that does not matter."""
+        longest_mm = MILLIMETRES * max(extent_m([mesh]) for _, mesh in load_folder(config))
+        return replace(self.metric, worst=longest_mm, tolerance=TOLERATED_SHARE * longest_mm)
 
     def notes(self, config: MeshesConfig, space: DesignSpace) -> list[str]:
         """Lengths that look like another unit, and a mesh that is trained on and held out."""
@@ -177,12 +193,12 @@ class MeshesTask:
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the surface that could be seen."""
         score = moving_score if SURFACES in scene.truth else surface_score
-        return score(self.metric, scene, returns)
+        return score(scene.truth.get(METRIC, self.metric), scene, returns)
 
     def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
         """Where the Chamfer distance is [mm]."""
         residuals = moving_residuals if SURFACES in scene.truth else surface_residuals
-        return residuals(self.metric, scene, returns)
+        return residuals(scene.truth.get(METRIC, self.metric), scene, returns)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """What returns tell about points of the visible surface in each frame, the more the nearer they are."""

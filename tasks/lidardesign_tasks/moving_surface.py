@@ -48,9 +48,11 @@ class MovingTruth(LazyTruth):
             return None
 
 
-def with_moving_truth(scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator) -> Scene:
+def with_moving_truth(
+    scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator, metric: Metric | None = None
+) -> Scene:
     """The scene with what some admissible ray can see in each frame as its truth: `surfaces`."""
-    return replace(scene, truth=MovingTruth(scene, space, points, int(generator.integers(2**62))))
+    return replace(scene, truth=MovingTruth(scene, space, points, int(generator.integers(2**62)), metric))
 
 
 def moving_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:

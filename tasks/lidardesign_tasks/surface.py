@@ -24,6 +24,7 @@ ITEMS = 200  # points of a surface that rays are chosen for
 COVERED_M = 0.010
 # a return further than this from the surface is none of it, unless the surface is known by points further apart
 OUTLIER_M = 0.010
+METRIC = "metric"
 STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps: with dense rays they made up half of the error
 
 
@@ -31,11 +32,14 @@ STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps: with dense rays the
 class LazyTruth(Mapping[str, Any]):
     """The truth of a scene under one key, found when it is first asked for: learning never asks.
 
+    Under `metric` stands what scores mean, where that follows from the configuration.
+
     Arguments:
         scene: The scene without a truth.
         space: What the sensors may do.
         points: Points of a cloud.
         seed: Of their random places.
+        metric: What scores mean; None: what they mean in every configuration.
     """
 
     key: ClassVar[str]
@@ -43,6 +47,7 @@ class LazyTruth(Mapping[str, Any]):
     space: DesignSpace
     points: int
     seed: int
+    metric: Metric | None = None
 
     @abstractmethod
     def find(self) -> Any:
@@ -54,15 +59,17 @@ class LazyTruth(Mapping[str, Any]):
         return self.find()
 
     def __getitem__(self, key: str) -> Any:
+        if key == METRIC and self.metric is not None:
+            return self.metric
         if key != self.key:
             raise KeyError(key)
         return self.found
 
     def __iter__(self) -> Iterator[str]:
-        return iter((self.key,))
+        return iter((self.key,) if self.metric is None else (self.key, METRIC))
 
     def __len__(self) -> int:
-        return 1
+        return sum(1 for _ in self)
 
 
 class VisibleTruth(LazyTruth):
@@ -81,10 +88,10 @@ def fewer_points(truth: Mapping[str, Any], count: int) -> Mapping[str, Any]:
 
 
 def with_visible_truth(
-    scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator
+    scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator, metric: Metric | None = None
 ) -> Scene:
     """The scene with what some admissible ray can see as its truth: `surface`, a `SurfaceCloud`."""
-    truth = VisibleTruth(scene, space, points, int(generator.integers(2**62)))
+    truth = VisibleTruth(scene, space, points, int(generator.integers(2**62)), metric)
     return replace(scene, truth=truth)
 
 

@@ -390,7 +390,7 @@ def test_the_search_gains_in_the_direction_of_the_metric_and_no_less_than_boundi
 def candidate_of(name, settings=None):
     design, space, train = FOLLOWED[name]
     conditions = [{"x_m": 0.25}, {"x_m": 0.75}] if name == "track" else [{}]
-    objective = TrainingObjective(AnyMissTask(), train, Planner(), 0)
+    objective = TrainingObjective(AnyMissTask(), AnyMissTask.metric, train, Planner(), 0)
     return CmaCandidate(
         design, space, conditions, TrainingViews(space, train), objective, settings or CmaSettings(FAST), 0
     )

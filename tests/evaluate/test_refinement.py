@@ -61,14 +61,12 @@ EVEN = trial(rays_at(np.linspace(0.2, 0.8, 9)))
 
 
 def refiner(refit, task=TASK, **options):
-    return Refiner(task, refit, LOOK, JUDGE, ATTENTION, sigma_m=SIGMA_M, **options)
+    return Refiner(task, task.metric, refit, LOOK, JUDGE, ATTENTION, sigma_m=SIGMA_M, **options)
 
 
 def mean_score(task, found):
-    scores = [
-        checked_score(task, scene, [frame for rays in found.positions for frame in simulate(scene, rays)]).value
-        for scene in JUDGE
-    ]
+    seen = [(scene, [frame for rays in found.positions for frame in simulate(scene, rays)]) for scene in JUDGE]
+    scores = [checked_score(task, task.metric, scene, returns).value for scene, returns in seen]
     return float(np.mean(scores))
 
 

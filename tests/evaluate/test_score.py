@@ -48,6 +48,43 @@ def test_failures_are_counted_at_the_worst_value_and_never_dropped():
     assert row.value == pytest.approx((row.per_scene[:3].sum() + 3 * 150.0) / 6)
 
 
+class CutTask(MissTask):
+    """Misses beyond 40 % are all alike, by a worst value that follows from the configuration."""
+
+    def metric_of(self, config):
+        return replace(self.metric, worst=40.0)
+
+
+def test_a_worst_value_of_the_configuration_cuts_scores_and_is_what_failures_have():
+    request = make_request([design(), design("blind", azimuth=0.45)], task=CutTask())
+    evaluation, usual = evaluate(request), rows_by_key(evaluate(replace(request, task=MissTask())))
+    assert evaluation.metric.worst == evaluation.as_dict()["metric"]["worst"] == 40.0
+    for key, row in rows_by_key(evaluation).items():
+        np.testing.assert_array_equal(row.per_scene, np.minimum(usual[key].per_scene, 40.0))
+
+
+@each_row(
+    ("designs", "task", "baselines", "said"),
+    [
+        ([design()], MissTask(), (), None),
+        ([design("blind", azimuth=0.45)], MissTask(), (), "6 of 6 scenes of 'blind' {} 150 % (6 failed)"),
+        ([design()], MissTask(), ("uniform",), "6 of 6 scenes of 'uniform' {} 150 % (6 failed)"),
+        ([design(spread=0.1)], CutTask(), (), "6 of 6 scenes of 'aimed' {} 40 %"),
+        # a design is named before baselines
+        (
+            [design("blind", azimuth=0.45)],
+            CutTask(),
+            ("uniform", "random"),
+            "6 of 6 scenes of 'blind' {} 40 % (6 failed); so do some of 2 other rows",
+        ),
+    ],
+)
+def test_scenes_at_the_worst_value_are_counted_in_one_note(designs, task, baselines, said):
+    request = make_request(designs, task=task, baselines=baselines, rays=(25,), equal_bandwidth=False)
+    notes = [note for note in evaluate(request).notes if "worst value" in note]
+    assert notes == ([] if said is None else [said.format("at 25 rays score the worst value,")])
+
+
 def test_every_design_is_paired_with_every_baseline_and_every_later_design():
     evaluation = evaluate(make_request([design("first"), design("second", azimuth=0.05)]))
     pairs = {(pair.a, pair.b, pair.rays): pair for pair in evaluation.paired}

@@ -167,7 +167,7 @@ class TestRaysThroughEdgesAndVertices:
         count = len(origins)
         rays = Rays(origins, directions, np.tile([0.0, 2.0], (count, 1)), np.zeros(count), np.zeros(count))
         scene = Scene((Body(mesh_of(BALL)),), "ball")
-        found = score_in_scene(CountingTask(), scene, [[rays]], Planner(choice="none"), None, 0)
+        found = score_in_scene(CountingTask(), CountingTask.metric, scene, [[rays]], Planner(choice="none"), None, 0)
         assert found.scores[0][0].value == 100.0
         slipped = found.second_casts
         assert slipped.rays == count

@@ -179,7 +179,7 @@ class TestEmptyReturns:
         task, scene, often = one_scene
         returns = [frame for _ in range(often) for frame in simulate(scene, rays)]
         assert not any(one.returned.any() for one in returns)
-        score = checked_score(task, scene, returns)
+        score = checked_score(task, task.metric, scene, returns)
         assert score.failed
         assert score.value == task.metric.worst
         assert all(math.isfinite(value) for value in score.details.values())
@@ -191,7 +191,7 @@ class TestEmptyReturns:
         task = MeshesTask()
         (scene, *_) = task.scenes(task.Config(folder=str(tmp_path), truth_points=200), "train", 0)
         for rays in (NO_RAYS, LOST):
-            score = checked_score(task, scene, simulate(scene, rays))
+            score = checked_score(task, task.metric, scene, simulate(scene, rays))
             assert (score.failed, score.value) == (True, task.metric.worst)
 
     @pytest.mark.parametrize("choice", ["none", "all"])
@@ -338,7 +338,7 @@ class TestEmitterAndDetectorTogetherOrBlind:
             assert lit.returned.mean() > 0.5, name
             assert not heard.returned.any(), name
             assert (heard.outcome[lit.returned] == Outcome.NOT_DETECTED).all(), name
-            score = checked_score(task, replace(one, truth=scene.truth), [heard])
+            score = checked_score(task, task.metric, replace(one, truth=scene.truth), [heard])
             assert (score.failed, score.value) == (True, task.metric.worst), name
 
     def test_a_pair_that_sees_no_point_together_leaves_no_truth(self):

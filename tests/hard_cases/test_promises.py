@@ -177,10 +177,12 @@ def rays_with(value, name):
     return Rays(**arrays)
 
 
+ERROR = SimpleNamespace(name="error", worst=1.0, better="lower")
+
+
 def scoring(value):
     """A task whose score is a value."""
-    metric = SimpleNamespace(name="error", worst=1.0, better="lower")
-    return SimpleNamespace(name="case", metric=metric, score=lambda scene, returns: Score(value))
+    return SimpleNamespace(name="case", score=lambda scene, returns: Score(value))
 
 
 def poses_with(value):
@@ -216,7 +218,7 @@ GIVEN = {
     "lloyd": lambda x: lloyd(np.array([[0.0], [x], [1.0]]), np.ones(3), 2, np.random.default_rng(0)),
     "Constraints": lambda x: Constraints.from_mapping({"gate": {"width_m": {"max": x}}}),
     "mean_interval": lambda x: mean_interval([1.0, x], 0),
-    "checked_score": lambda x: checked_score(scoring(x), BALL, simulate(BALL, rays_with(0.0, "origin_m"))),
+    "checked_score": lambda x: checked_score(scoring(x), ERROR, BALL, simulate(BALL, rays_with(0.0, "origin_m"))),
 }
 
 

@@ -71,7 +71,8 @@ def turned(returns, chosen, outcome, range_m):
 @each_row("name", TASKS)
 def test_without_a_single_detection_a_design_fails_at_the_worst_value(name, tmp_path):
     task, scene, returns = measure(name, tmp_path)
-    score = checked_score(task, scene, [turned(one, True, Outcome.NOT_DETECTED, np.nan) for one in returns])
+    blind = [turned(one, True, Outcome.NOT_DETECTED, np.nan) for one in returns]
+    score = checked_score(task, task.metric, scene, blind)
     assert score.failed
     assert score.value == task.metric.worst
 
@@ -84,13 +85,13 @@ def test_invented_returns_are_scored_as_returns_of_no_body(name, tmp_path):
     for one in returns:
         gate = one.rays.gate_m
         noisy.append(turned(one, generator.uniform(size=len(gate)) < 0.3, 0, generator.uniform(gate[:, 0], gate[:, 1])))
-    clean, score = (checked_score(task, scene, each) for each in (returns, noisy))
+    clean, score = (checked_score(task, task.metric, scene, each) for each in (returns, noisy))
     sign = 1 if task.metric.better == "lower" else -1
     assert np.isfinite(score.value)
     # where even clean returns are too few, chance may do better
     assert clean.failed or sign * score.value >= sign * clean.value
     invented = [turned(one, True, 0, one.rays.gate_m[:, 1] * 0.999) for one in returns]
-    assert clean.failed or sign * checked_score(task, scene, invented).value >= sign * clean.value
+    assert clean.failed or sign * checked_score(task, task.metric, scene, invented).value >= sign * clean.value
 
 
 def test_noise_is_not_told_from_the_ball_that_a_robot_carries():
@@ -150,7 +151,7 @@ def test_chance_is_the_same_for_rival_rays_and_another_one_at_each_position():
     rays = rays_along(np.tile((1.0, 0.0, 0.0), (count, 1)), (0.5, 2.0))
     task, detector = Remembering(), Detector("timed", jitter_sigma_s=1e-11)
     jobs = [(rays, rays), (rays, rays)]
-    list(score_lists(task, scene, jobs, build_casters(scene), Physics(detector, frozenset({"jitter"}))))
+    list(score_lists(task, task.metric, scene, jobs, build_casters(scene), Physics(detector, frozenset({"jitter"}))))
     (here, there), (other_here, other_there) = task.ranges
     assert np.array_equal(here, other_here)
     assert np.array_equal(there, other_there)

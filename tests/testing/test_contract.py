@@ -29,6 +29,7 @@ VALUE = "        return Score(min(1000 * off + 50 / len(points), 100.0))\n"
 CENTRE = "        centre = np.array([generator.uniform(2.0, 3.0), generator.uniform(-0.5, 0.5), 0.0])\n"
 CONFIG = "    Config = TaskConfig\n"
 RESIDUALS = "    def residuals(self, scene, returns):\n        return "
+METRIC_OF = "    def metric_of(self, config):\n        from dataclasses import replace\n        return "
 # All returns tell about the one thing that there is.
 INFORMS = """    def informs(self, scene, returns):
         from lidardesign.task import Information
@@ -52,6 +53,9 @@ BROKEN = {
         (METRIC, METRIC.replace("100.0", "float('inf')"), "metric.worst is inf"),
         (METRIC, METRIC.replace("lower", "smaller"), "metric.better is 'smaller'"),
         (METRIC, METRIC.replace("100.0", "10**400"), "OverflowError"),
+        (SCORE, METRIC_OF + "replace(self.metric, worst=float('nan'))\n\n" + SCORE, "metric.worst is nan"),
+        (SCORE, METRIC_OF + "100.0\n\n" + SCORE, "metric_of failed: it gave float"),
+        (SCORE, METRIC_OF + "replace(self.metric, unit='m')\n\n" + SCORE, "it gave radius error [m]"),
     ],
     "defaults are accepted": [
         (DEFAULTS, "Defaults(layout='spiral')", "defaults.layout is 'spiral'"),

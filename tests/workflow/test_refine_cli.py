@@ -264,7 +264,8 @@ def test_evaluate_lays_a_weighted_design_out_by_the_same_weighted_samples(lidard
     rows = refined(lidardesign, "evaluate", weighted, "--rays", count, "--effects", "none")["rows"]
     run = open_run(flat)
     rays = by_hand(weighted, flat, count)
-    scores = [checked_score(run.task, scene, simulate(scene, rays)).value for scene in run.scenes("test", SEED)]
+    scenes = run.scenes("test", SEED)
+    scores = [checked_score(run.task, run.metric, scene, simulate(scene, rays)).value for scene in scenes]
     own = [row for row in rows if row["design"] == "w"]
     assert own[0]["value"] == pytest.approx(np.mean(scores), rel=1e-9)
     plain = lay_out(load_design(weighted), 20, load_samples(flat), gates="ray")

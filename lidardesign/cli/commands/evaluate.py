@@ -261,7 +261,7 @@ def search_display(request: ScoreRequest | SeedsRequest, output: Output, bar: Ri
             if bar is None:
                 output.note(f"{label}: searching for {request.cma_seconds:g} s ...")
         if bar is not None:
-            best = f"best {progress.best:.4g} {request.run.task.metric.unit}"
+            best = f"best {progress.best:.4g} {request.run.metric.unit}"
             bar.update(lines[label], completed=progress.share, row=best)
 
     return show

@@ -69,7 +69,7 @@ def run_fit(request: FitRequest, output: Output) -> None:
     def show_round(entry: Round) -> None:
         text = f"{entry.change} (refused, {number(entry.seconds, 2)} s)"
         if entry.score is not None:
-            score = f"{number(entry.score)} {request.run.task.metric.unit} at {number(entry.bandwidth_mbps, 3)} Mbit/s"
+            score = f"{number(entry.score)} {request.run.metric.unit} at {number(entry.bandwidth_mbps, 3)} Mbit/s"
             verdict = "kept" if entry.kept else "not better"
             text = f"{entry.change}: {score}, {verdict} ({number(entry.seconds, 2)} s)"
         output.note(f"refine {entry.number}: {text}")

@@ -79,7 +79,7 @@ class Bench:
         """The score in a scene under some effects; random numbers are the same whatever the effects."""
         physics = Physics(detector, effects, self.request.seed) if effects else None
         scene, casters = self.scenes[number], self.casters[number]
-        ((score, _),) = score_lists(self.request.task, scene, [self.positions], casters, physics)
+        ((score, _),) = score_lists(self.request.task, self.request.metric, scene, [self.positions], casters, physics)
         return score.value
 
     def scores(self, effects: frozenset[str], detector: Detector) -> np.ndarray:
@@ -96,7 +96,7 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     first_hits = own.photons is None and own.bin_s is None and own.divergence_rad == 0 and own.timing_sigma_s == 0
     if first_hits:
         planner = Planner(load_detector(STAND_IN))
-        planner = replace(planner, tolerance=planner.tolerated.within(asked.task.metric))
+        planner = replace(planner, tolerance=planner.tolerated.within(asked.metric))
     count, positions = _rays(asked, design)
     most = max(RAYS // max(sum(len(rays) for rays in positions) * asked.test[0].frames, 1), 1)
     bench = Bench(asked, planner, positions, asked.test[: min(most, MOST_SCENES)])
@@ -136,7 +136,7 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
 
 
 def _footprint(bench: Bench, note: str, own: Detector) -> Sweep:
-    detector, metric = bench.planner.detector, bench.request.task.metric
+    detector, metric = bench.planner.detector, bench.request.metric
     most = MOST_THIN_RAYS // max(bench.rays * len(bench.scenes), 1)
     counts = sorted({count for count in FOOTPRINT_RAYS if count <= max(most, 1)} | {detector.footprint_rays})
     changed = {count: replace(detector, footprint_rays=count) for count in counts}
@@ -173,7 +173,7 @@ def _effects(bench: Bench, note: str, own: Detector) -> list[Sweep]:
         return []
     if dear:
         note += f"; without {', '.join(sorted(dear))}, which take{'s' if len(dear) == 1 else ''} too long here"
-    metric = bench.request.task.metric
+    metric = bench.request.metric
     return [
         Sweep(
             knob="effects",

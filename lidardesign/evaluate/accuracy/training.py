@@ -182,7 +182,7 @@ class _Judge:
         planner, scores = self._asked.planner, []
         for scene, casters in self._scenes:
             physics = planner.physics(planner.plan(scene, list(positions), casters), self._asked.seed)
-            ((score, _),) = score_lists(self._asked.task, scene, [positions], casters, physics)
+            ((score, _),) = score_lists(self._asked.task, self._asked.metric, scene, [positions], casters, physics)
             scores.append(score.value)
         return np.array(scores)
 
@@ -190,7 +190,7 @@ class _Judge:
         """The mean score, and its standard error beside the last measurement's, on the same scenes."""
         if scores is None or last is None:
             return {}
-        apart, unit = scores - last, re.sub(r"\W+", "", self._asked.task.metric.unit)
+        apart, unit = scores - last, re.sub(r"\W+", "", self._asked.metric.unit)
         error = float(apart.std(ddof=1) / math.sqrt(len(apart))) if len(apart) > 1 else 0.0
         name = f"score_{unit}" if unit else "score"
         return {name: float(scores.mean()), f"{name}_difference_error": error}

@@ -30,7 +30,7 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import build_casters, simulate_many
-from lidardesign.task import Task
+from lidardesign.task import Metric, Task
 
 # Scenes that the first steps see; as many as baselines are compared on. With 4, tracks of an arm that were best there
 # were more than twice as far off on 16.
@@ -61,12 +61,14 @@ class TrainingObjective:
 
     Arguments:
         task: Whose score is taken.
+        metric: What it means.
         scenes: Training scenes; the first ones are asked first.
         planner: The detector, and how effects are chosen.
         seed: Root of the effects' random streams.
     """
 
     task: Task
+    metric: Metric
     scenes: Sequence[Scene]
     planner: Planner
     seed: int
@@ -75,7 +77,7 @@ class TrainingObjective:
     @property
     def sign(self) -> float:
         """What turns the metric so that lower is better."""
-        return 1.0 if self.task.metric.better == "lower" else -1.0
+        return 1.0 if self.metric.better == "lower" else -1.0
 
     def values(
         self, lists: Sequence[RaysPerCondition], scenes: Sequence[int], stop: Callable[[], bool] = lambda: False
@@ -93,7 +95,7 @@ class TrainingObjective:
         found = np.empty((len(lists), len(scenes)))
         for column, number in enumerate(scenes):
             casters, physics = self._of_scene(number, lists)
-            scores = score_lists(self.task, self.scenes[number], lists, casters, physics)
+            scores = score_lists(self.task, self.metric, self.scenes[number], lists, casters, physics)
             found[:, column] = [self.sign * score.value for score, _ in scores]
             if column + 1 < len(scenes) and stop():
                 raise OutOfTimeError

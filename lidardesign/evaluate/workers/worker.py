@@ -26,7 +26,7 @@ from lidardesign.registry import load_task, plugin_guard
 from lidardesign.scene import Mesh, Scene
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.space import DesignSpace
-from lidardesign.task import Score, Task, scenes_of
+from lidardesign.task import Metric, Score, Task, metric_of, scenes_of
 
 # Far more than processors of different makes round differently, far less than any metric tells apart [m].
 OUTLINE_TOLERANCE_M = COARSE_SLACK
@@ -125,7 +125,7 @@ def score_job(job: SceneJob) -> SceneScores | SceneFailure:
     """The scores in a scene, or the error that was met; it never raises."""
     with _one_at_a_time:
         try:
-            task, scenes = make_scenes(job.source)
+            task, metric, scenes = make_scenes(job.source)
             if not (job.number < len(scenes) and same_outline(scene_outline(scenes[job.number]), job.outline)):
                 raise PluginError(
                     f"a worker made another scene {job.outline['name']!r} than this process",
@@ -133,7 +133,9 @@ def score_job(job: SceneJob) -> SceneScores | SceneFailure:
                     allowed="scenes that follow from configuration, split and seed alone",
                     hint="install the same version of the task everywhere; --workers 1 needs no second process",
                 )
-            found = score_in_scene(task, scenes[job.number], job.sets, job.planner, job.plan, job.source.seed)
+            found = score_in_scene(
+                task, metric, scenes[job.number], job.sets, job.planner, job.plan, job.source.seed
+            )
             # a task may give any mapping
             scores = [(Score(one.value, one.failed, dict(one.details)), seconds) for one, seconds in found.scores]
             return SceneScores(found.plan, found.planning_seconds, scores, found.second_casts)
@@ -143,8 +145,8 @@ def score_job(job: SceneJob) -> SceneScores | SceneFailure:
 
 
 @lru_cache(maxsize=1)
-def make_scenes(source: SceneSource) -> tuple[Task, Sequence[Scene]]:
-    """The task and the held-out scenes of a source; those of the last one are kept."""
+def make_scenes(source: SceneSource) -> tuple[Task, Metric, Sequence[Scene]]:
+    """The task, its metric and the held-out scenes of a source; those of the last one are kept."""
     if source.version != __version__:
         raise ConfigError(
             f"a worker has lidardesign {__version__}",
@@ -155,7 +157,8 @@ def make_scenes(source: SceneSource) -> tuple[Task, Sequence[Scene]]:
     task = load_task(source.task)
     config, space = task.Config.model_validate(json.loads(source.config)), json.loads(source.space)
     with plugin_guard(task.name):
-        return task, list(scenes_of(task, config, "test", source.held_out_seed, DesignSpace.from_dict(space)))
+        scenes = scenes_of(task, config, "test", source.held_out_seed, DesignSpace.from_dict(space))
+        return task, metric_of(task, config), list(scenes)
 
 
 def scene_outline(scene: Scene) -> dict[str, Any]:
