@@ -512,7 +512,7 @@ class Bar:
 
 
 def shown_settings(bar):
-    request = SimpleNamespace(cma_seconds=FAST.seconds, run=SimpleNamespace(task=AnyMissTask()))
+    request = SimpleNamespace(cma_seconds=FAST.seconds, run=SimpleNamespace(metric=AnyMissTask.metric))
     return CmaSettings(FAST, search_display(request, Output(), bar))
 
 

@@ -154,7 +154,7 @@ def test_changes_of_effects_are_those_of_evaluations_under_them():
     assert found["without footprint"].error == max(values["change_left_out"], values["change_alone"])
     assert sweep.measurements[-1].setting == "all"
     assert sweep.measurements[-1].reference
-    assert sweep.tolerance == pytest.approx(asked.request.task.metric.tolerance / len(there))
+    assert sweep.tolerance == pytest.approx(asked.request.metric.tolerance / len(there))
 
 
 def test_the_settings_that_the_evaluation_has_are_marked():
