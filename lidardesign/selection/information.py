@@ -88,8 +88,9 @@ def surface_information(
 ) -> Information:
     """What returns tell about a surface: max(0, D - distance) of each of its points, D the reach of a return.
 
-    A return of something else is taken for the surface, and spoils its share of what a choice reconstructs by its
-    distance from the surface, at most D: as much as a place that no return tells about.
+    A return of something else is taken for the surface, and spoils its share of all candidates' returns by its distance
+    from the surface, at most D. That is enough to choose gates that leave it out. Its share of the chosen returns would
+    be more than it spoils: others beside it meet the same thing, and a place without any ray is no better known.
 
     Arguments:
         points_m: Even points of the surface that each of the returns should show, (U, 3) [m]; few are enough. None at
@@ -105,7 +106,7 @@ def surface_information(
     targets = np.append(np.asarray(is_target, dtype=bool), False)  # a body of -1 is none
     hits = [one.returned & targets[one.body] for one in returns]
     reach_m = return_reach_m(size, sum(int(hit.sum()) for hit in hits), dimensions)
-    share = CHOSEN_SHARE * sum(int(one.returned.sum()) for one in returns)
+    count = sum(int(one.returned.sum()) for one in returns)
     rays, items, worths, frames, known = [], [], [], [], 0
     harm = np.zeros((len(returns), len(returns[0].rays)))
     for frame, (one, hit, points) in enumerate(zip(returns, hits, points_m, strict=True)):
@@ -120,7 +121,7 @@ def surface_information(
         items.append(first + pairs["j"])
         worths.append(reach_m - pairs["v"])
         away_m = np.minimum(tree.query(places[~on_target], distance_upper_bound=reach_m)[0], reach_m)
-        harm[frame, one.returned & ~hit] = away_m / share
+        harm[frame, one.returned & ~hit] = away_m / count
     return Information(
         np.concatenate([np.zeros(0, dtype=np.int64), *rays]),
         np.concatenate([np.zeros(0, dtype=np.int64), *items]),

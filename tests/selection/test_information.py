@@ -66,8 +66,7 @@ def test_only_returns_of_something_else_spoil_and_no_more_than_a_place_that_noth
     points, returns, places = random_look(seed)
     found = surface_information([points], [returns], [True, False], SIDE_M**2)
     nearest = np.linalg.norm(points[None] - places[:, None], axis=2).min(axis=1)
-    chosen = CHOSEN_SHARE * returns.returned.sum()
-    naive = np.where(returns.body == OCCLUDER, np.minimum(nearest, found.complete) / chosen, 0.0)
+    naive = np.where(returns.body == OCCLUDER, np.minimum(nearest, found.complete) / returns.returned.sum(), 0.0)
     np.testing.assert_allclose(found.harm[0], naive, atol=1e-12)
 
 
