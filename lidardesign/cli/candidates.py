@@ -37,6 +37,8 @@ BASELINES = {
     "uniform": "even over the whole design space",
     "random": "random over the whole design space",
     "bounding": "one even grid cropped to the training returns",
+    "silhouette": "a hexagonal lattice where training scenes return, a gate per ray",
+    "lloyd": "as silhouette, denser where returns are frequent and surfaces large",
     "occupancy": "rays towards cells that targets occupy",
     "no-visibility": "the first design without its occlusion term",
     "catalog:": "a real part where it sees most",

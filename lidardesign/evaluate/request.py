@@ -18,7 +18,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.baselines.catalog import Density
-from lidardesign.evaluate.baselines.simple import LayOut, baseline_of, is_baseline
+from lidardesign.evaluate.baselines.simple import ALWAYS, LayOut, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import CmaSettings
 from lidardesign.evaluate.scene_scores import ScenePass, Scorer, score_here
 from lidardesign.registry import plugin_guard
@@ -63,7 +63,7 @@ class EvaluationRequest:
     seed: int
     designs: Sequence[DesignSpec]
     rays: Sequence[int]
-    baselines: Sequence[str] = ("uniform", "random", "bounding")
+    baselines: Sequence[str] = ALWAYS
     bandwidth: Bandwidth = field(default_factory=Bandwidth)
     samples: Mapping[str, Samples] = field(default_factory=dict)
     equal_bandwidth: bool = True

@@ -18,12 +18,14 @@ import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.compare import outside_notes
+from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.layouts.track import travels
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.candidates import Candidate, RaysPerCondition, TrainingViews, mean_mbps
+from lidardesign.evaluate.baselines.candidates import Candidate, RaysPerCondition, mean_mbps
 from lidardesign.evaluate.baselines.catalog import part_notes
 from lidardesign.evaluate.baselines.simple import CMA, Baselines, Option, TwinCandidate
+from lidardesign.evaluate.baselines.views import TrainingViews
 from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
 from lidardesign.evaluate.cma.search import TrainingObjective
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out
@@ -109,6 +111,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         request.seed,
         partial(_judge, request),
         conditions=conditions,
+        gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
         without_visibility=partial(_twin, request, conditions) if request.without_visibility else None,
         density=request.density,
         optimised=partial(_optimised, request, conditions) if request.designs else None,
@@ -134,6 +137,11 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     return designs + [
         _entry(baselines, name, option, matched) for (name, _, matched), option in zip(wanted, chosen, strict=True)
     ]
+
+
+def has_gates_per_ray(design: DesignSpec) -> bool:
+    """Whether a design's rays have gates of their own, be it that each is a sensor."""
+    return gates_of(design) == "ray" or layout_of(design).one_sensor_per_ray
 
 
 def _check_tracks(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> None:

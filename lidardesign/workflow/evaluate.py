@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.config import with_task_settings
 from lidardesign.design.compare import outside_notes
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.evaluate.baselines.simple import baseline_of
+from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int, str], None]
 
-ALWAYS = ("uniform", "random", "bounding")
 CMA = "cma"
 LEAST_CMA_SECONDS = 0.1
 MILLIMETRES = 1000.0
@@ -64,7 +63,7 @@ class ScoreOptions:
 
     Arguments:
         rays: Numbers of rays per frame; the task's by default, and those of smaller fixed patterns.
-        baselines: Further baselines beside uniform, random and bounding, by name.
+        baselines: Further baselines beside uniform, random, bounding and silhouette, by name.
         seed: Root of every random stream; the run's by default.
         effects: auto, all, none, audit, or names of effects between commas.
         detector: The name of a detector, or its file.
@@ -305,9 +304,9 @@ class Scores:
     Example:
         >>> scores = run.evaluate([run.fit(sensors=2, rays=36, name="two")], rays=[16])
         >>> [row.design for row in scores.rows]
-        ['two', 'uniform', 'random', 'bounding']
+        ['two', 'uniform', 'random', 'bounding', 'silhouette']
         >>> [pair.b for pair in scores.paired]
-        ['uniform', 'random', 'bounding']
+        ['uniform', 'random', 'bounding', 'silhouette']
         >>> scores.to_csv("scores.csv").name
         'scores.csv'
     """

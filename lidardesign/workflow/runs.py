@@ -166,12 +166,12 @@ class Run(RunFolder):
         notes: Notes = log_note,
         **further: Any,
     ) -> Scores:
-        """Score designs on held-out scenes beside uniform, random and bounding.
+        """Score designs on held-out scenes beside uniform, random, bounding and silhouette.
 
         Arguments:
             designs: Designs and design files; all that are saved in the run by default.
             rays: Numbers of rays per frame; the task's by default.
-            baselines: Further baselines, as "occupancy", "no-visibility", "cma" or "catalog:NAME".
+            baselines: Further baselines, as "lloyd", "occupancy", "no-visibility", "cma" or "catalog:NAME".
             seed: Root of every random stream; the run's by default.
             effects: Physical effects: "auto", "all", "none", "audit" or names between commas.
             detector: What measures: a name, or a YAML file.

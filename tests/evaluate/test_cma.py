@@ -22,7 +22,8 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.sensor import DesignSpec, Sensor, Track, tangent_coordinates
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.candidates import TrainingViews, dense_points, mean_mbps, whole_range
+from lidardesign.evaluate.baselines.candidates import mean_mbps, whole_range
+from lidardesign.evaluate.baselines.views import TrainingViews, dense_points
 from lidardesign.evaluate.cma.candidate import CmaCandidate, CmaSettings
 from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, Way, widest_bins
 from lidardesign.evaluate.cma.parameters import SearchRules, exp_matrix, log_matrix

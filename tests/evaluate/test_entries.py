@@ -150,15 +150,13 @@ def test_baselines_lie_in_what_the_condition_leaves_free(place):
                 assert (rays.origin_m[:, 0] == PLACES[place]).all()
 
 
-def test_bounding_is_one_grid_over_the_whole_aisle():
-    request = aisle_request(SeenTask(PLACES))
-    entry = next(entry for entry in entries_of(request) if entry.name == "bounding")
-    first, *others = entry.positions
-    for other in others:
-        np.testing.assert_array_equal(other.direction, first.direction)
-        np.testing.assert_array_equal(other.gate_m, first.gate_m)
-    uniform = next(entry for entry in entries_of(request) if entry.name == "uniform")
-    assert np.ptp(first.direction[:, 2]) < np.ptp(uniform.positions[0].direction[:, 2])
+def test_bounding_is_cropped_at_every_place_of_an_aisle():
+    request = aisle_request(SeenTask(PLACES), rays=(10,), equal_bandwidth=False)
+    entries = {entry.name: entry for entry in entries_of(request)}
+    for mine, uniform in zip(entries["bounding"].positions, entries["uniform"].positions, strict=True):
+        assert len(np.unique(mine.gate_m, axis=0)) == 1
+        assert np.ptp(mine.direction[:, 2]) < np.ptp(uniform.direction[:, 2])
+    assert len({rays.direction.tobytes() for rays in entries["bounding"].positions}) == len(PLACES)
 
 
 def test_drawn_baselines_differ_from_scene_to_scene_and_from_place_to_place():

@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidardesign.evaluate.baselines.candidates import RAY_AXES, LayoutSite
+from lidardesign.evaluate.baselines.candidates import LayoutSite
 from lidardesign.evaluate.baselines.occupancy import AimedPoints, occupancy, occupancy_grid
+from lidardesign.evaluate.baselines.views import RAY_AXES
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, direction, observed_point
 

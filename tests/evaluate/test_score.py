@@ -24,7 +24,7 @@ from lidardesign.task import Score
 
 def test_rows_are_designs_then_baselines_at_every_number_of_rays():
     evaluation = evaluate(make_request())
-    names = ["aimed", "uniform", "random", "bounding"]
+    names = ["aimed", "uniform", "random", "bounding", "silhouette"]
     assert [(row.design, row.rays) for row in evaluation.rows] == [(name, n) for name in names for n in RAYS]
     for row in evaluation.rows:
         assert row.ci_low <= row.value <= row.ci_high
@@ -88,7 +88,7 @@ def test_scenes_at_the_worst_value_are_counted_in_one_note(designs, task, baseli
 def test_every_design_is_paired_with_every_baseline_and_every_later_design():
     evaluation = evaluate(make_request([design("first"), design("second", azimuth=0.05)]))
     pairs = {(pair.a, pair.b, pair.rays): pair for pair in evaluation.paired}
-    others = ("second", "uniform", "random", "bounding")
+    others = ("second", "uniform", "random", "bounding", "silhouette")
     expected = [("first", other, n) for n in RAYS for other in others]
     expected += [("second", other, n) for n in RAYS for other in others[1:]]
     assert sorted(pairs) == sorted(expected)
@@ -102,7 +102,7 @@ def test_every_design_is_paired_with_every_baseline_and_every_later_design():
 def test_baselines_at_equal_bandwidth_never_exceed_the_design_and_one_more_ray_would():
     evaluation = evaluate(make_request([design(), design("wide", range_m=2.0, spread=0.1)]))
     rows = rows_by_key(evaluation)
-    assert len(evaluation.equal_bandwidth) == 2 * len(RAYS) * 3
+    assert len(evaluation.equal_bandwidth) == 2 * len(RAYS) * 4
     for row in evaluation.equal_bandwidth:
         own = rows[row.matched_to, row.matched_rays]
         assert row.bandwidth_mbps <= own.bandwidth_mbps

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from support.heads import ARM, EVERYTHING, FACE, FLATLAND, face_rays, heads, rays_of
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.evaluate.baselines.candidates import even_placement, rays_at
+from lidardesign.evaluate.baselines.candidates import rays_at
+from lidardesign.evaluate.baselines.even import even_placement
 from lidardesign.evaluate.results import Audit, AuditRow
 from lidardesign.geometry.rays import fire_times
 from lidardesign.scene import Body, Box, rigid

@@ -45,13 +45,8 @@ from lidardesign.design.snap.parts import (
     useful_ray_filter,
 )
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.candidates import (
-    RaysPerCondition,
-    TrainingViews,
-    dense_points,
-    rays_within,
-    whole_range,
-)
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition, rays_within, whole_range
+from lidardesign.evaluate.baselines.views import TrainingViews, dense_points
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import effective_count, systematic_draw
 from lidardesign.run.clock import phase

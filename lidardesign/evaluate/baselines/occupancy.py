@@ -17,7 +17,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.evaluate.baselines.candidates import BaselineLayout, LayoutSite, central, opened_gate, spread_frames
+from lidardesign.evaluate.baselines.candidates import BaselineLayout, LayoutSite, opened_gate
+from lidardesign.evaluate.baselines.even import central
+from lidardesign.evaluate.baselines.views import spread_frames
 from lidardesign.geometry.surface import sample_body
 from lidardesign.numerics import TINY
 from lidardesign.scene import Scene

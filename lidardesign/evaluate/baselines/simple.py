@@ -3,25 +3,19 @@
 Each is built for exactly N rays, alone from the design space and from the training scenes. A baseline is one or
 more candidate layouts; where there are several, the best on training scenes is taken at each number of rays.
 
-- `uniform`: rays even in azimuth and elevation over the whole design space (the paper's grid), with the whole
-  range as their gate. Free origin axes join the layout: two free axes in all give a grid, more a
-  low-discrepancy set.
+- `uniform`: rays even on the sphere over the whole design space, with the whole range as their gate. Free origin axes
+  join the layout: two free axes in all give a grid, more a low-discrepancy set.
 - `random`: rays uniform in the measure of the design space, with the whole range as their gate, drawn anew for
   every scene.
-- `bounding`: one even layout over where the training returns are, see below.
+- `bounding`: one even layout over where the training returns are, see `lidardesign.evaluate.baselines.bounding`.
+- `silhouette` and `lloyd`: rays and gates by what training scenes return, see
+  `lidardesign.evaluate.baselines.silhouette`.
 - `occupancy`: see `lidardesign.evaluate.baselines.occupancy`.
 - `no-visibility`: the design fitted anew without its occlusion term, see below.
 - `catalog:NAME`: see `lidardesign.evaluate.baselines.catalog`.
 - `cma`: see `lidardesign.evaluate.cma.candidate`.
 
 Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
-
-The baseline `bounding`: what an engineer would build in five minutes from where the training returns are.
-
-One even layout, cropped per axis to the central 99 % of the training returns in angle and range. With free
-origins the better of two, on training scenes: parallel rays (vertical where the space allows it) from an even grid
-over the returns' box, and an even or low-discrepancy set in the central 99 % box of origins and angles. Where the
-density has conditions, one box is cropped over all of their values, and stands at each value as it is.
 
 The baseline `no-visibility`: the same design fitted to the density without its occlusion term.
 
@@ -32,7 +26,6 @@ design was weighted or refined, what that is worth as well: the twin is neither.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -43,20 +36,13 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.fit import fit_like
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
+from lidardesign.evaluate.baselines.bounding import bounding
 from lidardesign.evaluate.baselines.candidates import (
-    DENSE_RAYS,
-    RAY_AXES,
     BaselineLayout,
     Candidate,
     LayoutSite,
-    Observed,
     RaysPerCondition,
-    TrainingViews,
-    central,
-    dense_points,
-    even_placement,
-    mean_mbps,
-    opened_gate,
+    most_within,
     whole_range,
 )
 from lidardesign.evaluate.baselines.catalog import (
@@ -68,70 +54,16 @@ from lidardesign.evaluate.baselines.catalog import (
     scene_points,
     split_argument,
 )
+from lidardesign.evaluate.baselines.even import even_placement
 from lidardesign.evaluate.baselines.occupancy import occupancy
+from lidardesign.evaluate.baselines.silhouette import lloyd, silhouette
+from lidardesign.evaluate.baselines.views import RAY_AXES, TrainingViews
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
+from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
-
-# an origin axis within 45 degrees of parallel rays only moves them along themselves
-ALIGNED = math.cos(math.pi / 4)
-
-
-def bounding(views: TrainingViews) -> list[BaselineLayout]:
-    """The layouts to choose from; none where dense rays return nothing."""
-    space = views.space
-    observed = views.hits(dense_points(space))
-    if not len(observed.points):
-        return []
-    low, high = central(observed.points)
-    cropped = _boxed("cropped", space, low, high, opened_gate(low[RANGE], high[RANGE]))
-    if not [axis for axis in space.free if axis < AZIMUTH and axis not in space.conditioned]:
-        return [cropped]
-    return [*_parallel(views, observed), cropped]
-
-
-def _boxed(name: str, space: DesignSpace, low: np.ndarray, high: np.ndarray, gate_m: np.ndarray) -> BaselineLayout:
-    """Even rays in a box whose conditions take the values of the site."""
-    conditions = [axis for axis in space.conditioned if axis < RAY_AXES]
-
-    def place(count: int, site: LayoutSite) -> np.ndarray:
-        lowest, highest = (np.array(end[:RAY_AXES], dtype=np.float64) for end in (low, high))
-        lowest[conditions] = np.array(site.space.low)[conditions]
-        highest[conditions] = np.array(site.space.high)[conditions]
-        return even_placement(lowest, highest, count)
-
-    return BaselineLayout(name, place, gate_m)
-
-
-def _parallel(views: TrainingViews, observed: Observed) -> list[BaselineLayout]:
-    """Parallel rays from an even grid over the returns' box, within the admissible origins.
-
-    An origin axis that runs along the rays stays at the bound behind the scene. No layout where such rays
-    return nothing.
-    """
-    space = views.space
-    azimuth, elevation = parallel_angles(space, observed)
-    looking = direction(azimuth, elevation)
-    low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in central(observed.hits_m))
-    for axis in np.flatnonzero(np.abs(looking) > ALIGNED):
-        low[axis] = high[axis] = space.low[axis] if looking[axis] > 0 else space.high[axis]
-    low, high = np.append(low, [azimuth, elevation]), np.append(high, [azimuth, elevation])
-    seen = views.hits(even_placement(low, high, DENSE_RAYS))
-    if not len(seen.points):
-        return []
-    nearest, furthest = central(seen.points[:, RANGE])
-    return [_boxed("parallel", space, low, high, opened_gate(float(nearest), float(furthest)))]
-
-
-def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, float]:
-    """Straight down where the space allows it, else straight up, else the median direction of the returns."""
-    middle = np.median(observed.points[:, AZIMUTH])
-    vertical = [end for end in (-math.pi / 2, math.pi / 2) if space.low[ELEVATION] <= end <= space.high[ELEVATION]]
-    return float(middle), vertical[0] if vertical else float(np.median(observed.points[:, ELEVATION]))
-
 
 Judge = Callable[[Sequence[RaysPerCondition]], Sequence[float]]
 NO_VISIBILITY = "no-visibility"
@@ -154,6 +86,7 @@ class Baselines:
         seed: Root of the baselines that are drawn.
         judge: What lists of rays score on training scenes, lower is better; None counts missing returns.
         conditions: The condition values that rays are laid out at.
+        gates_per_ray: Whether the rays of `bounding` may have gates of their own.
         without_visibility: Makes the layout that stands for `no-visibility`; called when that is asked for.
         density: What a run has learned, or None where it has no samples; called when a baseline looks there.
         optimised: Makes the layout that stands for `cma`; called when that is asked for.
@@ -167,6 +100,7 @@ class Baselines:
         judge: Judge | None = None,
         *,
         conditions: Sequence[Mapping[str, float]] = ({},),
+        gates_per_ray: bool = False,
         without_visibility: Callable[[], Candidate] | None = None,
         density: Callable[[], Density | None] | None = None,
         optimised: Callable[[TrainingViews], Candidate] | None = None,
@@ -174,6 +108,7 @@ class Baselines:
         self.space, self.train, self.seed = space, train, seed
         self.spaces = [space.at(condition) for condition in conditions]
         self.views = TrainingViews(space, train)
+        self.gates_per_ray = gates_per_ray
         self.without_visibility, self.density, self.optimised = without_visibility, density, optimised
         self._judge = judge or self.views.missing_returns
         self._candidates: dict[str, list[Candidate]] = {}
@@ -227,7 +162,10 @@ def _keyed(name: str, options: Sequence[Option]) -> list[tuple[tuple[str, str, i
 
 
 def _uniform(source: Baselines, argument: str) -> list[Candidate]:
-    return [_boxed("even", source.space, source.space.low, source.space.high, whole_range(source.space))]
+    def place(count: int, site: LayoutSite) -> np.ndarray:
+        return even_placement(site.space.low[:RAY_AXES], site.space.high[:RAY_AXES], count)
+
+    return [BaselineLayout("even", place, whole_range(source.space))]
 
 
 def _random(source: Baselines, argument: str) -> list[Candidate]:
@@ -240,7 +178,15 @@ def _random(source: Baselines, argument: str) -> list[Candidate]:
 
 
 def _bounding(source: Baselines, argument: str) -> list[Candidate]:
-    return list(bounding(source.views)) or _uniform(source, argument)
+    return list(bounding(source.views, gates_per_ray=source.gates_per_ray)) or _uniform(source, argument)
+
+
+def _silhouette(source: Baselines, argument: str) -> list[Candidate]:
+    return list(silhouette(source.views)) or _uniform(source, argument)
+
+
+def _lloyd(source: Baselines, argument: str) -> list[Candidate]:
+    return list(lloyd(source.views)) or _uniform(source, argument)
 
 
 def _occupancy(source: Baselines, argument: str) -> list[Candidate]:
@@ -295,11 +241,17 @@ BASELINES: dict[str, Family] = {
     "uniform": Family(_uniform),
     "random": Family(_random),
     "bounding": Family(_bounding),
+    "silhouette": Family(_silhouette),
+    "lloyd": Family(_lloyd),
     "occupancy": Family(_occupancy),
     NO_VISIBILITY: Family(_no_visibility),
     FAMILY: Family(_catalog, "NAME", check=split_argument),
     CMA: Family(_cma),
 }
+
+
+# What stands beside every design, asked for or not.
+ALWAYS = ("uniform", "random", "bounding", "silhouette")
 
 
 def baseline_of(name: str, *, where: str = "baselines") -> tuple[Family, str]:
@@ -327,8 +279,6 @@ def is_baseline(name: str) -> bool:
     return name.partition(":")[0] in BASELINES
 
 
-# Bandwidth grows almost in proportion to the number of rays: a few steps find the largest number that fits.
-MOST_STEPS = 8
 CLOSE_ENOUGH = 0.98  # of the bandwidth: every further step may be another fit
 
 
@@ -386,13 +336,10 @@ class TwinCandidate:
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
     ) -> RaysPerCondition:
         """The most rays that a few steps in proportion to the bandwidth find; never more than fit."""
-        low, high = 0, math.inf
-        count = self._design.rays or max(len(self._design.sensors), 1)
-        for _ in range(MOST_STEPS):
-            cost = mean_mbps(self.positions(spaces, count), bandwidth)
-            low, high = (count, high) if cost <= limit_mbps else (low, count)
-            if high - low <= 1 or CLOSE_ENOUGH * limit_mbps <= cost <= limit_mbps:
-                break
-            guess = math.floor(count * limit_mbps / cost) if cost > 0 else 2 * count
-            count = int(min(max(guess, low + 1), high - 1))
-        return self.positions(spaces, low)
+        return most_within(
+            lambda count: self.positions(spaces, count),
+            limit_mbps,
+            bandwidth,
+            self._design.rays or max(len(self._design.sensors), 1),
+            close_enough=CLOSE_ENOUGH,
+        )

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from lidardesign.design.galvo import degree_frame, middle_boresight_deg, scan_angles_deg, scan_directions
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.evaluate.baselines.candidates import even_unit
+from lidardesign.evaluate.baselines.even import even_unit
 from lidardesign.evaluate.captures.capture import Capture
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import EPSILON

@@ -21,14 +21,9 @@ from lidardesign.design.constraints.document import Constraints, Gate
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec
-from lidardesign.evaluate.baselines.candidates import (
-    RaysPerCondition,
-    TrainingViews,
-    dense_points,
-    opened_gate,
-    whole_range,
-)
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition, opened_gate, whole_range
 from lidardesign.evaluate.baselines.simple import CMA
+from lidardesign.evaluate.baselines.views import TrainingViews, dense_points
 from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, Way
 from lidardesign.evaluate.cma.parameters import SearchRules
 from lidardesign.evaluate.cma.search import Progress, Search, SearchBudget, SearchResult, TrainingObjective

@@ -20,19 +20,10 @@ from scipy.spatial import cKDTree
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.sensor import Coupling, Sensor, boresight_frame
-from lidardesign.evaluate.baselines.candidates import (
-    RAY_AXES,
-    LayoutSite,
-    Observed,
-    TrainingViews,
-    central,
-    dense_points,
-    even_placement,
-    opened_gate,
-    unrolled,
-    whole_range,
-)
-from lidardesign.evaluate.baselines.simple import bounding, parallel_angles
+from lidardesign.evaluate.baselines.bounding import bounding, parallel_angles
+from lidardesign.evaluate.baselines.candidates import LayoutSite, opened_gate, whole_range
+from lidardesign.evaluate.baselines.even import central, even_placement
+from lidardesign.evaluate.baselines.views import RAY_AXES, Observed, TrainingViews, dense_points, unrolled
 from lidardesign.evaluate.cma.model import with_gate
 from lidardesign.evaluate.cma.parameters import NARROWEST_RAD, SearchRules, admitted_origins
 from lidardesign.numerics import TINY, sphere_exp, sphere_log
@@ -307,7 +298,8 @@ def scan_layouts(
     space: DesignSpace, views: TrainingViews, observed: Observed, count: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Points (N, 5) and one gate (2,) each: those of `bounding`, at equal shares of the returns, and of `uniform`."""
-    found = [(layout.place(count, LayoutSite(space)), layout.gate_m) for layout in bounding(views)]
+    laid_out = [layout.lay_out(count, LayoutSite(space)) for layout in bounding(views)]
+    found = [(points, gates[0]) for points, gates in laid_out]
     angular = [axis for axis in (AZIMUTH, ELEVATION) if axis in space.free]
     if len(angular) == 1 and len(observed.points) and found:
         points = found[0][0].copy()
