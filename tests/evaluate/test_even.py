@@ -139,7 +139,7 @@ def test_bounding_from_straight_above_covers_as_well_as_a_plain_grid_in_the_tang
         hits = 0.8 * looking[:, :2] / -looking[:, 2:]
         return cKDTree(hits).query(top)[0].mean()
 
-    half = even_placement(np.array([-0.35, -0.25, 0, 0, 0]), np.array([0.35, 0.25, 0, 0, 0]), count)[:, :2] / 0.8
+    half = even_placement(np.array([-0.32, -0.22, 0, 0, 0]), np.array([0.32, 0.22, 0, 0, 0]), count)[:, :2] / 0.8
     plain = np.column_stack([half, -np.ones(count)])
     assert coverage(rays) < 1.05 * coverage(plain)
     assert (gates[:, 0] > 0.75).all()
