@@ -55,7 +55,8 @@ WEIGHT_SUM_TOLERANCE = SLACK
 # How much below zero rounding may push an eigenvalue of a covariance, relative to the largest.
 COVARIANCE_ROUNDING = SLACK
 
-OPTIONAL = ("name", "layout", "level", "rays", "at", "gates", "ray_table", "track", "constraints", "provenance")
+OPTIONAL = ("name", "layout", "level", "rays", "at", "gates", "ray_table", "further_tables",
+    "track", "constraints", "provenance")
 SENSOR_OPTIONAL = (
     "name", "part", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays",
 )  # fmt: skip
@@ -123,9 +124,9 @@ def design_document(design: DesignSpec) -> dict[str, Any]:
         "sensors": [_sensor_document(replace(sensor, level=design.level)) for sensor in design.sensors],
     }
     if design.ray_table is not None:
-        table = design.ray_table
-        columns = (*table.origin_m.T, table.azimuth_rad, table.elevation_rad, *table.gate_m.T, table.sensor)
-        document["ray_table"] = {key: column.tolist() for key, column in zip(TABLE_KEYS, columns, strict=True)}
+        document["ray_table"] = _table_document(design.ray_table)
+    if design.further_tables:
+        document["further_tables"] = [_table_document(table) for table in design.further_tables]
     if design.track is not None:
         document["track"] = track_document(design.track)
     if design.at:
@@ -135,6 +136,11 @@ def design_document(design: DesignSpec) -> dict[str, Any]:
     document["constraints"] = design.constraints
     document["provenance"] = design.provenance
     return document
+
+
+def _table_document(table: Rays) -> dict[str, Any]:
+    columns = (*table.origin_m.T, table.azimuth_rad, table.elevation_rad, *table.gate_m.T, table.sensor)
+    return {key: column.tolist() for key, column in zip(TABLE_KEYS, columns, strict=True)}
 
 
 def _sensor_document(sensor: Sensor) -> dict[str, Any]:
@@ -164,9 +170,10 @@ def design_text(design: DesignSpec, path: Path) -> str:
         NumericalError: The design holds a number that is not finite.
         ConfigError: More explicit rays than a file can be read back with.
     """
-    if design.ray_table is not None and len(design.ray_table.sensor) > MOST_TABLE_RAYS:
+    explicit = sum(map(len, design.further_tables)) + (0 if design.ray_table is None else len(design.ray_table))
+    if explicit > MOST_TABLE_RAYS:
         raise ConfigError(
-            f"{len(design.ray_table.sensor)} explicit rays",
+            f"{explicit} explicit rays",
             where=str(path),
             allowed=f"at most {MOST_TABLE_RAYS}",
             hint="the layout grid needs no table",
@@ -263,6 +270,9 @@ def design_from_document(
         track=track,
         at={name: item.number() for name, item in keys["at"].mapping((), DIMENSIONS).items()} if "at" in keys else {},
         gates=keys["gates"].choice(get_args(Gates)) if "gates" in keys else None,  # type: ignore[arg-type]
+        further_tables=tuple(_ray_table(item, len(sensors)) for item in keys["further_tables"].items())
+        if "further_tables" in keys
+        else (),
     )
 
 
@@ -441,8 +451,11 @@ def _check_rays(
     """The places that may count rays must agree, and one of them says where rays go."""
     if table is not None and track is not None:
         raise keys["track"].error("is given beside ray_table", hint="remove either of the two")
-    if table is None and keys.get("layout") is not None and keys["layout"].value == "fixed":
-        raise keys["layout"].error("is fixed, but there is no ray_table", hint="the layout grid needs none")
+    layout = keys["layout"].value if "layout" in keys else None
+    if table is None and layout in ("fixed", "selected"):
+        raise keys["layout"].error(f"is {layout}, but there is no ray_table", hint="the layout grid needs none")
+    if "further_tables" in keys and layout != "selected":
+        raise keys["further_tables"].error(f"stand beside the layout {layout or 'grid'}", allowed="the layout selected")
     own = [sensor.rays for sensor in sensors]
     counts = {
         "rays": rays,

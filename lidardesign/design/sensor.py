@@ -27,9 +27,11 @@ DEFAULT_LEVEL = 0.95
 LEVELS = (0.01, 0.999999)
 # Returns of so many fill some 100 MB per scene; no scanner fires more in a frame.
 MOST_RAYS = 1_000_000
-LayoutName = Literal["grid", "density", "scan", "distributed", "fixed"]
+LayoutName = Literal["grid", "density", "scan", "distributed", "selected", "fixed"]
 # Those in which sensors are fitted: the rays of real parts are what they are.
-FITTED_LAYOUTS: tuple[LayoutName, ...] = ("grid", "density", "scan", "distributed")
+FITTED_LAYOUTS: tuple[LayoutName, ...] = ("grid", "density", "scan", "distributed", "selected")
+# Under this key of its provenance a design with chosen rays says how far from the best each choice may be.
+CERTIFICATES = "certificates"
 # Whether every ray has its sensor's gate or its own.
 Gates = Literal["sensor", "ray"]
 
@@ -232,9 +234,11 @@ class DesignSpec:
     Arguments:
         name: The file's stem, the row's name in tables.
         sensors: At least one.
-        layout: `grid`, `density`, `scan`, `distributed`, or `fixed`: the rays of its table, as real parts fire them.
+        layout: `grid`, `density`, `scan`, `distributed`, `selected`: rays chosen on training scenes, or `fixed`: the
+            rays of its table, as real parts fire them.
         rays: Rays per frame that it was made for; None leaves the budget to `evaluate`.
         ray_table: The explicit rays of every layout but `grid`.
+        further_tables: Of the layout `selected`, the rays that were chosen at other numbers of rays.
         constraints: The constraint document that it satisfies (plain values).
         provenance: Command, seed, run and versions, for people.
         level: The share of each marginal that intervals hold.
@@ -255,6 +259,7 @@ class DesignSpec:
     track: Track | None = None
     at: Mapping[str, float] = field(default_factory=dict)
     gates: Gates | None = None
+    further_tables: tuple[Rays, ...] = ()
 
     @property
     def weights(self) -> np.ndarray:

@@ -126,14 +126,15 @@ def pattern_size(design: DesignSpec) -> int | None:
 
 def can_fire(design: DesignSpec, count: int) -> bool:
     """Whether a design has so many rays."""
-    size = pattern_size(design)
-    return size is None or count <= size
+    size, counts = pattern_size(design), layout_of(design).counts(design)
+    return (size is None or count <= size) and (counts is None or count in counts)
 
 
 def usual_numbers(designs: Iterable[DesignSpec], budgets: Iterable[int]) -> list[int]:
     """The numbers to evaluate at where none is asked for: the task's, and those that smaller fixed patterns have."""
-    usual = set(budgets)
-    return sorted(usual | {size for size in map(pattern_size, designs) if size is not None and size < max(usual)})
+    designs, usual = list(designs), set(budgets)
+    smaller = {size for size in map(pattern_size, designs) if size is not None and size < max(usual)}
+    return sorted(usual.union(smaller, *(layout_of(design).counts(design) or () for design in designs)))
 
 
 def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[int]:
@@ -145,12 +146,17 @@ def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[
     asked = list(dict.fromkeys(counts))
     kept = [count for count in asked if not designs or any(can_fire(design, count) for design in designs)]
     if asked and not kept:
-        most = max(size for size in map(pattern_size, designs) if size is not None)
+        chosen = sorted({count for design in designs for count in layout_of(design).counts(design) or ()})
+        sizes = [size for size in map(pattern_size, designs) if size is not None]
+        why = "all are fixed patterns"
+        hint = "a design of more parts: lidardesign catalog show NAME --rays N --out FILE"
+        if chosen:
+            why, hint = "rays were chosen at other numbers", "lidardesign fit RUN --layout selected --rays N"
         raise ConfigError(
-            f"no design fires {_listed(asked, 'or')} rays: all are fixed patterns",
+            f"no design fires {_listed(asked, 'or')} rays: {why}",
             where="--rays",
-            allowed=f"at most {most}",
-            hint="a design of more parts: lidardesign catalog show NAME --rays N --out FILE",
+            allowed=_listed(chosen, "or") if chosen else f"at most {max(sizes)}",
+            hint=hint,
         )
     return kept
 
@@ -162,10 +168,10 @@ def left_out(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[str]:
     for design in designs:
         beyond = [count for count in asked if not can_fire(design, count)]
         if beyond:
-            lines.append(
-                f"{design.name} fires {pattern_size(design)} rays, its fixed pattern: "
-                f"it is left out at {_listed(beyond, 'and')} rays"
-            )
+            counts = layout_of(design).counts(design)
+            fires = f"{pattern_size(design)} rays, its fixed pattern"
+            fires = fires if counts is None else f"{_listed(counts, 'or')} rays, at which they were chosen"
+            lines.append(f"{design.name} fires {fires}: it is left out at {_listed(beyond, 'and')} rays")
     empty = [count for count in asked if designs and not any(can_fire(design, count) for design in designs)]
     if empty:
         lines.append(f"no design fires {_listed(empty, 'or')} rays: nothing is evaluated there")

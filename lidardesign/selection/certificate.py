@@ -22,7 +22,7 @@ from lidardesign.selection import kernels
 from lidardesign.selection.choice import Choice, RayCounts
 from lidardesign.selection.coverage import Coverage
 
-ROUNDS = 300  # of subgradients, at most
+ROUNDS = 200  # of subgradients, at most
 PRICE_BISECTIONS = 12
 PATIENCE = 20  # rounds without a lower bound after which steps are halved
 

@@ -1,8 +1,9 @@
-"""Rays and gates chosen out of many: lazy greedy, then swaps, within a count per sensor and a bandwidth.
+"""Rays and gates chosen out of many: greedily, then by swaps, within a count per sensor and a bandwidth.
 
-Greedy on F - price * bits - harm picks the ray and gate that add most (Nemhauser, Wolsey and Fisher 1978); what a ray
-would add only shrinks as others are taken, so few have to be asked again (Minoux 1978). Then one ray at a time leaves
-and the best that is left comes in, until no swap gains. No constant is promised: `certificate` bounds what is lost.
+Greedy on F - price * bits - harm takes the ray and gate that add most (Nemhauser, Wolsey and Fisher 1978). What every
+gate would add is kept true as rays come and go: few items change what is known of them, and few rays tell of an item.
+Then one ray at a time leaves and the best that is left comes in, until no swap gains. No constant is promised:
+`certificate` bounds what is lost.
 """
 
 from __future__ import annotations
@@ -71,11 +72,9 @@ class _Search:
         self.coverage, self.sensor, self.left = coverage, counts.sensor, counts.most.copy()
         self.cost = coverage.harm
         self.limit_mbps, self.spent_mbps = np.inf, 0.0
-        rays, gates = coverage.shape
-        self.gate = np.full(rays, -1)
+        self.gate = np.full(coverage.shape[0], -1)
         self.known = np.zeros(len(coverage.weight))
-        self.gains = np.zeros((rays, gates))
-        coverage.gains(np.arange(rays), self.known, self.gains)
+        self.gains = coverage.gains(self.known)
 
     def improve(
         self, price: float, limit_mbps: float, *, full: bool, passes: int, progress: Callable[[float], None] | None
@@ -86,6 +85,8 @@ class _Search:
         self.limit_mbps = limit_mbps
         self.fill(full)
         for _ in range(passes):
+            # sums of many changes drift by rounding
+            self.gains = coverage.gains(self.known)
             worth = float(coverage.weight @ coverage.counted(self.known))
             changed = self.swap(full, SMALLEST_GAIN * worth)
             self.fill(full)
@@ -98,53 +99,41 @@ class _Search:
         """What was chosen so far."""
         return Choice(self.gate.copy(), self.coverage.value_of(self.gate), *self.coverage.charge(self.gate), price)
 
-    def net(self, rays: np.ndarray | slice) -> np.ndarray:
-        """What each gate of rays would add at the least price that is known, -inf where it may not be taken."""
-        open_rays = (self.gate[rays] < 0) & (self.left[self.sensor[rays]] > 0)
-        affordable = self.spent_mbps + self.coverage.bits[rays] <= self.limit_mbps
-        return np.where(open_rays[:, None] & affordable, self.gains[rays] - self.cost[rays], -np.inf)
-
     def best(self) -> tuple[int, int, float]:
         """The ray and gate that add most now, and what they add; -inf where none may be taken."""
-        bound = self.net(slice(None)).max(axis=1)
-        while True:
-            ray = int(np.argmax(bound))
-            if bound[ray] == -np.inf:
-                return ray, -1, -np.inf
-            self.coverage.gains(np.array([ray]), self.known, self.gains)
-            nets = self.net(np.array([ray]))[0]
-            gate = int(np.argmax(nets))
-            bound[ray] = -np.inf
-            if nets[gate] >= bound.max():
-                return ray, gate, float(nets[gate])
-            bound[ray] = nets[gate]
+        may = ((self.gate < 0) & (self.left[self.sensor] > 0))[:, None]
+        may = may & (self.spent_mbps + self.coverage.bits <= self.limit_mbps)
+        net = np.where(may, self.gains - self.cost, -np.inf)
+        ray, gate = np.unravel_index(int(np.argmax(net)), net.shape)
+        return int(ray), int(gate), float(net[ray, gate])
 
     def take(self, ray: int, gate: int) -> None:
         """Fires a ray through a gate."""
-        self.coverage.learn_of(ray, gate, self.known)
+        self._change(ray, gate, adding=True)
         self.gate[ray] = gate
         self.left[self.sensor[ray]] -= 1
         self.spent_mbps += self.coverage.bits[ray, gate]
 
     def drop(self, ray: int) -> None:
-        """Takes a ray out; what rays beside it would add is asked anew."""
-        coverage, gate = self.coverage, int(self.gate[ray])
+        """Takes a ray out."""
+        gate = int(self.gate[ray])
         self.gate[ray] = -1
-        touched = np.zeros(len(self.gate), dtype=np.bool_)
-        touched[ray] = True
-        kernels.forget(
-            ray, coverage.start, coverage.item, coverage.worth, coverage.gates, *coverage.by_item,
-            self.gate, len(coverage.table) == 0, self.known, touched,
-        )  # fmt: skip
-        coverage.gains(np.flatnonzero(touched), self.known, self.gains)
+        self._change(ray, gate, adding=False)
         self.left[self.sensor[ray]] += 1
-        self.spent_mbps -= coverage.bits[ray, gate]
+        self.spent_mbps -= self.coverage.bits[ray, gate]
+
+    def _change(self, ray: int, gate: int, *, adding: bool) -> None:
+        coverage = self.coverage
+        kernels.change_choice(
+            ray, gate, adding, coverage.start, coverage.item, coverage.worth, coverage.gates, coverage.weight,
+            coverage.table, *coverage.by_item, self.gate, self.known, self.gains,
+        )  # fmt: skip
 
     def fill(self, full: bool) -> None:
         """Takes rays greedily until counts or bandwidth are used up or, unless `full`, none gains."""
         while True:
             ray, gate, net = self.best()
-            if gate < 0 or (net <= 0 and not full):
+            if net == -np.inf or (net <= 0 and not full):
                 return
             self.take(ray, gate)
 

@@ -66,11 +66,16 @@ class Coverage:
         return self.bits.shape
 
     @cached_property
-    def by_item(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where each item's entries begin (U + 1,), the entries in that order (E,), and the ray of each entry (E,)."""
+    def ray(self) -> np.ndarray:
+        """The ray of each entry, (E,)."""
+        return np.repeat(np.arange(len(self.start) - 1, dtype=np.int32), np.diff(self.start))
+
+    @cached_property
+    def by_item(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The table in the order of items: where each begins (U + 1,), and rays, worths and gates (E,)."""
         order = np.argsort(self.item, kind="stable")
         begin = np.searchsorted(self.item[order], np.arange(len(self.weight) + 1))
-        return begin, order, np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
+        return begin, self.ray[order], self.worth[order], self.gates[order]
 
     def known(self, gate: np.ndarray) -> np.ndarray:
         """What a choice of one gate per ray, -1 for none, (N,), knows about each item, (U,)."""
@@ -83,13 +88,19 @@ class Coverage:
         """Adds to `known` (U,) what a ray tells through a gate."""
         kernels.learn_of(ray, gate, self.start, self.item, self.worth, self.gates, len(self.table) == 0, known)
 
-    def gains(self, rays: np.ndarray, known: np.ndarray, gains: np.ndarray) -> None:
-        """Fills the rows `rays` of `gains` (N, G) with what each gate of these rays would add to F."""
-        kernels.gate_gains(rays, self.start, self.item, self.worth, self.gates, self.weight, self.table, known, gains)
+    def gains(self, known: np.ndarray) -> np.ndarray:
+        """What each gate of every ray would add to F, (N, G)."""
+        gains = np.empty(self.shape)
+        kernels.gate_gains(self.start, self.item, self.worth, self.gates, self.weight, self.table, known, gains)
+        return gains
 
     def value_of(self, gate: np.ndarray) -> float:
         """F of a choice of one gate per ray, -1 for none, (N,)."""
         return float(self.weight @ self.counted(self.known(gate)))
+
+    def loss_of(self, gate: np.ndarray) -> float:
+        """What F of a choice lacks of complete knowledge."""
+        return self.complete - self.value_of(gate)
 
     def counted(self, known: np.ndarray) -> np.ndarray:
         """What known worths count, any shape."""
@@ -124,9 +135,7 @@ def gather(
         require_valid(information, rays, len(returns))
         range_m = np.stack([frame.range_m for frame in returns])
         opened = (range_m[..., None] >= gates_m[..., 0]) & (range_m[..., None] < gates_m[..., 1])
-        passes = np.packbits(opened, axis=2, bitorder="little")[..., 0][
-            information.source, information.ray
-        ]
+        passes = np.packbits(opened, axis=2, bitorder="little")[..., 0][information.source, information.ray]
         if information.seen_in is not None:
             passes = _largest_alone(information, passes, gates)
         tells = np.flatnonzero((passes > 0) & (information.worth > 0))

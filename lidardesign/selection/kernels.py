@@ -25,8 +25,14 @@ def counted(known: float, table: np.ndarray) -> float:
 
 
 @njit(cache=True, nogil=True)
+def gain(known: float, worth: float, table: np.ndarray) -> float:
+    """What a further worth adds to what is known."""
+    after = max(known, worth) if len(table) == 0 else known + worth
+    return counted(after, table) - counted(known, table)
+
+
+@njit(cache=True, nogil=True)
 def gate_gains(
-    rays: np.ndarray,
     start: np.ndarray,
     item: np.ndarray,
     worth: np.ndarray,
@@ -36,17 +42,15 @@ def gate_gains(
     known: np.ndarray,
     gains: np.ndarray,
 ) -> None:
-    """What each gate of the given rays would add to what is known: fills those rows of `gains`, shape (N, G)."""
-    for ray in rays:
-        gains[ray] = 0.0
+    """What each gate of every ray would add to what is known: fills `gains`, shape (N, G)."""
+    gains[:] = 0.0
+    for ray in range(len(start) - 1):
         for entry in range(start[ray], start[ray + 1]):
-            now = known[item[entry]]
-            after = max(now, worth[entry]) if len(table) == 0 else now + worth[entry]
-            if after > now:
-                gain = weight[item[entry]] * (counted(after, table) - counted(now, table))
+            more = weight[item[entry]] * gain(known[item[entry]], worth[entry], table)
+            if more > 0.0:
                 for gate in range(gains.shape[1]):
                     if gates[entry] >> gate & 1:
-                        gains[ray, gate] += gain
+                        gains[ray, gate] += more
 
 
 @njit(cache=True, nogil=True)
@@ -68,31 +72,56 @@ def learn_of(
 
 
 @njit(cache=True, nogil=True)
-def forget(
+def change_choice(
     ray: int,
+    gate: int,
+    adding: bool,
     start: np.ndarray,
     item: np.ndarray,
     worth: np.ndarray,
     gates: np.ndarray,
+    weight: np.ndarray,
+    table: np.ndarray,
     item_start: np.ndarray,
-    entry_of: np.ndarray,
-    ray_of: np.ndarray,
+    item_ray: np.ndarray,
+    item_worth: np.ndarray,
+    item_gates: np.ndarray,
     chosen: np.ndarray,
-    largest: bool,
     known: np.ndarray,
-    touched: np.ndarray,
+    gains: np.ndarray,
 ) -> None:
-    """Recomputes `known` at a ray's items from the gates that are `chosen` (N,), -1 for none; marks the rays there."""
+    """Adds a ray through a gate, or takes it out; keeps what is known (U,) and what all gates would add (N, G) true.
+
+    `chosen` holds the gates of the other rays, -1 for none, (N,). Only items of which something else is known
+    afterwards are followed to the rays that tell of them.
+    """
     for own in range(start[ray], start[ray + 1]):
+        if not gates[own] >> gate & 1:
+            continue
         place = item[own]
-        now = 0.0
-        for index in range(item_start[place], item_start[place + 1]):
-            entry = entry_of[index]
-            other = ray_of[entry]
-            touched[other] = True
-            if chosen[other] >= 0 and gates[entry] >> chosen[other] & 1:
-                now = max(now, worth[entry]) if largest else now + worth[entry]
-        known[place] = now
+        old = known[place]
+        first, last = item_start[place], item_start[place + 1]
+        if len(table) > 0:
+            new = old + worth[own] if adding else max(old - worth[own], 0.0)
+        elif adding:
+            new = max(old, worth[own])
+        elif worth[own] < old:
+            continue
+        else:
+            new = 0.0
+            for index in range(first, last):
+                other = chosen[item_ray[index]]
+                if other >= 0 and item_gates[index] >> other & 1:
+                    new = max(new, item_worth[index])
+        if new == old:
+            continue
+        known[place] = new
+        for index in range(first, last):
+            more = gain(new, item_worth[index], table) - gain(old, item_worth[index], table)
+            if more != 0.0:
+                for other in range(gains.shape[1]):
+                    if item_gates[index] >> other & 1:
+                        gains[item_ray[index], other] += weight[place] * more
 
 
 @njit(cache=True, nogil=True)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.design.files import design_text, save_design
 from lidardesign.design.fit import FitResult
-from lidardesign.design.sensor import DesignSpec
+from lidardesign.design.layouts.rays import certificates_of
+from lidardesign.design.sensor import CERTIFICATES, DesignSpec
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import WAIT_S, phase
 from lidardesign.run.files import run_lock
@@ -174,6 +175,8 @@ class Design(DesignSource):
         """What `lidardesign fit --json` prints of it: sensors, and what the fit found."""
         place = self.name if self.path is None else str(self.path)
         further = {} if self.refinement is None else {"refinement": dict(self.refinement)}
+        certificates = certificates_of(self.specification)
+        further.update({CERTIFICATES: certificates} if certificates else {})
         if self.result is None:
             return {"design": place, "sensors": [sensor.as_dict() for sensor in self.specification.sensors]}
         return {**self.result.as_dict(), "design": place, **further}

@@ -149,6 +149,14 @@ class FitRequest:
                 notes(note)
         rules = constraints or Constraints()
         layout = layout or _usual_layout(rules, base, run)
+        beside = {"--refine": options.refine is not None, "--weight": options.weights, "snap": wants_parts(rules.rules)}
+        if LAYOUTS[layout].chosen_on_scenes and any(beside.values()):
+            raise ConfigError(
+                f"layout {layout} beside {next(name for name, given in beside.items() if given)}",
+                where="--layout",
+                allowed=", ".join(name for name in FITTED_LAYOUTS if not LAYOUTS[name].chosen_on_scenes),
+                hint="chosen rays follow from what scenes show alone",
+            )
         if options.sensors is not None and LAYOUTS[layout].one_sensor_per_ray:
             raise ConfigError(
                 f"{options.sensors} sensors of a scan, whose every ray is a sensor of its own",
@@ -262,7 +270,8 @@ def _usual_layout(constraints: Constraints, base: DesignSpec | None, run: RunFol
     if wants_parts(constraints.rules):
         return "grid"
     if base is not None:
-        return layout_of(base).fitted_as
+        layout = layout_of(base)
+        return layout.name if layout.chosen_on_scenes else layout.fitted_as
     return check_choice(run.task.defaults.layout, f"defaults.layout of task {run.task.name}", FITTED_LAYOUTS)
 
 

@@ -20,6 +20,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.fit import FitResult
 from lidardesign.design.fit import fit as fit_samples
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
+from lidardesign.design.layouts.rays import LAYOUTS
 from lidardesign.design.mixture.bounds import sensor_groups
 from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.sensor import DesignSpec
@@ -143,7 +144,11 @@ def fit_design(
     run, weighting, document = request.run, request.weighting, None
     if request.refine is None:
         fitter = Fitter(request, notes)
-        result = fitter.fit(weighting, fitter.samples(weighting))
+        samples = fitter.samples(weighting)
+        if LAYOUTS[request.choices["layout"]].chosen_on_scenes:
+            result = _selected(request, fitter, samples)
+        else:
+            result = fitter.fit(weighting, samples)
     else:
         refinement = _refined(request, request.refine, progress, notes)
         result = refinement.trial.result
@@ -176,6 +181,19 @@ def fit_design(
         checks = check_written(design, request)
     # broken ones were refused
     return replace(result, design=design, constraints=checks, satisfied=True), document
+
+
+def _selected(request: FitRequest, fitter: Fitter, samples: Samples) -> FitResult:
+    """Sensors with rays that were chosen on scenes: of the number that was asked for, or of each of the task's."""
+    from lidardesign.workflow.select_rays import select_rays
+
+    counts = sorted({request.choices["rays"]} if request.choices["rays"] else set(request.run.task.defaults.rays))
+    # sensors' own gates keep a bandwidth themselves, those of rays are priced when they are chosen
+    layout = "density" if request.choices["gates"] == "ray" else "grid"
+    fitted = fitter.fit(request.weighting, samples, layout=layout, rays=counts[-1])
+    gates = request.choices["gates"] or LAYOUTS["selected"].usual_gates
+    fitted = replace(fitted, design=replace(fitted.design, gates=gates))
+    return select_rays(request.run, fitted, counts, samples, request.seed)
 
 
 def check_written(design: DesignSpec, request: FitRequest) -> list[ConstraintCheck]:

@@ -93,8 +93,7 @@ class TestAChoice:
         more[1] = 1
         gains = {}
         for name, gate in (("few", few), ("more", more)):
-            gains[name] = np.zeros((rays, gates))
-            coverage.gains(np.arange(rays), coverage.known(gate), gains[name])
+            gains[name] = coverage.gains(coverage.known(gate))
             for ray, choice in itertools.product(range(2, rays), range(gates)):
                 added = gate.copy()
                 added[ray] = choice
@@ -148,7 +147,7 @@ class TestAChoice:
 def relaxed_by_highs(coverage, count, price, integral):
     """The facility location problem of one sensor as a program: rays' gates x, and who serves each item y <= x."""
     rays, gates = coverage.shape
-    ray_of = coverage.by_item[2]
+    ray_of = coverage.ray
     pairs = [(e, g) for e in range(len(coverage.item)) for g in range(gates) if coverage.gates[e] >> g & 1]
     chosen, served = rays * gates, len(pairs)
     gain = [-float(coverage.weight[coverage.item[e]] * coverage.worth[e]) for e, _ in pairs]

@@ -63,6 +63,27 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
     rich.print(text_table(("sensor", *figures), rows, title, figures, overflow="fold"))
     if len(design.sensors) > MOST_ROWS:
         rich.print(f"... and {len(design.sensors) - MOST_ROWS} more sensors; --json lists all")
+    _show_certificates(design, rich)
+
+
+def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
+    """Print what chosen rays leave unknown, and how much less any other choice of the same candidates could leave."""
+    from lidardesign.design.layouts.rays import certificates_of
+
+    columns = ("rays", "loss", "on other scenes", "less by at most", "candidates", "scenes")
+    rows = [
+        (
+            str(entry["rays"]),
+            number(entry["value"]),
+            number(entry["held_back_value"]),
+            f"{100 * entry['gap']:.1f} %",
+            str(entry["candidates"]),
+            str(entry["scenes"]),
+        )
+        for entry in certificates_of(design)
+    ]
+    if rows:
+        rich.print(text_table(columns, rows, "rays chosen on training scenes", columns))
 
 
 def _show_track(design: DesignSpec, track: Track, rich: RichConsole) -> None:

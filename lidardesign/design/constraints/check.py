@@ -85,8 +85,9 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
         checks += _snap(name, index, document, own.get("snap"))
         if bounds is not None:
             checks += _inside_space(name, sensor, bounds)
-    if document.get("ray_table"):
-        checks += _table(document["ray_table"], own_rules)
+    for table in (document.get("ray_table"), *document.get("further_tables", ())):
+        if table:
+            checks += _table(table, own_rules)
     if document.get("track"):
         checks += _excluded_travel(document["track"], sensors, rules)
         checks += _track(document["track"], rules, bounds)
@@ -351,7 +352,10 @@ def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[Cons
     if limit is not None:
         mbps = None
         if widths is not None:
-            bins = sum(count * max(math.ceil(width / bin_m * (1 - BIN_ROUNDING)), 1) for width, count in widths)
+            bins = max(
+                sum(count * max(math.ceil(width / bin_m * (1 - BIN_ROUNDING)), 1) for width, count in each)
+                for each in (widths, *map(_table_widths, document.get("further_tables", ())))
+            )
             mbps = bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6
         kept = mbps is not None and mbps <= limit + _slack(limit)
         checks.append(ConstraintCheck("budget.bandwidth_mbps", limit, mbps, kept))
@@ -366,7 +370,7 @@ def _widths(document: Mapping[str, Any], bin_m: float) -> list[tuple[float, int]
     """
     table, track, sensors = document.get("ray_table"), document.get("track"), document["sensors"]
     if table:
-        return [(end - start, 1) for start, end in zip(table["gate_start_m"], table["gate_end_m"], strict=True)]
+        return _table_widths(table)
     if not track:
         is_open = any(sensor.get("rays") is None for sensor in sensors)
         return None if is_open else [(s["gate_m"]["end"] - s["gate_m"]["start"], int(s["rays"])) for s in sensors]
@@ -383,6 +387,10 @@ def _widths(document: Mapping[str, Any], bin_m: float) -> list[tuple[float, int]
     every = np.concatenate(places)
     bins = np.maximum(np.ceil(every / bin_m * (1 - BIN_ROUNDING)), 1).sum(axis=1)
     return [(float(width), 1) for width in every[bins.argmax()]]
+
+
+def _table_widths(table: Mapping[str, Any]) -> list[tuple[float, int]]:
+    return [(end - start, 1) for start, end in zip(table["gate_start_m"], table["gate_end_m"], strict=True)]
 
 
 def _snap(name: str, index: int, document: Mapping[str, Any], snap: Any) -> list[ConstraintCheck]:

@@ -236,6 +236,7 @@ class Layout(ABC):
         follows_from_sensors: Whether the sensors alone say where rays go.
         follows_from_samples: Whether rays follow from samples of the density alone; None where only gates per ray do.
         starts_at_sensors: Whether rays start where their sensor stands.
+        chosen_on_scenes: Whether rays are chosen by what a task says of scenes, which takes a run.
         extends_origins: Whether rays start across their sensor's origins; then they have gates of their own, without
             samples too.
     """
@@ -247,6 +248,7 @@ class Layout(ABC):
     follows_from_sensors: ClassVar[bool] = True
     follows_from_samples: ClassVar[bool | None] = None
     starts_at_sensors: ClassVar[bool] = True
+    chosen_on_scenes: ClassVar[bool] = False
     extends_origins: ClassVar[bool] = False
 
     def check_constraints(self, constraints: Constraints) -> None:  # noqa: B027
@@ -327,6 +329,10 @@ class Layout(ABC):
 
     def most_count(self, spec: DesignSpec) -> int | None:
         """The most rays that a design can fire; None where it can be laid out at any number."""
+        return None
+
+    def counts(self, spec: DesignSpec) -> Sequence[int] | None:
+        """The only numbers of rays that a design can fire; None where it can fire others."""
         return None
 
 

@@ -20,10 +20,63 @@ from lidardesign.design.layouts.layout import Layout
 from lidardesign.design.layouts.scan import ScanLayout
 from lidardesign.design.layouts.track import moved, placed
 from lidardesign.design.mixture.support import Retarget, conditioned
-from lidardesign.design.sensor import DesignSpec, Gates
+from lidardesign.design.sensor import CERTIFICATES, DesignSpec, Gates
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import DEFAULT_RATE_HZ, Rays, fire_times
 from lidardesign.samples import Samples
+
+
+class SelectedLayout(Layout):
+    """Rays that were chosen on training scenes, a table for each number of rays; see `lidardesign.selection`."""
+
+    name = "selected"
+    fitted_as = "density"
+    follows_from_sensors = False
+    chosen_on_scenes = True
+
+    def leaves_rays_open(self, gates: Gates | None) -> bool:
+        """See `Layout`: a table is chosen for each of several numbers."""
+        return True
+
+    def check_constraints(self, constraints: Constraints) -> None:
+        """See `Layout`."""
+        raise ConfigError(
+            "rays are chosen on scenes, and samples alone show none", where="--layout selected",
+            hint="lidardesign fit RUN --layout selected; in Python, Run.fit",
+        )  # fmt: skip
+
+    def needs_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
+        """See `Layout`."""
+        return False
+
+    def counts(self, spec: DesignSpec) -> list[int]:
+        """See `Layout`."""
+        return sorted(len(table) for table in (spec.ray_table, *spec.further_tables) if table is not None)
+
+    def lay_out(self, spec: DesignSpec, count: int, samples: Samples | None, gates: Gates, seed: int) -> Rays:
+        """See `Layout`."""
+        for table in spec.further_tables:
+            if len(table) == count:
+                return table
+        raise ConfigError(
+            f"{count} rays, which were not chosen",
+            where=spec.name,
+            allowed=", ".join(map(str, self.counts(spec))),
+            hint=f"lidardesign fit RUN --layout selected --rays {count}",
+        )
+
+
+CERTIFIED = ("rays", "value", "bound", "gap", "held_back_value", "candidates", "gates", "scenes")
+
+
+def certificates_of(design: DesignSpec) -> list[Mapping[str, float]]:
+    """How far from the best a design's chosen rays may be, one entry per number of rays; none that is damaged."""
+    found = design.provenance.get(CERTIFICATES)
+    return [
+        entry
+        for entry in (found if isinstance(found, list) else ())
+        if isinstance(entry, dict) and all(type(entry.get(name)) in (int, float) for name in CERTIFIED)
+    ]
 
 
 class FixedLayout(Layout):
@@ -63,7 +116,8 @@ class FixedLayout(Layout):
 
 
 LAYOUTS: Mapping[str, Layout] = {
-    layout.name: layout for layout in (GridLayout(), DensityLayout(), ScanLayout(), DistributedLayout(), FixedLayout())
+    layout.name: layout
+    for layout in (GridLayout(), DensityLayout(), ScanLayout(), DistributedLayout(), SelectedLayout(), FixedLayout())
 }
 
 

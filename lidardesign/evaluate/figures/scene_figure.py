@@ -19,7 +19,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.figures.density_views import DensityView, density_view
-from lidardesign.evaluate.request import EvaluationRequest, fired_numbers, pattern_size
+from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, pattern_size
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.evaluate.score import ordered_conditions
 from lidardesign.geometry.raycast import SceneCaster
@@ -191,10 +191,10 @@ def figure_data(
     evaluation: Evaluation, request: EvaluationRequest, times: Mapping[str, Mapping[str, float]]
 ) -> FigureData:
     """Everything that can be drawn of an evaluation's designs, in its first held-out scene."""
-    most = max(fired_numbers(request.designs, request.rays))
+    counts = fired_numbers(request.designs, request.rays)
 
     def laid_out(design: DesignSpec, at: Conditions) -> Rays:
-        count = design.rays or pattern_size(design) or most
+        count = design.rays or pattern_size(design) or max(n for n in counts if can_fire(design, n))
         return request.lay_out(design, count, request.samples.get(design.name), at=at)
 
     # with the physics that the scenes call for, or by geometry alone

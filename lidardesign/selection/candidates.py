@@ -1,0 +1,81 @@
+"""What is chosen from: rays cast into scenes, what they tell there, and a few gates for each.
+
+Gates hold quantiles of what a ray, and rays near it, return that tells something. Narrow gates cost fewer bits and lose
+what lies outside; which of them pays is for the choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lidardesign.design.layouts.gates import central_intervals
+from lidardesign.geometry.rays import Rays, Returns
+from lidardesign.scene import Scene
+from lidardesign.simulate.simulate import simulate
+from lidardesign.task import Information
+
+# What a task says of a scene, and the returns that it says it of, of all candidates through their widest gates.
+InformedScene = tuple[Information, Sequence[Returns]]
+# Shares of what a ray returns that its gates hold; the first of them counts what rays near it return too.
+LEVELS = (1.0, 1.0, 0.98, 0.9, 0.75)
+NEIGHBOURS = 7  # of a ray, with itself: those around it in a hexagonal lattice
+FEWEST_RETURNS = 3  # of a ray by itself, below which its gates rest on those of rays near it
+
+
+def inform(
+    scenes: Sequence[Scene], rays: Rays, informs: Callable[[Scene, Sequence[Returns]], Information]
+) -> list[InformedScene]:
+    """What a task says of the returns of rays in each scene, through the rays' own gates."""
+    informed = []
+    for scene in scenes:
+        returns = simulate(scene, rays)
+        informed.append((informs(scene, returns), returns))
+    return informed
+
+
+def gate_choices(rays: Rays, informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
+    """A few gates for each ray, inside its own, (N, G, 2) [m]; a ray that tells nothing has its own alone.
+
+    Arguments:
+        rays: The candidates, with the widest gates that they may have.
+        informed: What the task says of training scenes.
+        margin_m: By how much gates that hold all of a ray's returns are longer at both ends: other scenes differ.
+    """
+    count = len(rays)
+    ray, range_m = _telling_returns(informed)
+    own = rays.gate_m
+    gates = np.repeat(own[:, None], len(LEVELS), axis=1)
+    if not len(ray):
+        return gates
+    seen = rays.origin_m + np.median(range_m) * rays.direction
+    near = cKDTree(seen).query(seen, min(NEIGHBOURS, count))[1].reshape(count, -1)
+    order = np.argsort(ray, kind="stable")
+    start = np.searchsorted(ray[order], np.arange(count + 1))
+    parts = [range_m[order[start[n] : start[n + 1]]] for n in range(count)]
+    shared = [np.concatenate([parts[n] for n in group]) for group in near]
+    alone = [part if len(part) >= FEWEST_RETURNS else group for part, group in zip(parts, shared, strict=True)]
+    for place, level in enumerate(LEVELS):
+        source = shared if place == 0 else alone
+        label = np.repeat(np.arange(count), [len(part) for part in source])
+        ends, _ = central_intervals(np.concatenate(source), np.ones(len(label)), label, count, level)
+        wider = margin_m if level == 1.0 else 0.0
+        ends += (-wider, np.nextafter(wider, np.inf) if wider else 0.0)
+        known = ~np.isnan(ends[:, 0])
+        gates[known, place] = np.clip(ends[known], own[known, :1], own[known, 1:])
+    return gates
+
+
+def _telling_returns(informed: Sequence[InformedScene]) -> tuple[np.ndarray, np.ndarray]:
+    """Every return that tells something: its ray (K,) and range (K,) [m]."""
+    rays, ranges = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
+    for information, returns in informed:
+        telling = information.worth > 0
+        count = len(returns[0].range_m)
+        pairs = np.unique(information.source[telling] * count + information.ray[telling])
+        frame, ray = np.divmod(pairs, count)
+        rays.append(ray)
+        ranges.append(np.stack([one.range_m for one in returns])[frame, ray])
+    return np.concatenate(rays), np.concatenate(ranges)

@@ -1,0 +1,132 @@
+"""Rays chosen from candidates on as many training scenes as it takes, for several numbers of rays.
+
+Scenes cost a cast each, so choices rest on many more of them than a density is learned from: they are doubled until the
+loss on scenes held back gains little. Every number of rays is a choice of its own: swaps leave no prefixes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.errors import InfeasibleError
+from lidardesign.geometry.rays import Rays, Returns
+from lidardesign.run.clock import phase
+from lidardesign.scene import Scene
+from lidardesign.selection.candidates import InformedScene, inform
+from lidardesign.selection.certificate import certify
+from lidardesign.selection.choice import Choice, RayCounts, choose, choose_within
+from lidardesign.selection.coverage import Coverage, gather
+from lidardesign.task import Information
+
+FIRST_SCENES, MOST_SCENES, HELD_BACK_SCENES = 50, 400, 50
+SMALLEST_GAIN = 0.01  # of the held-back loss: what twice the scenes must gain
+
+
+@dataclass(frozen=True, eq=False)
+class SelectionProblem:
+    """What rays are chosen from, and for.
+
+    Arguments:
+        rays: Candidates with the widest gates that they may have.
+        gates: A few gates for each, (N, G, 2) [m], of what their returns tell about scenes.
+        informs: What a task says of a scene's returns.
+        scenes: So many training scenes for a purpose, `choice` or `held back`; more begin with the same.
+        bandwidth: What reading out costs.
+        limit_mbps: The most that it may cost, inf without a limit.
+        name: Of the design, for messages.
+    """
+
+    rays: Rays
+    gates: Callable[[Sequence[InformedScene]], np.ndarray]
+    informs: Callable[[Scene, Sequence[Returns]], Information]
+    scenes: Callable[[str, int], Sequence[Scene]]
+    bandwidth: Bandwidth
+    limit_mbps: float
+    name: str
+
+    @phase("what returns tell")
+    def inform(self, scenes: Sequence[Scene]) -> list[InformedScene]:
+        """What the task says of scenes."""
+        return inform(scenes, self.rays, self.informs)
+
+    def coverage(self, informed: Sequence[InformedScene], gates_m: np.ndarray) -> Coverage:
+        """What the candidates tell about scenes, with the cost of their gates."""
+        one_bin = self.bandwidth.mbps_of_widths(np.zeros(1))
+        return gather(informed, gates_m, one_bin * self.bandwidth.bins(gates_m[..., 1] - gates_m[..., 0]))
+
+    @phase("choice")
+    def choice(self, coverage: Coverage, count: int) -> Choice:
+        """The choice of so many rays within the bandwidth.
+
+        Raises:
+            InfeasibleError: So many rays do not fit.
+        """
+        counts = RayCounts.of_one(len(self.rays), count)
+        limit = self.limit_mbps
+        choice = choose(coverage, counts) if np.isinf(limit) else choose_within(coverage, counts, limit)
+        if len(choice.rays) < count:
+            raise InfeasibleError(
+                f"{len(choice.rays)} of {count} rays fit in {limit:g} Mbit/s",
+                conflicts=["budget.bandwidth_mbps"],
+                hint=f"fewer rays, or a larger bandwidth, for {self.name}",
+            )
+        return choice
+
+
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """Chosen rays, and how far from the best they may be.
+
+    Arguments:
+        rays: In the order of their sensors.
+        certificate: `value` and `bound` of the loss on the scenes chosen on, `gap`, `held_back_value`, and the numbers
+            of `rays`, `candidates`, `gates` and `scenes`.
+    """
+
+    rays: Rays
+    certificate: dict[str, Any]
+
+
+def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
+    """The rays that are chosen at each number of rays.
+
+    Raises:
+        InfeasibleError: A bandwidth in which no choice of so many rays fits.
+    """
+    rays, middle = problem.rays, counts[len(counts) // 2]
+    held_back = problem.inform(problem.scenes("held back", HELD_BACK_SCENES))
+    informed: list[InformedScene] = []
+    wanted, loss = FIRST_SCENES, np.inf
+    while True:
+        informed += problem.inform(problem.scenes("choice", wanted)[len(informed) :])
+        gates_m = problem.gates(informed)
+        coverage, judged = problem.coverage(informed, gates_m), problem.coverage(held_back, gates_m)
+        before, loss = loss, judged.loss_of(problem.choice(coverage, middle).gate)
+        if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > MOST_SCENES:
+            break
+        wanted *= 2
+    selected = []
+    for count in counts:
+        choice = problem.choice(coverage, count)
+        with phase("certificate"):
+            limit = None if np.isinf(problem.limit_mbps) else problem.limit_mbps
+            certificate = certify(coverage, RayCounts.of_one(len(rays), count), choice, budget_mbps=limit)
+        chosen = choice.rays[np.lexsort((choice.rays, rays.sensor[choice.rays]))]
+        table = replace(rays.subset(chosen), gate_m=gates_m[chosen, choice.gate[chosen]]).as_angles()
+        document = {
+            "rays": count,
+            "value": float(coverage.complete - certificate.value),
+            "bound": float(coverage.complete - certificate.bound),
+            "gap": float(certificate.gap(coverage.complete)),
+            "held_back_value": float(judged.loss_of(choice.gate)),
+            "candidates": len(rays),
+            "gates": gates_m.shape[1],
+            "scenes": len(informed),
+        }
+        selected.append(Selected(table, document))
+    return selected
