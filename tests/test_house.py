@@ -18,7 +18,8 @@ MOST_PARAMETERS = 12
 # From the ground up: a room imports its own modules and those of rooms before it.
 ROOMS = (
     "errors", "numerics", "estimates", "run", "space", "scene", "geometry", "meshio", "samples", "task", "registry",
-    "config", "density", "design", "simulate", "selection", "evaluate", "export", "testing", "workflow", "cli", "__main__",
+    "config", "density", "design", "simulate", "selection", "evaluate", "export", "testing", "workflow", "cli",
+    "__main__",
 )  # fmt: skip
 
 # Where a library may be imported, by the beginnings of module names; nowhere else.

@@ -30,8 +30,8 @@ Layout = Annotated[
     str | None,
     typer.Option(
         "--layout",
-        metavar="grid|density|scan|distributed",
-        help="Rays even in the field of view, by density, each its own sensor, or starting across the origins.",
+        metavar="grid|density|scan|distributed|selected",
+        help="Rays even in the field of view, by density, each its own sensor, starting across the origins, or chosen.",
         show_default="the design's or the task's",
     ),
 ]

@@ -1,0 +1,167 @@
+"""`fit --layout selected`: rays that are chosen on training scenes, their tables, certificates and constraints."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from support.command_line import caller, make_run
+from support.tables import each_row
+
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.files import design_document, load_design, save_design
+from lidardesign.design.layouts.rays import certificates_of, lay_out
+from lidardesign.design.sensor import tangent_coordinates
+from lidardesign.errors import ConfigError
+from lidardesign.workflow import select_rays
+from lidardesign.workflow.run_folder import RunFolder
+from lidardesign.workflow.runs import open_run
+
+COUNTS = (4, 9, 16)
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("run") / "flat")
+
+
+@pytest.fixture(autouse=True)
+def few_scenes(monkeypatch):
+    monkeypatch.setattr("lidardesign.selection.select.FIRST_SCENES", 5)
+    monkeypatch.setattr("lidardesign.selection.select.MOST_SCENES", 10)
+    monkeypatch.setattr("lidardesign.selection.select.HELD_BACK_SCENES", 5)
+
+
+def chosen(run, **options):
+    return open_run(run).fit(layout="selected", sensors=2, name="chosen", **options)
+
+
+def tables_of(spec):
+    return [*spec.further_tables, spec.ray_table]
+
+
+class TestDesignsWithChosenRays:
+    @pytest.mark.parametrize("gates", ["sensor", "ray"])
+    def test_rays_lie_in_their_sensors_fields_and_gates(self, run, gates):
+        spec = chosen(run, gates=gates).specification
+        assert [len(table) for table in tables_of(spec)] == sorted(open_run(run).task.defaults.rays)
+        for table in tables_of(spec):
+            for index, sensor in enumerate(spec.sensors):
+                own = table.subset(table.sensor == index)
+                away = np.abs(tangent_coordinates(sensor.frame, own.direction))
+                assert (away <= np.array(sensor.field_of_view_rad) / 2 + 1e-9).all()
+                start, end = sensor.gate_m
+                assert (own.gate_m[:, 0] >= start - 1e-12).all()
+                assert (own.gate_m[:, 1] <= end + 1e-12).all()
+                assert gates == "ray" or (own.gate_m == [start, end]).all()
+
+    def test_no_two_chosen_rays_are_the_same(self, run):
+        for table in tables_of(chosen(run, gates="ray").specification):
+            assert len(np.unique(np.hstack([table.origin_m, table.angles_rad]), axis=0)) == len(table)
+
+    def test_constraints_are_kept_by_every_table(self, run):
+        rules = {"gate": {"width_m": {"max": 0.6}}, "budget": {"bandwidth_mbps": 0.3}}
+        design = chosen(run, gates="ray", constraints=rules)
+        document = design_document(design.specification)
+        checks = check_design(document, Constraints.from_mapping(rules), open_run(run).config.space)
+        assert all(check.satisfied for check in checks)
+        # a table that breaks them is found
+        document["further_tables"][0]["gate_end_m"][0] += 5.0
+        checks = check_design(document, Constraints.from_mapping(rules), open_run(run).config.space)
+        assert not all(check.satisfied for check in checks)
+
+    def test_files_give_them_back_bit_by_bit(self, run, tmp_path):
+        spec = chosen(run, gates="ray").specification
+        path = tmp_path / "chosen.yaml"
+        save_design(spec, path)
+        again = load_design(path)
+        assert design_document(again) == design_document(spec)
+        for table in tables_of(spec):
+            laid_out = lay_out(again, len(table))
+            for name in ("origin_m", "direction", "gate_m", "sensor", "time_s"):
+                np.testing.assert_array_equal(getattr(laid_out, name), getattr(table, name))
+
+    def test_other_numbers_of_rays_are_refused(self, run):
+        spec = chosen(run, rays=9).specification
+        with pytest.raises(ConfigError, match="10 rays, which were not chosen") as refusal:
+            lay_out(spec, 10)
+        assert refusal.value.allowed == "9"
+
+    def test_the_same_seed_chooses_the_same_rays_and_another_one_others(self, run):
+        first, second, other = (chosen(run, rays=9, seed=seed).specification for seed in (0, 0, 1))
+        np.testing.assert_array_equal(first.ray_table.direction, second.ray_table.direction)
+        assert not np.array_equal(first.ray_table.direction, other.ray_table.direction)
+
+    def test_certificates_bound_the_loss_from_below(self, run):
+        for entry in certificates_of(chosen(run, gates="ray").specification):
+            assert 0 <= entry["bound"] <= entry["value"]
+            assert entry["gap"] == pytest.approx((entry["value"] - entry["bound"]) / entry["value"])
+            assert entry["scenes"] in (5, 10)
+
+    def test_it_looks_at_training_scenes_that_nothing_was_learned_from(self, run, monkeypatch):
+        asked = []
+        scenes = RunFolder.scenes
+        monkeypatch.setattr(
+            RunFolder, "scenes", lambda self, split, seed: asked.append((split, seed)) or scenes(self, split, seed)
+        )
+        chosen(run, rays=9)
+        assert {split for split, _ in asked} == {"train"}
+        assert open_run(run).config.seed not in {seed for _, seed in asked}
+        # what judges is drawn apart from what is chosen on
+        assert len({seed for _, seed in asked}) >= 2
+
+    def test_constrained_again_they_are_chosen_again(self, run):
+        design = chosen(run, rays=9)
+        assert design.constrain(constraints={"gate": {"width_m": {"max": 0.5}}}).specification.layout == "selected"
+
+
+class TestTheCommand:
+    def test_says_how_far_from_the_best_they_are(self, lidardesign, run):
+        printed = lidardesign("fit", run, "--layout", "selected", "--sensors", 2, "--rays", 9, "--name", "a")
+        assert "rays chosen on training scenes" in printed.out
+        fitted = lidardesign("fit", run, "--layout", "selected", "--sensors", 2, "--rays", 9, "--name", "a", "--json")
+        shown = lidardesign("show", run / "designs" / "a.yaml", "--json")
+        assert json.loads(fitted.out)["certificates"] == json.loads(shown.out)["provenance"]["certificates"]
+
+    def test_evaluates_at_the_numbers_that_were_chosen(self, lidardesign, run):
+        lidardesign("fit", run, "--layout", "selected", "--sensors", 2, "--rays", 9, "--name", "a")
+        scored = lidardesign("evaluate", run / "designs" / "a.yaml", "--json", "--set", "test=2")
+        assert {row["rays"] for row in scored.json["rows"] if row["design"] == "a"} == {9}
+        refused = lidardesign("evaluate", run / "designs" / "a.yaml", "--rays", 10)
+        assert refused.code == 2
+        assert "rays were chosen at other numbers" in refused.err
+
+    @each_row(
+        ("options", "message"),
+        [
+            (("--refine", "1"), "layout selected beside --refine"),
+            (("--weight", "variation=0.1"), "layout selected beside --weight"),
+        ],
+    )
+    def test_what_does_not_go_together_is_refused(self, lidardesign, run, options, message):
+        refused = lidardesign("fit", run, "--layout", "selected", *options)
+        assert refused.code == 2
+        assert message in refused.err
+
+    def test_a_task_that_does_not_say_what_returns_tell_is_refused(self, lidardesign, run, monkeypatch):
+        monkeypatch.setattr(select_rays, "informs_rays", lambda task: False)
+        refused = lidardesign("fit", run, "--layout", "selected")
+        assert refused.code == 2
+        assert "does not say what returns tell" in refused.err
+
+    def test_damaged_certificates_are_left_out(self, lidardesign, run):
+        lidardesign("fit", run, "--layout", "selected", "--sensors", 2, "--rays", 9, "--name", "a")
+        path = run / "designs" / "a.yaml"
+        spec = load_design(path)
+        spec.provenance["certificates"] = [{"rays": "nine"}, 3]
+        save_design(spec, path)
+        shown = lidardesign("show", path)
+        assert shown.code == 0
+        assert "rays chosen on training scenes" not in shown.out
