@@ -25,15 +25,10 @@ NEIGHBOURS = 7  # of a ray, with itself: those around it in a hexagonal lattice
 FEWEST_RETURNS = 3  # of a ray by itself, below which its gates rest on those of rays near it
 
 
-def inform(
-    scenes: Sequence[Scene], rays: Rays, informs: Callable[[Scene, Sequence[Returns]], Information]
-) -> list[InformedScene]:
-    """What a task says of the returns of rays in each scene, through the rays' own gates."""
-    informed = []
-    for scene in scenes:
-        returns = simulate(scene, rays)
-        informed.append((informs(scene, returns), returns))
-    return informed
+def inform(scene: Scene, rays: Rays, informs: Callable[[Scene, Sequence[Returns]], Information]) -> InformedScene:
+    """What a task says of the returns of rays in a scene, through the rays' own gates."""
+    returns = simulate(scene, rays)
+    return informs(scene, returns), returns
 
 
 def gate_choices(rays: Rays, informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:

@@ -137,8 +137,7 @@ class _Thresholds:
     def step(self, value: float) -> float:
         """The bound at the present thresholds; moves them along its subgradient (Polyak 1969)."""
         coverage = self.coverage
-        entries = (coverage.start, coverage.item, coverage.worth, coverage.gates)
-        kernels.slopes_and_excess(*entries, coverage.weight, self.threshold, self.excess)
+        kernels.weigh_excess(coverage.entries, coverage.weight, self.threshold, self.excess)
         total, taken = self.admissible.best(self.excess)
         bound = float(coverage.weight @ self.threshold) + total
         self.stale += 1
@@ -146,7 +145,7 @@ class _Thresholds:
             self.least, self.stale = bound, 0
         if self.stale == PATIENCE:
             self.scale, self.stale = self.scale / 2, 0
-        kernels.count_exceeding(taken, *entries, self.threshold, self.count)
+        kernels.count_exceeding(coverage.entries, taken, self.threshold, self.count)
         # per unit of an item's weight, so that rare items move as far as frequent ones
         slope = 1.0 - self.count
         slope[(self.threshold <= 0) & (slope > 0)] = 0.0
@@ -169,10 +168,7 @@ class _Tangents:
         """The bound by tangents at the present mixture; moves it towards the best choice of the tangents."""
         coverage = self.coverage
         rise = self.rises[np.minimum(self.known.astype(np.intp), len(self.rises) - 1)]
-        kernels.slopes_and_excess(
-            coverage.start, coverage.item, coverage.worth, coverage.gates,
-            coverage.weight * rise, np.zeros(len(rise)), self.gains,
-        )  # fmt: skip
+        kernels.weigh_excess(coverage.entries, coverage.weight * rise, np.zeros(len(rise)), self.gains)
         total, taken = self.admissible.best(self.gains)
         bound = float(coverage.weight @ (coverage.counted(self.known) - rise * self.known)) + total
         self.made += 1

@@ -124,10 +124,7 @@ class _Search:
 
     def _change(self, ray: int, gate: int, *, adding: bool) -> None:
         coverage = self.coverage
-        kernels.change_choice(
-            ray, gate, adding, coverage.start, coverage.item, coverage.worth, coverage.gates, coverage.weight,
-            coverage.table, *coverage.by_item, self.gate, self.known, self.gains,
-        )  # fmt: skip
+        kernels.change_choice(ray, gate, adding, coverage.entries, coverage.by_item, self.gate, self.known, self.gains)
 
     def fill(self, full: bool) -> None:
         """Takes rays greedily until counts or bandwidth are used up or, unless `full`, none gains."""

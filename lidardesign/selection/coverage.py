@@ -71,27 +71,27 @@ class Coverage:
         return np.repeat(np.arange(len(self.start) - 1, dtype=np.int32), np.diff(self.start))
 
     @cached_property
-    def by_item(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The table in the order of items: where each begins (U + 1,), and rays, worths and gates (E,)."""
+    def entries(self) -> kernels.ByRay:
+        """The table for compiled loops."""
+        return kernels.ByRay(self.start, self.item, self.worth, self.gates, self.weight, self.table)
+
+    @cached_property
+    def by_item(self) -> kernels.ByItem:
+        """The table in the order of items."""
         order = np.argsort(self.item, kind="stable")
         begin = np.searchsorted(self.item[order], np.arange(len(self.weight) + 1))
-        return begin, self.ray[order], self.worth[order], self.gates[order]
+        return kernels.ByItem(begin, self.ray[order], self.worth[order], self.gates[order])
 
     def known(self, gate: np.ndarray) -> np.ndarray:
         """What a choice of one gate per ray, -1 for none, (N,), knows about each item, (U,)."""
-        known = np.zeros(len(self.weight))
-        for ray in np.flatnonzero(gate >= 0):
-            self.learn_of(int(ray), int(gate[ray]), known)
+        known = np.empty(len(self.weight))
+        kernels.know(self.entries, gate, known)
         return known
-
-    def learn_of(self, ray: int, gate: int, known: np.ndarray) -> None:
-        """Adds to `known` (U,) what a ray tells through a gate."""
-        kernels.learn_of(ray, gate, self.start, self.item, self.worth, self.gates, len(self.table) == 0, known)
 
     def gains(self, known: np.ndarray) -> np.ndarray:
         """What each gate of every ray would add to F, (N, G)."""
         gains = np.empty(self.shape)
-        kernels.gate_gains(self.start, self.item, self.worth, self.gates, self.weight, self.table, known, gains)
+        kernels.gate_gains(self.entries, known, gains)
         return gains
 
     def value_of(self, gate: np.ndarray) -> float:

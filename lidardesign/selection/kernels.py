@@ -8,8 +8,42 @@ what they count, by linear pieces between whole numbers; a table of no length st
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+
+
+class ByRay(NamedTuple):
+    """The entries of the table in the order of rays, and what items count.
+
+    Arguments:
+        start: Where the entries of each ray begin, (N + 1,).
+        item, worth, gates: Of each entry, (E,).
+        weight: Of each item, (U,).
+        table: What sums of worths count, of no length for the largest worth.
+    """
+
+    start: np.ndarray
+    item: np.ndarray
+    worth: np.ndarray
+    gates: np.ndarray
+    weight: np.ndarray
+    table: np.ndarray
+
+
+class ByItem(NamedTuple):
+    """The same entries in the order of items.
+
+    Arguments:
+        start: Where the entries of each item begin, (U + 1,).
+        ray, worth, gates: Of each entry, (E,).
+    """
+
+    start: np.ndarray
+    ray: np.ndarray
+    worth: np.ndarray
+    gates: np.ndarray
 
 
 @njit(cache=True, nogil=True)
@@ -32,43 +66,31 @@ def gain(known: float, worth: float, table: np.ndarray) -> float:
 
 
 @njit(cache=True, nogil=True)
-def gate_gains(
-    start: np.ndarray,
-    item: np.ndarray,
-    worth: np.ndarray,
-    gates: np.ndarray,
-    weight: np.ndarray,
-    table: np.ndarray,
-    known: np.ndarray,
-    gains: np.ndarray,
-) -> None:
+def gate_gains(entries: ByRay, known: np.ndarray, gains: np.ndarray) -> None:
     """What each gate of every ray would add to what is known: fills `gains`, shape (N, G)."""
     gains[:] = 0.0
-    for ray in range(len(start) - 1):
-        for entry in range(start[ray], start[ray + 1]):
-            more = weight[item[entry]] * gain(known[item[entry]], worth[entry], table)
+    for ray in range(len(entries.start) - 1):
+        for entry in range(entries.start[ray], entries.start[ray + 1]):
+            more = entries.weight[entries.item[entry]] * gain(
+                known[entries.item[entry]], entries.worth[entry], entries.table
+            )
             if more > 0.0:
                 for gate in range(gains.shape[1]):
-                    if gates[entry] >> gate & 1:
+                    if entries.gates[entry] >> gate & 1:
                         gains[ray, gate] += more
 
 
 @njit(cache=True, nogil=True)
-def learn_of(
-    ray: int,
-    gate: int,
-    start: np.ndarray,
-    item: np.ndarray,
-    worth: np.ndarray,
-    gates: np.ndarray,
-    largest: bool,
-    known: np.ndarray,
-) -> None:
-    """Adds to `known` what a ray tells through a gate."""
-    for entry in range(start[ray], start[ray + 1]):
-        if gates[entry] >> gate & 1:
-            place = item[entry]
-            known[place] = max(known[place], worth[entry]) if largest else known[place] + worth[entry]
+def know(entries: ByRay, chosen: np.ndarray, known: np.ndarray) -> None:
+    """What chosen gates, -1 for none, (N,), tell about each item: fills `known`, shape (U,)."""
+    known[:] = 0.0
+    for ray in range(len(entries.start) - 1):
+        if chosen[ray] < 0:
+            continue
+        for entry in range(entries.start[ray], entries.start[ray + 1]):
+            if entries.gates[entry] >> chosen[ray] & 1:
+                place, worth = entries.item[entry], entries.worth[entry]
+                known[place] = known[place] + worth if len(entries.table) else max(known[place], worth)
 
 
 @njit(cache=True, nogil=True)
@@ -76,16 +98,8 @@ def change_choice(
     ray: int,
     gate: int,
     adding: bool,
-    start: np.ndarray,
-    item: np.ndarray,
-    worth: np.ndarray,
-    gates: np.ndarray,
-    weight: np.ndarray,
-    table: np.ndarray,
-    item_start: np.ndarray,
-    item_ray: np.ndarray,
-    item_worth: np.ndarray,
-    item_gates: np.ndarray,
+    entries: ByRay,
+    items: ByItem,
     chosen: np.ndarray,
     known: np.ndarray,
     gains: np.ndarray,
@@ -95,70 +109,54 @@ def change_choice(
     `chosen` holds the gates of the other rays, -1 for none, (N,). Only items of which something else is known
     afterwards are followed to the rays that tell of them.
     """
-    for own in range(start[ray], start[ray + 1]):
-        if not gates[own] >> gate & 1:
+    for own in range(entries.start[ray], entries.start[ray + 1]):
+        if not entries.gates[own] >> gate & 1:
             continue
-        place = item[own]
+        place = entries.item[own]
         old = known[place]
-        first, last = item_start[place], item_start[place + 1]
-        if len(table) > 0:
-            new = old + worth[own] if adding else max(old - worth[own], 0.0)
+        first, last = items.start[place], items.start[place + 1]
+        if len(entries.table) > 0:
+            new = old + entries.worth[own] if adding else max(old - entries.worth[own], 0.0)
         elif adding:
-            new = max(old, worth[own])
-        elif worth[own] < old:
+            new = max(old, entries.worth[own])
+        elif entries.worth[own] < old:
             continue
         else:
             new = 0.0
             for index in range(first, last):
-                other = chosen[item_ray[index]]
-                if other >= 0 and item_gates[index] >> other & 1:
-                    new = max(new, item_worth[index])
+                other = chosen[items.ray[index]]
+                if other >= 0 and items.gates[index] >> other & 1:
+                    new = max(new, items.worth[index])
         if new == old:
             continue
         known[place] = new
         for index in range(first, last):
-            more = gain(new, item_worth[index], table) - gain(old, item_worth[index], table)
+            more = gain(new, items.worth[index], entries.table) - gain(old, items.worth[index], entries.table)
             if more != 0.0:
                 for other in range(gains.shape[1]):
-                    if item_gates[index] >> other & 1:
-                        gains[item_ray[index], other] += weight[place] * more
+                    if items.gates[index] >> other & 1:
+                        gains[items.ray[index], other] += entries.weight[place] * more
 
 
 @njit(cache=True, nogil=True)
-def slopes_and_excess(
-    start: np.ndarray,
-    item: np.ndarray,
-    worth: np.ndarray,
-    gates: np.ndarray,
-    weight: np.ndarray,
-    threshold: np.ndarray,
-    excess: np.ndarray,
-) -> None:
+def weigh_excess(entries: ByRay, weight: np.ndarray, threshold: np.ndarray, excess: np.ndarray) -> None:
     """By how much each gate's worths exceed the items' thresholds, weighted: fills `excess`, shape (N, G)."""
     excess[:] = 0.0
-    for ray in range(len(start) - 1):
-        for entry in range(start[ray], start[ray + 1]):
-            over = worth[entry] - threshold[item[entry]]
+    for ray in range(len(entries.start) - 1):
+        for entry in range(entries.start[ray], entries.start[ray + 1]):
+            over = entries.worth[entry] - threshold[entries.item[entry]]
             if over > 0:
                 for gate in range(excess.shape[1]):
-                    if gates[entry] >> gate & 1:
-                        excess[ray, gate] += weight[item[entry]] * over
+                    if entries.gates[entry] >> gate & 1:
+                        excess[ray, gate] += weight[entries.item[entry]] * over
 
 
 @njit(cache=True, nogil=True)
-def count_exceeding(
-    chosen: np.ndarray,
-    start: np.ndarray,
-    item: np.ndarray,
-    worth: np.ndarray,
-    gates: np.ndarray,
-    threshold: np.ndarray,
-    count: np.ndarray,
-) -> None:
+def count_exceeding(entries: ByRay, chosen: np.ndarray, threshold: np.ndarray, count: np.ndarray) -> None:
     """How many of the chosen rays exceed each item's threshold: fills `count`, shape (U,)."""
     count[:] = 0
-    for ray in range(len(start) - 1):
+    for ray in range(len(entries.start) - 1):
         if chosen[ray] >= 0:
-            for entry in range(start[ray], start[ray + 1]):
-                if gates[entry] >> chosen[ray] & 1 and worth[entry] > threshold[item[entry]]:
-                    count[item[entry]] += 1
+            for entry in range(entries.start[ray], entries.start[ray + 1]):
+                if entries.gates[entry] >> chosen[ray] & 1 and entries.worth[entry] > threshold[entries.item[entry]]:
+                    count[entries.item[entry]] += 1

@@ -6,7 +6,8 @@ loss on scenes held back gains little. Every number of rays is a choice of its o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,7 +36,7 @@ class SelectionProblem:
         rays: Candidates with the widest gates that they may have.
         gates: A few gates for each, (N, G, 2) [m], of what their returns tell about scenes.
         informs: What a task says of a scene's returns.
-        scenes: So many training scenes for a purpose, `choice` or `held back`; more begin with the same.
+        scenes: Training scenes without end for a purpose, `choice` or `held back`.
         bandwidth: What reading out costs.
         limit_mbps: The most that it may cost, inf without a limit.
         name: Of the design, for messages.
@@ -44,15 +45,15 @@ class SelectionProblem:
     rays: Rays
     gates: Callable[[Sequence[InformedScene]], np.ndarray]
     informs: Callable[[Scene, Sequence[Returns]], Information]
-    scenes: Callable[[str, int], Sequence[Scene]]
+    scenes: Callable[[str], Iterator[Scene]]
     bandwidth: Bandwidth
     limit_mbps: float
     name: str
 
     @phase("what returns tell")
-    def inform(self, scenes: Sequence[Scene]) -> list[InformedScene]:
-        """What the task says of scenes."""
-        return inform(scenes, self.rays, self.informs)
+    def inform(self, scenes: Iterator[Scene], count: int) -> list[InformedScene]:
+        """What the task says of the next so many scenes; they are not kept."""
+        return [inform(scene, self.rays, self.informs) for scene in itertools.islice(scenes, count)]
 
     def coverage(self, informed: Sequence[InformedScene], gates_m: np.ndarray) -> Coverage:
         """What the candidates tell about scenes, with the cost of their gates."""
@@ -99,11 +100,12 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
     rays, middle = problem.rays, counts[len(counts) // 2]
-    held_back = problem.inform(problem.scenes("held back", HELD_BACK_SCENES))
+    held_back = problem.inform(problem.scenes("held back"), HELD_BACK_SCENES)
     informed: list[InformedScene] = []
+    scenes = problem.scenes("choice")
     wanted, loss = FIRST_SCENES, np.inf
     while True:
-        informed += problem.inform(problem.scenes("choice", wanted)[len(informed) :])
+        informed += problem.inform(scenes, wanted - len(informed))
         gates_m = problem.gates(informed)
         coverage, judged = problem.coverage(informed, gates_m), problem.coverage(held_back, gates_m)
         before, loss = loss, judged.loss_of(problem.choice(coverage, middle).gate)

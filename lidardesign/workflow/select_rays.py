@@ -6,7 +6,8 @@ The density proposes rays inside the sensors; scenes that nothing was learned fr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -92,14 +93,10 @@ def select_rays(run: RunFolder, result: FitResult, counts: Sequence[int], sample
     return replace(result, design=design)
 
 
-def _scenes(run: RunFolder, seed: int, purpose: str, count: int) -> list[Scene]:
-    """So many training scenes that nothing was learned from, drawn with further seeds."""
-    scenes: list[Scene] = []
-    draw = 0
-    while len(scenes) < count:
-        scenes += run.scenes("train", int(random_generator(seed, "selection", purpose, draw).integers(2**31)))
-        draw += 1
-    return scenes[:count]
+def _scenes(run: RunFolder, seed: int, purpose: str) -> Iterator[Scene]:
+    """Training scenes that nothing was learned from, drawn with further seeds."""
+    for draw in itertools.count():
+        yield from run.scenes("train", int(random_generator(seed, "selection", purpose, draw).integers(2**31)))
 
 
 @phase("candidates")
