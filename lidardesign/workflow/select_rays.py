@@ -61,7 +61,9 @@ def select_rays(run: RunFolder, result: FitResult, counts: Sequence[int], sample
         )
     spec = result.design
     constraints = Constraints.from_mapping(spec.constraints, where=f"constraints of {spec.name}")
-    rays = _proposed(spec, samples, CANDIDATES_PER_RAY * counts[-1], seed)
+    # a task whose rays start all over their sensors' origins proposes such rays
+    layout = "distributed" if LAYOUTS[run.task.defaults.layout].extends_origins else "density"
+    rays = _proposed(spec, layout, samples, CANDIDATES_PER_RAY * counts[-1], seed)
     limit = constraints.budget.bandwidth_mbps
     problem = SelectionProblem(
         rays=rays,
@@ -100,14 +102,14 @@ def _scenes(run: RunFolder, seed: int, purpose: str) -> Iterator[Scene]:
 
 
 @phase("candidates")
-def _proposed(spec: DesignSpec, samples: Samples, count: int, seed: int) -> Rays:
+def _proposed(spec: DesignSpec, layout: str, samples: Samples, count: int, seed: int) -> Rays:
     """Rays inside the sensors, most of them where the density is, with their sensors' gates."""
     sensors = tuple(replace(sensor, rays=None) for sensor in spec.sensors)
     spec = replace(spec, ray_table=None, rays=None, sensors=sensors)
     even = round(EVEN_SHARE * count)
     parts = [
         LAYOUTS[name].lay_out(spec, number, samples, "sensor", seed)
-        for name, number in (("density", count - even), ("grid", even))
+        for name, number in ((layout, count - even), ("grid", even))
     ]
     names = ("origin_m", "direction", "gate_m", "sensor")
     return Rays(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), np.zeros(count))
