@@ -72,9 +72,8 @@ def main() -> None:
         "constrain", run, "--constraints", constraints, "--sensors", "4", "--name", "buyable",
     )  # fmt: skip
     step(
-        "Ten sensors with a gate per ray, refined by where the error is on training scenes.",
-        "fit", run, "--sensors", "10", "--layout", "density", "--gates", "ray", "--rays", "361", "--refine", "3",
-        "--name", "refined",
+        "Choose the rays, and a gate for each, that tell most together on training scenes.",
+        "fit", run, "--layout", "selected", "--gates", "ray", "--name", "chosen",
     )  # fmt: skip
     step(
         "Score all on held-out scenes against what one would build without learning.",

@@ -150,6 +150,6 @@ def test_rows_that_a_seed_lacks_are_left_out_with_a_note():
     first, second = three_seeds()[:2]
     lacking = replace(second, rows=[row for row in second.rows if row.design != "random"])
     joint = over_seeds([first, lacking], (0, 1), 0)
-    assert {row.design for row in joint.rows} == {"own", "uniform", "bounding"}
-    assert {pair.b for pair in joint.paired} == {"uniform", "bounding"}
+    assert {row.design for row in joint.rows} == {"own", "uniform", "bounding", "silhouette"}
+    assert {pair.b for pair in joint.paired} == {"uniform", "bounding", "silhouette"}
     assert any("left out: random" in note for note in joint.notes)

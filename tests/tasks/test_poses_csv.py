@@ -16,6 +16,7 @@ from lidardesign_tasks.motion import load_motion, moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES
 from lidardesign_tasks.pose import rotation_matrix
 from lidardesign_tasks.poses_csv import COLUMNS, interpolated, read_poses, rotation_vector
+from lidardesign_tasks.surface import METRIC
 from pydantic import ValidationError
 from support.rays import rays_of_points
 from support.tables import each_row
@@ -191,7 +192,10 @@ def test_every_frame_is_judged_by_where_the_object_is_then(folder):
     returns = simulate(scene, rays_at(scene, 2))
     found = task.score(scene, returns)
     alone = [
-        task.score(replace(scene, truth={"surface": surface}), [one for one in returns if one.frame == frame])
+        task.score(
+            replace(scene, truth={"surface": surface, METRIC: scene.truth[METRIC]}),
+            [one for one in returns if one.frame == frame],
+        )
         for frame, surface in enumerate(scene.truth[SURFACES])
     ]
     assert np.argmin([score.value for score in alone]) == 2
