@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.errors import InfeasibleError
+from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.geometry.rays import Rays, Returns
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
@@ -97,6 +97,7 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
     """The rays that are chosen at each number of rays.
 
     Raises:
+        DataError: No candidate tells anything about the scenes.
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
     rays, middle = problem.rays, counts[len(counts) // 2]
@@ -108,6 +109,12 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
         informed += problem.inform(scenes, wanted - len(informed))
         gates_m = problem.gates(informed)
         coverage, judged = problem.coverage(informed, gates_m), problem.coverage(held_back, gates_m)
+        if not len(coverage.item):
+            raise DataError(
+                f"none of {len(rays)} candidate rays tells anything about {len(informed)} training scenes",
+                where=problem.name,
+                hint="let sensors look at the targets: constrain less, or learn longer",
+            )
         before, loss = loss, judged.loss_of(problem.choice(coverage, middle).gate)
         if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > MOST_SCENES:
             break

@@ -32,6 +32,7 @@ from lidardesign.task import random_generator
 from lidardesign.workflow.run_folder import RunFolder
 
 CANDIDATES_PER_RAY = 5
+MOST_CHOSEN = 5000  # rays: what candidates tell of 400 scenes then takes minutes and gigabytes
 EVEN_SHARE = 0.25  # of the candidates that are even in the fields, where the density's samples may be sparse
 MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes returned, in the density's sigma
 
@@ -47,7 +48,8 @@ def select_rays(run: RunFolder, result: FitResult, counts: Sequence[int], sample
         seed: Root of the random streams.
 
     Raises:
-        ConfigError: The task does not say what returns tell.
+        ConfigError: The task does not say what returns tell, or more rays than can be chosen.
+        DataError: No ray inside the sensors tells anything about the training scenes.
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
     from lidardesign.selection.select import SelectionProblem, select
@@ -59,6 +61,8 @@ def select_rays(run: RunFolder, result: FitResult, counts: Sequence[int], sample
             allowed="tasks with informs",
             hint="another --layout, or give the task a method informs(scene, returns)",
         )
+    if counts[-1] > MOST_CHOSEN:
+        raise ConfigError(f"{counts[-1]} rays in the layout selected", where="--rays", allowed=f"at most {MOST_CHOSEN}")
     spec = result.design
     constraints = Constraints.from_mapping(spec.constraints, where=f"constraints of {spec.name}")
     # a task whose rays start all over their sensors' origins proposes such rays

@@ -15,6 +15,7 @@ from lidardesign.design.files import design_document, load_design, save_design
 from lidardesign.design.layouts.rays import certificates_of, lay_out
 from lidardesign.design.sensor import tangent_coordinates
 from lidardesign.errors import ConfigError
+from lidardesign.task import Information
 from lidardesign.workflow import select_rays
 from lidardesign.workflow.run_folder import RunFolder
 from lidardesign.workflow.runs import open_run
@@ -39,8 +40,8 @@ def few_scenes(monkeypatch):
     monkeypatch.setattr("lidardesign.selection.select.HELD_BACK_SCENES", 5)
 
 
-def chosen(run, **options):
-    return open_run(run).fit(layout="selected", sensors=2, name="chosen", **options)
+def chosen(run, sensors=2, **options):
+    return open_run(run).fit(layout="selected", sensors=sensors, name="chosen", **options)
 
 
 def tables_of(spec):
@@ -143,12 +144,23 @@ class TestTheCommand:
         [
             (("--refine", "1"), "layout selected beside --refine"),
             (("--weight", "variation=0.1"), "layout selected beside --weight"),
+            (("--rays", "5001"), "5001 rays in the layout selected"),
         ],
     )
     def test_what_does_not_go_together_is_refused(self, lidardesign, run, options, message):
         refused = lidardesign("fit", run, "--layout", "selected", *options)
         assert refused.code == 2
         assert message in refused.err
+
+    def test_rays_that_tell_nothing_are_refused(self, lidardesign, run, monkeypatch):
+        nothing = Information(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(5, int))
+        monkeypatch.setattr(select_rays, "checked_information", lambda task, scene, returns: nothing)
+        refused = lidardesign("fit", run, "--layout", "selected", "--rays", 4)
+        assert refused.code == 3
+        assert "tells anything about 5 training scenes" in refused.err
+
+    def test_a_single_ray_can_be_chosen(self, run):
+        assert len(chosen(run, sensors=1, rays=1, gates="ray").specification.ray_table) == 1
 
     def test_a_task_that_does_not_say_what_returns_tell_is_refused(self, lidardesign, run, monkeypatch):
         monkeypatch.setattr(select_rays, "informs_rays", lambda task: False)
