@@ -37,7 +37,11 @@ ANEW_LIMIT_S = 60
 MEMORY_BYTES = 8 << 30
 # Exit code of a process whose work raised, which pytest never lets a test do.
 BROKEN = 99
-OPTIONS = ["-x", "-q", "--capture=sys", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning"]
+# plain asserts: what rewrites them would import the project's own source before the changed one
+OPTIONS = [
+    "-x", "-q", "--assert=plain", "--capture=sys", "-p", "no:cacheprovider",
+    "-W", "ignore::pytest.PytestAssertRewriteWarning",
+]  # fmt: skip
 
 
 class Children:
