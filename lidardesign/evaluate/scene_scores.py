@@ -22,7 +22,7 @@ from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Returns
 from lidardesign.geometry.triangles import SecondCasts
-from lidardesign.registry import plugin_guard
+from lidardesign.registry import ask_of_returns, plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Physics
@@ -146,17 +146,7 @@ def checked_residuals(task: Task, scene: Scene, returns: Sequence[Returns]) -> R
     Raises:
         PluginError: The task's code raised, or returned something else.
     """
-    where = f"task {task.name}, residuals, scene {scene.name}"
-    try:
-        with plugin_guard(task.name):
-            found = task.residuals(scene, returns)  # type: ignore[attr-defined]
-    except PluginError as error:
-        raise PluginError(f"residuals failed: {error.message}", where=where, hint=error.hint) from error
-    if not isinstance(found, Residuals):
-        raise PluginError(
-            f"residuals returned {type(found).__name__}", where=where, allowed="lidardesign.task.Residuals"
-        )
-    return found
+    return ask_of_returns(task, "residuals", Residuals, scene, returns)
 
 
 def _is_number(value: object) -> bool:

@@ -8,7 +8,6 @@ Then one ray at a time leaves and the best that is left comes in, until no swap 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,9 +75,7 @@ class _Search:
         self.known = np.zeros(len(coverage.weight))
         self.gains = coverage.gains(self.known)
 
-    def improve(
-        self, price: float, limit_mbps: float, *, full: bool, passes: int, progress: Callable[[float], None] | None
-    ) -> None:
+    def improve(self, price: float, limit_mbps: float, *, full: bool, passes: int) -> None:
         """Takes rays at a price and within a bandwidth, then swaps them."""
         coverage = self.coverage
         self.cost = coverage.harm + price * np.where(np.isfinite(coverage.bits), coverage.bits, 0.0)
@@ -90,8 +87,6 @@ class _Search:
             worth = float(coverage.weight @ coverage.counted(self.known))
             changed = self.swap(full, SMALLEST_GAIN * worth)
             self.fill(full)
-            if progress is not None:
-                progress(worth)
             if not changed:
                 return
 
@@ -159,7 +154,6 @@ def choose(
     price: float = 0.0,
     full: bool = True,
     passes: int = MOST_PASSES,
-    progress: Callable[[float], None] | None = None,
 ) -> Choice:
     """Rays and gates of large F - price * bits - harm.
 
@@ -169,10 +163,9 @@ def choose(
         price: What 1 Mbit/s costs, in the unit of worth.
         full: Whether each sensor fires all its rays, also those that gain nothing.
         passes: How often each ray may be swapped.
-        progress: Told the objective after every pass.
     """
     search = _Search(coverage, counts)
-    search.improve(price, np.inf, full=full, passes=passes, progress=progress)
+    search.improve(price, np.inf, full=full, passes=passes)
     return search.choice(price)
 
 
@@ -182,14 +175,13 @@ def choose_within(
     budget_mbps: float,
     *,
     full: bool = True,
-    progress: Callable[[float], None] | None = None,
 ) -> Choice:
     """The best choice found that a bandwidth allows; as `choose`, with a budget [Mbit/s] for a price.
 
     A price reaches only the convex hull of what choices cost and are worth. So the price is bisected, and what the
     least price that keeps to the budget leaves over is spent at the next lower price, then at none.
     """
-    free = choose(coverage, counts, full=full, progress=progress)
+    free = choose(coverage, counts, full=full)
     if free.bits <= budget_mbps:
         return free
     low, high = 0.0, free.worth / free.bits
@@ -209,5 +201,5 @@ def choose_within(
             low = middle
     search = _Search(coverage, counts)
     for price in (high, low, 0.0):
-        search.improve(price, budget_mbps, full=full, passes=MOST_PASSES, progress=progress)
+        search.improve(price, budget_mbps, full=full, passes=MOST_PASSES)
     return search.choice(high)

@@ -14,7 +14,7 @@ import numpy as np
 
 from lidardesign.errors import PluginError
 from lidardesign.geometry.rays import Returns
-from lidardesign.registry import plugin_guard
+from lidardesign.registry import ask_of_returns
 from lidardesign.scene import Scene
 from lidardesign.task import Information, Task
 
@@ -36,18 +36,10 @@ def checked_information(task: Task, scene: Scene, returns: Sequence[Returns]) ->
     Raises:
         PluginError: The task's code raised, or returned something else, or what cannot be.
     """
+    answer = ask_of_returns(task, "informs", Information, scene, returns)
     where = f"task {task.name}, informs, scene {scene.name}"
-    try:
-        with plugin_guard(task.name):
-            found = task.informs(scene, returns)  # type: ignore[attr-defined]
-    except PluginError as error:
-        raise PluginError(f"informs failed: {error.message}", where=where, hint=error.hint) from error
-    if not isinstance(found, Information):
-        raise PluginError(
-            f"informs returned {type(found).__name__}", where=where, allowed="lidardesign.task.Information"
-        )
-    require_valid(found, len(returns[0].rays) if len(returns) else 0, len(returns), where)
-    return found
+    require_valid(answer, len(returns[0].rays) if len(returns) else 0, len(returns), where)
+    return answer
 
 
 def require_valid(information: Information, rays: int, frames: int, where: str = "task") -> None:

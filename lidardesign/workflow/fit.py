@@ -13,7 +13,7 @@ from lidardesign.design.constraints.document import CATALOG, Constraints, wants_
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import is_mounted, snap_to_space
 from lidardesign.design.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
-from lidardesign.design.layouts.rays import LAYOUTS, layout_of
+from lidardesign.design.layouts.rays import LAYOUTS, gates_of, layout_of
 from lidardesign.design.sensor import FITTED_LAYOUTS, LEVELS, DesignSpec, Gates
 from lidardesign.design.snap.parts import parts_of
 from lidardesign.errors import ConfigError, check_choice
@@ -149,7 +149,12 @@ class FitRequest:
                 notes(note)
         rules = constraints or Constraints()
         layout = layout or _usual_layout(rules, base, run)
-        beside = {"--refine": options.refine is not None, "--weight": options.weights, "snap": wants_parts(rules.rules)}
+        beside = {
+            "a density with conditions": run.config.space.conditioned,
+            "--refine": options.refine is not None,
+            "--weight": options.weights,
+            "snap": wants_parts(rules.rules),
+        }
         if LAYOUTS[layout].chosen_on_scenes and any(beside.values()):
             raise ConfigError(
                 f"layout {layout} beside {next(name for name, given in beside.items() if given)}",
@@ -177,7 +182,7 @@ class FitRequest:
                 "sensors": _sensors(options.sensors, rules, base, defaults.sensors),
                 "layout": layout,
                 "rays": _rays(options.rays, rules, base, most_rays),
-                "gates": options.gates,
+                "gates": options.gates or _own_gates(base, layout),
                 "level": level,
             },
             _weighting(settings_texts(options.weights), base, notes),
@@ -273,6 +278,14 @@ def _usual_layout(constraints: Constraints, base: DesignSpec | None, run: RunFol
         layout = layout_of(base)
         return layout.name if layout.chosen_on_scenes else layout.fitted_as
     return check_choice(run.task.defaults.layout, f"defaults.layout of task {run.task.name}", FITTED_LAYOUTS)
+
+
+def _own_gates(base: DesignSpec | None, layout: str) -> Gates | None:
+    """The gates of a design that is fitted again in its layout, where they are not the usual ones."""
+    if base is None or layout_of(base).name != layout:
+        return None
+    gates = gates_of(base)
+    return None if gates == LAYOUTS[layout].usual_gates else gates
 
 
 def _sensors(

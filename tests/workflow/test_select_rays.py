@@ -12,7 +12,7 @@ from support.tables import each_row
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document, load_design, save_design
-from lidardesign.design.layouts.rays import certificates_of, lay_out
+from lidardesign.design.layouts.rays import certificates_of, gates_of, lay_out
 from lidardesign.design.sensor import tangent_coordinates
 from lidardesign.errors import ConfigError
 from lidardesign.task import Information
@@ -118,9 +118,11 @@ class TestDesignsWithChosenRays:
         # what judges is drawn apart from what is chosen on
         assert len({seed for _, seed in asked}) >= 2
 
-    def test_constrained_again_they_are_chosen_again(self, run):
-        design = chosen(run, rays=9)
-        assert design.constrain(constraints={"gate": {"width_m": {"max": 0.5}}}).specification.layout == "selected"
+    @pytest.mark.parametrize("gates", ["sensor", "ray"])
+    def test_constrained_again_they_are_chosen_again_with_the_same_kind_of_gates(self, run, gates):
+        again = chosen(run, rays=9, gates=gates).constrain(constraints={"gate": {"width_m": {"max": 0.5}}})
+        assert again.specification.layout == "selected"
+        assert gates_of(again.specification) == gates
 
 
 class TestTheCommand:
@@ -151,6 +153,13 @@ class TestTheCommand:
         refused = lidardesign("fit", run, "--layout", "selected", *options)
         assert refused.code == 2
         assert message in refused.err
+
+    def test_densities_with_conditions_are_refused(self, lidardesign, tmp_path):
+        aisle = make_run(tmp_path / "aisle", task="warehouse")
+        for place in ((), ("--at", "x_m=0.5")):
+            refused = lidardesign("fit", aisle, "--layout", "selected", *place)
+            assert refused.code == 2
+            assert "layout selected beside a density with conditions" in refused.err
 
     def test_rays_that_tell_nothing_are_refused(self, lidardesign, run, monkeypatch):
         nothing = Information(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(5, int))
