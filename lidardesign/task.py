@@ -106,6 +106,7 @@ class Information:
             (frames, N); None: nothing.
         sums: None, or what sums of worths 0, 1, 2, ... count, linear in between: 0 at first, rising ever less.
         complete: What an item counts of which nothing is left to know; the loss of a choice is what lacks of it.
+        unit: Of `worth` and `complete`, as `m`; `1` for shares.
         seen_in: Which of the `Returns` each pair is from, int (E,), where returns of one frame tell about another, as
             about where a path goes on; a pair then comes once per frame, and its largest worth counts. None: those that
             show the item.
@@ -119,6 +120,7 @@ class Information:
     harm: np.ndarray | None = None
     sums: Sequence[float] | None = None
     complete: float = 1.0
+    unit: str = "1"
     seen_in: np.ndarray | None = None
 
     @property

@@ -102,6 +102,12 @@ class Rays:
         times = fire_times(len(looking), DEFAULT_RATE_HZ)
         return cls(origin_m, looking, gate_m, sensor, times, np.stack([azimuth_rad, elevation_rad], axis=1))
 
+    @classmethod
+    def joined(cls, parts: Sequence[Rays]) -> Rays:
+        """Several lists as one, one after the other, with angles as they follow from directions."""
+        names = ("origin_m", "direction", "gate_m", "sensor", "time_s")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
     @property
     def azimuth_rad(self) -> np.ndarray:
         """Shape (N,)."""

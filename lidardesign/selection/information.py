@@ -53,6 +53,7 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
         "seen_in of another length than item": information.seen_in is not None and len(seen_in) != pairs,
         "weight of another length than frame": weight.shape != (items,),
         f"harm of shape {harm.shape}, not {(frames, rays)}": harm.shape != (frames, rays),
+        "unit that is no text": not isinstance(information.unit, str),
         "weights that do not count": not weight.sum() > 0,
     }
     for name, index, count in (
@@ -122,6 +123,7 @@ def surface_information(
         weight=None if weight is None else np.concatenate(weight),
         harm=harm,
         complete=reach_m,
+        unit="m",
     )
 
 

@@ -22,9 +22,11 @@ from lidardesign.selection.candidates import InformedScene, inform
 from lidardesign.selection.certificate import certify
 from lidardesign.selection.choice import Choice, RayCounts, choose, choose_within
 from lidardesign.selection.coverage import Coverage, gather
+from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
 
 FIRST_SCENES, MOST_SCENES, HELD_BACK_SCENES = 50, 400, 50
+PROXY = "mean over items of what the returns of the chosen rays leave unknown, by informs of the task"
 SMALLEST_GAIN = 0.01  # of the held-back loss: what twice the scenes must gain
 
 
@@ -34,21 +36,23 @@ class SelectionProblem:
 
     Arguments:
         rays: Candidates with the widest gates that they may have.
-        gates: A few gates for each, (N, G, 2) [m], of what their returns tell about scenes.
+        gates: A few gates for each of some rays, (N, G, 2) [m], of what their returns tell about scenes.
         informs: What a task says of a scene's returns.
         scenes: Training scenes without end for a purpose, `choice` or `held back`.
         bandwidth: What reading out costs.
         limit_mbps: The most that it may cost, inf without a limit.
         name: Of the design, for messages.
+        further: As many rays again, which may not be chosen: a certificate says what they would gain.
     """
 
     rays: Rays
-    gates: Callable[[Sequence[InformedScene]], np.ndarray]
+    gates: Callable[[Rays, Sequence[InformedScene]], np.ndarray]
     informs: Callable[[Scene, Sequence[Returns]], Information]
     scenes: Callable[[str], Iterator[Scene]]
     bandwidth: Bandwidth
     limit_mbps: float
     name: str
+    further: Rays | None = None
 
     @phase("what returns tell")
     def inform(self, scenes: Iterator[Scene], count: int) -> list[InformedScene]:
@@ -86,7 +90,8 @@ class Selected:
     Arguments:
         rays: In the order of their sensors.
         certificate: `value` and `bound` of the loss on the scenes chosen on, `gap`, `held_back_value`, and the numbers
-            of `rays`, `candidates`, `gates` and `scenes`.
+            of `rays`, `candidates`, `gates` and `scenes`; at the middle number of rays `gap_doubled`, the gap with
+            candidates doubled, and `curve`, the price curve as pairs of Mbit/s and loss.
     """
 
     rays: Rays
@@ -107,7 +112,7 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
     wanted, loss = FIRST_SCENES, np.inf
     while True:
         informed += problem.inform(scenes, wanted - len(informed))
-        gates_m = problem.gates(informed)
+        gates_m = problem.gates(rays, informed)
         coverage, judged = problem.coverage(informed, gates_m), problem.coverage(held_back, gates_m)
         if not len(coverage.item):
             raise DataError(
@@ -136,6 +141,24 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
             "candidates": len(rays),
             "gates": gates_m.shape[1],
             "scenes": len(informed),
+            "proxy": PROXY,
+            "unit": informed[0][0].unit,
         }
+        if count == middle:
+            document["curve"] = price_curve(coverage, RayCounts.of_one(len(rays), count))
+            if problem.further is not None:
+                document["gap_doubled"] = _gap_doubled(problem, problem.further, count)
         selected.append(Selected(table, document))
     return selected
+
+
+@phase("certificate")
+def _gap_doubled(problem: SelectionProblem, further: Rays, count: int) -> float:
+    """The gap of a choice among the candidates on the first scenes, against choices among twice as many."""
+    own = len(problem.rays)
+    doubled = replace(problem, rays=Rays.joined([problem.rays, further]))
+    informed = doubled.inform(doubled.scenes("choice"), FIRST_SCENES)
+    coverage = doubled.coverage(informed, doubled.gates(doubled.rays, informed))
+    limit = None if np.isinf(problem.limit_mbps) else problem.limit_mbps
+    counts = RayCounts.of_one(len(doubled.rays), count)
+    return gap_among_more(coverage, counts, np.arange(len(doubled.rays)) < own, limit)

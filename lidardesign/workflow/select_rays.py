@@ -71,14 +71,13 @@ def select_rays(run: RunFolder, result: FitResult, counts: Sequence[int], sample
     limit = constraints.budget.bandwidth_mbps
     problem = SelectionProblem(
         rays=rays,
-        gates=partial(
-            _gates, spec, constraints, samples.space, rays, margin_m=MARGIN_SIGMAS * run.config.density.sigma_m
-        ),
+        gates=partial(_gates, spec, constraints, samples.space, margin_m=MARGIN_SIGMAS * run.config.density.sigma_m),
         informs=partial(checked_information, run.task),
         scenes=partial(_scenes, run, seed),
         bandwidth=bandwidth_limit(constraints, len(rays))[0],
         limit_mbps=np.inf if limit is None else limit,
         name=spec.name,
+        further=_further(spec, layout, samples, len(rays), seed),
     )
     selected = select(problem, counts)
     tables = [one.rays for one in selected]
@@ -115,8 +114,13 @@ def _proposed(spec: DesignSpec, layout: str, samples: Samples, count: int, seed:
         LAYOUTS[name].lay_out(spec, number, samples, "sensor", seed)
         for name, number in ((layout, count - even), ("grid", even))
     ]
-    names = ("origin_m", "direction", "gate_m", "sensor")
-    return Rays(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), np.zeros(count))
+    return replace(Rays.joined(parts), time_s=np.zeros(count))
+
+
+def _further(spec: DesignSpec, layout: str, samples: Samples, count: int, seed: int) -> Rays:
+    """As many rays again: at random every second one of twice as many, which are elsewhere."""
+    rays = _proposed(spec, layout, samples, 2 * count, seed)
+    return rays.subset(np.sort(random_generator(seed, "selection", "further").permutation(2 * count)[:count]))
 
 
 @phase("gates")

@@ -75,4 +75,4 @@ def path_information(returns: Sequence[Returns], target: int, ball_m: np.ndarray
     pairs = [len(hit) * len(items) for hit, items in zip(hits, near, strict=True)]
     seen_in = np.repeat([one.frame for one in returns], pairs)
     frame = np.arange(len(ball_m))
-    return Information(ray, item, left[seen_in, item], frame, complete=reach_m, seen_in=seen_in)
+    return Information(ray, item, left[seen_in, item], frame, complete=reach_m, unit="m", seen_in=seen_in)

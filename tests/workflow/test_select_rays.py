@@ -20,8 +20,6 @@ from lidardesign.workflow import select_rays
 from lidardesign.workflow.run_folder import RunFolder
 from lidardesign.workflow.runs import open_run
 
-COUNTS = (4, 9, 16)
-
 
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
@@ -105,6 +103,17 @@ class TestDesignsWithChosenRays:
             assert 0 <= entry["bound"] <= entry["value"]
             assert entry["gap"] == pytest.approx((entry["value"] - entry["bound"]) / entry["value"])
             assert entry["scenes"] in (5, 10)
+
+    @pytest.mark.parametrize("limit", [{}, {"budget": {"bandwidth_mbps": 0.3}}])
+    def test_the_middle_number_says_what_bandwidth_and_more_candidates_buy(self, run, limit):
+        entries = certificates_of(chosen(run, gates="ray", constraints=limit).specification)
+        (middle,) = (entry for entry in entries if {"curve", "gap_doubled"} & set(entry))
+        assert middle is entries[len(entries) // 2]
+        mbps, loss = np.array(middle["curve"]).T
+        assert (np.diff(mbps) > 0).all()
+        assert (np.diff(loss) < 0).all()
+        assert 0 <= middle["gap_doubled"] < 1
+        assert {entry["unit"] for entry in entries} == {"m"}
 
     def test_it_looks_at_training_scenes_that_nothing_was_learned_from(self, run, monkeypatch):
         asked = []

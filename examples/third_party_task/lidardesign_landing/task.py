@@ -91,7 +91,7 @@ class LandingTask:
         )
         frame = np.repeat(np.arange(len(returns)), hazards)
         counts = np.arange(FEWEST_RETURNS + 1.0)
-        return Information(ray, item, np.ones(len(ray)), frame, sums=counts, complete=FEWEST_RETURNS)
+        return Information(ray, item, np.ones(len(ray)), frame, sums=counts, complete=FEWEST_RETURNS, unit="returns")
 
 
 def looks(scene: Scene, returns: Sequence[Returns]) -> Iterator[Seen]:
