@@ -18,10 +18,12 @@ import numpy as np
 
 from lidardesign.config import FILE_NAME, RunConfig
 from lidardesign.design.constraints.slack import ConstraintSlack
+from lidardesign.design.sensor import CERTIFICATES
 from lidardesign.evaluate.accuracy.settings import Sweep
 from lidardesign.evaluate.figures.canvas import DASHES, Series, series
 from lidardesign.evaluate.figures.density_views import DensityView
 from lidardesign.evaluate.figures.scene_figure import FigureData, SceneFigure
+from lidardesign.evaluate.report.choice import choice_section
 from lidardesign.evaluate.report.figures import (
     FONT,
     MOST_DESIGNS,
@@ -124,6 +126,7 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
         ("rivals", "Against the rivals at equal rays", rivals),
         ("bandwidth", "Against the rivals at equal bandwidth", bandwidth),
         ("density", "The learned density", _density(report.density, looks) if report.density else ""),
+        ("choice", "Chosen rays and how far from the best", choice_section(designs, evaluation, looks)),
         ("constraints", "Constraints and how tight each is", "".join(constraints)),
         ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
         ("audit", "Audit of the physics", audit_section(evaluation, evaluation.audit) if evaluation.audit else ""),
@@ -256,7 +259,8 @@ def evaluation_report(
 
 
 def _origin(provenance: Mapping[str, object]) -> str:
-    told = [f"{name} {value}" for name, value in provenance.items() if name not in ("versions", "task", "run")]
+    elsewhere = ("versions", "task", "run", CERTIFICATES)
+    told = [f"{name} {value}" for name, value in provenance.items() if name not in elsewhere]
     return ", ".join(told) or "made by hand"
 
 
