@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,11 +73,19 @@ class Bench:
 
     def samples(self, settings: Mapping[str, Any]) -> Any:
         """The run's samples with the weights of some settings."""
+        import numpy as np
+
+        from lidardesign.space import RANGE
+        from lidardesign.task import random_generator
         from lidardesign.workflow.run_samples import RunTarget, Weighting, weighted_samples
 
         texts = tuple(f"{key}={value}" for key, value in settings.items())
-        weighting = Weighting(texts, range_spread_m=self.spread_m)
-        return weighted_samples(self.run, weighting, RunTarget(self.run, weighting=weighting))
+        weighting = Weighting(texts)
+        samples = weighted_samples(self.run, weighting, RunTarget(self.run, weighting=weighting))
+        points, space = samples.points.copy(), samples.space
+        noise = random_generator(self.run.config.seed, "range spread").normal(size=len(samples))
+        points[:, RANGE] = np.clip(points[:, RANGE] + self.spread_m * noise, space.low[RANGE], space.high[RANGE])
+        return replace(samples, points=points)
 
     def measured(self, samples: Any, choices: Mapping[str, Any], count: int) -> Measured:
         """Designs of one kind at a number of rays."""

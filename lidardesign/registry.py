@@ -18,18 +18,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, distributions, entry_points
-from typing import Any, TypeVar
+from typing import Any
 
 from lidardesign.errors import ConfigError, LidardesignError, PluginError
-from lidardesign.geometry.rays import Returns
 from lidardesign.run.clock import phase
-from lidardesign.scene import Scene
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
-
-Answer = TypeVar("Answer")
 
 # In the environment of a probing process, so that a plugin that asks for tasks does not start further ones.
 PROBING = "LIDARDESIGN_PROBING"
@@ -279,24 +275,6 @@ def plugin_guard(name: str) -> Iterator[None]:
             where=f"task {name}",
             hint=f"--debug shows where; {AUTHOR_HINT}",
         ) from error
-
-
-def ask_of_returns(task: Task, method: str, kind: type[Answer], scene: Scene, returns: Sequence[Returns]) -> Answer:
-    """What an optional method of a task, as `residuals` or `informs`, answers about returns in a scene.
-
-    Raises:
-        PluginError: The task's code raised, or returned something else.
-    """
-    where = f"task {task.name}, {method}, scene {scene.name}"
-    try:
-        with plugin_guard(task.name):
-            answer = getattr(task, method)(scene, returns)
-    except PluginError as error:
-        raise PluginError(f"{method} failed: {error.message}", where=where, hint=error.hint) from error
-    if not isinstance(answer, kind):
-        allowed = f"lidardesign.task.{kind.__name__}"
-        raise PluginError(f"{method} returned {type(answer).__name__}", where=where, allowed=allowed)
-    return answer
 
 
 def text_of(error: BaseException) -> str:

@@ -15,7 +15,7 @@ from lidardesign.numerics import normalised_weights, systematic_draw
 from lidardesign.run.arrays import guarded, read_npz
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import verify, write_recorded
-from lidardesign.space import RANGE, DesignSpace
+from lidardesign.space import DesignSpace
 
 FILE_NAME = "samples.npz"
 NUMBERS = ("points", "log_prob", "log_target")
@@ -71,23 +71,9 @@ class Samples:
         """The samples at an index or mask."""
         return Samples(self.points[keep], self.log_prob[keep], self.log_target[keep], self.space)
 
-    def reweighted(self, log_factors: np.ndarray) -> Samples:
-        """The samples with log p* moved by so much at each of them, shape (N,): of another target density."""
-        return replace(self, log_target=self.log_target + log_factors)
-
     def retargeted(self, log_target: np.ndarray) -> Samples:
         """The samples with another log p*, shape (N,), which they may have where the old one is -inf."""
         return replace(self, log_target=log_target)
-
-    def spread_in_range(self, spread_m: float, generator: np.random.Generator) -> Samples:
-        """The samples with normal noise on their ranges, inside the space: what scenes that were not seen may be.
-
-        Weights stay; log p* is no longer that of the moved points.
-        """
-        low, high = self.space.low[RANGE], self.space.high[RANGE]
-        points = self.points.copy()
-        points[:, RANGE] = np.clip(points[:, RANGE] + spread_m * generator.normal(size=len(self)), low, high)
-        return replace(self, points=points)
 
     def resample(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Design points drawn from p* by systematic importance resampling, shape (count, 6)."""

@@ -64,32 +64,6 @@ class Score:
 
 
 @dataclass(frozen=True, eq=False)
-class Residuals:
-    """Where in a scene the error of a set of returns is, for refinement.
-
-    Arguments:
-        points_m: Places in the world frame [m], shape (M, 3); on or near what rays should have observed.
-        values: What the score suffers there, 0 or more, shape (M,): larger where it suffers more, in any unit that
-            all scenes of the task share.
-
-    Raises:
-        ValueError: Shapes that do not fit, or values that are negative or no numbers.
-    """
-
-    points_m: np.ndarray
-    values: np.ndarray
-
-    def __post_init__(self) -> None:
-        for name in ("points_m", "values"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
-        points, values = self.points_m.shape, self.values.shape
-        if len(points) != 2 or points[1] != 3 or values != points[:1]:
-            raise ValueError(f"residuals of shape {values} at places of shape {points}: allowed are (M,) and (M, 3)")
-        if not (np.isfinite(self.points_m).all() and np.isfinite(self.values).all() and (self.values >= 0).all()):
-            raise ValueError("residuals or their places are negative, NaN or infinite")
-
-
-@dataclass(frozen=True, eq=False)
 class Information:
     """What returns tell about a scene: pairs of a ray and an item, as a point of the surface, a frame or a body.
 
@@ -164,9 +138,6 @@ class Task(Protocol):
 
     A task may name `weighing_keys`, keys of its configuration that only say what counts more in the density: designs
     of runs that differ in them alone are judged side by side.
-
-    A task may also give `residuals(scene, returns) -> Residuals`, where the error of what `score` judges is; designs
-    of a task without them cannot be refined.
 
     A task may also give `informs(scene, returns) -> Information`, what returns tell about a scene, for choosing rays;
     `returns` are as in `score`, of all candidate rays through open gates. Rays of a task without it are not chosen.

@@ -62,8 +62,8 @@ FURTHER = {
         learn flatland SETTINGS --out runs/flatland --resume
         learn flatland SETTINGS --tolerance 0.9 --out runs/staged
         evaluate runs/flatland/designs/scan.yaml --rays 12 --plots pictures
-        fit runs/flatland --layout scan --rays 12 --refine 1 --name refined
-        show runs/flatland/designs/refined.yaml --json
+        fit runs/flatland --layout selected --rays 12 --name chosen
+        show runs/flatland/designs/chosen.yaml --json
         tasks check flatland --json
         evaluate runs/flatland/designs/scan.yaml --rays 12 --effects all --detector single-photon --json
     """,
@@ -141,7 +141,7 @@ COMMANDS = (
 # Values of these keys are of the moment or of the machine; the laws of `tasks check` measure calls in seconds.
 MASKED_KEYS = re.compile(
     r"(.*_)?seconds(_.*)?|when|created|timings|phases|versions|lidardesign_version|peak_memory_bytes|peak_bytes"
-    r"|(Config|space|scenes|score|residuals)_s"
+    r"|(Config|space|scenes|score)_s"
 )
 # In text: durations, with the padding of their cell, memory, dates, and the table of what took how long.
 MASKED_TEXT = (

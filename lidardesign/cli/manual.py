@@ -98,7 +98,6 @@ MANUALS: dict[str, Manual] = {
         {
             "lidardesign fit runs/face --sensors 4 --name free": "four sensors, rays left open",
             "lidardesign fit runs/face --layout scan --rays 576 --name beams": "one steerable beam per ray",
-            "lidardesign fit runs/face --layout scan --rays 361 --refine 5 --name steered": "led by the task's error",
             "lidardesign fit runs/face --like robot.sdf --name instead": "no more than a rig that there is",
             "lidardesign fit runs/warehouse --rays 12 --at x_m=0.37 --name here": "for one position of a robot",
         },
@@ -106,7 +105,7 @@ MANUALS: dict[str, Manual] = {
         "sensors with a field of view and a gate.",
         files=("RUN/samples.npz: the samples of the density", "RUN/designs/NAME.yaml: the design"),
         exits=FROM_A_RUN,
-        see=("design-file.md", "refinement.md", "importance.md"),
+        see=("design-file.md", "selection.md", "importance.md"),
     ),
     "constrain": Manual(
         {

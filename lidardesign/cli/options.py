@@ -99,7 +99,7 @@ Refine = Annotated[
         metavar="N",
         min=1,
         max=100,
-        help="Then up to N rounds: look where the error is on training scenes, weigh, fit again, keep the best.",
+        help="With --layout selected: up to N rounds of new candidates.",
         show_default=False,
     ),
 ]

@@ -22,14 +22,14 @@ from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Returns
 from lidardesign.geometry.triangles import SecondCasts
-from lidardesign.registry import ask_of_returns, plugin_guard
+from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Physics
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.simulate import build_casters, simulate_many
 from lidardesign.space import DesignSpace
-from lidardesign.task import Metric, Residuals, Score, Task
+from lidardesign.task import Metric, Score, Task
 
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000
@@ -132,21 +132,6 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
         )
     clip = min if metric.better == "lower" else max
     return Score(clip(float(score.value), float(metric.worst)), details=score.details)
-
-
-def gives_residuals(task: Task) -> bool:
-    """Whether a task says where in a scene the error is."""
-    return callable(getattr(task, "residuals", None))
-
-
-@phase("metric")
-def checked_residuals(task: Task, scene: Scene, returns: Sequence[Returns]) -> Residuals:
-    """Where the error of returns is in a scene, by a task that gives residuals.
-
-    Raises:
-        PluginError: The task's code raised, or returned something else.
-    """
-    return ask_of_returns(task, "residuals", Residuals, scene, returns)
 
 
 def _is_number(value: object) -> bool:

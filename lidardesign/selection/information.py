@@ -14,7 +14,7 @@ import numpy as np
 
 from lidardesign.errors import PluginError
 from lidardesign.geometry.rays import Returns
-from lidardesign.registry import ask_of_returns
+from lidardesign.registry import plugin_guard
 from lidardesign.scene import Scene
 from lidardesign.task import Information, Task
 
@@ -36,8 +36,15 @@ def checked_information(task: Task, scene: Scene, returns: Sequence[Returns]) ->
     Raises:
         PluginError: The task's code raised, or returned something else, or what cannot be.
     """
-    answer = ask_of_returns(task, "informs", Information, scene, returns)
     where = f"task {task.name}, informs, scene {scene.name}"
+    try:
+        with plugin_guard(task.name):
+            answer = task.informs(scene, returns)
+    except PluginError as error:
+        raise PluginError(f"informs failed: {error.message}", where=where, hint=error.hint) from error
+    if not isinstance(answer, Information):
+        allowed = "lidardesign.task.Information"
+        raise PluginError(f"informs returned {type(answer).__name__}", where=where, allowed=allowed)
     require_valid(answer, len(returns[0].rays) if len(returns) else 0, len(returns), where)
     return answer
 

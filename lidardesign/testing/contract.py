@@ -85,7 +85,7 @@ def check_memory(subject: Subject) -> LawHolds | NotApplicable:
     return LawHolds(f"the process held {peak / MEBIBYTE:.0f} MiB at most", {"peak_bytes": peak})
 
 
-_AFTER = ("scores are numbers", "residuals are places", "returns inform")
+_AFTER = ("scores are numbers", "returns inform")
 CONDUCT_LAWS = (
     Law("no global random state", "conduct", "no global random state is used", check_random, after=_AFTER),
     Law("nothing is written", "conduct", "only temporary files and caches are written", check_files, after=_AFTER),

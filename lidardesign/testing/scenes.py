@@ -6,13 +6,13 @@ import pickle
 from importlib.util import find_spec
 
 from lidardesign.errors import LidardesignError
-from lidardesign.evaluate.scene_scores import gives_residuals
+from lidardesign.selection.information import informs_rays
 from lidardesign.task import Split
 from lidardesign.testing.elsewhere import fingerprints_in_process
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
 from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
 
-# Training scenes are drawn with other seeds for refinement; so many further seeds are tried.
+# Training scenes are drawn with other seeds where rays are chosen; so many further seeds are tried.
 FURTHER_SEEDS = 2
 SPLITS: tuple[Split, ...] = ("train", "test")
 
@@ -44,15 +44,15 @@ def check_repeatable(subject: Subject) -> LawHolds:
 
 
 def check_seeds(subject: Subject) -> LawHolds | NotApplicable:
-    """Another seed gives other training scenes: refinement, which needs residuals, trains on further ones."""
+    """Another seed gives other training scenes: rays are chosen on further ones, by a task with `informs`."""
     first = {geometry_fingerprint(scene) for scene in subject.scenes("train")}
     other = {geometry_fingerprint(scene) for scene in subject.scenes("train", subject.config.seed + 1)}
     shared = len(first & other)
     if shared == len(first):
         same = "another seed gives the same training scenes"
-        if not gives_residuals(subject.task):
-            return NotApplicable(f"{same}; without residuals, no further ones are drawn")
-        raise BrokenLawError(f"{same}, but refinement draws further ones", hint="draw chance from the seed")
+        if not informs_rays(subject.task):
+            return NotApplicable(f"{same}; without informs, no further ones are drawn")
+        raise BrokenLawError(f"{same}, but rays are chosen on further ones", hint="draw chance from the seed")
     return LawHolds(f"{shared} of {len(first)} training scenes are the same with another seed", {"shared": shared})
 
 

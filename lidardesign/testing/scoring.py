@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.evaluate.scene_scores import checked_residuals, gives_residuals
 from lidardesign.geometry.rays import Returns
 from lidardesign.numerics import SLACK
 from lidardesign.scene import Scene
@@ -151,19 +150,6 @@ def check_untouched(subject: Subject) -> LawHolds:
     return LawHolds(f"{len(subject.looked_at)} scenes and their returns are as they were")
 
 
-def check_residuals(subject: Subject) -> LawHolds | NotApplicable:
-    """Residuals are places and values of 0 or more, also where nothing was heard."""
-    if not gives_residuals(subject.task):
-        return NotApplicable("the task gives no residuals: its designs cannot be refined")
-    count = 0
-    for number, scene in _scenes(subject):
-        returns = _dense(subject, number)
-        for heard in (returns, without_returns(returns)):
-            with subject.calling("residuals"):
-                count += len(checked_residuals(subject.task, scene, heard).values)
-    return LawHolds(f"{count} places", {"places": count})
-
-
 def check_information(subject: Subject) -> LawHolds | NotApplicable:
     """Rays tell about items by their own returns alone: once, alike in any order, and nothing without a return."""
     if not informs_rays(subject.task):
@@ -244,13 +230,6 @@ LAWS = (
         "score",
         "scenes and returns are as they were after scoring",
         check_untouched,
-        needs=("scores are numbers",),
-    ),
-    Law(
-        "residuals are places",
-        "score",
-        "residuals are places and values of 0 or more",
-        check_residuals,
         needs=("scores are numbers",),
     ),
     Law(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,6 @@ from lidardesign.workflow.fit_design import fit_design
 from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, need_run, relative_folder
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.refinement import Round
     from lidardesign.evaluate.report.figures import Figure
 
 
@@ -43,7 +42,6 @@ class Design(DesignSource):
         run: The run that it was fitted in; None for a rig of others, or where the run has gone.
         path: Its file; None while it was not saved.
         result: What the fit found: log-likelihood, checks of constraints, standard errors; None for a loaded one.
-        refinement: How refinement went, as plain values; None without.
 
     Example:
         >>> design = run.fit(sensors=2, rays=36, name="two")
@@ -64,31 +62,25 @@ class Design(DesignSource):
         run: RunFolder | None = None,
         path: Path | None = None,
         result: FitResult | None = None,
-        refinement: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(specification, run, path)
-        self.result, self.refinement = result, refinement
+        self.result = result
 
     @classmethod
-    def fitted(
-        cls, request: FitRequest, *, progress: Callable[[Round], None] | None = None, notes: Notes = log_note
-    ) -> Design:
+    def fitted(cls, request: FitRequest, *, notes: Notes = log_note) -> Design:
         """The design that a request comes to; it is not saved yet."""
-        result, refinement = fit_design(request, progress=progress, notes=notes)
-        return cls(result.design, request.run, None, result, refinement)
+        result = fit_design(request, notes=notes)
+        return cls(result.design, request.run, None, result)
 
     @property
     def name(self) -> str:
         """Its name, which is its file's and its rows'."""
         return self.specification.name
 
-    def constrain(
-        self, *, progress: Callable[[Round], None] | None = None, notes: Notes = log_note, **options: Any
-    ) -> Design:
+    def constrain(self, *, notes: Notes = log_note, **options: Any) -> Design:
         """Fit again in its run; what is not chosen anew stays as it is.
 
         Arguments:
-            progress: Called with every round of refinement.
             notes: Called with every note.
             options: As of `FitOptions`: constraints, sensors, rays, layout, gates, level, at, refine, name and more.
 
@@ -98,7 +90,7 @@ class Design(DesignSource):
         """
         run = need_run(self.run, self.name if self.path is None else self.path)
         request = FitRequest.resolve(run, FitOptions(**options), self.specification, notes=notes)
-        return Design.fitted(request, progress=progress, notes=notes)
+        return Design.fitted(request, notes=notes)
 
     def rays(
         self, count: int | None = None, *, at: Mapping[str, float] | None = None, seed: int = 0, notes: Notes = log_note
@@ -174,9 +166,8 @@ class Design(DesignSource):
     def as_dict(self) -> dict[str, Any]:
         """What `lidardesign fit --json` prints of it: sensors, and what the fit found."""
         place = self.name if self.path is None else str(self.path)
-        further = {} if self.refinement is None else {"refinement": dict(self.refinement)}
         certificates = certificates_of(self.specification)
-        further.update({CERTIFICATES: certificates} if certificates else {})
+        further = {CERTIFICATES: certificates} if certificates else {}
         if self.result is None:
             return {"design": place, "sensors": [sensor.as_dict() for sensor in self.specification.sensors]}
         return {**self.result.as_dict(), "design": place, **further}

@@ -47,13 +47,13 @@ class FitOptions:
     Arguments:
         sensors: How many sensors, or "auto": as many as held-out likelihood says. A scan has one per ray.
         constraints: Constraints, a mapping of them, or a YAML file of them.
-        layout: grid, density, scan or distributed.
+        layout: grid, density, scan, distributed or selected.
         rays: Rays per frame over all sensors.
         gates: "sensor" or "ray": one gate per sensor, or one per ray.
         level: The share of rays and returns that fields of view and gates hold.
         at: Values of conditions that the design is for, as {"x_m": 0.37}.
         weights: Settings of the task towards which the learned density is weighted.
-        refine: At most so many rounds of refinement on training scenes.
+        refine: At most so many rounds of new candidates, for layout selected.
         like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
         name: The design's name.
         seed: Root of every random stream; the run's by default.
@@ -96,8 +96,8 @@ class FitRequest:
         constraints: Checked constraints, or None.
         at: Condition values that the design is for; without any, one for all of them.
         choices: sensors, layout, rays, gates and level, as `lidardesign.design.fit.fit` takes them.
-        weighting: What the density is multiplied by.
-        refine: Rounds of refinement, or None.
+        weighting: Settings of the task to whose scenes the density is weighted.
+        refine: Rounds of new candidates, or None.
         names: What sensors are called, where there are as many; none numbers them.
         command: For the design's provenance.
         files: Files that were read for it.
@@ -149,13 +149,20 @@ class FitRequest:
                 notes(note)
         rules = constraints or Constraints()
         layout = layout or _usual_layout(rules, base, run)
+        chosen_on_scenes = LAYOUTS[layout].chosen_on_scenes
+        if options.refine is not None and not chosen_on_scenes:
+            raise ConfigError(
+                f"layout {layout} beside --refine",
+                where="--refine",
+                allowed=f"layout {', '.join(name for name in FITTED_LAYOUTS if LAYOUTS[name].chosen_on_scenes)}",
+                hint="its rounds try new candidates for chosen rays",
+            )
         beside = {
             "a density with conditions": run.config.space.conditioned,
-            "--refine": options.refine is not None,
             "--weight": options.weights,
             "snap": wants_parts(rules.rules),
         }
-        if LAYOUTS[layout].chosen_on_scenes and any(beside.values()):
+        if chosen_on_scenes and any(beside.values()):
             raise ConfigError(
                 f"layout {layout} beside {next(name for name, given in beside.items() if given)}",
                 where="--layout",
@@ -185,19 +192,12 @@ class FitRequest:
                 "gates": options.gates or _own_gates(base, layout),
                 "level": level,
             },
-            _weighting(settings_texts(options.weights), base, notes),
+            _weighting(settings_texts(options.weights), base),
             options.refine,
             names,
             "fit" if asked is None else "constrain",
             tuple(files) if options.like is None else (*files, Path(options.like)),
         )
-
-    @property
-    def judged_rays(self) -> int:
-        """The number of rays that a refined design is judged at: its own, else the task's middle budget."""
-        budgets = sorted(self.run.task.defaults.rays)
-        asked = None if self.constraints is None else self.constraints.budget.rays
-        return self.choices.get("rays") or asked or budgets[len(budgets) // 2]
 
     def plan(self) -> RequestPlan:
         """What the fit would do.
@@ -245,7 +245,7 @@ class FitRequest:
         if constraints:
             steps.append(f"keep to constraints of {', '.join(constraints)}; check them on the finished file")
         if self.refine:
-            steps.append(f"refine it in up to {self.refine} rounds on training scenes of task {self.run.task.name}")
+            steps.append(f"try new candidates in up to {self.refine} rounds")
         return steps
 
 
@@ -308,12 +308,9 @@ def _rays(asked: int | None, constraints: Constraints, base: DesignSpec | None, 
     return base.rays if base is not None and base.rays is not None else usual
 
 
-def _weighting(settings: tuple[str, ...], base: DesignSpec | None, notes: Notes) -> Weighting:
+def _weighting(settings: tuple[str, ...], base: DesignSpec | None) -> Weighting:
     """How samples are weighted: by the user's settings, else as they were for the design."""
-    own = Weighting.of(base) if base else Weighting()
-    if settings and own.reweighting is not None:
-        notes("with --weight the design's refinement is left out; --refine finds another")
-    return Weighting(settings) if settings else own
+    return Weighting(settings) if settings or base is None else Weighting.of(base)
 
 
 def load_constraints(

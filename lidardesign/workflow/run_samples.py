@@ -1,4 +1,4 @@
-"""What a run's samples give its designs: their weights under settings and refinement, and the rays that follow."""
+"""What a run's samples give its designs: their weights under settings of the task, and the rays that follow."""
 
 from __future__ import annotations
 
@@ -16,42 +16,31 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.manifest import read_manifest
 from lidardesign.samples import Samples, load_samples
-from lidardesign.space import FARTHEST_M
 from lidardesign.task import random_generator
 from lidardesign.workflow.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from lidardesign.density.target.target import Target
     from lidardesign.evaluate.baselines.catalog import Density
-    from lidardesign.evaluate.reweighting import Reweighting
-
 
 KEY = "weighting"
-# Refinement spreads by a few sigma of the density, which is at most the largest length.
-WIDEST_SPREAD_M = 10 * FARTHEST_M
+FIT_AGAIN = "fit the design again: an earlier version refined it, or its file was changed by hand"
 # As many samples as the standard preset of `learn` leaves.
 TWIN_SAMPLES = 100_000
 TWIN_NAME = "no-visibility"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Weighting:
-    """What the density of a run is multiplied by for a design.
+    """Settings of the task to whose scenes the density of a run is weighted for a design.
 
     Arguments:
-        settings: Settings of the task, as KEY=VALUE: the target becomes that of their scenes.
-        reweighting: A factor over the scene, by refinement.
-        range_spread_m: Standard deviation by which samples are spread in range, by refinement [m].
-        origin: Where the settings were said: an option, or a design.
+        settings: As KEY=VALUE; none leaves the density as it was learned.
+        origin: Where they were said: an option, or a design.
     """
 
     settings: tuple[str, ...] = ()
-    reweighting: Reweighting | None = None
-    range_spread_m: float = 0.0
     origin: str = "--weight"
-
-    def __bool__(self) -> bool:
-        return bool(self.settings or self.reweighting is not None or self.range_spread_m)
 
     @classmethod
     def of(cls, design: DesignSpec) -> Weighting:
@@ -63,42 +52,16 @@ class Weighting:
         document, where = design.provenance.get(KEY), f"{KEY} of design {design.name}"
         if document is None:
             return cls()
-        from lidardesign.evaluate.reweighting import FIT_AGAIN, Reweighting
-
-        known = {"set", "factors", "range_spread_m"}
-        if not isinstance(document, Mapping) or not set(document) <= known:
-            allowed = f"some of the keys {', '.join(sorted(known))}"
-            raise ConfigError("is no weighting", where=where, allowed=allowed, hint=FIT_AGAIN)
-        settings, spread = document.get("set", ()), document.get("range_spread_m", 0.0)
-        listed = isinstance(settings, Sequence) and not isinstance(settings, str)
-        if not (listed and all(isinstance(text, str) for text in settings)):
+        if not isinstance(document, Mapping) or set(document) != {"set"}:
+            raise ConfigError("is no weighting", where=where, allowed="the key set", hint=FIT_AGAIN)
+        settings = document["set"]
+        if not isinstance(settings, list | tuple) or not all(isinstance(text, str) for text in settings):
             raise ConfigError(f"set is {settings!r}", where=where, allowed="a list of KEY=VALUE", hint=FIT_AGAIN)
-        is_number = isinstance(spread, int | float) and not isinstance(spread, bool)
-        if not (is_number and 0 <= spread <= WIDEST_SPREAD_M):
-            allowed = f"0 to {WIDEST_SPREAD_M:g}"
-            raise ConfigError(f"range_spread_m is {spread!r}", where=where, allowed=allowed, hint=FIT_AGAIN)
-        factors = document.get("factors")
-        reweighting = None if factors is None else Reweighting.from_document(factors, f"{where}: factors")
-        return cls(tuple(settings), reweighting, float(spread), f"{where}: set")
+        return cls(tuple(settings), f"{where}: set")
 
     def as_document(self) -> dict[str, Any]:
         """Plain values, as they stand in the provenance of a design."""
-        factors = None if self.reweighting is None else self.reweighting.as_document()
-        document = {"set": list(self.settings), "range_spread_m": self.range_spread_m, "factors": factors}
-        return {key: value for key, value in document.items() if value}
-
-    def log_target(self, samples: Samples, target: RunTarget) -> Samples:
-        """The samples with the log p* that they have under the settings and the factor; ranges stay."""
-        if self.settings:
-            return samples.retargeted(target(samples.points))
-        if self.reweighting is not None:
-            return samples.reweighted(self.reweighting.log_factor(samples.points))
-        return samples
-
-    def spread(self, samples: Samples, seed: int) -> Samples:
-        """The samples spread in range, where that was found to gain something."""
-        generator = random_generator(seed, "range spread")
-        return samples.spread_in_range(self.range_spread_m, generator) if self.range_spread_m else samples
+        return {"set": list(self.settings)}
 
 
 class RunTarget:
@@ -107,7 +70,7 @@ class RunTarget:
     Arguments:
         run: The run.
         visibility: The visibility to take instead of what the run decided.
-        weighting: Settings of the task whose scenes it is of instead, and a factor.
+        weighting: Settings of the task whose scenes it is of instead.
     """
 
     def __init__(self, run: RunFolder, visibility: str | None = None, weighting: Weighting | None = None) -> None:
@@ -126,9 +89,7 @@ class RunTarget:
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Design points (N, 6) to (N,)."""
-        values = self._target.log_density(points)
-        factor = self._weighting.reweighting
-        return values if factor is None else values + factor.log_factor(points)
+        return self._target.log_density(points)
 
 
 def weighted_samples(run: RunFolder, weighting: Weighting, target: RunTarget) -> Samples:
@@ -137,7 +98,8 @@ def weighted_samples(run: RunFolder, weighting: Weighting, target: RunTarget) ->
     Raises:
         DataError: The samples are damaged, or all weights are zero.
     """
-    return weighting.spread(weighting.log_target(load_samples(run.folder), target), run.config.seed)
+    samples = load_samples(run.folder)
+    return samples.retargeted(target(samples.points)) if weighting.settings else samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +127,7 @@ class Layouts:
         targets = {}
         for design, run in designs:
             weighting = Weighting.of(design)
-            targets[design.name] = RunTarget(run, weighting=weighting) if weighting else by_folder[run.folder]
+            targets[design.name] = RunTarget(run, weighting=weighting) if weighting.settings else by_folder[run.folder]
         if designs:
             targets[TWIN_NAME] = RunTarget(designs[0][1], visibility="off")
         return cls(targets)
@@ -178,7 +140,7 @@ class Layouts:
             if not (may_need_samples(design) and run.has_samples):
                 continue
             weighting = Weighting.of(design)
-            key = (run.folder, design.name if weighting else None)
+            key = (run.folder, design.name if weighting.settings else None)
             if key not in shared:
                 shared[key] = weighted_samples(run, weighting, self.targets[design.name])
             by_name[design.name] = shared[key]

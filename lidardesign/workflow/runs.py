@@ -19,7 +19,6 @@ from lidardesign.workflow.run_folder import MANIFEST, Notes, RunFolder, folder_o
 if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress
     from lidardesign.density.learned import LearnedDensity
-    from lidardesign.evaluate.refinement import Round
     from lidardesign.workflow.evaluate import Scores
 
 FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
@@ -106,7 +105,6 @@ class Run(RunFolder):
         refine: int | None = None,
         name: str | None = None,
         seed: int | None = None,
-        progress: Callable[[Round], None] | None = None,
         notes: Notes = log_note,
         **further: Any,
     ) -> Design:
@@ -118,10 +116,9 @@ class Run(RunFolder):
             rays: Rays per frame over all sensors.
             layout: grid, density, scan or distributed; the task's by default.
             at: Values of conditions that the design is for, as {"x_m": 0.37}.
-            refine: At most so many rounds of refinement on training scenes.
+            refine: At most so many rounds of new candidates, for layout selected.
             name: The design's name.
             seed: Root of every random stream; the run's by default.
-            progress: Called with every round of refinement.
             notes: Called with every note; they are logged by default.
             further: gates, level, weights and like, as of `FitOptions`.
 
@@ -142,7 +139,7 @@ class Run(RunFolder):
             notes=notes,
             **further,
         )
-        return Design.fitted(request, progress=progress, notes=notes)
+        return Design.fitted(request, notes=notes)
 
     def fit_request(self, *, notes: Notes = log_note, **options: Any) -> FitRequest:
         """What `fit` of the same choices would do, resolved: its `plan()` says it."""

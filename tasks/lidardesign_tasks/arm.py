@@ -18,10 +18,9 @@ from pydantic import Field, model_validator
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.metrics import discrete_frechet_m
 from lidardesign.geometry.rays import Returns
-from lidardesign.numerics import safe_divide
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
 from lidardesign_tasks.arm_motion import Arm, Motion
 from lidardesign_tasks.arm_robot import BALL_RADIUS_M, Robot, load_robot
 from lidardesign_tasks.arm_tracking import FEWEST_FRAMES, filled_path, path_information, tracked_places
@@ -116,20 +115,6 @@ class ArmTask:
             return Score(self.metric.worst, failed=True, details=details)
         path = filled_path(frames, places, scene.frames)
         return Score(min(discrete_frechet_m(path, scene.truth["ball_m"]), self.metric.worst), details=details)
-
-    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
-        """Where the ball was in each frame, and its share of the score [m], by the square of how far off its place is.
-
-        The longest leash decides about a path, and the second longest once that one is mended. Values sum to the
-        score before it is cut at the worst value, which a failure spreads evenly over all frames.
-        """
-        ball = scene.truth["ball_m"]
-        frames, places = _tracked(scene, returns)
-        if len(frames) < FEWEST_FRAMES:
-            return Residuals(ball, np.full(len(ball), self.metric.worst / len(ball)))
-        path = filled_path(frames, places, scene.frames)
-        squares = np.square(path - ball).sum(axis=1)
-        return Residuals(ball, discrete_frechet_m(path, ball) * safe_divide(squares, squares.sum()))
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """What returns on the ball tell about its place in their own and in neighbouring frames."""

@@ -19,10 +19,10 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Mesh, Receiver, Scene, inverse_rigid
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split
+from lidardesign.task import Defaults, Information, Metric, Score, Split
 from lidardesign_tasks.face import FaceTask, HeadConfig, Vector, head_scenes
 from lidardesign_tasks.importance import WEIGHING_KEYS
-from lidardesign_tasks.surface import surface_informs, surface_residuals, surface_score
+from lidardesign_tasks.surface import surface_informs, surface_score
 
 
 class EmitterConfig(HeadConfig):
@@ -126,10 +126,6 @@ class EmitterTask:
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the face that could be heard."""
         return surface_score(self.metric, scene, returns)
-
-    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
-        """Where the Chamfer distance is [mm]."""
-        return surface_residuals(self.metric, scene, returns)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """What returns tell about points of the visible face, the more the nearer they are."""

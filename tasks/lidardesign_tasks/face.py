@@ -23,11 +23,11 @@ from lidardesign.geometry.rays import Returns
 from lidardesign.meshio import check_mesh, usable_faces
 from lidardesign.scene import Body, Mesh, Receiver, Scene, Sign
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.pose import jittered_pose
-from lidardesign_tasks.surface import surface_informs, surface_residuals, surface_score, with_visible_truth
+from lidardesign_tasks.surface import surface_informs, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import any_direction, moving
 
 Vector = tuple[float, float, float]
@@ -106,10 +106,6 @@ class FaceTask:
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the face that could be seen."""
         return surface_score(self.metric, scene, returns)
-
-    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
-        """Where the Chamfer distance is [mm]."""
-        return surface_residuals(self.metric, scene, returns)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """What returns tell about points of the visible face, the more the nearer they are."""

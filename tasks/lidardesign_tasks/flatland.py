@@ -15,13 +15,13 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from lidardesign.evaluate.metrics import chamfer_m, nearest_m
+from lidardesign.evaluate.metrics import chamfer_m
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Body, Capsule, Scene, Sphere, rigid
 from lidardesign.selection.information import surface_information
 from lidardesign.space import DesignSpace, aim
-from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
 from lidardesign_tasks.surroundings import Surroundings
 
 MILLIMETRES = 1000.0
@@ -89,17 +89,6 @@ class FlatlandTask:
             return Score(self.metric.worst, failed=True, details={"returns": float(len(points))})
         value = MILLIMETRES * chamfer_m(curve, scene.truth["curve_m"])
         return Score(min(value, self.metric.worst), details={"returns": float(len(points))})
-
-    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
-        """Where the Chamfer distance [mm] is: on the visible curve what is missed, on the estimate what is wrong.
-
-        Values sum to the score before it is cut at the worst value, which a failure spreads evenly.
-        """
-        truth, curve = scene.truth["curve_m"], reconstruct_curve(measured_points(returns))
-        if curve is None:
-            return Residuals(in_space(truth), np.full(len(truth), self.metric.worst / len(truth)))
-        missed, wrong = nearest_m(curve, truth) / len(truth), nearest_m(truth, curve) / len(curve)
-        return Residuals(in_space(np.concatenate([truth, curve])), MILLIMETRES * np.concatenate([missed, wrong]))
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """What returns tell about points of the visible curve, the more the nearer they are."""

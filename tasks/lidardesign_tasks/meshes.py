@@ -25,16 +25,15 @@ from lidardesign.meshio import COLOURS, Painted, list_mesh_files, load_mesh
 from lidardesign.numerics import circular_difference
 from lidardesign.scene import Body, Mesh, Scene, Sign
 from lidardesign.space import DesignSpace, aim
-from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
-from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_residuals, moving_score, with_moving_truth
+from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import (
     METRIC,
     MILLIMETRES,
     surface_informs,
-    surface_residuals,
     surface_score,
     with_visible_truth,
 )
@@ -194,11 +193,6 @@ class MeshesTask:
         """Chamfer distance [mm] between the reconstruction and the part of the surface that could be seen."""
         score = moving_score if SURFACES in scene.truth else surface_score
         return score(scene.truth.get(METRIC, self.metric), scene, returns)
-
-    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
-        """Where the Chamfer distance is [mm]."""
-        residuals = moving_residuals if SURFACES in scene.truth else surface_residuals
-        return residuals(scene.truth.get(METRIC, self.metric), scene, returns)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """What returns tell about points of the visible surface in each frame, the more the nearer they are."""

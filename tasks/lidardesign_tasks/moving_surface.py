@@ -16,8 +16,8 @@ from lidardesign.evaluate.metrics import SurfaceCloud, visible_surface
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
 from lidardesign.space import DesignSpace
-from lidardesign.task import Information, Metric, Residuals, Score, random_generator
-from lidardesign_tasks.surface import ITEMS, LazyTruth, fewer_points, information_of, surface_residuals, surface_score
+from lidardesign.task import Information, Metric, Score, random_generator
+from lidardesign_tasks.surface import ITEMS, LazyTruth, fewer_points, information_of, surface_score
 
 SURFACES = "surfaces"
 FEWEST_ITEMS = 25  # of a frame: so few tell its area to a tenth or two
@@ -68,13 +68,6 @@ def moving_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Sc
     failed = sum(score.failed for score in scores)
     value = float(np.mean([score.value for score in scores]))
     return Score(value, failed=failed == len(scores), details={**details, "failed_frames": float(failed)})
-
-
-def moving_residuals(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Residuals:
-    """Where the Chamfer distances are [mm], of all frames; they sum to the score before it is cut."""
-    found = [surface_residuals(metric, still, seen) for still, seen in _frames(scene, returns)]
-    values = np.concatenate([residuals.values for residuals in found]) / len(found)
-    return Residuals(np.concatenate([residuals.points_m for residuals in found]), values)
 
 
 def moving_informs(scene: Scene, returns: Sequence[Returns]) -> Information:

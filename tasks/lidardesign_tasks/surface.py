@@ -16,7 +16,7 @@ from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Mesh, Scene
 from lidardesign.selection.information import scattered_area_m2, surface_information
 from lidardesign.space import DesignSpace
-from lidardesign.task import Information, Metric, Residuals, Score, random_generator
+from lidardesign.task import Information, Metric, Score, random_generator
 
 MILLIMETRES = 1000.0
 RECONSTRUCTION_POINTS = 4000
@@ -141,7 +141,8 @@ def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> S
     reconstruction within 10 mm.
     """
     details = {"returns": float(sum(int(frame.returned.sum()) for frame in returns))}
-    estimate, truth = _reconstructed(scene, returns), scene.truth["surface"]
+    viewpoint_m = None if scene.receiver is None else np.array(scene.receiver.origin_m)
+    estimate, truth = reconstruct(returns, viewpoint_m), scene.truth["surface"]
     if details["returns"]:
         away_m = truth.distance_m(np.concatenate([frame.points_m for frame in returns]))
         details["outliers_percent"] = 100.0 * float((away_m > max(OUTLIER_M, truth.gap_m)).mean())
@@ -150,22 +151,6 @@ def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> S
     missed, wrong = estimate.distance_m(truth.points), truth.distance_m(estimate.points)
     details["coverage"] = float((missed <= COVERED_M).mean())
     return Score(min(MILLIMETRES * float(missed.mean() + wrong.mean()), metric.worst), details=details)
-
-
-def surface_residuals(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Residuals:
-    """Where the Chamfer distance is: on the visible surface what is missed, on the reconstruction what is wrong.
-
-    Values sum to the score [mm] before it is cut at the metric's worst value; where nothing can be reconstructed,
-    that value is spread evenly over the visible surface.
-    """
-    estimate, truth = _reconstructed(scene, returns), scene.truth["surface"]
-    if estimate is None:
-        return Residuals(truth.points, np.full(len(truth.points), metric.worst / len(truth.points)))
-    missed = estimate.distance_m(truth.points) / len(truth.points)
-    wrong = truth.distance_m(estimate.points) / len(estimate.points)
-    return Residuals(
-        np.concatenate([truth.points, estimate.points]), MILLIMETRES * np.concatenate([missed, wrong])
-    )
 
 
 def surface_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
@@ -200,9 +185,3 @@ def importance_at(scene: Scene, points_m: np.ndarray, frame: int) -> np.ndarray:
         for mesh in (body.shape for body in meshes)
     ]
     return np.concatenate(counts)[cKDTree(np.concatenate(vertices)).query(points_m)[1]]
-
-
-def _reconstructed(scene: Scene, returns: Sequence[Returns]) -> SurfaceCloud | None:
-    """The surface through returns, as a fixed receiver sees them where the scene has one."""
-    viewpoint_m = None if scene.receiver is None else np.array(scene.receiver.origin_m)
-    return reconstruct(returns, viewpoint_m)

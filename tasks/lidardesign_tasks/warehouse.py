@@ -19,10 +19,10 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
 from lidardesign.space import DIMENSIONS, DesignSpace, X
-from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split, conditions_of, random_generator
+from lidardesign.task import Defaults, Information, Metric, Score, Split, conditions_of, random_generator
 from lidardesign_tasks.surroundings import Surroundings, moving
 from lidardesign_tasks.warehouse_shelf import Interval, ShelfPlan, build_shelf
-from lidardesign_tasks.warehouse_truth import BoxTruth, box_information, miss_residuals, miss_score
+from lidardesign_tasks.warehouse_truth import BoxTruth, box_information, miss_score
 
 AISLE_M = (-0.5, 4.0)
 PAPER_POSITIONS_M = (0.0, 1.2, 2.4, 3.6)
@@ -139,10 +139,6 @@ class WarehouseTask:
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """The share [%] of boxes in the sensor's plane that no ray returned on; one `Returns` per position."""
         return miss_score(self.metric, scene, returns)
-
-    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
-        """Where rays could have seen the boxes that are missed, and their share of the score [%]."""
-        return miss_residuals(scene, returns)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """Which returns lie on which boxes that could be seen from their position."""

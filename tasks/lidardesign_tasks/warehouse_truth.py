@@ -17,8 +17,8 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Body, Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
-from lidardesign.task import Information, Metric, Residuals, Score
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
+from lidardesign.task import Information, Metric, Score
 
 PERCENT = 100.0
 # No step between neighbouring elevations is wider: the ends of the design space's range cut faces to this angle.
@@ -98,41 +98,20 @@ def _crossed(body: Body, origin_m: np.ndarray, forward: np.ndarray) -> tuple[flo
     return (near, far) if near < far else None
 
 
-@dataclass(frozen=True, eq=False)
-class Sweep:
-    """What every admissible ray of a plane sees: one ray per step of elevations with the same first hit.
+def visible_boxes(cut: PlaneCut, space: DesignSpace) -> np.ndarray:
+    """The bodies of the boxes that some admissible ray of the plane sees, ascending, shape (V,).
 
-    Arguments:
-        elevation_rad: Of the ray in the middle of each step, shape (S,).
-        width_rad: Of each step, shape (S,).
-        body: What the ray sees, shape (S,).
-        range_m: How far away it is, shape (S,).
+    One ray stands for each step of elevations with the same first hit.
     """
-
-    elevation_rad: np.ndarray
-    width_rad: np.ndarray
-    body: np.ndarray
-    range_m: np.ndarray
-
-
-def swept(cut: PlaneCut, space: DesignSpace) -> Sweep:
-    """The steps of the space's elevations whose rays see a box within the space's ranges."""
     low, high = space.low[ELEVATION], space.high[ELEVATION]
     corners = [np.arctan2(z, s) for s in (cut.low[:, 0], cut.high[:, 0]) for z in (cut.low[:, 1], cut.high[:, 1])]
     even = np.linspace(low, high, math.ceil((high - low) / LARGEST_STEP_RAD) + 1)
     edges = np.unique(np.clip(np.concatenate([*corners, even]), low, high))
-    elevation = (edges[:-1] + edges[1:]) / 2
-    row, range_m = cut.first_hits(elevation)
+    row, range_m = cut.first_hits((edges[:-1] + edges[1:]) / 2)
     seen = (row >= 0) & (range_m >= space.low[RANGE]) & (range_m <= space.high[RANGE])
     seen[seen] = cut.is_box[row[seen]]
-    return Sweep(elevation[seen], np.diff(edges)[seen], cut.body[row[seen]], range_m[seen])
-
-
-def visible_boxes(cut: PlaneCut, space: DesignSpace) -> np.ndarray:
-    """The bodies of the boxes that some admissible ray of the plane sees, ascending, shape (V,)."""
-    sweep = swept(cut, space)
-    bodies, box = np.unique(sweep.body, return_inverse=True)
-    return bodies[np.bincount(box, sweep.width_rad, len(bodies)) >= SMALLEST_VISIBLE_RAD]
+    bodies, box = np.unique(cut.body[row[seen]], return_inverse=True)
+    return bodies[np.bincount(box, np.diff(edges)[seen], len(bodies)) >= SMALLEST_VISIBLE_RAD]
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,26 +257,3 @@ def box_information(scene: Scene, returns: Sequence[Returns]) -> Information:
         known += len(visible)
     ray = np.concatenate(rays)
     return Information(ray, np.concatenate(items), np.ones(len(ray)), np.concatenate(frames))
-
-
-def miss_residuals(scene: Scene, returns: Sequence[Returns]) -> Residuals:
-    """Where rays could have met the boxes that are missed, [%] of all (box, position) pairs that could be seen.
-
-    The share of a pair is spread over the box's visible part, even in the elevation of the rays that see it. Values
-    sum to the score.
-
-    Raises:
-        ConfigError: The number of returns is not the number of evaluated positions.
-    """
-    truth = scene.truth
-    points, values = [np.empty((0, 3))], [np.empty(0)]
-    for origin, cut, missed in zip(truth.origins_m, truth.cuts, missed_boxes(scene, returns), strict=True):
-        sweep = swept(cut, truth.space)
-        chosen = np.isin(sweep.body, missed)
-        ray = direction(truth.space.low[AZIMUTH], sweep.elevation_rad[chosen])
-        _, box = np.unique(sweep.body[chosen], return_inverse=True)
-        width = sweep.width_rad[chosen]
-        points.append(origin + sweep.range_m[chosen, None] * ray)
-        values.append(width / np.bincount(box, width)[box])
-    share = PERCENT / sum(map(len, truth.visible))
-    return Residuals(np.concatenate(points), share * np.concatenate(values))

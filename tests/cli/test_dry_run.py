@@ -146,12 +146,11 @@ def test_samples_that_were_changed_are_refused_before_anything_is_fitted(lidarde
 
 def test_people_are_told_in_words(lidardesign, flat, tmp_path):
     lidardesign("fit", flat, "--sensors", 2)
-    result = lidardesign("fit", flat, "--sensors", 2, "--refine", 3, "--weight", "variation=1.5", "--dry-run")
+    result = lidardesign("fit", flat, "--sensors", 2, "--weight", "variation=1.5", "--dry-run")
     lines = result.out.splitlines()
     assert lines[0] == "fit would"
     assert "  fit 2 sensors, layout grid, rays left open, level 0.95, seed 3" in lines
     assert "  weigh the density with variation=1.5" in lines
-    assert "  refine it in up to 3 rounds on training scenes of task flatland" in lines
     assert f"write  {flat}/designs/fit.yaml (replaced)" in lines
     assert any(line.startswith(f"time   the last fit of {flat} took") for line in lines)
     assert lines[-1] == "nothing was done: leave out --dry-run to do it"

@@ -421,7 +421,7 @@ def test_samples_of_the_plain_density_reweighted_are_those_of_the_weighted_one(l
     target = prepare_target(scenes, config, visibility="off")[0]
     plain = replace(target, surfaces=replace(target.surfaces, importance=None))
     factors = plain.log_density(samples.points) - target.log_density(samples.points)
-    back = samples.reweighted(factors)
+    back = samples.retargeted(samples.log_target + factors)
     share = float(back.weights[back.points[:, 3] > 0].sum())
     assert share == pytest.approx(0.5, abs=0.02)
     # shares of 3/4 and 1/4 weighted to halves: ESS = 1 / sum (1/2)^2 / share

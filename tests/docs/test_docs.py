@@ -16,7 +16,6 @@ from lidardesign.cli.main import app
 from lidardesign.config import resolve
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.errors import LidardesignError
-from lidardesign.evaluate.scene_scores import checked_residuals
 from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
 from lidardesign.run.yaml import parse_yaml
@@ -165,16 +164,6 @@ def test_the_moving_ball_of_the_guide_is_scored_over_its_frames():
     assert task.score(scene, simulate(scene, everywhere)).value < task.score(
         scene, simulate(scene, seen_at_the_ends)
     ).value
-
-
-def test_the_residuals_of_the_guide_are_the_frames_without_the_ball():
-    task, _, scene = moving_scene_of("PassingTask", 0)
-    ball = scene.bodies[0].poses[:, :3, 3]
-    returns = simulate(scene, rays_at(ball[[0]], np.array([0.0, 0.0, 0.3])))
-    found = checked_residuals(task, scene, returns)
-    assert np.array_equal(found.points_m, ball)
-    assert found.values[0] == 0.0 < found.values[-1]
-    assert found.values.sum() == pytest.approx(task.score(scene, returns).value)
 
 
 def test_the_returns_of_the_guide_tell_about_the_frames_that_they_are_of():

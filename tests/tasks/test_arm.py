@@ -260,26 +260,6 @@ def test_fewer_than_two_tracked_frames_fail_with_the_worst_value(scenes):
     assert 0 < two.value < 1
 
 
-def test_residuals_are_where_the_ball_was_by_the_square_of_how_far_off_its_place_is(scenes):
-    scene = scenes["test"][0]
-    ball, shift = scene.truth["ball_m"], np.zeros((scene.frames, 3))
-    assert TASK.residuals(scene, exact_returns(scene, ball)).values.max() < 1e-9
-    shift[[3, 7], 0] = 0.02, 0.01
-    found = TASK.residuals(scene, exact_returns(scene, ball + shift))
-    np.testing.assert_array_equal(found.points_m, ball)
-    expected = np.zeros(scene.frames)
-    expected[[3, 7]] = TASK.score(scene, exact_returns(scene, ball + shift)).value * np.array([0.8, 0.2])
-    np.testing.assert_allclose(found.values, expected, atol=1e-9)
-
-
-def test_a_frame_that_was_not_seen_is_where_the_error_is(scenes):
-    scene = scenes["test"][0]
-    seen = [frame for frame in range(scene.frames) if frame not in (5, 6)]
-    found = TASK.residuals(scene, exact_returns(scene, scene.truth["ball_m"], frames=seen))
-    assert set(np.argsort(found.values)[-2:]) == {5, 6}
-    assert found.values[[5, 6]].sum() == pytest.approx(found.values.sum())
-
-
 def test_returns_on_the_ball_tell_of_frames_by_the_way_in_between(scenes):
     scene = scenes["test"][0]
     ball, hit = scene.truth["ball_m"], [2, 5]

@@ -200,23 +200,6 @@ def test_what_is_not_told_about_is_the_miss_rate(shelves, rays):
         assert 100 * (1 - told) == pytest.approx(TASK.score(scene, returns).value, abs=1e-9)
 
 
-def test_residuals_are_where_rays_would_have_met_the_boxes_that_are_missed(shelves):
-    generator = np.random.default_rng(8)
-    for scene in shelves[:4]:
-        returns = returns_of(scene, generator.uniform(0.0, 1.1, 8))
-        found, places = TASK.residuals(scene, returns), scene.truth.origins_m
-        pairs = sum(len(visible) for visible in scene.truth["visible"])
-        for place, visible, one in zip(places, scene.truth["visible"], returns, strict=True):
-            here = np.abs(found.points_m[:, 0] - place[0]) < ROUNDING_M
-            away = found.points_m[here] - place
-            hits = SceneCaster(scene).first_hit(np.tile(place, (len(away), 1)), away)
-            np.testing.assert_allclose(hits.range_m, np.linalg.norm(away, axis=1), atol=1e-5)
-            missed = np.setdiff1d(visible, one.body)
-            assert set(hits.body) == set(missed)
-            for box in missed:
-                assert found.values[here][hits.body == box].sum() == pytest.approx(100.0 / pairs)
-
-
 def test_a_position_without_rays_only_costs_its_own_boxes(shelves):
     scene = shelves[0]
     dense = np.linspace(0.0, math.pi / 2, SWEEP_RAYS)

@@ -28,7 +28,6 @@ SCORE = "    def score(self, scene, returns):\n"
 VALUE = "        return Score(min(1000 * off + 50 / len(points), 100.0))\n"
 CENTRE = "        centre = np.array([generator.uniform(2.0, 3.0), generator.uniform(-0.5, 0.5), 0.0])\n"
 CONFIG = "    Config = TaskConfig\n"
-RESIDUALS = "    def residuals(self, scene, returns):\n        return "
 METRIC_OF = "    def metric_of(self, config):\n        from dataclasses import replace\n        return "
 # All returns tell about the one thing that there is.
 INFORMS = """    def informs(self, scene, returns):
@@ -82,7 +81,7 @@ BROKEN = {
     ],
     "seeds differ": [
         ("random_generator(seed,", "random_generator(0,", "the same training scenes"),
-        (SCORE, RESIDUALS + "None\n\n" + SCORE, ""),
+        (SCORE, INFORMS + SCORE, ""),
     ],
     "splits are disjoint": [("split, i)", "i)", "is the held-out scene 'test 0'")],
     "scenes are picklable": [('{"at": centre}', '{"at": centre, "f": lambda: 0}', "cannot be pickled")],
@@ -112,10 +111,6 @@ BROKEN = {
     "scores change nothing": [
         (VALUE, "        returns[0].range_m[:] = 1.0\n" + VALUE, "score changed returns"),
         (VALUE, "        scene.bodies[0].poses[0, 3] += 1e-9\n" + VALUE, "score changed the scene 'train 0'"),
-    ],
-    "residuals are places": [
-        (SCORE, RESIDUALS + "None\n\n" + SCORE, "residuals returned NoneType"),
-        (SCORE, RESIDUALS + "__import__('lidardesign.task').task.Residuals([[0, 0, 0]], [-1])\n\n" + SCORE, "negative"),
     ],
     "returns inform": [
         (SCORE, INFORMS.replace("Information(", "print(").replace("import print", "import Information") + SCORE,
@@ -210,7 +205,6 @@ def test_a_good_task_keeps_every_law_that_applies(kept):
     assert {finding.law for finding in kept.values() if finding.outcome == "skip"} == {
         "conditions lie in the space",
         "scenes repeat elsewhere",
-        "residuals are places",
         "returns inform",
     }
     assert not [finding for finding in kept.values() if finding.outcome == "fail"]

@@ -166,7 +166,7 @@ def test_the_fixture_runs_one_test_per_task_and_law_and_names_what_is_broken(pyt
     monkeypatch.syspath_prepend(pytester.path / "installed")
     pytester.makeini("[pytest]\nlidardesign_tasks =\n    fixture_good\n    fixture_backwards\n")
     pytester.makepyfile(CONTRACT_TEST)
-    result = pytester.runpytest_inprocess("-k", "best or metric or residuals", "-rf")
+    result = pytester.runpytest_inprocess("-k", "best or metric or inform", "-rf")
     result.assert_outcomes(passed=3, skipped=1 + 1, failed=1)
     result.stdout.fnmatch_lines(["best on the truth: the score does not reward seeing the targets: *"])
     result.stdout.fnmatch_lines(["FAILED *fixture_backwards: best on the truth*"])

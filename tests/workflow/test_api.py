@@ -15,7 +15,6 @@ from support.small_runs import shifted
 import lidardesign
 from lidardesign.design.fit import fit
 from lidardesign.errors import ConfigError, DataError, InfeasibleError, ThresholdError
-from lidardesign.evaluate.refinement import Refiner
 
 SCRIPT = '''
 import lidardesign as ld
@@ -26,7 +25,7 @@ points = run.density.sample(1000)                                      # and run
 
 free = run.fit(sensors=4, name="free")
 kept = run.fit(sensors=4, constraints={"gate": {"width_m": {"max": 0.1}}}, rays=576, name="kept")
-best = run.fit(sensors=10, rays=361, layout="density", gates="ray", refine=5, name="best")
+best = run.fit(sensors=10, rays=361, layout="density", gates="ray", name="best")
 best.save(); best.export("rays.csv"); rays = best.rays(196)
 
 scores = run.evaluate([free, kept, best], rays=[196, 361], baselines=["bounding"])
@@ -57,8 +56,7 @@ def run(learned, tmp_path, monkeypatch):
 
 
 def test_the_script_of_users_runs_as_it_stands(tmp_path, monkeypatch):
-    learn, refine = lidardesign.learn, Refiner.run
-    monkeypatch.setattr(Refiner, "run", lambda self, rounds, *start: refine(self, min(rounds, 1), *start))
+    learn = lidardesign.learn
     monkeypatch.setitem(fit.__kwdefaults__, "restarts", 2)
     monkeypatch.setitem(fit.__kwdefaults__, "em_samples", 4000)
     monkeypatch.setattr(
@@ -150,10 +148,9 @@ def test_designs_work_without_a_run_and_find_their_own(run, tmp_path):
         alone.constrain(constraints={})
 
 
-def test_notes_and_rounds_go_to_whoever_asks(run, caplog):
-    notes, rounds = [], []
-    run.fit(sensors=2, rays=12, refine=1, weights={"variation": 1.5}, progress=rounds.append, notes=notes.append)
-    assert rounds[0].number == 0
+def test_notes_go_to_whoever_asks(run, caplog):
+    notes = []
+    run.fit(sensors=2, rays=12, weights={"variation": 1.5}, notes=notes.append)
     assert any("variation=1.5" in note for note in notes)
     with caplog.at_level("INFO", "lidardesign"):
         run.fit(sensors=2, rays=12, weights=["variation=1.5"])

@@ -153,7 +153,6 @@ class TestTheCommand:
     @each_row(
         ("options", "message"),
         [
-            (("--refine", "1"), "layout selected beside --refine"),
             (("--weight", "variation=0.1"), "layout selected beside --weight"),
             (("--rays", "5001"), "5001 rays in the layout selected"),
         ],
@@ -162,6 +161,14 @@ class TestTheCommand:
         refused = lidardesign("fit", run, "--layout", "selected", *options)
         assert refused.code == 2
         assert message in refused.err
+
+    def test_rounds_of_new_candidates_are_for_chosen_rays_alone(self, lidardesign, run):
+        planned = lidardesign("fit", run, "--layout", "selected", "--refine", 3, "--dry-run")
+        assert "  try new candidates in up to 3 rounds" in planned.out.splitlines()
+        for name in ("grid", "density", "scan", "distributed"):
+            refused = lidardesign("fit", run, "--layout", name, "--refine", 3)
+            assert refused.code == 2
+            assert f"--refine: layout {name} beside --refine" in refused.err
 
     def test_densities_with_conditions_are_refused(self, lidardesign, tmp_path):
         aisle = make_run(tmp_path / "aisle", task="warehouse")

@@ -19,13 +19,11 @@ class Seen(NamedTuple):
     """What returns of one frame show.
 
     Arguments:
-        centres_m: Where the hazards are, shape (H, 3) [m].
         missed: Which of them no estimate knows of, shape (H,).
         phantoms_m: Raised returns where nothing stands, shape (P, 3) [m].
         raised: The number of raised returns.
     """
 
-    centres_m: np.ndarray
     missed: np.ndarray
     phantoms_m: np.ndarray
     raised: int
@@ -41,8 +39,7 @@ def seen(scene: Scene, points_m: np.ndarray, frame: int) -> Seen:
     """What points (N, 3) [m] show of a scene in a frame; the estimate is the raised ones among them."""
     raised = points_m[points_m[:, 2] > RAISED_M]
     near = on_hazards(scene, raised, frame)
-    centres = np.stack([body.pose(frame)[:3, 3] for body in scene.bodies if body.is_target])
-    return Seen(centres, near.sum(axis=1) < FEWEST_RETURNS, raised[~near.any(axis=0)], len(raised))
+    return Seen(near.sum(axis=1) < FEWEST_RETURNS, raised[~near.any(axis=0)], len(raised))
 
 
 def on_hazards(scene: Scene, points_m: np.ndarray, frame: int) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The task landing: a drone descends to a landing place and must see the boxes that stand around it.
 
 The drone's height is a condition: its sensors fire other rays from 6 m than from 2 m, and the score is a mean over
-heights. The task shows conditions, bodies that only block rays, optional motion, residuals, and what returns tell.
+heights. The task shows conditions, bodies that only block rays, optional motion, and what returns tell.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Residuals, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
 
 from lidardesign_landing.config import LandingConfig
 from lidardesign_landing.hazards import FEWEST_RETURNS, Seen, on_hazards, seen
@@ -68,17 +68,6 @@ class LandingTask:
             "raised returns": float(np.mean([one.raised for one in found])),
         }
         return Score(PERCENT * float(np.mean([one.error for one in found])), details=details)
-
-    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
-        """Where hazards were missed, and where phantoms are; values add up to the score."""
-        places, values = [np.zeros((0, 3))], [np.zeros(0)]
-        found = list(looks(scene, returns))
-        for one in found:
-            missed, scale = float(one.missed.mean()), PERCENT / len(found)
-            places += [one.centres_m, one.phantoms_m]
-            hidden = (1.0 - missed) / max(one.raised, 1)
-            values += [scale * one.missed / len(one.missed), np.full(len(one.phantoms_m), scale * hidden)]
-        return Residuals(np.concatenate(places), np.concatenate(values))
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """Which returns are of which hazards, for choosing rays: items are hazards, anew at each height and frame."""

@@ -49,14 +49,6 @@ def test_the_ground_is_no_hazard_and_noise_makes_phantoms(scene):
     assert (raised.raised, len(raised.phantoms_m)) == (9, 9)
 
 
-def test_residuals_add_up_to_the_score(scene):
-    task = LandingTask()
-    returns = simulate(scene, rays_at(on_top(2.0)))
-    found = task.residuals(scene, returns)
-    assert found.values.sum() == pytest.approx(task.score(scene, returns).value)
-    assert found.values.tolist() == [50.0, 0.0]
-
-
 def test_the_second_return_of_a_box_tells_as_much_as_the_first_and_the_third_nothing(scene):
     returns = simulate(scene, rays_at(np.concatenate([on_top(2.0, 3), np.zeros((1, 3))])))
     found = LandingTask().informs(scene, returns)

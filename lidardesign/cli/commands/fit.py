@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.output import Output, command, keep_times, show_plan
 from lidardesign.cli.tables.designs import show_fit
-from lidardesign.cli.tables.grids import RichConsole, number, text_table
+from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.refinement import Round
     from lidardesign.workflow.fit import FitRequest
 
 
@@ -66,47 +64,15 @@ def run_fit(request: FitRequest, output: Output) -> None:
     """Fit the design of a request, save it, and give the result."""
     from lidardesign.workflow.designs import Design
 
-    def show_round(entry: Round) -> None:
-        text = f"{entry.change} (refused, {number(entry.seconds, 2)} s)"
-        if entry.score is not None:
-            score = f"{number(entry.score)} {request.run.metric.unit} at {number(entry.bandwidth_mbps, 3)} Mbit/s"
-            verdict = "kept" if entry.kept else "not better"
-            text = f"{entry.change}: {score}, {verdict} ({number(entry.seconds, 2)} s)"
-        output.note(f"refine {entry.number}: {text}")
-
-    design = Design.fitted(request, progress=show_round, notes=output.remark)
+    design = Design.fitted(request, notes=output.remark)
     design.save()
     document = design.as_dict()
     keep_times(request.run.folder, request.command, output, wait_s=WAIT_S)
 
     def show(rich: RichConsole) -> None:
-        if design.refinement is not None:
-            _show_refinement(design.refinement, rich)
         show_fit(document, design.specification, design.result.constraints if design.result else (), rich)
 
     output.result(document, show)
-
-
-def _show_refinement(document: Mapping[str, Any], rich: RichConsole) -> None:
-
-    scenes, unit = document["scenes"], document["unit"]
-    title = (
-        f"refinement: {scenes['looked_at']} training scenes to look at, score on {scenes['judged_on']} others "
-        f"({number(document['start'])} to {number(document['end'])} {unit})"
-    )
-    rows = [
-        (
-            str(entry["round"]),
-            entry["change"],
-            number(entry["score"]),
-            number(entry["bandwidth_mbps"], 3),
-            "yes" if entry["kept"] else "no",
-            number(entry["seconds"], 2),
-        )
-        for entry in document["rounds"]
-    ]
-    figures = ("round", unit, "Mbit/s", "kept", "s")
-    rich.print(text_table(("round", "change", *figures[1:]), rows, title, figures))
 
 
 def constrain(

@@ -128,12 +128,6 @@ class RayRanges:
     ray: np.ndarray
     count: int
 
-    def held_by(self, gates: np.ndarray) -> float:
-        """The weight that gates (N, 2) hold; what lies on their very ends counts, whatever rounding did to these."""
-        start, end = gates[self.ray].T
-        held = (self.range_m >= start - THINNEST_GATE_M) & (self.range_m <= end + THINNEST_GATE_M)
-        return float(self.weights[held].sum())
-
 
 def gates_within(heard: RayRanges, bounds: Bounds, level: float, model: Bandwidth, most_bins: int | None) -> np.ndarray:
     """Gates that hold the level of what each ray hears, or less where their bins would be too many.

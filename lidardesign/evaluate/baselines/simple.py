@@ -21,7 +21,7 @@ The baseline `no-visibility`: the same design fitted to the density without its 
 
 The number of sensors, the layout, the constraints, the level and the seed are those of a fitted design; only the
 samples differ. What its rays are worth beside that design is what knowing about occlusion is worth, and where that
-design was weighted or refined, what that is worth as well: the twin is neither.
+design was weighted, what that is worth as well: the twin is not.
 """
 
 from __future__ import annotations
