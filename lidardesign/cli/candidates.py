@@ -39,6 +39,7 @@ BASELINES = {
     "bounding": "one even grid cropped to the training returns",
     "silhouette": "a hexagonal lattice where training scenes return, a gate per ray",
     "lloyd": "as silhouette, denser where returns are frequent and surfaces large",
+    "greedy": "chosen on training scenes, without a density",
     "occupancy": "rays towards cells that targets occupy",
     "no-visibility": "the first design without its occlusion term",
     "catalog:": "a real part where it sees most",

@@ -18,6 +18,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.baselines.catalog import Density
+from lidardesign.evaluate.baselines.greedy import GreedySource
 from lidardesign.evaluate.baselines.simple import ALWAYS, LayOut, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import CmaSettings
 from lidardesign.evaluate.scene_scores import ScenePass, Scorer, score_here
@@ -50,6 +51,7 @@ class EvaluationRequest:
         without_visibility: The design that stands for the baseline `no-visibility`, and the samples that it was
             fitted to; called when that is asked for.
         density: What was learned, for baselines that look where it is; None where a run has no samples.
+        greedy: What the baseline `greedy` chooses by; None: it is left out.
         cma: How long the baseline `cma` searches, and who is told how it stands.
         planner: The detector, and how the effects that are simulated are chosen.
         audit: Whether all rows are scored under all effects too.
@@ -72,6 +74,7 @@ class EvaluationRequest:
     lay_out: LayOut = rays_at
     without_visibility: Callable[[], tuple[DesignSpec, Samples]] | None = None
     density: Callable[[], Density | None] | None = None
+    greedy: GreedySource | None = None
     cma: CmaSettings = field(default_factory=CmaSettings)
     planner: Planner = field(default_factory=Planner)
     audit: bool = False

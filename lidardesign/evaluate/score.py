@@ -20,10 +20,11 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.compare import outside_notes
 from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.layouts.track import travels
-from lidardesign.design.sensor import DesignSpec
+from lidardesign.design.sensor import CERTIFICATES, DesignSpec
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import Candidate, RaysPerCondition, mean_mbps
 from lidardesign.evaluate.baselines.catalog import part_notes
+from lidardesign.evaluate.baselines.greedy import GREEDY, USUAL_SCENES, Fired, GreedyCandidate, greedy_rays
 from lidardesign.evaluate.baselines.simple import CMA, Baselines, Option, TwinCandidate
 from lidardesign.evaluate.baselines.views import TrainingViews
 from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
@@ -45,6 +46,7 @@ from lidardesign.numerics import ROUNDING
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene, group_numbers
+from lidardesign.selection.candidates import CANDIDATES_PER_RAY
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.task import Metric, Score, conditions_of, notes_of
 
@@ -105,6 +107,14 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     """
     conditions = _conditions(request)
     _check_tracks(request, conditions)
+    counts = fired_numbers(request.designs, request.rays)
+    designs = [
+        Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
+        for design in request.designs
+        for count in counts
+        if can_fire(design, count)
+    ]
+    choosable = [] if request.greedy is None else greedy_rays(request.task, request.space, counts)[0]
     baselines = Baselines(
         request.space,
         request.train,
@@ -115,16 +125,13 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         without_visibility=partial(_twin, request, conditions) if request.without_visibility else None,
         density=request.density,
         optimised=partial(_optimised, request, conditions) if request.designs else None,
+        chosen=partial(_chosen, request, designs, max(choosable, default=0)),
     )
-    counts = fired_numbers(request.designs, request.rays)
-    designs = [
-        Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
-        for design in request.designs
-        for count in counts
-        if can_fire(design, count)
-    ]
     wanted: list[tuple[str, list[Option], Entry | None]] = [
-        (name, baselines.options(name, count), None) for name in request.baselines for count in counts
+        (name, baselines.options(name, count), None)
+        for name in request.baselines
+        for count in counts
+        if name != GREEDY or count in choosable
     ]
     if request.equal_bandwidth:
         wanted += [
@@ -132,6 +139,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
             for entry in designs
             for name in request.baselines
             if name != CMA or entry.name == request.designs[0].name
+            if name != GREEDY or entry.rays in choosable
         ]
     chosen = baselines.best([(name, options) for name, options, _ in wanted])
     return designs + [
@@ -203,6 +211,20 @@ def _optimised(
         objective=TrainingObjective(request.task, request.metric, request.train, request.planner, request.seed),
         settings=request.cma,
         seed=request.seed,
+    )
+
+
+def _chosen(request: EvaluationRequest, designs: Sequence[Entry], most: int, views: TrainingViews) -> Candidate:
+    numbers = [one["scenes"] for design in request.designs for one in design.provenance.get(CERTIFICATES, ())]
+    return GreedyCandidate(
+        task=request.task,
+        views=views,
+        source=request.greedy,
+        scenes=max(numbers, default=USUAL_SCENES),
+        gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
+        candidates=CANDIDATES_PER_RAY * most,
+        fired=[Fired(entry.rays, entry.mbps(request.bandwidth)) for entry in designs],
+        bandwidth=request.bandwidth,
     )
 
 
@@ -384,6 +406,8 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
     if positions > 1:
         notes.append(f"rays and bandwidth count per position; every scene is seen from {positions} positions")
     notes += group_notes(request.test)
+    if GREEDY in request.baselines and request.greedy is not None:
+        notes += greedy_rays(request.task, request.space, [entry.rays for entry in entries])[1]
     with plugin_guard(request.task.name):
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:

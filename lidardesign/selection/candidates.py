@@ -19,6 +19,7 @@ from lidardesign.task import Information
 
 # What a task says of a scene, and the returns that it says it of, of all candidates through their widest gates.
 InformedScene = tuple[Information, Sequence[Returns]]
+CANDIDATES_PER_RAY = 5
 # Shares of what a ray returns that its gates hold; the first of them counts what rays near it return too.
 LEVELS = (1.0, 1.0, 0.98, 0.9, 0.75)
 NEIGHBOURS = 7  # of a ray, with itself: those around it in a hexagonal lattice

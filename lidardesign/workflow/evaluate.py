@@ -7,13 +7,14 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import with_task_settings
 from lidardesign.design.compare import outside_notes
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
 from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
@@ -42,6 +43,7 @@ from lidardesign.workflow.run_folder import (
     settings_texts,
 )
 from lidardesign.workflow.run_samples import Layouts, learned_density, twin_without_visibility
+from lidardesign.workflow.select_rays import gate_margin_m, selection_scenes
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.cma.candidate import Show
@@ -63,7 +65,7 @@ class ScoreOptions:
 
     Arguments:
         rays: Numbers of rays per frame; the task's by default, and those of smaller fixed patterns.
-        baselines: Further baselines beside uniform, random, bounding and silhouette, by name.
+        baselines: Further baselines beside uniform, random, bounding, silhouette and greedy, by name.
         seed: Root of every random stream; the run's by default.
         effects: auto, all, none, audit, or names of effects between commas.
         detector: The name of a detector, or its file.
@@ -216,7 +218,9 @@ class ScoreRequest:
         specifications = [design.specification for design in self.designs]
         counts = fired_numbers(specifications, self.rays)
         scored = sum(can_fire(design, count) for design in specifications for count in counts)
-        rows, matched = scored + len(self.baselines) * len(counts), scored * len(self.baselines)
+        choosable, notes = greedy_rays(run.task, run.config.space, counts)
+        baselines = [name for name in self.baselines if name != GREEDY or choosable]
+        rows, matched = scored + len(baselines) * len(counts), scored * len(baselines)
         names = [design.name for design in specifications]
         listed = ", ".join(names[:MOST_NAMED])
         listed += f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
@@ -235,8 +239,9 @@ class ScoreRequest:
             [
                 f"score {listed} in the held-out scenes of task {run.task.name}, with {', '.join(map(str, counts))} "
                 "rays per frame",
-                f"beside {', '.join(self.baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
+                f"beside {', '.join(baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
                 *left_out(specifications, self.rays),
+                *notes,
                 *(line for design in specifications for line in outside_notes(design, run.config.space)),
                 *([f"with {', '.join(given)}"] if given else []),
             ],
@@ -304,9 +309,9 @@ class Scores:
     Example:
         >>> scores = run.evaluate([run.fit(sensors=2, rays=36, name="two")], rays=[16])
         >>> [row.design for row in scores.rows]
-        ['two', 'uniform', 'random', 'bounding', 'silhouette']
+        ['two', 'uniform', 'random', 'bounding', 'silhouette', 'greedy']
         >>> [pair.b for pair in scores.paired]
-        ['uniform', 'random', 'bounding', 'silhouette']
+        ['uniform', 'random', 'bounding', 'silhouette', 'greedy']
         >>> scores.to_csv("scores.csv").name
         'scores.csv'
     """
@@ -550,4 +555,5 @@ def evaluation_request(
         lay_out=layouts,
         without_visibility=(lambda: twin_without_visibility(*from_runs[0], layouts)) if from_runs else None,
         density=cache(lambda: learned_density(from_runs[0][1] if from_runs else run)),
+        greedy=GreedySource(partial(selection_scenes, run, seed), gate_margin_m(run)),
     )

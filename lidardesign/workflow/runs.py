@@ -163,7 +163,7 @@ class Run(RunFolder):
         notes: Notes = log_note,
         **further: Any,
     ) -> Scores:
-        """Score designs on held-out scenes beside uniform, random, bounding and silhouette.
+        """Score designs on held-out scenes beside uniform, random, bounding, silhouette and greedy.
 
         Arguments:
             designs: Designs and design files; all that are saved in the run by default.

@@ -25,13 +25,12 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scene import Scene
-from lidardesign.selection.candidates import InformedScene, gate_choices
+from lidardesign.selection.candidates import CANDIDATES_PER_RAY, InformedScene, gate_choices
 from lidardesign.selection.information import checked_information, informs_rays
 from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 from lidardesign.workflow.run_folder import RunFolder
 
-CANDIDATES_PER_RAY = 5
 MOST_CHOSEN = 5000  # rays: what candidates tell of 400 scenes then takes minutes and gigabytes
 EVEN_SHARE = 0.25  # of the candidates that are even in the fields, where the density's samples may be sparse
 MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes returned, in the density's sigma
@@ -71,9 +70,9 @@ def select_rays(run: RunFolder, result: FitResult, counts: Sequence[int], sample
     limit = constraints.budget.bandwidth_mbps
     problem = SelectionProblem(
         rays=rays,
-        gates=partial(_gates, spec, constraints, samples.space, margin_m=MARGIN_SIGMAS * run.config.density.sigma_m),
+        gates=partial(_gates, spec, constraints, samples.space, margin_m=gate_margin_m(run)),
         informs=partial(checked_information, run.task),
-        scenes=partial(_scenes, run, seed),
+        scenes=partial(selection_scenes, run, seed),
         bandwidth=bandwidth_limit(constraints, len(rays))[0],
         limit_mbps=np.inf if limit is None else limit,
         name=spec.name,
@@ -98,10 +97,15 @@ def select_rays(run: RunFolder, result: FitResult, counts: Sequence[int], sample
     return replace(result, design=design)
 
 
-def _scenes(run: RunFolder, seed: int, purpose: str) -> Iterator[Scene]:
+def selection_scenes(run: RunFolder, seed: int, purpose: str) -> Iterator[Scene]:
     """Training scenes that nothing was learned from, drawn with further seeds."""
     for draw in itertools.count():
         yield from run.scenes("train", int(random_generator(seed, "selection", purpose, draw).integers(2**31)))
+
+
+def gate_margin_m(run: RunFolder) -> float:
+    """By how much gates are longer at both ends than what training scenes returned [m]."""
+    return MARGIN_SIGMAS * run.config.density.sigma_m
 
 
 @phase("candidates")

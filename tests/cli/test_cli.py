@@ -108,7 +108,7 @@ def test_further_baselines_are_built_where_they_are_asked_for(lidardesign, flat)
     lidardesign("fit", flat, "--sensors", 2)
     asked = ("--baseline", "occupancy", "--baseline", "no-visibility")
     result = lidardesign("evaluate", flat, "--rays", 12, *asked, "--report", "page.html", "--json").json
-    names = ["fit", "uniform", "random", "bounding", "silhouette", "occupancy", "no-visibility"]
+    names = ["fit", "uniform", "random", "bounding", "silhouette", "greedy", "occupancy", "no-visibility"]
     assert [row["design"] for row in result["rows"]] == names
     assert all(row["rays"] == 12 for row in result["rows"])
     assert {row["design"] for row in result["equal_bandwidth"]} == {*names[1:]}

@@ -155,8 +155,8 @@ def test_people_are_told_in_words(lidardesign, flat, tmp_path):
     assert any(line.startswith(f"time   the last fit of {flat} took") for line in lines)
     assert lines[-1] == "nothing was done: leave out --dry-run to do it"
     told = lidardesign("evaluate", flat, "--rays", 9, "--rays", 16, "--baseline", "occupancy", "--dry-run").out
-    assert "beside uniform, random, bounding, silhouette, occupancy: 12 rows at equal rays" in told
-    assert "up to 10 at equal bandwidth" in told
+    assert "beside uniform, random, bounding, silhouette, greedy, occupancy: 14 rows at equal rays" in told
+    assert "up to 12 at equal bandwidth" in told
 
 
 def test_a_manifest_without_times_or_with_odd_ones_promises_nothing(lidardesign, flat, tmp_path):

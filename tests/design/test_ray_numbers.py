@@ -74,7 +74,7 @@ def test_a_design_of_a_fixed_pattern_spoils_no_evaluation_of_its_run(call, run, 
     assert note in found["notes"]
     few = [pair for pair in found["paired"] if "few" in (pair["a"], pair["b"])]
     assert {pair["rays"] for pair in few} == {5}
-    assert {pair["b"] for pair in few} == {"few", "uniform", "random", "bounding", "silhouette"}
+    assert {pair["b"] for pair in few} == {"few", "uniform", "random", "bounding", "silhouette", "greedy"}
     matched = {(row["matched_to"], row["matched_rays"]) for row in found["equal_bandwidth"]}
     assert matched == {("any", 5), ("any", 12), ("few", 5)}
     with (tmp_path / "rows.csv").open() as file:

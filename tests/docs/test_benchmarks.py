@@ -373,7 +373,7 @@ def test_the_arm_is_measured(run_script):
     found = run_script("arm", "--preset", "draft", *SMALL_ARM, "--sensors", "2", "--rays", "40")
     rows = next(rows for caption, rows in found["tables"].items() if caption.startswith("Scores"))
     assert {row["design"] for row in rows} == {
-        "benchmark-2", "uniform", "random", "bounding", "silhouette", "occupancy", "no-visibility",
+        "benchmark-2", "uniform", "random", "bounding", "silhouette", "greedy", "occupancy", "no-visibility",
     }  # fmt: skip
     assert len(found["conclusions"]) == 4
 

@@ -41,7 +41,7 @@ def test_designs_of_one_name_are_one_row_over_seeds_and_scenes(lidardesign, runs
     written = [word for option in files.items() for word in option]
     found = json.loads(lidardesign("evaluate", *runs, *SMALL, *written, "--json").out)
     assert found["seeds"] == [1, 2, 3]
-    assert [row["design"] for row in found["rows"]] == ["two", "uniform", "random", "bounding", "silhouette"]
+    assert [row["design"] for row in found["rows"]] == ["two", "uniform", "random", "bounding", "silhouette", "greedy"]
     assert any("in the held-out scenes of seed 1" in note for note in found["notes"])
     assert all(path.exists() for path in files.values())
     alone = [

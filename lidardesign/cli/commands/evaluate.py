@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from lidardesign.workflow.seeds import SeedsRequest
 
 BASELINE_HELP = (
-    "A further baseline beside uniform, random, bounding and silhouette: lloyd (as silhouette, denser where returns "
-    "are frequent and surfaces large), occupancy (rays towards cells that targets occupy) or no-visibility (the first "
-    "design fitted anew to the density without its occlusion term, from samples drawn for it: some seconds), "
-    "catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres and degrees: "
-    "catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on training "
+    "A further baseline beside uniform, random, bounding, silhouette and greedy: lloyd (as silhouette, denser where "
+    "returns are frequent and surfaces large), occupancy (rays towards cells that targets occupy) or no-visibility "
+    "(the first design fitted anew to the density without its occlusion term, from samples drawn for it: some "
+    "seconds), catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres and "
+    "degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on training "
     "scenes, for --cma-seconds). Repeatable."
 )
 
@@ -189,7 +189,7 @@ def evaluate(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """Score designs on held-out scenes against the baselines uniform, random, bounding and silhouette."""
+    """Score designs on held-out scenes against the baselines uniform, random, bounding, silhouette and greedy."""
     with command(json=json, quiet=quiet, debug=debug) as output:
         claim_outputs(output, dry_run=dry_run, csv=csv, report=report, plots=plots)
         if fail_above is not None and not math.isfinite(fail_above):

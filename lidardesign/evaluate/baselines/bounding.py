@@ -61,14 +61,17 @@ def bounding(views: TrainingViews, *, gates_per_ray: bool = False) -> list[Gated
         views: The training scenes.
         gates_per_ray: Whether there is a layout of each kind whose rays have gates of their own, too.
     """
-    space = views.space
-    kinds = {"cropped": box_crop}
-    if [axis for axis in space.free if axis < AZIMUTH and axis not in space.conditioned]:
-        kinds = {"parallel": _parallel_crop, **kinds}
+    kinds = crop_kinds(views.space)
     return [layout for name, crop_of in kinds.items() for layout in _cropped(name, views, crop_of, gates_per_ray)]
 
 
 CropOf = Callable[[TrainingViews, DesignSpace, Observed], Crop | None]
+
+
+def crop_kinds(space: DesignSpace) -> dict[str, CropOf]:
+    """How a design space can be cropped to what returns; with free origins there are two ways."""
+    origins = [axis for axis in space.free if axis < AZIMUTH and axis not in space.conditioned]
+    return {"parallel": _parallel_crop, "cropped": box_crop} if origins else {"cropped": box_crop}
 
 
 def _cropped(name: str, views: TrainingViews, crop_of: CropOf, gates_per_ray: bool) -> list[GatedLayout]:

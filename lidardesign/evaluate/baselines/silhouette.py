@@ -81,7 +81,7 @@ PlaceRays = Callable[[Survey, int], np.ndarray]
 
 def silhouette(views: TrainingViews) -> list[GatedLayout]:
     """The layout; none where dense rays return nothing."""
-    return _layouts("silhouette", views, _lattice_rays, 0.0, SILHOUETTE_SIGMAS)
+    return _layouts("silhouette", views, lattice_rays, 0.0, SILHOUETTE_SIGMAS)
 
 
 def lloyd(views: TrainingViews) -> list[GatedLayout]:
@@ -112,7 +112,7 @@ def _layouts(name: str, views: TrainingViews, place: PlaceRays, tail: float, sig
     return [GatedLayout(name, lay_out)]
 
 
-def _lattice_rays(found: Survey, count: int) -> np.ndarray:
+def lattice_rays(found: Survey, count: int) -> np.ndarray:
     """The rays of a lattice where enough scenes return, shape (count, 5)."""
     table, field = found.table, found.directions
     supported = found.supported

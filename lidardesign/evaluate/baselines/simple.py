@@ -10,6 +10,7 @@ more candidate layouts; where there are several, the best on training scenes is 
 - `bounding`: one even layout over where the training returns are, see `lidardesign.evaluate.baselines.bounding`.
 - `silhouette` and `lloyd`: rays and gates by what training scenes return, see
   `lidardesign.evaluate.baselines.silhouette`.
+- `greedy`: rays chosen on training scenes without a density, see `lidardesign.evaluate.baselines.greedy`.
 - `occupancy`: see `lidardesign.evaluate.baselines.occupancy`.
 - `no-visibility`: the design fitted anew without its occlusion term, see below.
 - `catalog:NAME`: see `lidardesign.evaluate.baselines.catalog`.
@@ -55,6 +56,7 @@ from lidardesign.evaluate.baselines.catalog import (
     split_argument,
 )
 from lidardesign.evaluate.baselines.even import even_placement
+from lidardesign.evaluate.baselines.greedy import GREEDY
 from lidardesign.evaluate.baselines.occupancy import occupancy
 from lidardesign.evaluate.baselines.silhouette import lloyd, silhouette
 from lidardesign.evaluate.baselines.views import RAY_AXES, TrainingViews
@@ -90,6 +92,7 @@ class Baselines:
         without_visibility: Makes the layout that stands for `no-visibility`; called when that is asked for.
         density: What a run has learned, or None where it has no samples; called when a baseline looks there.
         optimised: Makes the layout that stands for `cma`; called when that is asked for.
+        chosen: Makes the layout that stands for `greedy`; called when that is asked for.
     """
 
     def __init__(
@@ -104,12 +107,14 @@ class Baselines:
         without_visibility: Callable[[], Candidate] | None = None,
         density: Callable[[], Density | None] | None = None,
         optimised: Callable[[TrainingViews], Candidate] | None = None,
+        chosen: Callable[[TrainingViews], Candidate] | None = None,
     ) -> None:
         self.space, self.train, self.seed = space, train, seed
         self.spaces = [space.at(condition) for condition in conditions]
         self.views = TrainingViews(space, train)
         self.gates_per_ray = gates_per_ray
         self.without_visibility, self.density, self.optimised = without_visibility, density, optimised
+        self.chosen = chosen
         self._judge = judge or self.views.missing_returns
         self._candidates: dict[str, list[Candidate]] = {}
         self._scores: dict[tuple[str, str, int], float] = {}
@@ -189,6 +194,12 @@ def _lloyd(source: Baselines, argument: str) -> list[Candidate]:
     return list(lloyd(source.views)) or _uniform(source, argument)
 
 
+def _greedy(source: Baselines, argument: str) -> list[Candidate]:
+    if source.chosen is None or not len(source.views.observed(source.space).points):
+        return _uniform(source, argument)
+    return [source.chosen(source.views)]
+
+
 def _occupancy(source: Baselines, argument: str) -> list[Candidate]:
     layout = occupancy(source.space, source.train, source.seed)
     return _random(source, argument) if layout is None else [layout]
@@ -243,6 +254,7 @@ BASELINES: dict[str, Family] = {
     "bounding": Family(_bounding),
     "silhouette": Family(_silhouette),
     "lloyd": Family(_lloyd),
+    GREEDY: Family(_greedy),
     "occupancy": Family(_occupancy),
     NO_VISIBILITY: Family(_no_visibility),
     FAMILY: Family(_catalog, "NAME", check=split_argument),
@@ -251,7 +263,7 @@ BASELINES: dict[str, Family] = {
 
 
 # What stands beside every design, asked for or not.
-ALWAYS = ("uniform", "random", "bounding", "silhouette")
+ALWAYS = ("uniform", "random", "bounding", "silhouette", GREEDY)
 
 
 def baseline_of(name: str, *, where: str = "baselines") -> tuple[Family, str]:

@@ -1,0 +1,187 @@
+"""`greedy`: exact numbers of rays in no more bandwidth than the design, and nearer to surfaces than even rays."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from support.rivals import Rivals, balls
+from support.scoring import MissTask, design, make_request, rows_by_key
+from support.tables import each_row
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.evaluate.baselines import greedy as greedy_module
+from lidardesign.evaluate.baselines.candidates import mean_mbps, whole_range
+from lidardesign.evaluate.baselines.greedy import Fired, GreedyCandidate, GreedySource
+from lidardesign.evaluate.baselines.views import TrainingViews
+from lidardesign.evaluate.score import entries_of, evaluate
+from lidardesign.selection.information import surface_information
+from lidardesign.simulate.simulate import simulate
+from lidardesign.space import DesignSpace, angles
+
+RADIUS_M = 0.4
+EVEN_ON_A_BALL = np.random.default_rng(4).normal(size=(300, 3))
+AHEAD = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
+BOX = DesignSpace((-0.3, -0.1, -0.1, -0.5, -0.5, 0.05), (0.1, 0.1, 0.1, 0.5, 0.5, 4.0))
+LINE = DesignSpace((0, 0, 0, -0.5, 0, 0.05), (0, 0, 0, 0.5, 0, 4.0))
+AROUND = DesignSpace((0, 0, 0, 0, -0.8, 0.05), (0, 0, 0, 2 * np.pi, 0.8, 4.0))
+SUBJECTS = {"ahead": AHEAD, "from a box": BOX, "along a line": LINE, "all around": AROUND}
+COUNTS = (5, 30)
+BANDWIDTH = Bandwidth()
+BIN_MBPS = float(BANDWIDTH.mbps_of_widths(np.zeros(1)))
+
+
+def scenes(seed, count=12):
+    return balls(np.array([3.0, 0, 0]), RADIUS_M, count=count, seed=seed)
+
+
+def visible(scene):
+    """Points of the half of a ball that looks to the sensor, (U, 3) [m]."""
+    outward = EVEN_ON_A_BALL / np.linalg.norm(EVEN_ON_A_BALL, axis=1, keepdims=True)
+    return scene.bodies[0].pose(0)[:3, 3] + RADIUS_M * outward[outward[:, 0] < 0]
+
+
+class BallTask(MissTask):
+    """Says that returns tell about points of balls that are near them."""
+
+    def informs(self, scene, returns):
+        points = visible(scene)
+        return surface_information([points] * len(returns), returns, [True], 2 * np.pi * RADIUS_M**2)
+
+
+def drawn(purpose):
+    """Training scenes without end."""
+    start = {"choice": 100, "held back": 200}[purpose]
+    return itertools.chain.from_iterable(scenes(start + number) for number in itertools.count())
+
+
+SOURCE = GreedySource(drawn, 0.02)
+
+
+def candidate(space=AHEAD, fired=(), gates_per_ray=True):
+    return GreedyCandidate(
+        BallTask(), TrainingViews(space, scenes(1)), SOURCE, 24, gates_per_ray, 5 * max(COUNTS), fired, BANDWIDTH
+    )
+
+
+def fired_at(bins):
+    """Designs that spend so many bins on each ray."""
+    return [Fired(count, count * bins * BIN_MBPS) for count in COUNTS]
+
+
+@each_row("gates_per_ray", (True, False))
+@each_row("subject", SUBJECTS)
+def test_numbers_of_rays_are_met_exactly_inside_the_space_and_no_bandwidth_is_exceeded(subject, gates_per_ray):
+    space = SUBJECTS[subject]
+    # one bin per ray, which is the least, and few more
+    for bins in (1, 3):
+        fired = fired_at(bins)
+        subject_of = candidate(space, fired, gates_per_ray)
+        for count, mbps in fired:
+            (rays,) = positions = subject_of.positions([space], count)
+            assert len(rays) == count
+            points = np.column_stack([rays.origin_m, *angles(rays.direction), rays.gate_m.mean(axis=1)])
+            assert space.contains(space.wrap(points)).all()
+            within = subject_of.positions_within([space], mbps, BANDWIDTH)
+            assert mean_mbps(within, BANDWIDTH) <= mbps * (1 + 1e-12)
+            if gates_per_ray:
+                assert mean_mbps(positions, BANDWIDTH) <= mbps * (1 + 1e-12)
+                assert len(within[0]) == count
+
+
+def distance(rays, over):
+    """The mean distance from points of scenes to the nearest return [m]."""
+    found = []
+    for scene in over:
+        (returns,) = simulate(scene, rays)
+        found.append(cKDTree(returns.points_m).query(visible(scene))[0].mean())
+    return float(np.mean(found))
+
+
+@each_row("subject", ("ahead", "all around"))
+def test_returns_are_nearer_to_surfaces_than_those_of_even_and_random_rays_in_no_less_bandwidth(subject):
+    space, held_out = SUBJECTS[subject], scenes(900, count=20)
+    rivals = Rivals(space, scenes(1), 3, gates_per_ray=True)
+    (even,), count = rivals.positions("bounding", COUNTS[-1]), COUNTS[-1]
+    (random,) = rivals.positions("random", count)
+    (chosen,) = candidate(space, [Fired(count, BANDWIDTH.mbps(even))]).positions([space], count)
+    assert BANDWIDTH.mbps(chosen) <= BANDWIDTH.mbps(even)
+    assert distance(chosen, held_out) < 0.95 * distance(even, held_out)
+    assert distance(chosen, held_out) < 0.8 * distance(random, held_out)
+
+
+def arrays(positions):
+    return [array for rays in positions for array in (rays.origin_m, rays.direction, rays.gate_m, rays.time_s)]
+
+
+def test_a_choice_repeats_whatever_was_chosen_before_it():
+    fired = fired_at(4)
+    first, second = candidate(fired=fired), candidate(fired=fired)
+    upward = {count: first.positions([AHEAD], count) for count in COUNTS}
+    downward = {count: second.positions([AHEAD], count) for count in reversed(COUNTS)}
+    for count in COUNTS:
+        for one, other in zip(arrays(upward[count]), arrays(downward[count]), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_one_gate_for_all_is_that_of_the_crops_and_costs_what_it_costs():
+    (rays,) = candidate(fired=fired_at(1), gates_per_ray=False).positions([AHEAD], COUNTS[-1])
+    gates = np.unique(rays.gate_m, axis=0)
+    assert len(gates) == 1
+    assert np.diff(gates[0]) < np.diff(whole_range(AHEAD))
+    assert BANDWIDTH.mbps(rays) > COUNTS[-1] * BIN_MBPS
+
+
+def aimed(specification, count, samples, *, at=None):
+    """Rays straight ahead, in all as the design beside `greedy`."""
+    (rays,) = Rivals(AHEAD, scenes(1), 3).positions("bounding", count)
+    return rays
+
+
+def ball_request(**changes):
+    designs = [replace(design(), gates="ray")]
+    values = {"task": BallTask(), "greedy": SOURCE, "train": scenes(1), "test": scenes(2), "rays": COUNTS}
+    return make_request(designs, **{**values, "lay_out": aimed, **changes})
+
+
+def test_an_evaluation_has_it_at_each_number_of_rays_in_no_more_bandwidth_than_the_design():
+    evaluation = evaluate(ball_request())
+    rows = rows_by_key(evaluation)
+    for count in COUNTS:
+        assert rows["greedy", count].bandwidth_mbps <= rows["aimed", count].bandwidth_mbps
+    matched = [(row.matched_rays, row.rays) for row in evaluation.equal_bandwidth if row.design == "greedy"]
+    assert matched == [(count, count) for count in COUNTS]
+
+
+@each_row(
+    "changes, note",
+    [
+        ({"task": MissTask()}, "greedy is left out: the task miss does not say what returns tell"),
+        ({"rays": (5, 40)}, "greedy is left out above 30 rays: choosing them takes too long"),
+        ({"greedy": None}, None),
+    ],
+)
+def test_it_is_left_out_with_one_note_where_rays_cannot_be_chosen(monkeypatch, changes, note):
+    monkeypatch.setattr(greedy_module, "MOST_CHOSEN", 30)
+    evaluation = evaluate(ball_request(**changes))
+    kept = {row.rays for row in [*evaluation.rows, *evaluation.equal_bandwidth] if row.design == "greedy"}
+    assert kept == ({5} if "rays" in changes else set())
+    assert [line for line in evaluation.notes if "greedy" in line] == ([note] if note else [])
+
+
+def test_scenes_are_as_many_as_designs_beside_it_were_chosen_on(monkeypatch):
+    asked = []
+
+    def counted(number, purpose):
+        for scene in drawn(purpose):
+            asked.append(number)
+            yield scene
+
+    for number in (7, 12):
+        chosen = replace(design(), gates="ray", provenance={"certificates": [{"scenes": number}]})
+        entries_of(replace(ball_request(greedy=GreedySource(partial(counted, number), 0.02)), designs=[chosen]))
+        assert asked.count(number) == pytest.approx(number, abs=1)
