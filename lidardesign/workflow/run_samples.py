@@ -53,7 +53,8 @@ class Weighting:
         if document is None:
             return cls()
         if not isinstance(document, Mapping) or set(document) != {"set"}:
-            raise ConfigError("is no weighting", where=where, allowed="the key set", hint=FIT_AGAIN)
+            found = f"keys {', '.join(map(str, document))}" if isinstance(document, Mapping) else repr(document)
+            raise ConfigError(f"holds {found}", where=where, allowed="the key set alone", hint=FIT_AGAIN)
         settings = document["set"]
         if not isinstance(settings, list | tuple) or not all(isinstance(text, str) for text in settings):
             raise ConfigError(f"set is {settings!r}", where=where, allowed="a list of KEY=VALUE", hint=FIT_AGAIN)
