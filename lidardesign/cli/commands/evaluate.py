@@ -39,8 +39,8 @@ BASELINE_HELP = (
     "returns are frequent and surfaces large), occupancy (rays towards cells that targets occupy) or no-visibility "
     "(the first design fitted anew to the density without its occlusion term, from samples drawn for it: some "
     "seconds), catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres and "
-    "degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on training "
-    "scenes, for --cma-seconds). Repeatable."
+    "degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on "
+    "training scenes, for --cma-seconds). Repeatable."
 )
 
 
