@@ -7,6 +7,7 @@ what lies outside; which of them pays is for the choice.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -29,7 +30,11 @@ FEWEST_RETURNS = 3  # of a ray by itself, below which its gates rest on those of
 def inform(scene: Scene, rays: Rays, informs: Callable[[Scene, Sequence[Returns]], Information]) -> InformedScene:
     """What a task says of the returns of rays in a scene, through the rays' own gates."""
     returns = simulate(scene, rays)
-    return informs(scene, returns), returns
+    information = informs(scene, returns)
+    # there are many pairs, and all scenes' are held at once
+    small = {"ray": np.int32, "item": np.int32, "worth": np.float32}
+    columns = {name: np.asarray(getattr(information, name)).astype(dtype) for name, dtype in small.items()}
+    return replace(information, **columns), returns
 
 
 def gate_choices(rays: Rays, informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:

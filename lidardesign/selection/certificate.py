@@ -6,7 +6,8 @@ For thresholds t >= 0 of items and a price lambda >= 0 of bandwidth, every admis
                       + max_R sum_{r in R} max_g [ sum_u w_u (a(r,g,u) - t_u)+ - lambda b(r,g) - h(r,g) ]+
 
 where R holds the best rays of each sensor, as many as it fires (Cornuejols, Fisher and Nemhauser 1977): whatever the
-thresholds, an item counts at most its threshold and what single rays exceed it by. Subgradients lower the bound. For
+thresholds, an item counts at most its threshold and what single rays exceed it by. Subgradients lower the bound, each
+with a part of the one before, as else they zigzag (Camerini, Fratta and Maffioli 1975). For
 concave sums phi(z) <= phi(y) + slope(y) (z - y) takes the place of thresholds, and Frank and Wolfe (1956) choose y.
 Without a budget lambda is the price that bandwidth was given, and lambda B is left out.
 """
@@ -22,9 +23,13 @@ from lidardesign.selection import kernels
 from lidardesign.selection.choice import Choice, RayCounts
 from lidardesign.selection.coverage import Coverage
 
-ROUNDS = 200  # of subgradients, at most
+ROUNDS = (
+    80  # of subgradients, at most; more of them lower the bound of 361 rays on faces by less than 0.1 % of the loss
+)
 PRICE_BISECTIONS = 12
-PATIENCE = 20  # rounds without a lower bound after which steps are halved
+PATIENCE = 5  # rounds without a lower bound after which steps are halved
+PROGRESS = 0.02  # of what the bound exceeds the value by: a bound that is lower by less is not lower
+MEMORY = 0.7  # how much of its last direction a step keeps
 
 
 @dataclass(frozen=True)
@@ -132,6 +137,7 @@ class _Thresholds:
         self.threshold = coverage.known(choice.gate)
         self.excess = np.zeros(coverage.shape)
         self.count = np.zeros(len(coverage.weight))
+        self.direction = np.zeros(len(coverage.weight))
         self.scale, self.stale, self.least = 1.0, 0, np.inf
 
     def step(self, value: float) -> float:
@@ -141,14 +147,15 @@ class _Thresholds:
         total, taken = self.admissible.best(self.excess)
         bound = float(coverage.weight @ self.threshold) + total
         self.stale += 1
-        if bound < self.least:
-            self.least, self.stale = bound, 0
+        if bound < value + (1 - PROGRESS) * (self.least - value):
+            self.stale = 0
+        self.least = min(self.least, bound)
         if self.stale == PATIENCE:
             self.scale, self.stale = self.scale / 2, 0
         kernels.count_exceeding(coverage.entries, taken, self.threshold, self.count)
         # per unit of an item's weight, so that rare items move as far as frequent ones
-        slope = 1.0 - self.count
-        slope[(self.threshold <= 0) & (slope > 0)] = 0.0
+        self.direction = 1.0 - self.count + MEMORY * self.direction
+        slope = np.where((self.threshold <= 0) & (self.direction > 0), 0.0, self.direction)
         length = float(coverage.weight @ slope**2)
         if length > 0:
             self.threshold = np.maximum(self.threshold - self.scale * (bound - value) / length * slope, 0.0)

@@ -79,8 +79,9 @@ class Coverage:
     def by_item(self) -> kernels.ByItem:
         """The table in the order of items."""
         order = np.argsort(self.item, kind="stable")
-        begin = np.searchsorted(self.item[order], np.arange(len(self.weight) + 1))
-        return kernels.ByItem(begin, self.ray[order], self.worth[order], self.gates[order])
+        return kernels.ByItem(
+            _begins(self.item, len(self.weight)), self.ray[order], self.worth[order], self.gates[order]
+        )
 
     def known(self, gate: np.ndarray) -> np.ndarray:
         """What a choice of one gate per ray, -1 for none, (N,), knows about each item, (U,)."""
@@ -129,8 +130,10 @@ def gather(
     rays, gates = bits.shape
     if gates > MOST_GATES:
         raise ConfigError(f"{gates} gates per ray", where="selection", allowed=f"at most {MOST_GATES}")
-    parts, weights, items, sums = [], [], 0, LARGEST
+    columns: tuple[list[np.ndarray], ...] = ([], [], [], [])
+    weights, items, sums = [], 0, LARGEST
     harm, complete = np.zeros((rays, gates)), 0.0
+    small = np.uint16 if rays <= np.iinfo(np.uint16).max else np.int32
     for information, returns in informed:
         require_valid(information, rays, len(returns))
         range_m = np.stack([frame.range_m for frame in returns])
@@ -139,7 +142,10 @@ def gather(
         if information.seen_in is not None:
             passes = _largest_alone(information, passes, gates)
         tells = np.flatnonzero((passes > 0) & (information.worth > 0))
-        parts.append((information.ray[tells], items + information.item[tells], information.worth[tells], passes[tells]))
+        # few bytes each, as there are many; small integers are sorted fast
+        found = (information.ray, items + information.item, information.worth, passes)
+        for column, values, dtype in zip(columns, found, (small, np.int32, np.float32, np.uint8), strict=True):
+            column.append(values[tells].astype(dtype))
         count = len(information.frame)
         weight = np.ones(count) if information.weight is None else np.asarray(information.weight, dtype=np.float64)
         weights.append(weight / weight.sum())
@@ -147,26 +153,39 @@ def gather(
             harm += np.einsum("fn,fng->ng", information.harm, opened)
         items, complete = items + count, complete + information.complete
         sums = LARGEST if information.sums is None else np.asarray(information.sums, dtype=np.float64)
-    if not parts:
+    if not weights:
         raise ConfigError("no scene", where="selection", allowed="at least one training scene")
-    ray, item, worth, passes = (np.concatenate(column) for column in zip(*parts, strict=True))
+    ray = _joined(columns[0])
     order = np.argsort(ray, kind="stable")
+    item, worth, opens = (_joined(column)[order] for column in columns[1:])
     return Coverage(
-        start=np.searchsorted(ray[order], np.arange(rays + 1)),
-        item=item[order].astype(np.int32),
-        worth=worth[order].astype(np.float32),
-        gates=passes[order],
-        weight=np.concatenate(weights) / len(parts),
+        start=_begins(ray, rays),
+        item=item,
+        worth=worth,
+        gates=opens,
+        weight=np.concatenate(weights) / len(weights),
         bits=bits,
-        harm=harm / len(parts),
+        harm=harm / len(weights),
         table=sums,
-        complete=complete / len(parts),
+        complete=complete / len(weights),
     )
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """Parts as one array; they are let go."""
+    joined = np.concatenate(parts)
+    parts.clear()
+    return joined
+
+
+def _begins(labels: np.ndarray, count: int) -> np.ndarray:
+    """Where each of `count` labels begins, and the last ends, once they are sorted, (count + 1,)."""
+    return np.concatenate([[0], np.cumsum(np.bincount(labels, minlength=count))])
 
 
 def _largest_alone(information: Information, passes: np.ndarray, gates: int) -> np.ndarray:
     """The gates (E,) without those through which a ray tells more about the same item in another frame."""
-    pair = information.ray * len(information.frame) + information.item
+    pair = information.ray.astype(np.int64) * len(information.frame) + information.item
     order = np.lexsort((-information.worth, pair))
     kept = np.zeros_like(passes)
     for gate in range(gates):
