@@ -407,7 +407,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
         notes.append(f"rays and bandwidth count per position; every scene is seen from {positions} positions")
     notes += group_notes(request.test)
     if GREEDY in request.baselines and request.greedy is not None:
-        notes += greedy_rays(request.task, request.space, [entry.rays for entry in entries])[1]
+        notes += greedy_rays(request.task, request.space, request.rays)[1]
     with plugin_guard(request.task.name):
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:
