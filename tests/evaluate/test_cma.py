@@ -22,7 +22,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.sensor import DesignSpec, Sensor, Track, tangent_coordinates
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.candidates import mean_mbps, whole_range
+from lidardesign.evaluate.baselines.candidates import mean_mbps, rays_at, whole_range
 from lidardesign.evaluate.baselines.views import TrainingViews, dense_points
 from lidardesign.evaluate.cma.candidate import CmaCandidate, CmaSettings
 from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, Way, widest_bins
@@ -332,7 +332,16 @@ def track(count=3):
     return DesignSpec("mine", sensors(count), layout="scan", rays=count, track=followed)
 
 
+def chosen():
+    """A design whose nine rays were chosen, each with a gate of its own."""
+    points = np.column_stack([np.zeros((9, 3)), np.linspace(0.1, 0.5, 9), np.full(9, 0.3)])
+    gates = np.linspace((1.5, 1.7), (1.9, 2.3), 9)
+    table = rays_at(points, gates)
+    return DesignSpec("mine", sensors(2), layout="selected", gates="ray", rays=9, ray_table=table)
+
+
 FOLLOWED = {
+    "selected": (chosen(), FIXED, AHEAD),
     "grid": (DesignSpec("mine", sensors(2)), FIXED, AHEAD),
     "density": (DesignSpec("mine", sensors(2), layout="density"), FIXED, AHEAD),
     "scan": (DesignSpec("mine", sensors(6), layout="scan", rays=6), FIXED, AHEAD),

@@ -2,8 +2,8 @@
 
 It varies the sensors that the first design has, under the design's constraints and with its layout of rays, and asks
 the task's metric on training scenes alone (see `lidardesign.evaluate.cma.search`). A design whose rays follow from
-samples of the density (layout `density`), or from the pattern of a part (`fixed`), is followed with even rays in its
-sensors' fields.
+samples of the density (layout `density`), were chosen (`selected`), or are the pattern of a part (`fixed`), is followed
+with even rays in its sensors' fields.
 """
 
 from __future__ import annotations
