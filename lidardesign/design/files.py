@@ -10,6 +10,7 @@ cut at 0. Numbers are written with all their digits: what is loaded is bit for b
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -55,8 +56,20 @@ WEIGHT_SUM_TOLERANCE = SLACK
 # How much below zero rounding may push an eigenvalue of a covariance, relative to the largest.
 COVARIANCE_ROUNDING = SLACK
 
-OPTIONAL = ("name", "layout", "level", "rays", "at", "gates", "ray_table", "further_tables",
-    "track", "constraints", "provenance")
+OPTIONAL = (
+    "name",
+    "layout",
+    "level",
+    "rays",
+    "at",
+    "gates",
+    "ray_table",
+    "further_tables",
+    "track",
+    "further_tracks",
+    "constraints",
+    "provenance",
+)
 SENSOR_OPTIONAL = (
     "name", "part", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays",
 )  # fmt: skip
@@ -129,6 +142,8 @@ def design_document(design: DesignSpec) -> dict[str, Any]:
         document["further_tables"] = [_table_document(table) for table in design.further_tables]
     if design.track is not None:
         document["track"] = track_document(design.track)
+    if design.further_tracks:
+        document["further_tracks"] = [track_document(track) for track in design.further_tracks]
     if design.at:
         document["at"] = {name: float(value) for name, value in design.at.items()}
     if design.gates is not None and design.gates != design.table_gates:
@@ -178,9 +193,10 @@ def design_text(design: DesignSpec, path: Path) -> str:
             allowed=f"at most {MOST_TABLE_RAYS}",
             hint="the layout grid needs no table",
         )
-    if design.track is not None and design.track.azimuth_rad.size > MOST_TRACK_RAYS:
+    at_knots = sum(track.azimuth_rad.size for track in (design.track, *design.further_tracks) if track is not None)
+    if at_knots > MOST_TRACK_RAYS:
         raise ConfigError(
-            f"{design.track.azimuth_rad.size} rays at knots of the track",
+            f"{at_knots} rays at knots of the track",
             where=str(path),
             allowed=f"at most {MOST_TRACK_RAYS}",
             hint="fewer rays per position",
@@ -261,7 +277,7 @@ def design_from_document(
     return DesignSpec(
         name=keys["name"].text() if "name" in keys else Path(where).stem,
         sensors=sensors,
-        layout=keys["layout"].choice(LAYOUTS) if "layout" in keys else "grid",  # type: ignore[arg-type]
+        layout=_layout(keys, track),
         rays=rays,
         ray_table=table,
         constraints=keys["constraints"].plain() if "constraints" in keys else {},
@@ -273,7 +289,16 @@ def design_from_document(
         further_tables=tuple(_ray_table(item, len(sensors)) for item in keys["further_tables"].items())
         if "further_tables" in keys
         else (),
+        further_tracks=tuple(read_track(item, len(sensors)) for item in keys["further_tracks"].items())
+        if "further_tracks" in keys
+        else (),
     )
+
+
+def _layout(keys: Mapping[str, Node], track: Track | None) -> LayoutName:
+    """The layout; the rays of a track are a scan at every value of its condition, unless they were chosen."""
+    layout: Any = keys["layout"].choice(LAYOUTS) if "layout" in keys else "grid"
+    return "scan" if track is not None and layout != "selected" else layout
 
 
 def _sensors(node: Node, level: float) -> tuple[Sensor, ...]:
@@ -452,10 +477,11 @@ def _check_rays(
     if table is not None and track is not None:
         raise keys["track"].error("is given beside ray_table", hint="remove either of the two")
     layout = keys["layout"].value if "layout" in keys else None
-    if table is None and layout in ("fixed", "selected"):
+    if table is None and (layout == "fixed" or (layout == "selected" and track is None)):
         raise keys["layout"].error(f"is {layout}, but there is no ray_table", hint="the layout grid needs none")
-    if "further_tables" in keys and layout != "selected":
-        raise keys["further_tables"].error(f"stand beside the layout {layout or 'grid'}", allowed="the layout selected")
+    for name in ("further_tables", "further_tracks"):
+        if name in keys and layout != "selected":
+            raise keys[name].error(f"stand beside the layout {layout or 'grid'}", allowed="the layout selected")
     own = [sensor.rays for sensor in sensors]
     counts = {
         "rays": rays,

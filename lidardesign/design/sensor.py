@@ -238,7 +238,7 @@ class DesignSpec:
             rays of its table, as real parts fire them.
         rays: Rays per frame that it was made for; None leaves the budget to `evaluate`.
         ray_table: The explicit rays of every layout but `grid`.
-        further_tables: Of the layout `selected`, the rays that were chosen at other numbers of rays.
+        further_tables, further_tracks: Of the layout `selected`, the rays that were chosen at other numbers of rays.
         constraints: The constraint document that it satisfies (plain values).
         provenance: Command, seed, run and versions, for people.
         level: The share of each marginal that intervals hold.
@@ -260,6 +260,7 @@ class DesignSpec:
     at: Mapping[str, float] = field(default_factory=dict)
     gates: Gates | None = None
     further_tables: tuple[Rays, ...] = ()
+    further_tracks: tuple[Track, ...] = ()
 
     @property
     def weights(self) -> np.ndarray:

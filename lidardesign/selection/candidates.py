@@ -7,19 +7,17 @@ what lies outside; which of them pays is for the choice.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.design.layouts.gates import central_intervals
-from lidardesign.geometry.rays import Rays, Returns
+from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.scene import Scene
-from lidardesign.simulate.simulate import simulate
+from lidardesign.selection.coverage import InformedScene
+from lidardesign.simulate.simulate import simulate_many
 from lidardesign.task import Information
 
-# What a task says of a scene, and the returns that it says it of, of all candidates through their widest gates.
-InformedScene = tuple[Information, Sequence[Returns]]
 CANDIDATES_PER_RAY = 5
 # Shares of what a ray returns that its gates hold; the first of them counts what rays near it return too.
 LEVELS = (1.0, 1.0, 0.98, 0.9, 0.75)
@@ -27,21 +25,38 @@ NEIGHBOURS = 7  # of a ray, with itself: those around it in a hexagonal lattice
 FEWEST_RETURNS = 3  # of a ray by itself, below which its gates rest on those of rays near it
 
 
-def inform(scene: Scene, rays: Rays, informs: Callable[[Scene, Sequence[Returns]], Information]) -> InformedScene:
-    """What a task says of the returns of rays in a scene, through the rays' own gates."""
-    returns = simulate(scene, rays)
-    information = informs(scene, returns)
-    # there are many pairs, and all scenes' are held at once
-    small = {"ray": np.int32, "item": np.int32, "worth": np.float32}
-    columns = {name: np.asarray(getattr(information, name)).astype(dtype) for name, dtype in small.items()}
-    return replace(information, **columns), returns
+def inform(
+    scene: Scene,
+    rays: Rays,
+    visits: Sequence[slice],
+    informs: Callable[[Scene, Sequence[Returns]], Information],
+) -> InformedScene:
+    """What a task says of the returns of rays in a scene, through the rays' own gates.
+
+    Arguments:
+        scene: The scene.
+        rays: All candidates.
+        visits: The rays at each condition, one after the other; at the other conditions these have no returns.
+        informs: What the task says of a scene's returns.
+    """
+    fired = simulate_many(scene, [rays.subset(visit) for visit in visits])
+    returns = [_among(rays, visit, frame) for visit, frames in zip(visits, fired, strict=True) for frame in frames]
+    return InformedScene.of(informs(scene, returns), returns)
 
 
-def gate_choices(rays: Rays, informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
+def _among(rays: Rays, fired: slice, returns: Returns) -> Returns:
+    """The returns of some rays among all rays, of which the others return nothing."""
+    outcome, range_m, body = np.full(len(rays), Outcome.MISS), np.full(len(rays), np.nan), np.full(len(rays), -1)
+    outcome[fired], range_m[fired], body[fired] = returns.outcome, returns.range_m, returns.body
+    return Returns(rays, outcome, range_m, body, returns.frame)
+
+
+def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
     """A few gates for each ray, inside its own, (N, G, 2) [m]; a ray that tells nothing has its own alone.
 
     Arguments:
         rays: The candidates, with the widest gates that they may have.
+        visits: The rays at each condition; only those of one are near each other.
         informed: What the task says of training scenes.
         margin_m: By how much gates that hold all of a ray's returns are longer at both ends: other scenes differ.
     """
@@ -52,7 +67,11 @@ def gate_choices(rays: Rays, informed: Sequence[InformedScene], margin_m: float)
     if not len(ray):
         return gates
     seen = rays.origin_m + np.median(range_m) * rays.direction
-    near = cKDTree(seen).query(seen, min(NEIGHBOURS, count))[1].reshape(count, -1)
+    near = [
+        visit.start + rows
+        for visit in visits
+        for rows in cKDTree(seen[visit]).query(seen[visit], [*range(1, min(NEIGHBOURS, len(seen[visit])) + 1)])[1]
+    ]
     order = np.argsort(ray, kind="stable")
     start = np.searchsorted(ray[order], np.arange(count + 1))
     parts = [range_m[order[start[n] : start[n + 1]]] for n in range(count)]
@@ -72,11 +91,11 @@ def gate_choices(rays: Rays, informed: Sequence[InformedScene], margin_m: float)
 def _telling_returns(informed: Sequence[InformedScene]) -> tuple[np.ndarray, np.ndarray]:
     """Every return that tells something: its ray (K,) and range (K,) [m]."""
     rays, ranges = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
-    for information, returns in informed:
-        telling = information.worth > 0
-        count = len(returns[0].range_m)
-        pairs = np.unique(information.source[telling] * count + information.ray[telling])
-        frame, ray = np.divmod(pairs, count)
-        rays.append(ray)
-        ranges.append(np.stack([one.range_m for one in returns])[frame, ray])
+    for scene in informed:
+        # a return tells of several items
+        order = np.lexsort((scene.range_m, scene.ray))
+        ray, range_m = scene.ray[order], scene.range_m[order]
+        is_first = np.append(True, (np.diff(ray) > 0) | (np.diff(range_m) > 0))[: len(ray)]
+        rays.append(ray[is_first].astype(np.intp))
+        ranges.append(range_m[is_first])
     return np.concatenate(rays), np.concatenate(ranges)

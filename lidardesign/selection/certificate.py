@@ -23,9 +23,8 @@ from lidardesign.selection import kernels
 from lidardesign.selection.choice import Choice, RayCounts
 from lidardesign.selection.coverage import Coverage
 
-ROUNDS = (
-    80  # of subgradients, at most; more of them lower the bound of 361 rays on faces by less than 0.1 % of the loss
-)
+# Of subgradients, at most; more of them lower the bound of 361 rays on faces by less than 0.1 % of the loss.
+ROUNDS = 80
 PRICE_BISECTIONS = 12
 PATIENCE = 5  # rounds without a lower bound after which steps are halved
 PROGRESS = 0.02  # of what the bound exceeds the value by: a bound that is lower by less is not lower

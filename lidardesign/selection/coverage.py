@@ -9,7 +9,7 @@ that S hears of item u (facility location), or a concave table of their sum. Bot
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -79,8 +79,20 @@ class Coverage:
     def by_item(self) -> kernels.ByItem:
         """The table in the order of items."""
         order = np.argsort(self.item, kind="stable")
-        return kernels.ByItem(
-            _begins(self.item, len(self.weight)), self.ray[order], self.worth[order], self.gates[order]
+        begin = _begins(self.item, len(self.weight))
+        return kernels.ByItem(begin, self.ray[order], self.worth[order], self.gates[order])
+
+    def of_rays(self, rays: slice) -> Coverage:
+        """The table of some rays, one after the other."""
+        first, last = self.start[rays.start], self.start[rays.stop]
+        return replace(
+            self,
+            start=self.start[rays.start : rays.stop + 1] - first,
+            item=self.item[first:last],
+            worth=self.worth[first:last],
+            gates=self.gates[first:last],
+            bits=self.bits[rays],
+            harm=self.harm[rays],
         )
 
     def known(self, gate: np.ndarray) -> np.ndarray:
@@ -113,18 +125,76 @@ class Coverage:
         return float(self.bits[rays, gate[rays]].sum()), float(self.harm[rays, gate[rays]].sum())
 
 
-def gather(
-    informed: Iterable[tuple[Information, Sequence[Returns]]], gates_m: np.ndarray, bits: np.ndarray
-) -> Coverage:
+@dataclass(frozen=True, eq=False)
+class InformedScene:
+    """What a task says of a scene's returns, with the ranges that say through which gates they are heard.
+
+    Arguments:
+        ray, item: Of each pair, int32 (E,).
+        worth: Above 0, float32 (E,).
+        range_m: The range of its return, (E,) [m].
+        weight: What items count, (U,); they sum to 1.
+        spoiling: Rays whose returns spoil something, one entry per return, (H,).
+        harm, harm_range_m: What each of these spoils, and its range [m], (H,).
+        sums: The table of sums, or `LARGEST`.
+        complete: What an item counts of which nothing is left to know.
+        is_repeated: Whether a ray may tell of an item by several frames, of which the largest worth counts.
+        unit: Of worth.
+    """
+
+    ray: np.ndarray
+    item: np.ndarray
+    worth: np.ndarray
+    range_m: np.ndarray
+    weight: np.ndarray
+    spoiling: np.ndarray
+    harm: np.ndarray
+    harm_range_m: np.ndarray
+    sums: np.ndarray
+    complete: float
+    is_repeated: bool
+    unit: str
+
+    @classmethod
+    def of(cls, information: Information, returns: Sequence[Returns]) -> InformedScene:
+        """What is kept of the returns of all candidate rays, through open gates.
+
+        Raises:
+            PluginError: Pairs, weights or harm that cannot be.
+        """
+        range_m = np.stack([frame.range_m for frame in returns])
+        require_valid(information, range_m.shape[1], len(returns))
+        tells = np.flatnonzero(information.worth > 0)
+        ray, item = information.ray[tells], information.item[tells]
+        count = len(information.frame)
+        weight = np.ones(count) if information.weight is None else np.asarray(information.weight, dtype=np.float64)
+        harm = np.zeros_like(range_m) if information.harm is None else np.asarray(information.harm)
+        spoiling = np.nonzero(harm)
+        return cls(
+            ray=ray.astype(np.int32),
+            item=item.astype(np.int32),
+            worth=information.worth[tells].astype(np.float32),
+            range_m=range_m[information.source[tells], ray],
+            weight=weight / weight.sum(),
+            spoiling=spoiling[1],
+            harm=harm[spoiling],
+            harm_range_m=range_m[spoiling],
+            sums=LARGEST if information.sums is None else np.asarray(information.sums, dtype=np.float64),
+            complete=information.complete,
+            is_repeated=information.seen_in is not None,
+            unit=information.unit,
+        )
+
+
+def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndarray) -> Coverage:
     """The table over scenes, each of which counts as much as any other.
 
     Arguments:
-        informed: What a task says of each scene, and the returns that it says it of: of all rays, through open gates.
+        informed: What a task says of each scene.
         gates_m: The gates of each ray, each from a start to before an end, shape (N, G, 2).
         bits: What reading a ray out through each gate costs, inf for gates that are not allowed, (N, G) [Mbit/s].
 
     Raises:
-        PluginError: Pairs, weights or harm that cannot be.
         ConfigError: No scene, or more gates than an entry has bits.
     """
     rays, gates = bits.shape
@@ -134,25 +204,20 @@ def gather(
     weights, items, sums = [], 0, LARGEST
     harm, complete = np.zeros((rays, gates)), 0.0
     small = np.uint16 if rays <= np.iinfo(np.uint16).max else np.int32
-    for information, returns in informed:
-        require_valid(information, rays, len(returns))
-        range_m = np.stack([frame.range_m for frame in returns])
-        opened = (range_m[..., None] >= gates_m[..., 0]) & (range_m[..., None] < gates_m[..., 1])
-        passes = np.packbits(opened, axis=2, bitorder="little")[..., 0][information.source, information.ray]
-        if information.seen_in is not None:
-            passes = _largest_alone(information, passes, gates)
-        tells = np.flatnonzero((passes > 0) & (information.worth > 0))
+    for scene in informed:
+        passes = _passes(scene.range_m, gates_m[scene.ray])
+        if scene.is_repeated:
+            passes = _largest_alone(scene, passes, gates)
+        heard = passes > 0
         # few bytes each, as there are many; small integers are sorted fast
-        found = (information.ray, items + information.item, information.worth, passes)
-        for column, values, dtype in zip(columns, found, (small, np.int32, np.float32, np.uint8), strict=True):
-            column.append(values[tells].astype(dtype))
-        count = len(information.frame)
-        weight = np.ones(count) if information.weight is None else np.asarray(information.weight, dtype=np.float64)
-        weights.append(weight / weight.sum())
-        if information.harm is not None:
-            harm += np.einsum("fn,fng->ng", information.harm, opened)
-        items, complete = items + count, complete + information.complete
-        sums = LARGEST if information.sums is None else np.asarray(information.sums, dtype=np.float64)
+        found = (scene.ray.astype(small), np.int32(items) + scene.item, scene.worth, passes)
+        for column, values in zip(columns, found, strict=True):
+            column.append(values[heard])
+        spoils = _passes(scene.harm_range_m, gates_m[scene.spoiling])
+        for gate in range(gates):
+            harm[:, gate] += np.bincount(scene.spoiling, np.where(spoils >> gate & 1, scene.harm, 0.0), rays)
+        weights.append(scene.weight)
+        items, complete, sums = items + len(scene.weight), complete + scene.complete, scene.sums
     if not weights:
         raise ConfigError("no scene", where="selection", allowed="at least one training scene")
     ray = _joined(columns[0])
@@ -183,10 +248,16 @@ def _begins(labels: np.ndarray, count: int) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(np.bincount(labels, minlength=count))])
 
 
-def _largest_alone(information: Information, passes: np.ndarray, gates: int) -> np.ndarray:
+def _passes(range_m: np.ndarray, gates_m: np.ndarray) -> np.ndarray:
+    """One bit for each gate (K, G, 2) that lets a return at a range (K,) through, uint8 (K,)."""
+    opened = (range_m[:, None] >= gates_m[..., 0]) & (range_m[:, None] < gates_m[..., 1])
+    return np.packbits(opened, axis=1, bitorder="little")[:, 0]
+
+
+def _largest_alone(scene: InformedScene, passes: np.ndarray, gates: int) -> np.ndarray:
     """The gates (E,) without those through which a ray tells more about the same item in another frame."""
-    pair = information.ray.astype(np.int64) * len(information.frame) + information.item
-    order = np.lexsort((-information.worth, pair))
+    pair = scene.ray.astype(np.int64) * len(scene.weight) + scene.item
+    order = np.lexsort((-scene.worth, pair))
     kept = np.zeros_like(passes)
     for gate in range(gates):
         through = order[passes[order] >> gate & 1 > 0]

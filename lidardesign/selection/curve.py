@@ -15,7 +15,7 @@ from lidardesign.selection.coverage import Coverage
 PRICES = 7  # beside none: each half of the one before, from twice what the bits of a free choice are worth
 
 
-def price_curve(coverage: Coverage, counts: RayCounts) -> list[list[float]]:
+def price_curve(coverage: Coverage, counts: RayCounts, visits: int = 1) -> list[list[float]]:
     """The loss of choices [in the unit of worth] against their bandwidth [Mbit/s], as pairs that rise and fall.
 
     Choices that cost more and lose no less than others are left out.
@@ -23,12 +23,13 @@ def price_curve(coverage: Coverage, counts: RayCounts) -> list[list[float]]:
     Arguments:
         coverage: What the candidates tell.
         counts: How many rays each sensor fires.
+        visits: Over how many values of a condition the bandwidth is a mean.
     """
     free = choose(coverage, counts, passes=0)
     prices = 2 * free.worth / free.bits * 0.5 ** np.arange(PRICES) if free.bits > 0 else []
     choices = [free, *(choose(coverage, counts, price=float(price), passes=0) for price in prices)]
     points: list[list[float]] = []
-    for mbps, loss in sorted((one.bits, coverage.complete - (one.worth - one.harm)) for one in choices):
+    for mbps, loss in sorted((one.bits / visits, coverage.complete - (one.worth - one.harm)) for one in choices):
         if not points or loss < points[-1][1]:
             points.append([float(mbps), float(loss)])
     return points

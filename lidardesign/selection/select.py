@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.bandwidth import Bandwidth, split_budget
 from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.geometry.rays import Rays, Returns
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
-from lidardesign.selection.candidates import InformedScene, inform
+from lidardesign.selection.candidates import inform
 from lidardesign.selection.certificate import certify
 from lidardesign.selection.choice import Choice, RayCounts, choose, choose_within
-from lidardesign.selection.coverage import Coverage, gather
+from lidardesign.selection.coverage import Coverage, InformedScene, gather
 from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
 
@@ -36,6 +36,8 @@ class SelectionProblem:
 
     Arguments:
         rays: Candidates with the widest gates that they may have.
+        visits: Which of them fire at each of the values of a condition, one after the other; all at once without.
+        shares: The share of the rays that each sensor fires, (S,); None leaves it to the choice.
         gates: A few gates for each of some rays, (N, G, 2) [m], of what their returns tell about scenes.
         informs: What a task says of a scene's returns.
         scenes: Training scenes without end for a purpose, `choice` or `held back`.
@@ -46,7 +48,9 @@ class SelectionProblem:
     """
 
     rays: Rays
-    gates: Callable[[Rays, Sequence[InformedScene]], np.ndarray]
+    visits: Sequence[slice]
+    shares: np.ndarray | None
+    gates: Callable[[Rays, Sequence[slice], Sequence[InformedScene]], np.ndarray]
     informs: Callable[[Scene, Sequence[Returns]], Information]
     scenes: Callable[[str], Iterator[Scene]]
     bandwidth: Bandwidth
@@ -57,7 +61,15 @@ class SelectionProblem:
     @phase("what returns tell")
     def inform(self, scenes: Iterator[Scene], count: int) -> list[InformedScene]:
         """What the task says of the next so many scenes; they are not kept."""
-        return [inform(scene, self.rays, self.informs) for scene in itertools.islice(scenes, count)]
+        return [inform(scene, self.rays, self.visits, self.informs) for scene in itertools.islice(scenes, count)]
+
+    def counts(self, count: int, visit: slice = slice(None)) -> RayCounts:
+        """How many of the candidates, or of some, each sensor fires at each value of a condition."""
+        place = np.repeat(np.arange(len(self.visits)), [one.stop - one.start for one in self.visits])[visit]
+        if self.shares is None:
+            return RayCounts(place, np.full(len(self.visits), count))
+        most = np.tile(split_budget(self.shares, count), len(self.visits))
+        return RayCounts(place * len(self.shares) + self.rays.sensor[visit], most)
 
     def coverage(self, informed: Sequence[InformedScene], gates_m: np.ndarray) -> Coverage:
         """What the candidates tell about scenes, with the cost of their gates."""
@@ -65,22 +77,42 @@ class SelectionProblem:
         return gather(informed, gates_m, one_bin * self.bandwidth.bins(gates_m[..., 1] - gates_m[..., 0]))
 
     @phase("choice")
-    def choice(self, coverage: Coverage, count: int) -> Choice:
-        """The choice of so many rays within the bandwidth.
+    def choices(self, coverage: Coverage, count: int) -> list[Choice]:
+        """The choice of so many rays within the bandwidth, at each value of a condition.
 
         Raises:
             InfeasibleError: So many rays do not fit.
         """
-        counts = RayCounts.of_one(len(self.rays), count)
-        limit = self.limit_mbps
-        choice = choose(coverage, counts) if np.isinf(limit) else choose_within(coverage, counts, limit)
-        if len(choice.rays) < count:
-            raise InfeasibleError(
-                f"{len(choice.rays)} of {count} rays fit in {limit:g} Mbit/s",
-                conflicts=["budget.bandwidth_mbps"],
-                hint=f"fewer rays, or a larger bandwidth, for {self.name}",
-            )
-        return choice
+        choices, limit = [], self.limit_mbps
+        if len(self.visits) > 1:
+            # between two values gates are linear, and every ray may cost one bin more than at the dearer of them
+            limit -= self.bandwidth.mbps_of_widths(np.zeros(count))
+        for visit in self.visits:
+            own, counts = coverage.of_rays(visit), self.counts(count, visit)
+            choice = choose(own, counts) if np.isinf(limit) else choose_within(own, counts, limit)
+            if len(choice.rays) < count:
+                raise InfeasibleError(
+                    f"{len(choice.rays)} of {count} rays fit in {limit:g} Mbit/s",
+                    conflicts=["budget.bandwidth_mbps"],
+                    hint=f"fewer rays, or a larger bandwidth, for {self.name}",
+                )
+            choices.append(choice)
+        return choices
+
+    @phase("certificate")
+    def certified(self, coverage: Coverage, choices: Sequence[Choice]) -> tuple[float, float]:
+        """What choices lose, and what any choices lose at least: values of a condition share no items."""
+        limit, value, bound = None if np.isinf(self.limit_mbps) else self.limit_mbps, 0.0, 0.0
+        for visit, choice in zip(self.visits, choices, strict=True):
+            own = coverage.of_rays(visit)
+            one = certify(own, self.counts(len(choice.rays), visit), choice, budget_mbps=limit)
+            value, bound = value + one.value, bound + one.bound
+        return coverage.complete - value, coverage.complete - bound
+
+
+def _gate_of(choices: Sequence[Choice]) -> np.ndarray:
+    """The gate of each candidate, -1 for those that do not fire, (N,)."""
+    return np.concatenate([choice.gate for choice in choices])
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,77 +120,78 @@ class Selected:
     """Chosen rays, and how far from the best they may be.
 
     Arguments:
-        rays: In the order of their sensors.
+        rays: Those of each value of a condition, in the order of their sensors.
         certificate: `value` and `bound` of the loss on the scenes chosen on, `gap`, `held_back_value`, and the numbers
             of `rays`, `candidates`, `gates` and `scenes`; at the middle number of rays `gap_doubled`, the gap with
             candidates doubled, and `curve`, the price curve as pairs of Mbit/s and loss.
     """
 
-    rays: Rays
+    rays: Sequence[Rays]
     certificate: dict[str, Any]
 
 
 def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
-    """The rays that are chosen at each number of rays.
+    """The rays that are chosen at each of some numbers of rays, ascending.
 
     Raises:
         DataError: No candidate tells anything about the scenes.
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
-    rays, middle = problem.rays, counts[len(counts) // 2]
+    middle = counts[len(counts) // 2]
     held_back = problem.inform(problem.scenes("held back"), HELD_BACK_SCENES)
     informed: list[InformedScene] = []
-    scenes = problem.scenes("choice")
-    wanted, loss = FIRST_SCENES, np.inf
+    scenes, wanted, loss = problem.scenes("choice"), FIRST_SCENES, np.inf
     while True:
         informed += problem.inform(scenes, wanted - len(informed))
-        gates_m = problem.gates(rays, informed)
+        gates_m = problem.gates(problem.rays, problem.visits, informed)
         coverage, judged = problem.coverage(informed, gates_m), problem.coverage(held_back, gates_m)
         if not len(coverage.item):
             raise DataError(
-                f"none of {len(rays)} candidate rays tells anything about {len(informed)} training scenes",
+                f"none of {len(problem.rays)} candidate rays tells anything about {len(informed)} training scenes",
                 where=problem.name,
                 hint="let sensors look at the targets: constrain less, or learn longer",
             )
-        before, loss = loss, judged.loss_of(problem.choice(coverage, middle).gate)
+        before, loss = loss, judged.loss_of(_gate_of(problem.choices(coverage, middle)))
         if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > MOST_SCENES:
             break
         wanted *= 2
+    rays = problem.rays
     selected = []
     for count in counts:
-        choice = problem.choice(coverage, count)
-        with phase("certificate"):
-            limit = None if np.isinf(problem.limit_mbps) else problem.limit_mbps
-            certificate = certify(coverage, RayCounts.of_one(len(rays), count), choice, budget_mbps=limit)
-        chosen = choice.rays[np.lexsort((choice.rays, rays.sensor[choice.rays]))]
-        table = replace(rays.subset(chosen), gate_m=gates_m[chosen, choice.gate[chosen]]).as_angles()
+        choices = problem.choices(coverage, count)
+        value, bound = problem.certified(coverage, choices)
+        gate = _gate_of(choices)
+        tables = []
+        for visit, choice in zip(problem.visits, choices, strict=True):
+            chosen = visit.start + choice.rays
+            chosen = chosen[np.lexsort((chosen, rays.sensor[chosen]))]
+            tables.append(replace(rays.subset(chosen), gate_m=gates_m[chosen, gate[chosen]]).as_angles())
         document = {
             "rays": count,
-            "value": float(coverage.complete - certificate.value),
-            "bound": float(coverage.complete - certificate.bound),
-            "gap": float(certificate.gap(coverage.complete)),
-            "held_back_value": float(judged.loss_of(choice.gate)),
+            "value": float(value),
+            "bound": float(bound),
+            "gap": float((value - bound) / value) if value > 0 else 0.0,
+            "held_back_value": float(judged.loss_of(gate)),
             "candidates": len(rays),
             "gates": gates_m.shape[1],
             "scenes": len(informed),
             "proxy": PROXY,
-            "unit": informed[0][0].unit,
+            "unit": informed[0].unit,
         }
         if count == middle:
-            document["curve"] = price_curve(coverage, RayCounts.of_one(len(rays), count))
+            document["curve"] = price_curve(coverage, problem.counts(count), len(problem.visits))
             if problem.further is not None:
                 document["gap_doubled"] = _gap_doubled(problem, problem.further, count)
-        selected.append(Selected(table, document))
+        selected.append(Selected(tables, document))
     return selected
 
 
 @phase("certificate")
 def _gap_doubled(problem: SelectionProblem, further: Rays, count: int) -> float:
     """The gap of a choice among the candidates on the first scenes, against choices among twice as many."""
-    own = len(problem.rays)
-    doubled = replace(problem, rays=Rays.joined([problem.rays, further]))
+    own, rays = len(problem.rays), Rays.joined([problem.rays, further])
+    doubled = replace(problem, rays=rays, visits=[slice(0, len(rays))])
     informed = doubled.inform(doubled.scenes("choice"), FIRST_SCENES)
-    coverage = doubled.coverage(informed, doubled.gates(doubled.rays, informed))
+    coverage = doubled.coverage(informed, doubled.gates(rays, doubled.visits, informed))
     limit = None if np.isinf(problem.limit_mbps) else problem.limit_mbps
-    counts = RayCounts.of_one(len(doubled.rays), count)
-    return gap_among_more(coverage, counts, np.arange(len(doubled.rays)) < own, limit)
+    return gap_among_more(coverage, doubled.counts(count), np.arange(len(rays)) < own, limit)

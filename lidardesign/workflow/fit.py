@@ -158,7 +158,7 @@ class FitRequest:
                 hint="its rounds try new candidates for chosen rays",
             )
         beside = {
-            "a density with conditions": run.config.space.conditioned,
+            "--at": options.at or (base is not None and base.at),
             "--weight": options.weights,
             "snap": wants_parts(rules.rules),
         }

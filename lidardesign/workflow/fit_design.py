@@ -11,14 +11,15 @@ from lidardesign.design.fit import FitResult
 from lidardesign.design.fit import fit as fit_samples
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
 from lidardesign.design.layouts.rays import LAYOUTS
+from lidardesign.design.layouts.track import travelled
 from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import versions
 from lidardesign.run.yaml import dump_yaml, parse_yaml
-from lidardesign.samples import load_samples
-from lidardesign.task import random_generator
+from lidardesign.samples import Samples, load_samples
+from lidardesign.task import conditions_of, random_generator
 from lidardesign.workflow.fit import FitRequest
 from lidardesign.workflow.run_folder import Notes, log_note, relative_folder
 from lidardesign.workflow.run_samples import KEY, RunTarget
@@ -58,9 +59,9 @@ class Fitter:
             )
 
     @phase("fitting")
-    def fit(self, **choices: Any) -> FitResult:
-        """The design, by the request's choices and these instead of some of them."""
-        request, samples = self.request, self.samples
+    def fit(self, samples: Samples | None = None, **choices: Any) -> FitResult:
+        """The design, by the request's choices and these instead of some of them, to other samples if there are."""
+        request, samples = self.request, self.samples if samples is None else samples
         if request.at:
             count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (request.choices.get("rays") or 0))
             samples = at_condition(samples, request.at, self.target, count, random_generator(request.seed, "condition"))
@@ -115,16 +116,21 @@ def fit_design(request: FitRequest, *, notes: Notes = log_note) -> FitResult:
 
 def _selected(fitter: Fitter) -> FitResult:
     """Sensors with rays that were chosen on scenes: of the number that was asked for, or of each of the task's."""
-    from lidardesign.workflow.select_rays import select_rays
+    from lidardesign.workflow.select_rays import near, select_rays
 
-    request = fitter.request
+    request, samples = fitter.request, fitter.samples
     counts = sorted({request.choices["rays"]} if request.choices["rays"] else set(request.run.task.defaults.rays))
+    if samples.space.conditioned:
+        travelled(samples.space, "selected")
+    # the rays of a track have gates of their own, as those of a scan
+    gates = request.choices["gates"] or ("ray" if samples.space.conditioned else LAYOUTS["selected"].usual_gates)
     # sensors' own gates keep a bandwidth themselves, those of rays are priced when they are chosen
-    layout = "density" if request.choices["gates"] == "ray" else "grid"
-    fitted = fitter.fit(layout=layout, rays=counts[-1])
-    gates = request.choices["gates"] or LAYOUTS["selected"].usual_gates
+    layout = "density" if gates == "ray" else "grid"
+    (first, *_) = conditions_of(request.run.task, request.run.config.task, samples.space)
+    # a sensor that moves along a condition looks everywhere the same way
+    fitted = fitter.fit(near(samples, first, 1.0), layout=layout, rays=counts[-1], gates=gates)
     fitted = replace(fitted, design=replace(fitted.design, gates=gates))
-    return select_rays(request.run, fitted, counts, fitter.samples, request.seed)
+    return select_rays(request.run, fitted, counts, samples, request.seed)
 
 
 def check_written(design: DesignSpec, request: FitRequest) -> list[ConstraintCheck]:

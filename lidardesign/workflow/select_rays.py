@@ -1,13 +1,15 @@
 """Rays of a fitted design that are chosen on training scenes: `fit --layout selected`.
 
 The density proposes rays inside the sensors; scenes that nothing was learned from say what each of them tells (see
-`lidardesign.selection`).
+`lidardesign.selection`). Along a condition, as a robot's position, rays are chosen at each of its values that the task
+judges at, and become tracks.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -18,32 +20,45 @@ from lidardesign.design.fit import FitResult
 from lidardesign.design.layouts.density import bandwidth_limit
 from lidardesign.design.layouts.gates import bounded_gates
 from lidardesign.design.layouts.rays import LAYOUTS
+from lidardesign.design.layouts.track import placed, track_of
 from lidardesign.design.mixture.bounds import bounds_of
-from lidardesign.design.sensor import CERTIFICATES, DesignSpec, interval_factor
+from lidardesign.design.sensor import (
+    CERTIFICATES,
+    DesignSpec,
+    interval_factor,
+)
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scene import Scene
-from lidardesign.selection.candidates import CANDIDATES_PER_RAY, InformedScene, gate_choices
+from lidardesign.selection.candidates import CANDIDATES_PER_RAY, gate_choices
+from lidardesign.selection.coverage import InformedScene
 from lidardesign.selection.information import checked_information, informs_rays
-from lidardesign.space import DesignSpace
-from lidardesign.task import random_generator
+from lidardesign.space import DIMENSIONS, DesignSpace
+from lidardesign.task import conditions_of, random_generator
 from lidardesign.workflow.run_folder import RunFolder
 
 MOST_CHOSEN = 5000  # rays: what candidates tell of 400 scenes then takes minutes and gigabytes
 EVEN_SHARE = 0.25  # of the candidates that are even in the fields, where the density's samples may be sparse
 MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes returned, in the density's sigma
+NEAREST_SHARE = 0.1  # of the samples along a condition that propose rays at one of its values
 
 
-def select_rays(run: RunFolder, result: FitResult, counts: Sequence[int], samples: Samples, seed: int) -> FitResult:
-    """The design of a fit with rays that were chosen, one table for each number of rays.
+def select_rays(
+    run: RunFolder,
+    result: FitResult,
+    counts: Sequence[int],
+    samples: Samples,
+    seed: int,
+) -> FitResult:
+    """The design of a fit with rays that were chosen, one table or track for each number of rays.
 
     Arguments:
         run: The run, whose task says what returns tell.
         result: The fitted sensors; `gates` of the design says whether rays have gates of their own.
-        counts: Numbers of rays, ascending.
-        samples: What the sensors were fitted to.
+        counts: Numbers of rays, ascending; along a condition, at each of its values.
+        samples: Of the density, at all values of its condition.
         seed: Root of the random streams.
 
     Raises:
@@ -64,41 +79,42 @@ def select_rays(run: RunFolder, result: FitResult, counts: Sequence[int], sample
         raise ConfigError(f"{counts[-1]} rays in the layout selected", where="--rays", allowed=f"at most {MOST_CHOSEN}")
     spec = result.design
     constraints = Constraints.from_mapping(spec.constraints, where=f"constraints of {spec.name}")
-    # a task whose rays start all over their sensors' origins proposes such rays
-    layout = "distributed" if LAYOUTS[run.task.defaults.layout].extends_origins else "density"
-    rays = _proposed(spec, layout, samples, CANDIDATES_PER_RAY * counts[-1], seed)
+    proposals = Proposals(run, spec, samples, seed)
+    candidates = proposals.at_conditions(CANDIDATES_PER_RAY * counts[-1])
+    ends = np.cumsum([0, *map(len, candidates)])
+    rays, visits = Rays.joined(candidates), [slice(*pair) for pair in itertools.pairwise(ends.tolist())]
     limit = constraints.budget.bandwidth_mbps
     problem = SelectionProblem(
         rays=rays,
-        gates=partial(_gates, spec, constraints, samples.space, margin_m=gate_margin_m(run)),
+        visits=visits,
+        shares=spec.weights if len(visits) > 1 else None,
+        gates=partial(_gates, spec, constraints, samples.space, gate_margin_m(run)),
         informs=partial(checked_information, run.task),
         scenes=partial(selection_scenes, run, seed),
         bandwidth=bandwidth_limit(constraints, len(rays))[0],
         limit_mbps=np.inf if limit is None else limit,
         name=spec.name,
-        further=_further(spec, layout, samples, len(rays), seed),
+        further=None if len(visits) > 1 else proposals.further(len(rays)),
     )
     selected = select(problem, counts)
+    provenance = {**spec.provenance, CERTIFICATES: [one.certificate for one in selected]}
+    design = replace(spec, layout="selected", rays=counts[0] if len(counts) == 1 else None, provenance=provenance)
     tables = [one.rays for one in selected]
-    only = len(counts) == 1
-    own = np.bincount(tables[-1].sensor, minlength=len(spec.sensors))
-    sensors = (
-        replace(sensor, rays=int(number) if only else None) for sensor, number in zip(spec.sensors, own, strict=True)
-    )
-    design = replace(
-        spec,
-        sensors=tuple(sensors),
-        layout="selected",
-        rays=counts[0] if only else None,
-        ray_table=tables[-1],
-        further_tables=tuple(tables[:-1]),
-        provenance={**spec.provenance, CERTIFICATES: [one.certificate for one in selected]},
-    )
-    return replace(result, design=design)
+    own = np.bincount(tables[-1][0].sensor, minlength=len(spec.sensors))
+    sensors = spec.sensors
+    if len(counts) == 1:
+        sensors = tuple(replace(sensor, rays=int(number)) for sensor, number in zip(sensors, own, strict=True))
+    design = replace(design, sensors=sensors)
+    if len(visits) == 1:
+        return replace(
+            result,
+            design=replace(design, ray_table=tables[-1][0], further_tables=tuple(one[0] for one in tables[:-1])),
+        )
+    return replace(result, design=_on_tracks(design, tables, proposals.conditions, samples.space))
 
 
 def selection_scenes(run: RunFolder, seed: int, purpose: str) -> Iterator[Scene]:
-    """Training scenes that nothing was learned from, drawn with further seeds."""
+    """Training scenes that nothing was learned from, without end, drawn with further seeds for each purpose."""
     for draw in itertools.count():
         yield from run.scenes("train", int(random_generator(seed, "selection", purpose, draw).integers(2**31)))
 
@@ -108,23 +124,53 @@ def gate_margin_m(run: RunFolder) -> float:
     return MARGIN_SIGMAS * run.config.density.sigma_m
 
 
-@phase("candidates")
-def _proposed(spec: DesignSpec, layout: str, samples: Samples, count: int, seed: int) -> Rays:
-    """Rays inside the sensors, most of them where the density is, with their sensors' gates."""
-    sensors = tuple(replace(sensor, rays=None) for sensor in spec.sensors)
-    spec = replace(spec, ray_table=None, rays=None, sensors=sensors)
-    even = round(EVEN_SHARE * count)
-    parts = [
-        LAYOUTS[name].lay_out(spec, number, samples, "sensor", seed)
-        for name, number in ((layout, count - even), ("grid", even))
-    ]
-    return replace(Rays.joined(parts), time_s=np.zeros(count))
+def near(samples: Samples, at: Mapping[str, float], share: float = NEAREST_SHARE) -> Samples:
+    """The share of samples whose condition is nearest to a value, as if it were there; all without a condition."""
+    if not at:
+        return samples
+    ((name, value),) = at.items()
+    axis = DIMENSIONS.index(name)
+    away = np.abs(samples.points[:, axis] - value)
+    nearest = samples.subset(np.sort(np.argsort(away, kind="stable")[: math.ceil(share * len(samples))]))
+    points = nearest.points.copy()
+    points[:, axis] = value
+    return replace(nearest, points=points, space=samples.space.at(at))
 
 
-def _further(spec: DesignSpec, layout: str, samples: Samples, count: int, seed: int) -> Rays:
-    """As many rays again: at random every second one of twice as many, which are elsewhere."""
-    rays = _proposed(spec, layout, samples, 2 * count, seed)
-    return rays.subset(np.sort(random_generator(seed, "selection", "further").permutation(2 * count)[:count]))
+class Proposals:
+    """Candidate rays inside the sensors of a design.
+
+    Arguments:
+        run: The run of the density.
+        spec: The design.
+        samples: Of the density.
+        seed: Root of the random streams.
+    """
+
+    def __init__(self, run: RunFolder, spec: DesignSpec, samples: Samples, seed: int) -> None:
+        self.samples, self.seed = samples, seed
+        self.conditions = conditions_of(run.task, run.config.task, samples.space)
+        sensors = tuple(replace(sensor, rays=None) for sensor in spec.sensors)
+        self.spec = replace(spec, ray_table=None, rays=None, sensors=sensors)
+        # a task whose rays start all over their sensors' origins proposes such rays
+        self.layout = "distributed" if LAYOUTS[run.task.defaults.layout].extends_origins else "density"
+
+    @phase("candidates")
+    def at_conditions(self, count: int) -> list[Rays]:
+        """So many rays at each value of the condition, most of them where the density is."""
+        even = round(EVEN_SHARE * count)
+        layouts = ((self.layout, count - even), ("grid", even))
+        return [Rays.joined([self._laid_out(*layout, at) for layout in layouts]) for at in self.conditions]
+
+    def further(self, count: int) -> Rays:
+        """As many rays again: at random every second one of twice as many, which are elsewhere."""
+        (rays,) = self.at_conditions(2 * count)
+        return rays.subset(np.sort(random_generator(self.seed, "selection", "further").permutation(2 * count)[:count]))
+
+    def _laid_out(self, layout: str, count: int, at: Mapping[str, float]) -> Rays:
+        here = placed(self.spec, at) if at else self.spec
+        rays = LAYOUTS[layout].lay_out(here, count, near(self.samples, at), "sensor", self.seed)
+        return replace(rays, time_s=np.zeros(count))
 
 
 @phase("gates")
@@ -132,15 +178,15 @@ def _gates(
     spec: DesignSpec,
     constraints: Constraints,
     space: DesignSpace,
-    rays: Rays,
-    informed: Sequence[InformedScene],
-    *,
     margin_m: float,
+    rays: Rays,
+    visits: Sequence[slice],
+    informed: Sequence[InformedScene],
 ) -> np.ndarray:
     """The gates that rays may have inside the design's constraints, (N, G, 2) [m]."""
     if spec.gates != "ray":
         return rays.gate_m[:, None]
-    gates_m = gate_choices(rays, informed, margin_m)
+    gates_m = gate_choices(rays, visits, informed, margin_m)
     for index, sensor in enumerate(spec.sensors):
         own = rays.sensor == index
         wanted = gates_m[own].reshape(-1, 2)
@@ -148,3 +194,24 @@ def _gates(
         allowed = bounded_gates(wanted, sensor, bounds.take(np.zeros(len(wanted), dtype=np.int64)))
         gates_m[own] = allowed.reshape(-1, *gates_m.shape[1:])
     return gates_m
+
+
+def _on_tracks(
+    design: DesignSpec,
+    tables: Sequence[Sequence[Rays]],
+    conditions: Sequence[Mapping[str, float]],
+    space: DesignSpace,
+) -> DesignSpec:
+    """The design with a track of each number of rays, its sensors in the middle of their travel."""
+    (dimension,), name = space.conditioned, DIMENSIONS[space.conditioned[0]]
+    ends = space.low[dimension], space.high[dimension]
+    tracks = [track_of(dimension, [at[name] for at in conditions], one, ends) for one in tables]
+    middle = placed(design, {name: sum(ends) / 2})
+    covariance = np.zeros((3, 3))
+    covariance[dimension, dimension] = ((ends[1] - ends[0]) / (2 * interval_factor(design.level))) ** 2
+    sensors = tuple(
+        replace(sensor, origin_covariance_m2=sensor.origin_covariance_m2 + covariance) for sensor in middle.sensors
+    )
+    at = {key: value for key, value in design.at.items() if key != name}
+    tracked = replace(design, sensors=sensors, ray_table=None, at=at)
+    return replace(tracked, track=tracks[-1], further_tracks=tuple(tracks[:-1]))

@@ -396,7 +396,6 @@ def test_the_warehouse_is_measured(run_script):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="rays are not chosen along an aisle yet")
 def test_rivals_are_measured_drawn_and_put_on_their_page(run_script, tmp_path):
     page, picture = tmp_path / "page.md", tmp_path / "picture.png"
     page.write_text("before\n\n<!-- warehouse -->\n\n<!-- warehouse -->\n\nafter\n")

@@ -14,7 +14,7 @@ from support.coverages import SUMS, relaxed_by_highs, small
 from lidardesign.errors import PluginError
 from lidardesign.selection.certificate import certify
 from lidardesign.selection.choice import RayCounts, choose, choose_within
-from lidardesign.selection.coverage import LARGEST, gather
+from lidardesign.selection.coverage import LARGEST, InformedScene, gather
 from lidardesign.task import Information
 
 seeds = st.integers(0, 10_000)
@@ -142,7 +142,7 @@ def test_of_what_a_ray_tells_in_several_frames_the_largest_counts_that_a_gate_le
     returns = [SimpleNamespace(range_m=generator.uniform(1, 2, rays)) for _ in range(frames)]
     gates_m = np.sort(generator.uniform(1, 2, (rays, gates, 2)), axis=2)
     information = Information(ray, item, worth, np.arange(items) % frames, seen_in=seen_in)
-    coverage = gather([(information, returns)], gates_m, np.zeros((rays, gates)))
+    coverage = gather([InformedScene.of(information, returns)], gates_m, np.zeros((rays, gates)))
     for one, gate in itertools.product(range(rays), range(gates)):
         most = np.zeros(items)
         for e in np.flatnonzero(ray == one):

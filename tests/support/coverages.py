@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from lidardesign.selection.coverage import LARGEST, Coverage, gather
+from lidardesign.selection.coverage import LARGEST, Coverage, InformedScene, gather
 from lidardesign.task import Information
 
 SUMS = np.array([0.0, 1.0, 1.6, 1.9, 2.0])
@@ -22,7 +22,7 @@ def scene_of(generator, rays, items, pairs, table):
     weight, frame = generator.uniform(0.5, 1, items), np.zeros(items, dtype=int)
     sums = None if len(table) == 0 else table
     returns = SimpleNamespace(range_m=generator.uniform(1, 2, rays))
-    return Information(ray, item, worth, frame, weight, sums=sums), [returns]
+    return InformedScene.of(Information(ray, item, worth, frame, weight, sums=sums), [returns])
 
 
 def small(seed, rays=7, gates=2, items=12, scenes=3, table=LARGEST, harm=0.0):

@@ -24,7 +24,7 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.scene import Scene, group_numbers
-from lidardesign.selection.coverage import gather
+from lidardesign.selection.coverage import InformedScene, gather
 from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim
@@ -214,7 +214,8 @@ def test_a_design_without_rays_fails(case, name):
 def told_by(information, returns, rays):
     """What a choice of the candidates, at these indices, knows of what there is to know, from 0 to 1."""
     count = len(returns[0].rays)
-    coverage = gather([(information, returns)], np.tile([0.0, np.inf], (count, 1, 1)), np.zeros((count, 1)))
+    informed, open_gates = InformedScene.of(information, returns), np.tile([0.0, np.inf], (count, 1, 1))
+    coverage = gather([informed], open_gates, np.zeros((count, 1)))
     gate = np.full(count, -1)
     gate[rays] = 0
     return coverage.value_of(gate) / coverage.complete

@@ -9,12 +9,15 @@ import pytest
 from support.command_line import caller, make_run
 from support.tables import each_row
 
+from lidardesign.density.target.proposals import samples_without_visibility
+from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document, load_design, save_design
 from lidardesign.design.layouts.rays import certificates_of, gates_of, lay_out
 from lidardesign.design.sensor import tangent_coordinates
 from lidardesign.errors import ConfigError
+from lidardesign.samples import save_samples
 from lidardesign.task import Information
 from lidardesign.workflow import select_rays
 from lidardesign.workflow.run_folder import RunFolder
@@ -31,11 +34,12 @@ def run(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("run") / "flat")
 
 
-@pytest.fixture(autouse=True)
-def few_scenes(monkeypatch):
-    monkeypatch.setattr("lidardesign.selection.select.FIRST_SCENES", 5)
-    monkeypatch.setattr("lidardesign.selection.select.MOST_SCENES", 10)
-    monkeypatch.setattr("lidardesign.selection.select.HELD_BACK_SCENES", 5)
+@pytest.fixture(autouse=True, scope="module")
+def few_scenes():
+    with pytest.MonkeyPatch.context() as patch:
+        for name, count in (("FIRST_SCENES", 5), ("MOST_SCENES", 10), ("HELD_BACK_SCENES", 5)):
+            patch.setattr(f"lidardesign.selection.select.{name}", count)
+        yield
 
 
 def chosen(run, sensors=2, **options):
@@ -170,13 +174,6 @@ class TestTheCommand:
             assert refused.code == 2
             assert f"--refine: layout {name} beside --refine" in refused.err
 
-    def test_densities_with_conditions_are_refused(self, lidardesign, tmp_path):
-        aisle = make_run(tmp_path / "aisle", task="warehouse")
-        for place in ((), ("--at", "x_m=0.5")):
-            refused = lidardesign("fit", aisle, "--layout", "selected", *place)
-            assert refused.code == 2
-            assert "layout selected beside a density with conditions" in refused.err
-
     def test_rays_that_tell_nothing_are_refused(self, lidardesign, run, monkeypatch):
         nothing = Information(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(5, int))
         monkeypatch.setattr(select_rays, "checked_information", lambda task, scene, returns: nothing)
@@ -202,3 +199,48 @@ class TestTheCommand:
         shown = lidardesign("show", path)
         assert shown.code == 0
         assert "rays chosen on training scenes" not in shown.out
+
+
+@pytest.fixture(scope="module")
+def aisle(tmp_path_factory):
+    folder = make_run(tmp_path_factory.mktemp("run") / "aisle", task="warehouse")
+    config = RunFolder.open(folder).config
+    scenes = RunFolder.open(folder).scenes("train", config.seed)
+    generator = np.random.default_rng(0)
+    save_samples(samples_without_visibility(scenes, config.space, config.density, 20_000, generator), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def along(aisle):
+    return chosen(aisle, constraints={"budget": {"bandwidth_mbps": 0.2}}).specification
+
+
+class TestTracksOfChosenRays:
+    def test_each_number_of_rays_has_one_that_leads_through_the_whole_aisle(self, aisle, along):
+        space, tracks = open_run(aisle).config.space, [*along.further_tracks, along.track]
+        assert [len(track.sensor) for track in tracks] == sorted(open_run(aisle).task.defaults.rays)
+        for track in tracks:
+            assert (track.knots[0], track.knots[-1]) == (space.low[0], space.high[0])
+        for count, at in ((6, space.low[0]), (12, 1.0), (18, space.high[0])):
+            rays = lay_out(along, count, at={"x_m": at})
+            assert len(rays) == count
+            assert (rays.origin_m[:, 0] == at).all()
+
+    def test_the_bandwidth_is_kept_everywhere_between_knots_too(self, aisle, along):
+        rules = Constraints.from_mapping({"budget": {"bandwidth_mbps": 0.2}})
+        checks = check_design(design_document(along), rules, open_run(aisle).config.space)
+        assert all(check.satisfied for check in checks)
+        for count in (6, 12, 18):
+            for at in np.linspace(-0.5, 4.0, 97):
+                assert Bandwidth().mbps(lay_out(along, count, at={"x_m": float(at)})) <= 0.2 + 1e-12
+
+    def test_files_give_them_back_bit_by_bit(self, along, tmp_path):
+        path = tmp_path / "chosen.yaml"
+        save_design(along, path)
+        assert design_document(load_design(path)) == design_document(along)
+
+    def test_a_place_is_refused_by_name(self, lidardesign, aisle):
+        refused = lidardesign("fit", aisle, "--layout", "selected", "--at", "x_m=0.5")
+        assert refused.code == 2
+        assert "layout selected beside --at" in refused.err

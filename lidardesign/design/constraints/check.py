@@ -88,9 +88,9 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     for table in (document.get("ray_table"), *document.get("further_tables", ())):
         if table:
             checks += _table(table, own_rules)
-    if document.get("track"):
-        checks += _excluded_travel(document["track"], sensors, rules)
-        checks += _track(document["track"], rules, bounds)
+    for track in (document.get("track"), *document.get("further_tracks", ())):
+        if track:
+            checks += _excluded_travel(track, sensors, rules) + _track(track, rules, bounds)
     return checks + _mounts(sensors, own_rules) + _budget(document, rules.get("budget") or {})
 
 
@@ -354,7 +354,11 @@ def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[Cons
         if widths is not None:
             bins = max(
                 sum(count * max(math.ceil(width / bin_m * (1 - BIN_ROUNDING)), 1) for width, count in each)
-                for each in (widths, *map(_table_widths, document.get("further_tables", ())))
+                for each in (
+                    widths,
+                    *map(_table_widths, document.get("further_tables", ())),
+                    *(_track_widths(track, bin_m) for track in document.get("further_tracks", ())),
+                )
             )
             mbps = bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6
         kept = mbps is not None and mbps <= limit + _slack(limit)
@@ -363,17 +367,22 @@ def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[Cons
 
 
 def _widths(document: Mapping[str, Any], bin_m: float) -> list[tuple[float, int]] | None:
-    """Gate widths and how many rays have them, of a track where they cost most; None without a number of rays.
-
-    Widths of a track are linear between knots, so bins change only where one crosses a whole number, and one place
-    between each two of these tells all.
-    """
+    """Gate widths and how many rays have them, of a track where they cost most; None without a number of rays."""
     table, track, sensors = document.get("ray_table"), document.get("track"), document["sensors"]
     if table:
         return _table_widths(table)
     if not track:
         is_open = any(sensor.get("rays") is None for sensor in sensors)
         return None if is_open else [(s["gate_m"]["end"] - s["gate_m"]["start"], int(s["rays"])) for s in sensors]
+    return _track_widths(track, bin_m)
+
+
+def _track_widths(track: Mapping[str, Any], bin_m: float) -> list[tuple[float, int]]:
+    """Gate widths of a track where they cost most.
+
+    They are linear between knots, so bins change only where one crosses a whole number, and one place between each two
+    of these tells all.
+    """
     width = np.array(track["gate_end_m"], dtype=np.float64) - np.array(track["gate_start_m"], dtype=np.float64)
     places = [width]
     for left, right in zip(width[:-1] / bin_m, width[1:] / bin_m, strict=True):

@@ -51,7 +51,9 @@ class SelectedLayout(Layout):
 
     def counts(self, spec: DesignSpec) -> list[int]:
         """See `Layout`."""
-        return sorted(len(table) for table in (spec.ray_table, *spec.further_tables) if table is not None)
+        tables = [len(table) for table in (spec.ray_table, *spec.further_tables) if table is not None]
+        tracks = [len(track.sensor) for track in (spec.track, *spec.further_tracks) if track is not None]
+        return sorted(tables + tracks)
 
     def lay_out(self, spec: DesignSpec, count: int, samples: Samples | None, gates: Gates, seed: int) -> Rays:
         """See `Layout`."""
@@ -122,8 +124,8 @@ LAYOUTS: Mapping[str, Layout] = {
 
 
 def layout_of(design: DesignSpec) -> Layout:
-    """The layout of a design's rays; those of a track are a scan at every value of its condition."""
-    return LAYOUTS[design.layout if design.track is None else "scan"]
+    """The layout of a design's rays."""
+    return LAYOUTS[design.layout]
 
 
 def gates_of(design: DesignSpec) -> Gates:
@@ -176,6 +178,9 @@ def lay_out(
             not given.
     """
     total = own_count(design) if count is None else count
+    for track in design.further_tracks:
+        if len(track.sensor) == total:
+            design = replace(design, track=track)
     # what moves was fitted where it was made: its rays are laid out there, then moved
     home = (at or {}) if design.track is not None else {**(at or {}), **design.at}
     here = placed(design, home) if home or design.track is not None else design

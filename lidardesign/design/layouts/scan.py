@@ -44,7 +44,7 @@ from lidardesign.design.layouts.layout import (
     shares_of,
 )
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY, lloyd
-from lidardesign.design.layouts.track import TRAVELLED, TrackSamples, aimed_rays, boresight_azimuth, interpolated
+from lidardesign.design.layouts.track import TrackSamples, aimed_rays, boresight_azimuth, interpolated, travelled
 from lidardesign.design.mixture.bounds import Bounds, Group, bounds_of
 from lidardesign.design.mixture.em import EMResult, mixture_of_labels
 from lidardesign.design.mixture.ensemble import Ensemble, GroupSamples, sensors_of
@@ -213,7 +213,7 @@ def fit_track(request: FitProblem) -> FittedDesign:
         InfeasibleError: Constraints that hold too little of the density or that no track keeps.
     """
     samples, constraints, level, read_out = request.samples, request.constraints, request.level, request.budget
-    dimension = _travelled(samples.space)
+    dimension = travelled(samples.space, "scan")
     if read_out.rays is None:
         raise ConfigError("a track needs its number of rays per position", where="--layout scan", hint="give --rays N")
     group = Group((None, None, None), tuple(range(read_out.rays)))
@@ -236,29 +236,6 @@ def fit_track(request: FitProblem) -> FittedDesign:
         level=level, track=track, at=fixed_conditions(samples.space),
     )  # fmt: skip
     return FittedDesign(design, score, [support])
-
-
-def _travelled(space: DesignSpace) -> int:
-    """The one condition that is free, which must be a coordinate of the origin, the others fixed.
-
-    Raises:
-        ConfigError: It is not so.
-    """
-    names = [DIMENSIONS[index] for index in space.conditioned]
-    if len(names) != 1 or names[0] not in TRAVELLED:
-        raise ConfigError(
-            f"no track along {', '.join(names) or 'no condition'}: a track follows one coordinate of the origin",
-            where="--layout scan",
-            hint="give --at " + " --at ".join(f"{name}=VALUE" for name in names) if names else None,
-        )
-    free = [DIMENSIONS[index] for index in range(3) if index in space.free and DIMENSIONS[index] != names[0]]
-    if free:
-        raise ConfigError(
-            f"rays along {names[0]} start at one place beside it, but {', '.join(free)} is free",
-            where="--layout scan",
-            hint=f"learn with --set space.{free[0]}=VALUE, or give --at {names[0]}=VALUE",
-        )
-    return space.conditioned[0]
 
 
 def _track_ends(space: DesignSpace, rules: SensorRules, dimension: int, level: float) -> tuple[float, float]:

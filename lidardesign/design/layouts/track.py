@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -120,6 +120,68 @@ def moved(rays: Rays, design: DesignSpec, at: Mapping[str, float]) -> Rays:
         ConfigError: A name that is no coordinate of the origin, at another value than the design's own.
     """
     return replace(rays, origin_m=_moved(rays.origin_m, _moves(design, at)))
+
+
+def travelled(space: DesignSpace, layout: str) -> int:
+    """The one condition that is free, which must be a coordinate of the origin, the others fixed.
+
+    Arguments:
+        space: The design space.
+        layout: That needs it, for messages.
+
+    Raises:
+        ConfigError: It is not so.
+    """
+    names = [DIMENSIONS[index] for index in space.conditioned]
+    if len(names) != 1 or names[0] not in TRAVELLED:
+        raise ConfigError(
+            f"no track along {', '.join(names) or 'no condition'}: a track follows one coordinate of the origin",
+            where=f"--layout {layout}",
+            hint="give --at " + " --at ".join(f"{name}=VALUE" for name in names) if names else None,
+        )
+    free = [DIMENSIONS[index] for index in range(3) if index in space.free and DIMENSIONS[index] != names[0]]
+    if free:
+        raise ConfigError(
+            f"rays along {names[0]} start at one place beside it, but {', '.join(free)} is free",
+            where=f"--layout {layout}",
+            hint=f"learn with --set space.{free[0]}=VALUE, or give --at {names[0]}=VALUE",
+        )
+    return space.conditioned[0]
+
+
+def track_of(dimension: int, knots: Sequence[float], tables: Sequence[Rays], ends: tuple[float, float]) -> Track:
+    """The track of rays that are given at knots; beyond the first and last knot they stay as they are there.
+
+    Ray n is at each knot the one that aims nearest to where it aimed at the knot before, all rays of a sensor together.
+
+    Arguments:
+        dimension: Index of the condition.
+        knots: Distinct condition values, P of them.
+        tables: As many rays of each sensor at each of them, in the order of their sensors.
+        ends: From where to where the track leads, which holds the knots.
+    """
+    order = np.argsort(knots)
+    rays = [tables[order[0]]]
+    for place in order[1:]:
+        aims = [one.direction * one.gate_m.mean(axis=1, keepdims=True) for one in (rays[-1], tables[place])]
+        sensor, taken = rays[-1].sensor, []
+        for index in np.unique(sensor):
+            own = np.flatnonzero(sensor == index)
+            taken.append(own[_assigned(aims[0][own], aims[1][own])])
+        rays.append(tables[place].subset(np.concatenate(taken)))
+    places = np.array(knots, dtype=np.float64)[order]
+    if ends[0] < places[0]:
+        places, rays = np.append(ends[0], places), [rays[0], *rays]
+    if ends[1] > places[-1]:
+        places, rays = np.append(places, ends[1]), [*rays, rays[-1]]
+    return Track(
+        dimension=DIMENSIONS[dimension],
+        knots=places,
+        azimuth_rad=np.unwrap(np.stack([one.azimuth_rad for one in rays]), axis=0),
+        elevation_rad=np.stack([one.elevation_rad for one in rays]),
+        gate_m=np.stack([one.gate_m for one in rays]),
+        sensor=rays[0].sensor.astype(np.int64),
+    )
 
 
 def interpolated(track: Track, at: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -302,11 +364,15 @@ def _started(along: TrackSamples, surface: np.ndarray, count: int, generator: np
 
 def _matched(before: np.ndarray, fresh: np.ndarray) -> np.ndarray:
     """Centres (N, 3) in the order in which all of them together moved least: emptied cells may change places."""
+    return fresh[_assigned(before, fresh)]
+
+
+def _assigned(before: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+    """Which fresh point (N, 3) each point before (N, 3) becomes, so that the squares of all moves sum to the least."""
     # slow to import
     from scipy.optimize import linear_sum_assignment
 
-    squared = np.square(before[:, None] - fresh[None]).sum(axis=2)
-    return fresh[linear_sum_assignment(squared)[1]]
+    return linear_sum_assignment(np.square(before[:, None] - fresh[None]).sum(axis=2))[1]
 
 
 def _best_start(points: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:

@@ -31,8 +31,7 @@ from lidardesign.space import AZIMUTH, DesignSpace
 from lidardesign.task import Task
 
 if TYPE_CHECKING:
-    from lidardesign.selection.candidates import InformedScene
-    from lidardesign.selection.coverage import Coverage
+    from lidardesign.selection.coverage import Coverage, InformedScene
     from lidardesign.selection.select import SelectionProblem
 
 GREEDY = "greedy"
@@ -133,7 +132,7 @@ class GreedyCandidate:
 
         table = self._table
         try:
-            choice = replace(table.problem, limit_mbps=limit_mbps).choice(table.coverage, count)
+            (choice,) = replace(table.problem, limit_mbps=limit_mbps).choices(table.coverage, count)
         except InfeasibleError:
             # no design spends less than one bin per ray
             choice = choose(table.coverage, RayCounts.of_one(len(self._rays), count), price=1 / COARSE_SLACK)
@@ -181,6 +180,8 @@ class GreedyCandidate:
 
         problem = SelectionProblem(
             rays=self._rays,
+            visits=[slice(0, len(self._rays))],
+            shares=None,
             gates=self._gates,
             informs=partial(checked_information, self.task),
             scenes=self.source.scenes,
@@ -189,18 +190,18 @@ class GreedyCandidate:
             name=GREEDY,
         )
         informed = problem.inform(problem.scenes("choice"), self.scenes)
-        gates_m = problem.gates(self._rays, informed)
+        gates_m = problem.gates(self._rays, problem.visits, informed)
         return _Table(problem, problem.coverage(informed, gates_m), gates_m)
 
     @phase("gates")
-    def _gates(self, rays: Rays, informed: Sequence[InformedScene]) -> np.ndarray:
+    def _gates(self, rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene]) -> np.ndarray:
         """The gates that candidates may have, (N, G, 2) [m]; the last is of one bin, so that any design's bits do."""
         from lidardesign.selection.candidates import gate_choices
 
         own = rays.gate_m[:, None]
         if not self.gates_per_ray:
             return own
-        gates_m = gate_choices(rays, informed, self.source.margin_m)
+        gates_m = gate_choices(rays, visits, informed, self.source.margin_m)
         middle, half = gates_m[:, -1:].mean(axis=2), self.bandwidth.bin_m / 2
         one_bin = np.stack([np.maximum(middle - half, 0.0), middle + half], axis=2)
         return np.concatenate([gates_m, one_bin], axis=1)

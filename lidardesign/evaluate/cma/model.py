@@ -298,8 +298,8 @@ class DesignModel:
             shares = np.ones(len(found)) if one_each else split_budget(np.exp(found.log_weight), count)
             sensors = found.sensors(rules, [int(share) for share in shares])
         return DesignSpec(
-            name="cma", sensors=sensors, layout=rules.layout, rays=count, constraints=self._document,
-            level=rules.level, track=track, at=at,
+            name="cma", sensors=sensors, layout=rules.layout if track is None else "scan", rays=count,
+            constraints=self._document, level=rules.level, track=track, at=at,
         )  # fmt: skip
 
     def _track(self, found: SensorParameters, way: Way) -> tuple[Track, tuple[Sensor, ...]]:
