@@ -319,6 +319,17 @@ def test_growth_is_measured(run_script):
 
 
 @pytest.mark.slow
+def test_choosing_rays_is_measured_and_no_choice_exceeds_its_bound(run_script):
+    words = ["--scenes", "4", "8", "--candidates", "100", "200", "--count", "25", "--problems", "2"]
+    found = run_script("selection", "--model", "embedded", *words, "--proxy", "100", "4", "2")
+    growth, _, (small, *_), proxy = found["tables"].values()
+    assert [row["scenes"] for row in growth] == [4, 8]
+    assert small["value / best"] <= 1 + 1e-6
+    assert small["bound / best, most"] >= 1 - 1e-6
+    assert len(proxy) == 9
+
+
+@pytest.mark.slow
 def test_ray_casting_is_measured_and_stays_exact_far_from_the_origin(run_script):
     found = run_script("raycasting", "--model", "embedded", "--rays", "2000", "--checked", "100")
     ours = [row for row in found["tables"]["100 rays against float64"] if row["way"] == "lidardesign"]
