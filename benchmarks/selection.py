@@ -67,9 +67,11 @@ def chosen(options: Any, candidates: int, scenes: int) -> tuple[Any, Any, Any, n
     def mark() -> None:
         marks.append(time.process_time())
 
-    informed = [inform(scene, rays, task.informs) for scene in training_heads(options.model, scenes)]
+    informed = [
+        inform(scene, rays, [slice(0, len(rays))], task.informs) for scene in training_heads(options.model, scenes)
+    ]
     mark()
-    gates_m = gate_choices(rays, informed, MARGIN_M)
+    gates_m = gate_choices(rays, [slice(0, len(rays))], informed, MARGIN_M)
     mark()
     bits = bandwidth.mbps_of_widths(np.zeros(1)) * bandwidth.bins(gates_m[..., 1] - gates_m[..., 0])
     coverage = gather(informed, gates_m, bits)
@@ -140,7 +142,10 @@ def proxy_beside_score(options: Any) -> tuple[list[list[object]], float]:
         gates[f"at random, {number}"] = gate
     config = task.Config(test=options.proxy[2], **face_settings(options.model))
     held_out = list(task.scenes(config, "test", 0))
-    others = [inform(scene, rays, task.informs) for scene in face_scenes(options.model, options.proxy[2], seed=7)]
+    others = [
+        inform(scene, rays, [slice(0, len(rays))], task.informs)
+        for scene in face_scenes(options.model, options.proxy[2], seed=7)
+    ]
     judged = gather(others, gates_m, coverage.bits)
     rows: list[list[object]] = []
     for name, gate in gates.items():
