@@ -81,11 +81,25 @@ def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[Informe
         source = shared if place == 0 else alone
         label = np.repeat(np.arange(count), [len(part) for part in source])
         ends, _ = central_intervals(np.concatenate(source), np.ones(len(label)), label, count, level)
-        wider = margin_m if level == 1.0 else 0.0
-        ends += (-wider, np.nextafter(wider, np.inf) if wider else 0.0)
-        known = ~np.isnan(ends[:, 0])
-        gates[known, place] = np.clip(ends[known], own[known, :1], own[known, 1:])
+        gates[:, place] = _inside(rays, ends, margin_m if level == 1.0 else 0.0)
     return gates
+
+
+def sensor_gates(rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
+    """A few gates of each ray's sensor, (N, G, 2) [m], by all that its rays return; as `gate_choices`."""
+    ray, range_m = _telling_returns(informed)
+    gates = np.repeat(rays.gate_m[:, None], len(LEVELS), axis=1)
+    for place, level in enumerate(LEVELS[1:], start=1):
+        ends, _ = central_intervals(range_m, np.ones(len(ray)), rays.sensor[ray], int(rays.sensor.max()) + 1, level)
+        gates[:, place] = _inside(rays, ends[rays.sensor], margin_m if level == 1.0 else 0.0)
+    return gates
+
+
+def _inside(rays: Rays, ends_m: np.ndarray, wider_m: float) -> np.ndarray:
+    """Gates (N, 2) that hold these ends, wider at both, inside the rays' own; their own where there are none [m]."""
+    own, wider = rays.gate_m, np.array([-wider_m, np.nextafter(wider_m, np.inf) if wider_m else 0.0])
+    held = np.clip(ends_m + wider, own[:, :1], own[:, 1:])
+    return np.where(np.isnan(ends_m), own, held)
 
 
 def _telling_returns(informed: Sequence[InformedScene]) -> tuple[np.ndarray, np.ndarray]:

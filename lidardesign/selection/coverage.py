@@ -95,6 +95,16 @@ class Coverage:
             harm=self.harm[rays],
         )
 
+    def through(self, gate: np.ndarray) -> Coverage:
+        """The table with one gate of each ray, (N,), and no other."""
+        rays = np.arange(len(gate))
+        return replace(
+            self,
+            gates=self.gates >> gate.astype(np.uint8)[self.ray] & 1,
+            bits=self.bits[rays, gate][:, None],
+            harm=self.harm[rays, gate][:, None],
+        )
+
     def known(self, gate: np.ndarray) -> np.ndarray:
         """What a choice of one gate per ray, -1 for none, (N,), knows about each item, (U,)."""
         known = np.empty(len(self.weight))

@@ -21,12 +21,13 @@ from lidardesign.scene import Scene
 from lidardesign.selection.candidates import inform
 from lidardesign.selection.certificate import certify
 from lidardesign.selection.choice import Choice, RayCounts, choose, choose_within
-from lidardesign.selection.coverage import Coverage, InformedScene, gather
+from lidardesign.selection.coverage import MOST_GATES, Coverage, InformedScene, gather
 from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
 
 FIRST_SCENES, MOST_SCENES, HELD_BACK_SCENES = 50, 400, 50
 PROXY = "mean over items of what the returns of the chosen rays leave unknown, by informs of the task"
+LOSS_PER_BANDWIDTH = 0.1  # where bandwidth has no limit: ten percent more of it must bring one percent less loss
 SMALLEST_GAIN = 0.01  # of the held-back loss: what twice the scenes must gain
 
 
@@ -42,7 +43,8 @@ class SelectionProblem:
         informs: What a task says of a scene's returns.
         scenes: Training scenes without end for a purpose, `choice` or `held back`.
         bandwidth: What reading out costs.
-        limit_mbps: The most that it may cost, inf without a limit.
+        limit_mbps: The most that it may cost; inf without a limit, where bits have a price.
+        one_gate: Whether all rays of a sensor have one gate.
         name: Of the design, for messages.
         further: As many rays again, which may not be chosen: a certificate says what they would gain.
     """
@@ -55,6 +57,7 @@ class SelectionProblem:
     scenes: Callable[[str], Iterator[Scene]]
     bandwidth: Bandwidth
     limit_mbps: float
+    one_gate: bool
     name: str
     further: Rays | None = None
 
@@ -83,13 +86,16 @@ class SelectionProblem:
         Raises:
             InfeasibleError: So many rays do not fit.
         """
-        choices, limit = [], self.limit_mbps
-        if len(self.visits) > 1:
+        limit, price = self.limit_mbps, 0.0
+        if np.isinf(limit):
+            price = self._price(coverage, count)
+        elif len(self.visits) > 1:
             # between two values gates are linear, and every ray may cost one bin more than at the dearer of them
             limit -= self.bandwidth.mbps_of_widths(np.zeros(count))
+        choices = []
         for visit in self.visits:
             own, counts = coverage.of_rays(visit), self.counts(count, visit)
-            choice = choose(own, counts) if np.isinf(limit) else choose_within(own, counts, limit)
+            choice = choose(own, counts, price=price) if np.isinf(limit) else choose_within(own, counts, limit)
             if len(choice.rays) < count:
                 raise InfeasibleError(
                     f"{len(choice.rays)} of {count} rays fit in {limit:g} Mbit/s",
@@ -99,15 +105,31 @@ class SelectionProblem:
             choices.append(choice)
         return choices
 
+    def _price(self, coverage: Coverage, count: int) -> float:
+        """The price at which so much more bandwidth has to bring a tenth of that share of the loss."""
+        free = choose(coverage, self.counts(count), passes=0)
+        loss = coverage.complete - (free.worth - free.harm)
+        return LOSS_PER_BANDWIDTH * max(loss, 0.0) / free.bits if free.bits > 0 else 0.0
+
     @phase("certificate")
     def certified(self, coverage: Coverage, choices: Sequence[Choice]) -> tuple[float, float]:
-        """What choices lose, and what any choices lose at least: values of a condition share no items."""
-        limit, value, bound = None if np.isinf(self.limit_mbps) else self.limit_mbps, 0.0, 0.0
+        """What choices lose, and what any others of no more bandwidth lose at least.
+
+        Values of a condition share no items, so their losses sum.
+        """
+        limit, worth, gap = None if np.isinf(self.limit_mbps) else self.limit_mbps, 0.0, 0.0
         for visit, choice in zip(self.visits, choices, strict=True):
-            own = coverage.of_rays(visit)
-            one = certify(own, self.counts(len(choice.rays), visit), choice, budget_mbps=limit)
-            value, bound = value + one.value, bound + one.bound
-        return coverage.complete - value, coverage.complete - bound
+            found = certify(coverage.of_rays(visit), self.counts(len(choice.rays), visit), choice, budget_mbps=limit)
+            worth, gap = worth + choice.worth - choice.harm, gap + found.bound - found.value
+        return coverage.complete - worth, coverage.complete - worth - gap
+
+
+def _usual_gate(gate: np.ndarray, sensor: np.ndarray) -> np.ndarray:
+    """For each candidate the gate that most of the chosen rays of its sensor have, (N,)."""
+    chosen = np.flatnonzero(gate >= 0)
+    taken = np.zeros((int(sensor.max()) + 1, MOST_GATES), dtype=np.intp)
+    np.add.at(taken, (sensor[chosen], gate[chosen]), 1)
+    return taken.argmax(axis=1)[sensor]
 
 
 def _gate_of(choices: Sequence[Choice]) -> np.ndarray:
@@ -151,11 +173,16 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
                 where=problem.name,
                 hint="let sensors look at the targets: constrain less, or learn longer",
             )
-        before, loss = loss, judged.loss_of(_gate_of(problem.choices(coverage, middle)))
+        gate = _gate_of(problem.choices(coverage, middle))
+        before, loss = loss, judged.loss_of(gate)
         if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > MOST_SCENES:
             break
         wanted *= 2
     rays = problem.rays
+    if problem.one_gate:
+        usual = _usual_gate(gate, rays.sensor)
+        coverage, judged = coverage.through(usual), judged.through(usual)
+        gates_m = gates_m[np.arange(len(rays)), usual][:, None]
     selected = []
     for count in counts:
         choices = problem.choices(coverage, count)

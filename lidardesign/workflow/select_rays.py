@@ -22,17 +22,13 @@ from lidardesign.design.layouts.gates import bounded_gates
 from lidardesign.design.layouts.rays import LAYOUTS
 from lidardesign.design.layouts.track import placed, track_of
 from lidardesign.design.mixture.bounds import bounds_of
-from lidardesign.design.sensor import (
-    CERTIFICATES,
-    DesignSpec,
-    interval_factor,
-)
+from lidardesign.design.sensor import CERTIFICATES, DesignSpec, Sensor, interval_factor
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scene import Scene
-from lidardesign.selection.candidates import CANDIDATES_PER_RAY, gate_choices
+from lidardesign.selection.candidates import CANDIDATES_PER_RAY, gate_choices, sensor_gates
 from lidardesign.selection.coverage import InformedScene
 from lidardesign.selection.information import checked_information, informs_rays
 from lidardesign.space import DIMENSIONS, DesignSpace
@@ -93,6 +89,7 @@ def select_rays(
         scenes=partial(selection_scenes, run, seed),
         bandwidth=bandwidth_limit(constraints, len(rays))[0],
         limit_mbps=np.inf if limit is None else limit,
+        one_gate=spec.gates != "ray",
         name=spec.name,
         further=None if len(visits) > 1 else proposals.further(len(rays)),
     )
@@ -100,10 +97,16 @@ def select_rays(
     provenance = {**spec.provenance, CERTIFICATES: [one.certificate for one in selected]}
     design = replace(spec, layout="selected", rays=counts[0] if len(counts) == 1 else None, provenance=provenance)
     tables = [one.rays for one in selected]
-    own = np.bincount(tables[-1][0].sensor, minlength=len(spec.sensors))
+    fired = tables[-1][0]
+    own = [np.flatnonzero(fired.sensor == index) for index in range(len(spec.sensors))]
     sensors = spec.sensors
     if len(counts) == 1:
-        sensors = tuple(replace(sensor, rays=int(number)) for sensor, number in zip(sensors, own, strict=True))
+        sensors = tuple(replace(sensor, rays=len(rows)) for sensor, rows in zip(sensors, own, strict=True))
+    if spec.gates != "ray":
+        sensors = tuple(
+            _with_gate(sensor, fired.gate_m[rows[0]], spec.level) if len(rows) else sensor
+            for sensor, rows in zip(sensors, own, strict=True)
+        )
     design = replace(design, sensors=sensors)
     if len(visits) == 1:
         return replace(
@@ -111,6 +114,11 @@ def select_rays(
             design=replace(design, ray_table=tables[-1][0], further_tables=tuple(one[0] for one in tables[:-1])),
         )
     return replace(result, design=_on_tracks(design, tables, proposals.conditions, samples.space))
+
+
+def _with_gate(sensor: Sensor, gate_m: np.ndarray, level: float) -> Sensor:
+    spread_m = float(gate_m[1] - gate_m[0]) / (2 * interval_factor(level))
+    return replace(sensor, range_m=float(gate_m.mean()), spread_range_m=spread_m)
 
 
 def selection_scenes(run: RunFolder, seed: int, purpose: str) -> Iterator[Scene]:
@@ -184,9 +192,8 @@ def _gates(
     informed: Sequence[InformedScene],
 ) -> np.ndarray:
     """The gates that rays may have inside the design's constraints, (N, G, 2) [m]."""
-    if spec.gates != "ray":
-        return rays.gate_m[:, None]
-    gates_m = gate_choices(rays, visits, informed, margin_m)
+    choices = gate_choices if spec.gates == "ray" else sensor_gates
+    gates_m = choices(rays, visits, informed, margin_m)
     for index, sensor in enumerate(spec.sensors):
         own = rays.sensor == index
         wanted = gates_m[own].reshape(-1, 2)

@@ -187,6 +187,7 @@ class GreedyCandidate:
             scenes=self.source.scenes,
             bandwidth=self.bandwidth,
             limit_mbps=np.inf,
+            one_gate=False,
             name=GREEDY,
         )
         informed = problem.inform(problem.scenes("choice"), self.scenes)
