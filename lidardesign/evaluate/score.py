@@ -114,7 +114,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         for count in counts
         if can_fire(design, count)
     ]
-    choosable = [] if request.greedy is None else greedy_rays(request.task, request.space, counts)[0]
+    choosable = [] if request.greedy is None else greedy_rays(request.task, len(conditions), counts)[0]
     baselines = Baselines(
         request.space,
         request.train,
@@ -125,7 +125,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         without_visibility=partial(_twin, request, conditions) if request.without_visibility else None,
         density=request.density,
         optimised=partial(_optimised, request, conditions) if request.designs else None,
-        chosen=partial(_chosen, request, designs, max(choosable, default=0)),
+        chosen=partial(_chosen, request, conditions, designs, max(choosable, default=0)),
     )
     wanted: list[tuple[str, list[Option], Entry | None]] = [
         (name, baselines.options(name, count), None)
@@ -214,11 +214,18 @@ def _optimised(
     )
 
 
-def _chosen(request: EvaluationRequest, designs: Sequence[Entry], most: int, views: TrainingViews) -> Candidate:
+def _chosen(
+    request: EvaluationRequest,
+    conditions: Sequence[Mapping[str, float]],
+    designs: Sequence[Entry],
+    most: int,
+    views: TrainingViews,
+) -> Candidate:
     numbers = [one["scenes"] for design in request.designs for one in design.provenance.get(CERTIFICATES, ())]
     return GreedyCandidate(
         task=request.task,
         views=views,
+        spaces=[request.space.at(condition) for condition in conditions],
         source=request.greedy,
         scenes=max(numbers, default=USUAL_SCENES),
         gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
@@ -407,7 +414,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
         notes.append(f"rays and bandwidth count per position; every scene is seen from {positions} positions")
     notes += group_notes(request.test)
     if GREEDY in request.baselines and request.greedy is not None:
-        notes += greedy_rays(request.task, request.space, request.rays)[1]
+        notes += greedy_rays(request.task, positions, request.rays)[1]
     with plugin_guard(request.task.name):
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:

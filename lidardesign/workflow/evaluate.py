@@ -26,7 +26,7 @@ from lidardesign.run.clock import outermost_clock, phase, running
 from lidardesign.run.files import is_there
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
-from lidardesign.task import scoring_settings
+from lidardesign.task import conditions_of, scoring_settings
 from lidardesign.workflow.designs import Design, html_table
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
@@ -218,7 +218,9 @@ class ScoreRequest:
         specifications = [design.specification for design in self.designs]
         counts = fired_numbers(specifications, self.rays)
         scored = sum(can_fire(design, count) for design in specifications for count in counts)
-        choosable, notes = greedy_rays(run.task, run.config.space, counts)
+        choosable, notes = greedy_rays(
+            run.task, len(conditions_of(run.task, run.config.task, run.config.space)), counts
+        )
         baselines = [name for name in self.baselines if name != GREEDY or choosable]
         rows, matched = scored + len(baselines) * len(counts), scored * len(baselines)
         names = [design.name for design in specifications]

@@ -16,10 +16,10 @@ from support.tables import each_row
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.evaluate.baselines import greedy as greedy_module
 from lidardesign.evaluate.baselines.candidates import mean_mbps, whole_range
-from lidardesign.evaluate.baselines.greedy import Fired, GreedyCandidate, GreedySource
+from lidardesign.evaluate.baselines.greedy import Fired, GreedyCandidate, GreedySource, greedy_rays
 from lidardesign.evaluate.baselines.views import TrainingViews
 from lidardesign.evaluate.score import entries_of, evaluate
-from lidardesign.selection.information import surface_information
+from lidardesign.selection import information
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, angles
 
@@ -29,7 +29,9 @@ AHEAD = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
 BOX = DesignSpace((-0.3, -0.1, -0.1, -0.5, -0.5, 0.05), (0.1, 0.1, 0.1, 0.5, 0.5, 4.0))
 LINE = DesignSpace((0, 0, 0, -0.5, 0, 0.05), (0, 0, 0, 0.5, 0, 4.0))
 AROUND = DesignSpace((0, 0, 0, 0, -0.8, 0.05), (0, 0, 0, 2 * np.pi, 0.8, 4.0))
-SUBJECTS = {"ahead": AHEAD, "from a box": BOX, "along a line": LINE, "all around": AROUND}
+ASIDE = DesignSpace((0, -0.6, 0, -0.5, -0.5, 0.05), (0, 0.6, 0, 0.5, 0.5, 4.0), condition=("y_m",))
+PLACES = [ASIDE.at({"y_m": value}) for value in (-0.6, 0.2, 0.5)]
+SUBJECTS = {"ahead": AHEAD, "from a box": BOX, "along a line": LINE, "all around": AROUND, "at three places": ASIDE}
 COUNTS = (5, 30)
 BANDWIDTH = Bandwidth()
 BIN_MBPS = float(BANDWIDTH.mbps_of_widths(np.zeros(1)))
@@ -50,7 +52,9 @@ class BallTask(MissTask):
 
     def informs(self, scene, returns):
         points = visible(scene)
-        return surface_information([points] * len(returns), returns, [True], 2 * np.pi * RADIUS_M**2)
+        return information.surface_information(
+            [points] * len(returns), returns, [True], len(returns) * 2 * np.pi * RADIUS_M**2
+        )
 
 
 def drawn(purpose):
@@ -62,9 +66,10 @@ def drawn(purpose):
 SOURCE = GreedySource(drawn, 0.02)
 
 
-def candidate(space=AHEAD, fired=(), gates_per_ray=True):
+def candidate(space=AHEAD, fired=(), gates_per_ray=True, spaces=None):
+    views = TrainingViews(space, scenes(1))
     return GreedyCandidate(
-        BallTask(), TrainingViews(space, scenes(1)), SOURCE, 24, gates_per_ray, 5 * max(COUNTS), fired, BANDWIDTH
+        BallTask(), views, spaces or [space], SOURCE, 24, gates_per_ray, 5 * max(COUNTS), fired, BANDWIDTH
     )
 
 
@@ -77,20 +82,22 @@ def fired_at(bins):
 @each_row("subject", SUBJECTS)
 def test_numbers_of_rays_are_met_exactly_inside_the_space_and_no_bandwidth_is_exceeded(subject, gates_per_ray):
     space = SUBJECTS[subject]
+    spaces = PLACES if space is ASIDE else [space]
     # one bin per ray, which is the least, and few more
     for bins in (1, 3):
         fired = fired_at(bins)
-        subject_of = candidate(space, fired, gates_per_ray)
+        subject_of = candidate(space, fired, gates_per_ray, spaces)
         for count, mbps in fired:
-            (rays,) = positions = subject_of.positions([space], count)
-            assert len(rays) == count
-            points = np.column_stack([rays.origin_m, *angles(rays.direction), rays.gate_m.mean(axis=1)])
-            assert space.contains(space.wrap(points)).all()
-            within = subject_of.positions_within([space], mbps, BANDWIDTH)
+            positions = subject_of.positions(spaces, count)
+            for here, rays in zip(spaces, positions, strict=True):
+                assert len(rays) == count
+                points = np.column_stack([rays.origin_m, *angles(rays.direction), rays.gate_m.mean(axis=1)])
+                assert here.contains(here.wrap(points)).all()
+            within = subject_of.positions_within(spaces, mbps, BANDWIDTH)
             assert mean_mbps(within, BANDWIDTH) <= mbps * (1 + 1e-12)
             if gates_per_ray:
                 assert mean_mbps(positions, BANDWIDTH) <= mbps * (1 + 1e-12)
-                assert len(within[0]) == count
+                assert [len(rays) for rays in within] == [count] * len(spaces)
 
 
 def distance(rays, over):
@@ -134,6 +141,32 @@ def test_one_gate_for_all_is_that_of_the_crops_and_costs_what_it_costs():
     assert len(gates) == 1
     assert np.diff(gates[0]) < np.diff(whole_range(AHEAD))
     assert BANDWIDTH.mbps(rays) > COUNTS[-1] * BIN_MBPS
+
+
+def test_rays_of_a_place_are_those_that_are_chosen_there_alone(monkeypatch):
+    # how far a return tells follows from all returns
+    monkeypatch.setattr(information, "return_reach_m", lambda *arguments: 0.1)
+    together = candidate(ASIDE, gates_per_ray=False, spaces=PLACES).positions(PLACES, COUNTS[-1])
+    for place, rays in zip(PLACES, together, strict=True):
+        alone = candidate(ASIDE, gates_per_ray=False, spaces=[place]).positions([place], COUNTS[-1])
+        for one, other in zip(arrays([rays]), arrays(alone), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_bandwidth_is_spent_at_the_places_where_it_tells_most():
+    spaces, count = [ASIDE.at({"y_m": value}) for value in (0.0, 0.6)], COUNTS[-1]
+    limit = 2 * count * BIN_MBPS
+    rays = candidate(ASIDE, [Fired(count, limit)], spaces=spaces).positions(spaces, count)
+    spent = [BANDWIDTH.mbps(one) for one in rays]
+    assert np.mean(spent) <= limit * (1 + 1e-12)
+    assert max(spent) > limit
+
+
+def test_many_rays_at_many_places_take_too_long():
+    assert greedy_rays(BallTask(), 4, (5, 500, 600)) == (
+        [5, 500],
+        ["greedy is left out above 500 rays: choosing them takes too long"],
+    )
 
 
 def aimed(specification, count, samples, *, at=None):

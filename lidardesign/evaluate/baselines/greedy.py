@@ -4,10 +4,14 @@ Candidates are even over where training scenes return: on the lattice of `silhou
 `bounding`. Which of them fire, and through which gates, is chosen as by `fit --layout selected`: by what the task says
 that returns tell about scenes, of the same scenes, as many, and in the bandwidth of the design beside it. Where no
 design has gates per ray there is one gate, that of the crops, and at equal rays it costs what it costs.
+
+Where the density has conditions, rays are chosen at each of their values, all of them at once: the bandwidth is a mean
+over the values, and is spent at those where it tells most.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,12 +21,11 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.errors import InfeasibleError
 from lidardesign.evaluate.baselines.bounding import Crop, crop_kinds
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition, rays_at, rays_within, whole_range
 from lidardesign.evaluate.baselines.even import even_placement
 from lidardesign.evaluate.baselines.silhouette import LEAST_SHARE, lattice_rays, survey
-from lidardesign.evaluate.baselines.views import TrainingViews
+from lidardesign.evaluate.baselines.views import RAY_AXES, TrainingViews
 from lidardesign.geometry.rays import Rays, fire_times
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.run.clock import phase
@@ -36,7 +39,9 @@ if TYPE_CHECKING:
 
 GREEDY = "greedy"
 USUAL_SCENES = 200  # that rays are chosen on where no design says on how many it was
-MOST_CHOSEN = 2000  # rays: choosing more would take longer than all else in an evaluation
+MOST_CHOSEN = (
+    2000  # rays over all values of a condition: choosing more would take longer than all else in an evaluation
+)
 SMALLEST_SHARE = 0.1  # of even rays that return: where fewer do, candidates are those that return most often
 
 
@@ -52,17 +57,16 @@ class GreedySource(NamedTuple):
     margin_m: float
 
 
-def greedy_rays(task: Task, space: DesignSpace, counts: Iterable[int]) -> tuple[list[int], list[str]]:
-    """The numbers of rays that `greedy` can choose, and why not the others, for people."""
+def greedy_rays(task: Task, positions: int, counts: Iterable[int]) -> tuple[list[int], list[str]]:
+    """The numbers of rays that `greedy` can choose at so many condition values, and why not the others, for people."""
     from lidardesign.selection.information import informs_rays
 
     if not informs_rays(task):
         return [], [f"{GREEDY} is left out: the task {task.name} does not say what returns tell"]
-    if space.conditioned:
-        return [], [f"{GREEDY} is left out: it does not go with conditions yet"]
-    beyond = any(count > MOST_CHOSEN for count in counts)
-    notes = [f"{GREEDY} is left out above {MOST_CHOSEN} rays: choosing them takes too long"] if beyond else []
-    return [count for count in counts if count <= MOST_CHOSEN], notes
+    most = MOST_CHOSEN // positions
+    beyond = any(count > most for count in counts)
+    notes = [f"{GREEDY} is left out above {most} rays: choosing them takes too long"] if beyond else []
+    return [count for count in counts if count <= most], notes
 
 
 class Fired(NamedTuple):
@@ -87,10 +91,11 @@ class GreedyCandidate:
     Arguments:
         task: Says what returns tell.
         views: The training scenes, for where they return.
+        spaces: The design space at each of the condition values.
         source: Scenes to choose on, and the margin of gates.
         scenes: On how many scenes rays are chosen.
         gates_per_ray: Whether each ray has a gate of its own.
-        candidates: How many rays are chosen from.
+        candidates: How many rays are chosen from, at each of the values.
         fired: What the designs beside it fire.
         bandwidth: The read-out model.
     """
@@ -99,13 +104,14 @@ class GreedyCandidate:
     drawn_anew: ClassVar[bool] = False
     task: Task
     views: TrainingViews
+    spaces: Sequence[DesignSpace]
     source: GreedySource
     scenes: int
     gates_per_ray: bool
     candidates: int
     fired: Sequence[Fired]
     bandwidth: Bandwidth
-    _known: dict[tuple[int, float], Rays] = field(default_factory=dict, repr=False)
+    _known: dict[tuple[int, float], RaysPerCondition] = field(default_factory=dict, repr=False)
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """See `Candidate`; in no more than the largest bandwidth of a design with so many rays."""
@@ -118,49 +124,59 @@ class GreedyCandidate:
         """As many rays as the design of this bandwidth fires; with one gate as many as fit."""
         if self.gates_per_ray:
             return self._chosen(max(one.rays for one in self.fired if one.mbps == limit_mbps), limit_mbps)
-        fit = rays_within(limit_mbps, bandwidth, self._rays.gate_m[0])
-        return self._chosen(min(fit, len(self._rays), MOST_CHOSEN), np.inf)
+        gates_m = np.concatenate([rays.gate_m[:1] for rays in self._proposed])
+        fit = rays_within(limit_mbps * len(gates_m), bandwidth, gates_m)
+        most = min(MOST_CHOSEN // len(gates_m), *(len(rays) for rays in self._proposed))
+        return self._chosen(min(fit, most), np.inf)
 
     def _chosen(self, count: int, limit_mbps: float) -> RaysPerCondition:
-        """The choice of so many rays in a bandwidth [Mbit/s]."""
+        """The choice of so many rays at each value, in a bandwidth that is a mean over the values [Mbit/s]."""
         if (count, limit_mbps) not in self._known:
             self._known[count, limit_mbps] = self._choice(count, limit_mbps)
-        return (self._known[count, limit_mbps],)
+        return self._known[count, limit_mbps]
 
-    def _choice(self, count: int, limit_mbps: float) -> Rays:
-        from lidardesign.selection.choice import RayCounts, choose
+    def _choice(self, count: int, limit_mbps: float) -> RaysPerCondition:
+        from lidardesign.selection.choice import choose, choose_within
 
-        table = self._table
-        try:
-            (choice,) = replace(table.problem, limit_mbps=limit_mbps).choices(table.coverage, count)
-        except InfeasibleError:
-            # no design spends less than one bin per ray
-            choice = choose(table.coverage, RayCounts.of_one(len(self._rays), count), price=1 / COARSE_SLACK)
-        return replace(
-            self._rays.subset(choice.rays),
-            gate_m=table.gates_m[choice.rays, choice.gate[choice.rays]],
-            time_s=fire_times(count, self.bandwidth.rate_hz),
-        )
+        table, values = self._table, len(self.spaces)
+        counts = table.problem.counts(count)
+        with phase("choice"):
+            choice = choose_within(table.coverage, counts, limit_mbps * values)
+            if len(choice.rays) < count * values:
+                # no design spends less than one bin per ray
+                choice = choose(table.coverage, counts, price=1 / COARSE_SLACK)
+        gate_m = table.gates_m[choice.rays, choice.gate[choice.rays]]
+        fired = replace(table.problem.rays.subset(choice.rays), gate_m=gate_m)
+        time_s = fire_times(count, self.bandwidth.rate_hz)
+        # candidates are in the order of the values, and as many are chosen at each
+        places = np.arange(count * values).reshape(values, count)
+        return tuple(replace(fired.subset(place), time_s=time_s) for place in places)
 
     @cached_property
-    def _rays(self) -> Rays:
-        """Even candidates, each with the widest gate that it may have."""
-        space = self.views.space
-        crops = self._crops
-        free_origins = [axis for axis in space.free if axis < AZIMUTH]
-        found = None if free_origins else survey(self.views, space)
+    def _proposed(self) -> list[Rays]:
+        """Candidates at each of the values, with the widest gates that they may have."""
+        return [self._candidates(space) for space in self.spaces]
+
+    def _candidates(self, space: DesignSpace) -> Rays:
+        """Even candidates at a value; where nothing returns there, by what returns at any of them."""
+        views = self.views
+        crops = self._crops(space) or self._crops(views.space)
+        found = None
+        if not any(axis < AZIMUTH for axis in space.free):
+            found = survey(views, space) or survey(views, views.space)
         if found is not None:
             points = lattice_rays(found, self.candidates)
         else:
             each = math.ceil(self.candidates / len(crops))
             points = np.concatenate([self._returning(crop, each) for crop in crops])
+        for axis in (axis for axis in views.space.conditioned if axis < RAY_AXES):
+            points[:, axis] = np.clip(points[:, axis], space.low[axis], space.high[axis])
         ends = np.array([crop.gate_m for crop in crops])
         gate_m = np.array([ends[:, 0].min(), ends[:, 1].max()])
         return rays_at(points, whole_range(space) if self.gates_per_ray else gate_m)
 
-    @cached_property
-    def _crops(self) -> list[Crop]:
-        space, observed = self.views.space, self.views.observed(self.views.space)
+    def _crops(self, space: DesignSpace) -> list[Crop]:
+        observed = self.views.observed(space)
         crops = [crop_of(self.views, space, observed) for crop_of in crop_kinds(space).values() if len(observed.points)]
         return [crop for crop in crops if crop is not None]
 
@@ -178,9 +194,10 @@ class GreedyCandidate:
         from lidardesign.selection.information import checked_information
         from lidardesign.selection.select import SelectionProblem
 
+        ends = np.cumsum([0, *map(len, self._proposed)]).tolist()
         problem = SelectionProblem(
-            rays=self._rays,
-            visits=[slice(0, len(self._rays))],
+            rays=Rays.joined(self._proposed),
+            visits=[slice(*pair) for pair in itertools.pairwise(ends)],
             shares=None,
             gates=self._gates,
             informs=partial(checked_information, self.task),
@@ -191,7 +208,7 @@ class GreedyCandidate:
             name=GREEDY,
         )
         informed = problem.inform(problem.scenes("choice"), self.scenes)
-        gates_m = problem.gates(self._rays, problem.visits, informed)
+        gates_m = problem.gates(problem.rays, problem.visits, informed)
         return _Table(problem, problem.coverage(informed, gates_m), gates_m)
 
     @phase("gates")
