@@ -108,17 +108,13 @@ class Defaults:
     """What a task suggests where the user says nothing.
 
     Arguments:
-        sensors: The number of sensors to fit.
         rays: Ray budgets per frame to evaluate at; where the density has conditions, per condition value.
-        layout: How `fit` lays rays out.
         level: The share of each marginal that fields of view and gates hold.
         density: Overrides of the `density` configuration section (for example {"sigma_m": 0.005}).
         learning: Overrides of the `learning` section, by preset name.
     """
 
-    sensors: int = 4
     rays: tuple[int, ...] = (36, 100, 196, 361, 576)
-    layout: str = "grid"
     level: float = 0.95
     density: Mapping[str, Any] = field(default_factory=dict)
     learning: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

@@ -41,6 +41,16 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: order.get(item.path.name, len(LONGEST)))
 
 
+@pytest.fixture(autouse=True, scope="session")
+def choices_look_at_few_scenes():
+    """Rays and sensors are chosen as users choose them, but on fewer scenes: those take half a minute."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lidardesign.selection.information.FEW_SCENES", 5)
+        patch.setattr("lidardesign.selection.information.MOST_SCENES", 10)
+        patch.setattr("lidardesign.workflow.fit.COUNTS", (1, 2))
+        yield
+
+
 def _torch_state() -> tuple[object, ...] | None:
     torch = sys.modules.get("torch")
     if torch is None or not hasattr(torch, "get_rng_state"):

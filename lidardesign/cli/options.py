@@ -77,9 +77,10 @@ Sensors = Annotated[
     str | None,
     typer.Option(
         "--sensors",
-        metavar="N|auto",
-        help="Number of sensors (a scan has one per ray); auto: by held-out likelihood.",
-        show_default="the task's",
+        metavar="N|best|auto",
+        help="Number of sensors (a scan has one per ray); best: by the task's score on training scenes, auto: by "
+        "held-out likelihood.",
+        show_default="the design's, else best",
     ),
 ]
 Weights = Annotated[
@@ -89,17 +90,6 @@ Weights = Annotated[
         metavar="KEY=VALUE",
         help="Weigh the learned density towards the task with another setting, as importance; nothing is learned "
         "again. Repeatable.",
-        show_default=False,
-    ),
-]
-Refine = Annotated[
-    int | None,
-    typer.Option(
-        "--refine",
-        metavar="N",
-        min=1,
-        max=100,
-        help="With --layout selected: up to N rounds of new candidates.",
         show_default=False,
     ),
 ]
@@ -174,13 +164,13 @@ def parse_at(texts: list[str] | None) -> dict[str, float]:
 
 
 def sensor_count(text: str | None) -> int | str | None:
-    """The value of `--sensors`: a number from 1, `auto`, or None.
+    """The value of `--sensors`: a number from 1, `best`, `auto`, or None.
 
     Raises:
         ConfigError: It is neither.
     """
-    if text is None or text == "auto":
+    if text in (None, "best", "auto"):
         return text
     if not text.isdecimal() or int(text) < 1:
-        raise ConfigError(f"{text!r}", where="--sensors", allowed="a whole number from 1, or auto")
+        raise ConfigError(f"{text!r}", where="--sensors", allowed="a whole number from 1, best or auto")
     return int(text)

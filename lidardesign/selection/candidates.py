@@ -21,6 +21,7 @@ from lidardesign.task import Information
 CANDIDATES_PER_RAY = 5
 # Shares of what a ray returns that its gates hold; the first of them counts what rays near it return too.
 LEVELS = (1.0, 1.0, 0.98, 0.9, 0.75)
+SENSOR_LEVELS = (1.0, 0.98, 0.9, 0.75, 0.5, 0.25)  # the same of what all rays of a sensor return
 NEIGHBOURS = 7  # of a ray, with itself: those around it in a hexagonal lattice
 FEWEST_RETURNS = 3  # of a ray by itself, below which its gates rest on those of rays near it
 
@@ -86,10 +87,10 @@ def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[Informe
 
 
 def sensor_gates(rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
-    """A few gates of each ray's sensor, (N, G, 2) [m], by all that its rays return; as `gate_choices`."""
+    """A few gates of each ray's sensor, each narrower than the one before, (N, G, 2) [m]; as `gate_choices`."""
     ray, range_m = _telling_returns(informed)
-    gates = np.repeat(rays.gate_m[:, None], len(LEVELS), axis=1)
-    for place, level in enumerate(LEVELS[1:], start=1):
+    gates = np.repeat(rays.gate_m[:, None], 1 + len(SENSOR_LEVELS), axis=1)
+    for place, level in enumerate(SENSOR_LEVELS, start=1):
         ends, _ = central_intervals(range_m, np.ones(len(ray)), rays.sensor[ray], int(rays.sensor.max()) + 1, level)
         gates[:, place] = _inside(rays, ends[rays.sensor], margin_m if level == 1.0 else 0.0)
     return gates

@@ -18,14 +18,14 @@ from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.geometry.rays import Rays, Returns
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
+from lidardesign.selection import information
 from lidardesign.selection.candidates import inform
 from lidardesign.selection.certificate import certify
 from lidardesign.selection.choice import Choice, RayCounts, choose, choose_within
-from lidardesign.selection.coverage import MOST_GATES, Coverage, InformedScene, gather
+from lidardesign.selection.coverage import Coverage, InformedScene, gather
 from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
 
-FIRST_SCENES, MOST_SCENES, HELD_BACK_SCENES = 50, 400, 50
 PROXY = "mean over items of what the returns of the chosen rays leave unknown, by informs of the task"
 LOSS_PER_BANDWIDTH = 0.1  # where bandwidth has no limit: ten percent more of it must bring one percent less loss
 SMALLEST_GAIN = 0.01  # of the held-back loss: what twice the scenes must gain
@@ -45,6 +45,7 @@ class SelectionProblem:
         bandwidth: What reading out costs.
         limit_mbps: The most that it may cost; inf without a limit, where bits have a price.
         one_gate: Whether all rays of a sensor have one gate.
+        most_scenes: On how many scenes rays are chosen at most.
         name: Of the design, for messages.
         further: As many rays again, which may not be chosen: a certificate says what they would gain.
     """
@@ -58,6 +59,7 @@ class SelectionProblem:
     bandwidth: Bandwidth
     limit_mbps: float
     one_gate: bool
+    most_scenes: int
     name: str
     further: Rays | None = None
 
@@ -124,12 +126,26 @@ class SelectionProblem:
         return coverage.complete - worth, coverage.complete - worth - gap
 
 
-def _usual_gate(gate: np.ndarray, sensor: np.ndarray) -> np.ndarray:
-    """For each candidate the gate that most of the chosen rays of its sensor have, (N,)."""
+def _shared_gates(gate: np.ndarray, sensor: np.ndarray, bits: np.ndarray, limit_mbps: float) -> np.ndarray:
+    """For each candidate the gate that most of the chosen rays of its sensor have, narrower where these cost too much.
+
+    Arguments:
+        gate: The gate of each candidate, -1 for those that do not fire, (N,).
+        sensor: The sensor of each, (N,).
+        bits: What its sensor's gates cost, from wide to narrow, (N, G) [Mbit/s].
+        limit_mbps: What all rays may cost.
+    """
     chosen = np.flatnonzero(gate >= 0)
-    taken = np.zeros((int(sensor.max()) + 1, MOST_GATES), dtype=np.intp)
+    taken = np.zeros((int(sensor.max()) + 1, bits.shape[1]), dtype=np.intp)
     np.add.at(taken, (sensor[chosen], gate[chosen]), 1)
-    return taken.argmax(axis=1)[sensor]
+    usual, count = taken.argmax(axis=1), taken.sum(axis=1)
+    own = bits[np.unique(sensor, return_index=True)[1]]
+    cost = np.zeros((len(count), bits.shape[1]))
+    cost[np.unique(sensor)] = own * count[np.unique(sensor), None]
+    while cost[np.arange(len(usual)), usual].sum() > limit_mbps and (usual < bits.shape[1] - 1).any():
+        saved = cost[np.arange(len(usual)), usual] * (usual < bits.shape[1] - 1)
+        usual[saved.argmax()] += 1
+    return usual[sensor]
 
 
 def _gate_of(choices: Sequence[Choice]) -> np.ndarray:
@@ -160,9 +176,9 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
     middle = counts[len(counts) // 2]
-    held_back = problem.inform(problem.scenes("held back"), HELD_BACK_SCENES)
+    held_back = problem.inform(problem.scenes("held back"), information.FEW_SCENES)
     informed: list[InformedScene] = []
-    scenes, wanted, loss = problem.scenes("choice"), FIRST_SCENES, np.inf
+    scenes, wanted, loss = problem.scenes("choice"), information.FEW_SCENES, np.inf
     while True:
         informed += problem.inform(scenes, wanted - len(informed))
         gates_m = problem.gates(problem.rays, problem.visits, informed)
@@ -175,12 +191,12 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
             )
         gate = _gate_of(problem.choices(coverage, middle))
         before, loss = loss, judged.loss_of(gate)
-        if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > MOST_SCENES:
+        if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > problem.most_scenes:
             break
         wanted *= 2
     rays = problem.rays
     if problem.one_gate:
-        usual = _usual_gate(gate, rays.sensor)
+        usual = _shared_gates(gate, rays.sensor, coverage.bits, problem.limit_mbps)
         coverage, judged = coverage.through(usual), judged.through(usual)
         gates_m = gates_m[np.arange(len(rays)), usual][:, None]
     selected = []
@@ -218,7 +234,7 @@ def _gap_doubled(problem: SelectionProblem, further: Rays, count: int) -> float:
     """The gap of a choice among the candidates on the first scenes, against choices among twice as many."""
     own, rays = len(problem.rays), Rays.joined([problem.rays, further])
     doubled = replace(problem, rays=rays, visits=[slice(0, len(rays))])
-    informed = doubled.inform(doubled.scenes("choice"), FIRST_SCENES)
+    informed = doubled.inform(doubled.scenes("choice"), information.FEW_SCENES)
     coverage = doubled.coverage(informed, doubled.gates(rays, doubled.visits, informed))
     limit = None if np.isinf(problem.limit_mbps) else problem.limit_mbps
     return gap_among_more(coverage, doubled.counts(count), np.arange(len(rays)) < own, limit)

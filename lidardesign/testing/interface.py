@@ -8,7 +8,6 @@ import numpy as np
 from pydantic import ValidationError
 
 from lidardesign.config import PRESETS, resolve
-from lidardesign.design.sensor import FITTED_LAYOUTS
 from lidardesign.errors import ConfigError
 from lidardesign.space import DesignSpace
 from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
@@ -70,13 +69,11 @@ def _is_finite(value: object) -> bool:
 
 
 def check_defaults(subject: Subject) -> LawHolds:
-    """Suggested sensors, rays, layout, level and settings are ones that the commands accept, in every preset."""
+    """Suggested rays, level and settings are ones that the commands accept, in every preset."""
     defaults = subject.task.defaults
-    allowed = "sensors and rays of 1 or more, a known layout, a level between 0 and 1"
+    allowed = "rays of 1 or more, a level between 0 and 1"
     wrong = {
-        "sensors": not _is_count(defaults.sensors),
         "rays": not (isinstance(defaults.rays, list | tuple) and defaults.rays and all(map(_is_count, defaults.rays))),
-        "layout": defaults.layout not in FITTED_LAYOUTS,
         "level": not _is_finite(defaults.level) or not 0 < defaults.level < 1,
     }
     for name, is_wrong in wrong.items():
@@ -93,7 +90,7 @@ def check_defaults(subject: Subject) -> LawHolds:
         except ConfigError as error:
             raise BrokenLawError(f"preset {preset}: {error.message}", allowed=error.allowed) from error
     rays = ", ".join(map(str, defaults.rays))
-    return LawHolds(f"layout {defaults.layout}, level {defaults.level:g}, evaluated at {rays} rays")
+    return LawHolds(f"level {defaults.level:g}, evaluated at {rays} rays")
 
 
 def _as_yaml(value: object) -> str:

@@ -75,8 +75,6 @@ def describe_task(task: Task) -> dict[str, Any]:
         "learning": _describe_keys(LearningSettings, defaults.learning.get("standard", {})),
         "space": space,
         "defaults": {
-            "sensors": defaults.sensors,
-            "layout": defaults.layout,
             "level": defaults.level,
             "rays": list(defaults.rays),
         },

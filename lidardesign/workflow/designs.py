@@ -82,7 +82,7 @@ class Design(DesignSource):
 
         Arguments:
             notes: Called with every note.
-            options: As of `FitOptions`: constraints, sensors, rays, layout, gates, level, at, refine, name and more.
+            options: As of `FitOptions`: constraints, sensors, rays, layout, gates, level, at, name and more.
 
         Raises:
             DataError: The run has gone.

@@ -13,12 +13,14 @@ from lidardesign.design.constraints.document import CATALOG, Constraints, wants_
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import is_mounted, snap_to_space
 from lidardesign.design.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
+from lidardesign.design.layouts.layout import Layout
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, layout_of
 from lidardesign.design.sensor import FITTED_LAYOUTS, LEVELS, DesignSpec, Gates
 from lidardesign.design.snap.parts import parts_of
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.manifest import verify
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
+from lidardesign.selection.information import informs_rays
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
     MANIFEST,
@@ -34,6 +36,9 @@ from lidardesign.workflow.run_folder import (
 )
 from lidardesign.workflow.run_samples import Weighting
 
+BEST = "best"  # as many sensors as score best on training scenes
+COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
+CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones would only leave candidates out
 # Of designs: names that a file may have everywhere.
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
 # Keys by which tasks are told where sensors may be.
@@ -45,7 +50,8 @@ class FitOptions:
     """What a user may choose for a fit; what is left out follows from an earlier design, the constraints or the task.
 
     Arguments:
-        sensors: How many sensors, or "auto": as many as held-out likelihood says. A scan has one per ray.
+        sensors: How many sensors, "best": as many as score best on training scenes, or "auto": as many as held-out
+            likelihood says. A scan has one per ray.
         constraints: Constraints, a mapping of them, or a YAML file of them.
         layout: grid, density, scan, distributed or selected.
         rays: Rays per frame over all sensors.
@@ -53,7 +59,6 @@ class FitOptions:
         level: The share of rays and returns that fields of view and gates hold.
         at: Values of conditions that the design is for, as {"x_m": 0.37}.
         weights: Settings of the task towards which the learned density is weighted.
-        refine: At most so many rounds of new candidates, for layout selected.
         like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
         name: The design's name.
         seed: Root of every random stream; the run's by default.
@@ -70,7 +75,6 @@ class FitOptions:
     level: float | None = None
     at: Mapping[str, float] = field(default_factory=dict)
     weights: Sequence[str] | Mapping[str, Any] = ()
-    refine: int | None = None
     like: Path | str | None = None
     name: str | None = None
     seed: int | None = None
@@ -97,7 +101,6 @@ class FitRequest:
         at: Condition values that the design is for; without any, one for all of them.
         choices: sensors, layout, rays, gates and level, as `lidardesign.design.fit.fit` takes them.
         weighting: Settings of the task to whose scenes the density is weighted.
-        refine: Rounds of new candidates, or None.
         names: What sensors are called, where there are as many; none numbers them.
         command: For the design's provenance.
         files: Files that were read for it.
@@ -110,7 +113,6 @@ class FitRequest:
     at: Mapping[str, float] = field(default_factory=dict)
     choices: Mapping[str, Any] = field(default_factory=dict)
     weighting: Weighting = field(default_factory=Weighting)
-    refine: int | None = None
     names: Sequence[str] = ()
     command: str = "fit"
     files: Sequence[Path] = ()
@@ -148,21 +150,13 @@ class FitRequest:
             for note in moved:
                 notes(note)
         rules = constraints or Constraints()
-        layout = layout or _usual_layout(rules, base, run)
-        chosen_on_scenes = LAYOUTS[layout].chosen_on_scenes
-        if options.refine is not None and not chosen_on_scenes:
-            raise ConfigError(
-                f"layout {layout} beside --refine",
-                where="--refine",
-                allowed=f"layout {', '.join(name for name in FITTED_LAYOUTS if LAYOUTS[name].chosen_on_scenes)}",
-                hint="its rounds try new candidates for chosen rays",
-            )
+        layout = layout or _usual_layout(rules, base, run, options)
         beside = {
             "--at": options.at or (base is not None and base.at),
             "--weight": options.weights,
             "snap": wants_parts(rules.rules),
         }
-        if chosen_on_scenes and any(beside.values()):
+        if LAYOUTS[layout].chosen_on_scenes and any(beside.values()):
             raise ConfigError(
                 f"layout {layout} beside {next(name for name, given in beside.items() if given)}",
                 where="--layout",
@@ -175,7 +169,8 @@ class FitRequest:
                 where="--sensors",
                 hint="give --rays N alone, or another --layout",
             )
-        level = options.level if options.level is not None else base.level if base else defaults.level
+        usual_level = CHOSEN_LEVEL if LAYOUTS[layout].chosen_on_scenes else defaults.level
+        level = options.level if options.level is not None else base.level if base else usual_level
         if not LEVELS[0] <= level <= LEVELS[1]:
             raise ConfigError(f"{level:g}", where="--level", allowed=f"{LEVELS[0]:g} to {LEVELS[1]:g}")
         most_rays = None if LAYOUTS[layout].leaves_rays_open(options.gates) else max(defaults.rays)
@@ -186,14 +181,13 @@ class FitRequest:
             constraints,
             {**(base.at if base else {}), **options.at},
             {
-                "sensors": _sensors(options.sensors, rules, base, defaults.sensors),
+                "sensors": _sensors(options.sensors, rules, base, LAYOUTS[layout]),
                 "layout": layout,
                 "rays": _rays(options.rays, rules, base, most_rays),
                 "gates": options.gates or _own_gates(base, layout),
                 "level": level,
             },
             _weighting(settings_texts(options.weights), base),
-            options.refine,
             names,
             "fit" if asked is None else "constrain",
             tuple(files) if options.like is None else (*files, Path(options.like)),
@@ -219,7 +213,6 @@ class FitRequest:
             "seed": self.seed,
             "at": dict(self.at),
             "weights": list(self.weighting.settings),
-            "refine": self.refine,
             "constraints": None if self.constraints is None else self.constraints.as_document(),
         }
         return RequestPlan(
@@ -234,7 +227,11 @@ class FitRequest:
     def _steps(self, constraints: Mapping[str, Any] | None) -> list[str]:
         choices = self.choices
         rays = "rays left open" if choices["rays"] is None else f"{choices['rays']} rays"
-        counted = {None: "sensors as many as follow", "auto": "sensors as many as held-out likelihood says"}
+        counted = {
+            None: "sensors as many as follow",
+            BEST: "sensors as many as score best on training scenes",
+            "auto": "sensors as many as held-out likelihood says",
+        }
         sensors = counted.get(choices["sensors"], f"{choices['sensors']} sensors")
         sensors = "one sensor per ray" if LAYOUTS[choices["layout"]].one_sensor_per_ray else sensors
         place = "".join(f", {key} = {value:g}" for key, value in self.at.items())
@@ -244,8 +241,6 @@ class FitRequest:
             steps.append(f"weigh the density with {', '.join(self.weighting.settings)}")
         if constraints:
             steps.append(f"keep to constraints of {', '.join(constraints)}; check them on the finished file")
-        if self.refine:
-            steps.append(f"try new candidates in up to {self.refine} rounds")
         return steps
 
 
@@ -270,14 +265,16 @@ def _with_rig(
     return constraints, layout, tuple(sensor.name for sensor in rig.sensors)
 
 
-def _usual_layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder) -> str:
-    """The layout where none is named: the design's, else the task's; sensors that become parts are fitted as grids."""
+def _usual_layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, options: FitOptions) -> str:
+    """The layout where none is named: the design's; else rays are chosen where scenes can say what they tell."""
     if wants_parts(constraints.rules):
         return "grid"
     if base is not None:
         layout = layout_of(base)
         return layout.name if layout.chosen_on_scenes else layout.fitted_as
-    return check_choice(run.task.defaults.layout, f"defaults.layout of task {run.task.name}", FITTED_LAYOUTS)
+    if informs_rays(run.task) and not options.at and not options.weights:
+        return "selected"
+    return "scan" if run.config.space.conditioned else "grid"
 
 
 def _own_gates(base: DesignSpec | None, layout: str) -> Gates | None:
@@ -289,13 +286,15 @@ def _own_gates(base: DesignSpec | None, layout: str) -> Gates | None:
 
 
 def _sensors(
-    asked: int | str | None, constraints: Constraints, base: DesignSpec | None, usual: int
+    asked: int | str | None, constraints: Constraints, base: DesignSpec | None, layout: Layout
 ) -> int | str | None:
-    """The number of sensors: the user's, then what the constraints ask for, the design's, the task's."""
+    """The number of sensors: the user's, then what the constraints ask for, the design's, the best."""
     bounds = constraints.sensors
     if asked is not None or bounds.count is not None or is_mounted(constraints.rules):  # mounts say how many
         return asked if asked is not None else bounds.count
-    usual = max(len(base.sensors) if base else usual, len(constraints.each))
+    if base is None:
+        return None if layout.one_sensor_per_ray else BEST
+    usual = max(len(base.sensors), len(constraints.each))
     return min(max(usual, bounds.min or usual), bounds.max or usual)
 
 

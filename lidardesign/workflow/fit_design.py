@@ -1,13 +1,25 @@
-"""How a design is fitted, its rays chosen on scenes where that is asked for, and checked before anyone sees it."""
+"""How a design is fitted, its rays chosen on scenes where that is asked for, and checked before anyone sees it.
+
+Where nobody says how many sensors it has, designs of a few and of more are fitted alike, at the middle number of rays
+and in the bandwidth of the first of them. The task scores them on training scenes that were held back; the fewest
+sensors win that are no worse than the best by more than a standard error.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from itertools import islice
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import ConstraintCheck, check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
-from lidardesign.design.fit import FitResult
+from lidardesign.design.fit import FitResult, rays_at
 from lidardesign.design.fit import fit as fit_samples
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
 from lidardesign.design.layouts.rays import LAYOUTS
@@ -15,12 +27,18 @@ from lidardesign.design.layouts.track import travelled
 from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError, InfeasibleError
+from lidardesign.evaluate.baselines.candidates import mean_mbps
+from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import versions
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples, load_samples
+from lidardesign.scene import Scene, group_numbers
+from lidardesign.selection import information
+from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import conditions_of, random_generator
-from lidardesign.workflow.fit import FitRequest
+from lidardesign.workflow import fit as fit_choices
+from lidardesign.workflow.fit import BEST, FitRequest
 from lidardesign.workflow.run_folder import Notes, log_note, relative_folder
 from lidardesign.workflow.run_samples import KEY, RunTarget
 
@@ -93,7 +111,10 @@ def fit_design(request: FitRequest, *, notes: Notes = log_note) -> FitResult:
         InfeasibleError: Constraints that contradict each other, or that the design does not keep.
     """
     run, weighting, fitter = request.run, request.weighting, Fitter(request, notes)
-    result = _selected(fitter) if LAYOUTS[request.choices["layout"]].chosen_on_scenes else fitter.fit()
+    if request.choices["sensors"] == BEST:
+        count = _best_count(fitter)
+        request = fitter.request = replace(request, choices={**request.choices, "sensors": count})
+    result = _fitted(fitter)
     for note in result.notes:
         notes(note)
     design, further = result.design, {KEY: weighting.as_document()} if weighting.settings else {}
@@ -114,23 +135,125 @@ def fit_design(request: FitRequest, *, notes: Notes = log_note) -> FitResult:
     return replace(result, design=design, constraints=checks, satisfied=True)
 
 
-def _selected(fitter: Fitter) -> FitResult:
-    """Sensors with rays that were chosen on scenes: of the number that was asked for, or of each of the task's."""
+def _best_count(fitter: Fitter) -> int:
+    """The number of sensors that scores best on training scenes; says what was tried."""
+    from lidardesign.workflow.select_rays import selection_scenes
+
+    request = fitter.request
+    run = request.run
+    scenes = {
+        purpose: list(islice(selection_scenes(run, request.seed, purpose), information.FEW_SCENES))
+        for purpose in ("choice", "held back")
+    }
+
+    def fit(trial: FitRequest) -> FitResult:
+        fitter.request = trial
+        return _fitted(fitter, lambda purpose: iter(scenes[purpose]))
+
+    trials = trials_of(request, fitter.samples, scenes["held back"], fit)
+    best = best_of(trials, scenes["held back"])
+    sign = 1.0 if run.metric.better == "lower" else -1.0
+    found = ", ".join(f"{trial.sensors}: {sign * trial.scores.mean():.4g}" for trial in trials)
+    fitter.notes(
+        f"sensors: {best.sensors}; {run.metric.name} [{run.metric.unit}] on {len(scenes['held back'])} training scenes "
+        f"in {trials[0].mbps:.3g} Mbit/s by their number: {found}"
+    )
+    return best.sensors
+
+
+class Trial(NamedTuple):
+    """A design of some number of sensors: its score on each scene, turned so that lower is better, and its bits."""
+
+    sensors: int
+    scores: np.ndarray
+    mbps: float
+
+
+@phase("trials")
+def trials_of(
+    request: FitRequest, samples: Samples, scenes: Sequence[Scene], fit: Callable[[FitRequest], FitResult]
+) -> list[Trial]:
+    """Designs of ever more sensors.
+
+    Arguments:
+        request: What is asked for, but for the number of sensors.
+        samples: What layouts follow from.
+        scenes: Training scenes that designs are not fitted to.
+        fit: Fits the design of a request.
+
+    Raises:
+        InfeasibleError: No number of sensors keeps the constraints.
+    """
+    run, constraints = request.run, request.constraints or Constraints()
+    budgets = sorted(run.task.defaults.rays)
+    rays = request.choices["rays"] or budgets[len(budgets) // 2]
+    conditions = [request.at] if request.at else conditions_of(run.task, run.config.task, run.config.space)
+    casters = [build_casters(scene) for scene in scenes]
+    sign = 1.0 if run.metric.better == "lower" else -1.0
+    low = max(constraints.sensors.min or 1, len(constraints.each))
+    high = constraints.sensors.max or math.inf
+    trials: list[Trial] = []
+    refused = None
+    for count in [count for count in fit_choices.COUNTS if low <= count <= high] or [low]:
+        limited = _within(request.constraints, trials[0].mbps) if trials else request.constraints
+        choices = {**request.choices, "sensors": count, "rays": rays}
+        try:
+            design = fit(replace(request, choices=choices, constraints=limited)).design
+        except InfeasibleError as error:
+            refused = refused or error
+            continue
+        fired = tuple(rays_at(design, rays, samples, at=at or None) for at in conditions)
+        scores = [
+            next(score_lists(run.task, run.metric, scene, [fired], caster))[0].value
+            for scene, caster in zip(scenes, casters, strict=True)
+        ]
+        trials.append(Trial(count, sign * np.array(scores), mean_mbps(fired, Bandwidth())))
+    if not trials and refused is not None:
+        raise refused
+    return trials
+
+
+def best_of(trials: Sequence[Trial], scenes: Sequence[Scene]) -> Trial:
+    """The fewest sensors that are no worse than the best by more than the standard error of the difference."""
+    best = min(trials, key=lambda trial: trial.scores.mean())
+    groups = group_numbers(scenes)
+    for trial in trials:
+        lost = np.bincount(groups, trial.scores - best.scores) / np.bincount(groups)
+        error = lost.std(ddof=1) / math.sqrt(len(lost)) if len(lost) > 1 else 0.0
+        if lost.mean() <= error:
+            return trial
+    return best
+
+
+def _within(constraints: Constraints | None, mbps: float) -> Constraints:
+    """Constraints with a bandwidth, where they have none."""
+    document: dict[str, Any] = {} if constraints is None else dict(constraints.as_document())
+    budget = document.get("budget") or {}
+    return Constraints.from_mapping({**document, "budget": {"bandwidth_mbps": mbps, **budget}})
+
+
+def _fitted(fitter: Fitter, few: Callable[[str], Iterator[Scene]] | None = None) -> FitResult:
+    """The design of a fitter's request; in layouts whose rays are chosen, for each number of rays.
+
+    Arguments:
+        fitter: Fits sensors.
+        few: The only scenes to choose on, by purpose; None takes as many as it takes.
+    """
+    request, samples = fitter.request, fitter.samples
+    if not LAYOUTS[request.choices["layout"]].chosen_on_scenes:
+        return fitter.fit()
     from lidardesign.workflow.select_rays import near, select_rays
 
-    request, samples = fitter.request, fitter.samples
     counts = sorted({request.choices["rays"]} if request.choices["rays"] else set(request.run.task.defaults.rays))
     if samples.space.conditioned:
         travelled(samples.space, "selected")
     # the rays of a track have gates of their own, as those of a scan
     gates = request.choices["gates"] or ("ray" if samples.space.conditioned else LAYOUTS["selected"].usual_gates)
-    # sensors' own gates keep a bandwidth themselves, those of rays are priced when they are chosen
-    layout = "density" if gates == "ray" else "grid"
     (first, *_) = conditions_of(request.run.task, request.run.config.task, samples.space)
-    # a sensor that moves along a condition looks everywhere the same way
-    fitted = fitter.fit(near(samples, first, 1.0), layout=layout, rays=counts[-1], gates=gates)
+    # the gates of chosen rays keep a bandwidth; a sensor that moves along a condition looks everywhere the same way
+    fitted = fitter.fit(near(samples, first, 1.0), layout="density", rays=counts[-1], gates="ray")
     fitted = replace(fitted, design=replace(fitted.design, gates=gates))
-    return select_rays(request.run, fitted, counts, samples, request.seed)
+    return select_rays(request.run, fitted, counts, samples, request.seed, few)
 
 
 def check_written(design: DesignSpec, request: FitRequest) -> list[ConstraintCheck]:

@@ -102,7 +102,6 @@ class Run(RunFolder):
         rays: int | None = None,
         layout: str | None = None,
         at: Mapping[str, float] | None = None,
-        refine: int | None = None,
         name: str | None = None,
         seed: int | None = None,
         notes: Notes = log_note,
@@ -111,12 +110,13 @@ class Run(RunFolder):
         """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
 
         Arguments:
-            sensors: How many, or "auto": as many as held-out likelihood says.
+            sensors: How many, "best": as many as score best on training scenes, or "auto": as many as held-out
+                likelihood says; by default the best.
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
-            layout: grid, density, scan or distributed; the task's by default.
+            layout: grid, density, scan, distributed or selected; by default selected, where the task says what
+                returns tell.
             at: Values of conditions that the design is for, as {"x_m": 0.37}.
-            refine: At most so many rounds of new candidates, for layout selected.
             name: The design's name.
             seed: Root of every random stream; the run's by default.
             notes: Called with every note; they are logged by default.
@@ -133,7 +133,6 @@ class Run(RunFolder):
             rays=rays,
             layout=layout,
             at=at or {},
-            refine=refine,
             name=name,
             seed=seed,
             notes=notes,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -28,6 +28,7 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scene import Scene
+from lidardesign.selection import information
 from lidardesign.selection.candidates import CANDIDATES_PER_RAY, gate_choices, sensor_gates
 from lidardesign.selection.coverage import InformedScene
 from lidardesign.selection.information import checked_information, informs_rays
@@ -47,6 +48,7 @@ def select_rays(
     counts: Sequence[int],
     samples: Samples,
     seed: int,
+    few: Callable[[str], Iterator[Scene]] | None = None,
 ) -> FitResult:
     """The design of a fit with rays that were chosen, one table or track for each number of rays.
 
@@ -56,6 +58,7 @@ def select_rays(
         counts: Numbers of rays, ascending; along a condition, at each of its values.
         samples: Of the density, at all values of its condition.
         seed: Root of the random streams.
+        few: The only scenes to choose on, by purpose, for a trial; None takes as many as it takes.
 
     Raises:
         ConfigError: The task does not say what returns tell, or more rays than can be chosen.
@@ -86,12 +89,13 @@ def select_rays(
         shares=spec.weights if len(visits) > 1 else None,
         gates=partial(_gates, spec, constraints, samples.space, gate_margin_m(run)),
         informs=partial(checked_information, run.task),
-        scenes=partial(selection_scenes, run, seed),
+        scenes=few or partial(selection_scenes, run, seed),
+        most_scenes=information.FEW_SCENES if few else information.MOST_SCENES,
         bandwidth=bandwidth_limit(constraints, len(rays))[0],
         limit_mbps=np.inf if limit is None else limit,
         one_gate=spec.gates != "ray",
         name=spec.name,
-        further=None if len(visits) > 1 else proposals.further(len(rays)),
+        further=None if few or len(visits) > 1 else proposals.further(len(rays)),
     )
     selected = select(problem, counts)
     provenance = {**spec.provenance, CERTIFICATES: [one.certificate for one in selected]}
@@ -160,8 +164,9 @@ class Proposals:
         self.conditions = conditions_of(run.task, run.config.task, samples.space)
         sensors = tuple(replace(sensor, rays=None) for sensor in spec.sensors)
         self.spec = replace(spec, ray_table=None, rays=None, sensors=sensors)
-        # a task whose rays start all over their sensors' origins proposes such rays
-        self.layout = "distributed" if LAYOUTS[run.task.defaults.layout].extends_origins else "density"
+        # rays start all over the origins of their sensors, where these are left free
+        has_extent = any(np.any(sensor.origin_covariance_m2) for sensor in sensors)
+        self.layout = "distributed" if has_extent else "density"
 
     @phase("candidates")
     def at_conditions(self, count: int) -> list[Rays]:

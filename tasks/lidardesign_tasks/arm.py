@@ -69,9 +69,7 @@ class ArmTask:
     Config: ClassVar[type[ArmConfig]] = ArmConfig
     metric: ClassVar[Metric] = Metric("Frechet distance", "m", "lower", worst=1.0, tolerance=0.002)
     defaults: ClassVar[Defaults] = Defaults(
-        sensors=4,
         rays=(400, 1000, 1200),
-        layout="distributed",
         level=0.99,  # a path is as bad as its worst frame, so a lost return costs more than a bin
         density={"sigma_m": 0.025, "surface_tolerance_nats": 10.0},
         learning={"standard": {"steps": 800, "hidden": 64}},

@@ -89,7 +89,7 @@ class EmitterTask:
     Config: ClassVar[type[EmitterConfig]] = EmitterConfig
     metric: ClassVar[Metric] = FaceTask.metric
     defaults: ClassVar[Defaults] = Defaults(
-        sensors=1, rays=(100, 196, 361, 576), layout="density", level=0.99, density={"sigma_m": 0.005}
+        rays=(100, 196, 361, 576), level=0.99, density={"sigma_m": 0.005}
     )
 
     def space(self, config: EmitterConfig) -> DesignSpace:

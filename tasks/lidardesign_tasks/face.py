@@ -85,7 +85,7 @@ class FaceTask:
     Config: ClassVar[type[FaceConfig]] = FaceConfig
     metric: ClassVar[Metric] = Metric("Chamfer distance", "mm", "lower", worst=200.0, tolerance=0.1)
     defaults: ClassVar[Defaults] = Defaults(
-        sensors=4, rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005}
+        rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005}
     )
 
     def space(self, config: FaceConfig) -> DesignSpace:

@@ -54,7 +54,6 @@ class FlatlandTask:
     Config: ClassVar[type[FlatlandConfig]] = FlatlandConfig
     metric: ClassVar[Metric] = Metric("Chamfer distance", "mm", "lower", worst=500.0, tolerance=0.5)
     defaults: ClassVar[Defaults] = Defaults(
-        sensors=3,
         rays=(8, 16, 32, 64),
         density={"sigma_m": 0.02},
         learning={

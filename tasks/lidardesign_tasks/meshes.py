@@ -122,7 +122,7 @@ class MeshesTask:
         "Chamfer distance", "mm", "lower", worst=MILLIMETRES, tolerance=MILLIMETRES * TOLERATED_SHARE
     )
     defaults: ClassVar[Defaults] = Defaults(
-        sensors=4, rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005}
+        rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005}
     )
 
     def space(self, config: MeshesConfig) -> DesignSpace:

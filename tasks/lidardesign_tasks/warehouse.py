@@ -97,7 +97,7 @@ class WarehouseTask:
     Config: ClassVar[type[WarehouseConfig]] = WarehouseConfig
     metric: ClassVar[Metric] = Metric("miss rate", "%", "lower", worst=100.0, tolerance=0.5)
     defaults: ClassVar[Defaults] = Defaults(
-        sensors=12, rays=(6, 12, 18), layout="scan", density={"sigma_m": 0.02}
+        rays=(6, 12, 18), density={"sigma_m": 0.02}
     )
 
     def space(self, config: WarehouseConfig) -> DesignSpace:

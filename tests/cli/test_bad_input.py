@@ -159,7 +159,6 @@ CASES = [
     ("fit run --sensors -2", 2, "from 1, or auto"),
     ("fit run --sensors 2.5", 2, "from 1, or auto"),
     ("fit run --sensors many", 2, "from 1, or auto"),
-    *((f"fit run --refine {rounds}", 2, "--refine") for rounds in ("0", "-1", "101", "many", "1.5")),
     ("fit run --layout spiral", 2, "grid, density, scan"),
     ("fit run --gates one", 2, "sensor, ray"),
     ("fit run --name ../elsewhere", 2, "no name for a design"),

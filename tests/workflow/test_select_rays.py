@@ -34,14 +34,6 @@ def run(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("run") / "flat")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def few_scenes():
-    with pytest.MonkeyPatch.context() as patch:
-        for name, count in (("FIRST_SCENES", 5), ("MOST_SCENES", 10), ("HELD_BACK_SCENES", 5)):
-            patch.setattr(f"lidardesign.selection.select.{name}", count)
-        yield
-
-
 def chosen(run, sensors=2, **options):
     return open_run(run).fit(layout="selected", sensors=sensors, name="chosen", **options)
 
@@ -165,14 +157,6 @@ class TestTheCommand:
         refused = lidardesign("fit", run, "--layout", "selected", *options)
         assert refused.code == 2
         assert message in refused.err
-
-    def test_rounds_of_new_candidates_are_for_chosen_rays_alone(self, lidardesign, run):
-        planned = lidardesign("fit", run, "--layout", "selected", "--refine", 3, "--dry-run")
-        assert "  try new candidates in up to 3 rounds" in planned.out.splitlines()
-        for name in ("grid", "density", "scan", "distributed"):
-            refused = lidardesign("fit", run, "--layout", name, "--refine", 3)
-            assert refused.code == 2
-            assert f"--refine: layout {name} beside --refine" in refused.err
 
     def test_rays_that_tell_nothing_are_refused(self, lidardesign, run, monkeypatch):
         nothing = Information(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(5, int))

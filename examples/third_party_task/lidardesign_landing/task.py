@@ -35,7 +35,7 @@ class LandingTask:
     Config: ClassVar[type[LandingConfig]] = LandingConfig
     metric: ClassVar[Metric] = Metric("missed hazards", "%", "lower", worst=PERCENT, tolerance=1.0)
     defaults: ClassVar[Defaults] = Defaults(
-        layout="scan", rays=(64, 128, 256), density={"sigma_m": 0.1}, learning={"draft": {"steps": 800}}
+        rays=(64, 128, 256), density={"sigma_m": 0.1}, learning={"draft": {"steps": 800}}
     )
 
     def space(self, config: LandingConfig) -> DesignSpace:

@@ -205,6 +205,7 @@ class GreedyCandidate:
             bandwidth=self.bandwidth,
             limit_mbps=np.inf,
             one_gate=False,
+            most_scenes=self.scenes,
             name=GREEDY,
         )
         informed = problem.inform(problem.scenes("choice"), self.scenes)
