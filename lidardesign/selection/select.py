@@ -127,7 +127,7 @@ class SelectionProblem:
 
 
 def _shared_gates(gate: np.ndarray, sensor: np.ndarray, bits: np.ndarray, limit_mbps: float) -> np.ndarray:
-    """For each candidate the gate that most of the chosen rays of its sensor have, narrower where these cost too much.
+    """For each sensor the gate that most of its chosen rays have, narrower where these cost too much, (S,).
 
     Arguments:
         gate: The gate of each candidate, -1 for those that do not fire, (N,).
@@ -138,14 +138,13 @@ def _shared_gates(gate: np.ndarray, sensor: np.ndarray, bits: np.ndarray, limit_
     chosen = np.flatnonzero(gate >= 0)
     taken = np.zeros((int(sensor.max()) + 1, bits.shape[1]), dtype=np.intp)
     np.add.at(taken, (sensor[chosen], gate[chosen]), 1)
-    usual, count = taken.argmax(axis=1), taken.sum(axis=1)
-    own = bits[np.unique(sensor, return_index=True)[1]]
-    cost = np.zeros((len(count), bits.shape[1]))
-    cost[np.unique(sensor)] = own * count[np.unique(sensor), None]
-    while cost[np.arange(len(usual)), usual].sum() > limit_mbps and (usual < bits.shape[1] - 1).any():
-        saved = cost[np.arange(len(usual)), usual] * (usual < bits.shape[1] - 1)
-        usual[saved.argmax()] += 1
-    return usual[sensor]
+    found, first = np.unique(sensor, return_index=True)
+    cost = np.zeros(taken.shape)
+    cost[found] = bits[first] * taken.sum(axis=1)[found, None]
+    usual, sensors = taken.argmax(axis=1), np.arange(len(taken))
+    while cost[sensors, usual].sum() > limit_mbps and (usual < bits.shape[1] - 1).any():
+        usual[np.where(usual < bits.shape[1] - 1, cost[sensors, usual], -1.0).argmax()] += 1
+    return usual
 
 
 def _gate_of(choices: Sequence[Choice]) -> np.ndarray:
@@ -194,11 +193,12 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
         if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > problem.most_scenes:
             break
         wanted *= 2
-    rays = problem.rays
+    rays, shared = problem.rays, None
     if problem.one_gate:
-        usual = _shared_gates(gate, rays.sensor, coverage.bits, problem.limit_mbps)
-        coverage, judged = coverage.through(usual), judged.through(usual)
-        gates_m = gates_m[np.arange(len(rays)), usual][:, None]
+        shared = _shared_gates(gate, rays.sensor, coverage.bits, problem.limit_mbps)
+        own = shared[rays.sensor]
+        coverage, judged = coverage.through(own), judged.through(own)
+        gates_m = gates_m[np.arange(len(rays)), own][:, None]
     selected = []
     for count in counts:
         choices = problem.choices(coverage, count)
@@ -224,17 +224,18 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
         if count == middle:
             document["curve"] = price_curve(coverage, problem.counts(count), len(problem.visits))
             if problem.further is not None:
-                document["gap_doubled"] = _gap_doubled(problem, problem.further, count)
+                document["gap_doubled"] = _gap_doubled(problem, problem.further, count, shared)
         selected.append(Selected(tables, document))
     return selected
 
 
 @phase("certificate")
-def _gap_doubled(problem: SelectionProblem, further: Rays, count: int) -> float:
+def _gap_doubled(problem: SelectionProblem, further: Rays, count: int, shared: np.ndarray | None) -> float:
     """The gap of a choice among the candidates on the first scenes, against choices among twice as many."""
     own, rays = len(problem.rays), Rays.joined([problem.rays, further])
     doubled = replace(problem, rays=rays, visits=[slice(0, len(rays))])
     informed = doubled.inform(doubled.scenes("choice"), information.FEW_SCENES)
     coverage = doubled.coverage(informed, doubled.gates(rays, doubled.visits, informed))
+    coverage = coverage if shared is None else coverage.through(shared[rays.sensor])
     limit = None if np.isinf(problem.limit_mbps) else problem.limit_mbps
     return gap_among_more(coverage, doubled.counts(count), np.arange(len(rays)) < own, limit)
