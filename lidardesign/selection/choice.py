@@ -181,6 +181,7 @@ def choose_within(
     A price reaches only the convex hull of what choices cost and are worth. So the price is bisected, and what the
     least price that keeps to the budget leaves over is spent at the next lower price, then at none.
     """
+    budget_mbps *= 1 + SLACK  # the same bits added up in another order
     free = choose(coverage, counts, full=full)
     if free.bits <= budget_mbps:
         return free

@@ -16,6 +16,7 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth, split_budget
 from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.geometry.rays import Rays, Returns
+from lidardesign.numerics import SLACK
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.selection import information
@@ -142,7 +143,7 @@ def _shared_gates(gate: np.ndarray, sensor: np.ndarray, bits: np.ndarray, limit_
     cost = np.zeros(taken.shape)
     cost[found] = bits[first] * taken.sum(axis=1)[found, None]
     usual, sensors = taken.argmax(axis=1), np.arange(len(taken))
-    while cost[sensors, usual].sum() > limit_mbps and (usual < bits.shape[1] - 1).any():
+    while cost[sensors, usual].sum() > (1 + SLACK) * limit_mbps and (usual < bits.shape[1] - 1).any():
         usual[np.where(usual < bits.shape[1] - 1, cost[sensors, usual], -1.0).argmax()] += 1
     return usual
 

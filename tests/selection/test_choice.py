@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -87,6 +88,12 @@ class TestAChoice:
         assert certificate.value <= best + 1e-12
         assert certificate.bound >= best - 1e-12
         assert (np.bincount(counts.sensor[choice.rays], minlength=2) <= counts.most).all()
+
+    def test_has_room_in_the_bandwidth_that_its_rays_take_however_bits_are_added_up(self, table):
+        coverage = small(0, table=table)
+        coverage = replace(coverage, bits=np.full(coverage.shape, 0.1))
+        assert 0.1 + 0.1 + 0.1 > 0.3
+        assert len(choose_within(coverage, RayCounts.of_one(len(coverage.bits), 3), 0.3).rays) == 3
 
     @given(seed=seeds, share=st.floats(0.1, 1.2))
     def test_within_a_budget_is_near_the_best_of_all_and_its_certificate_above_it(self, table, seed, share):
