@@ -96,13 +96,15 @@ MANUALS: dict[str, Manual] = {
     ),
     "fit": Manual(
         {
-            "lidardesign fit runs/face --sensors 4 --name free": "four sensors, rays left open",
+            "lidardesign fit runs/face": "as many sensors as score best, their rays chosen",
+            "lidardesign fit runs/face --sensors 4 --layout grid --name even": "four sensors, rays even and left open",
             "lidardesign fit runs/face --layout scan --rays 576 --name beams": "one steerable beam per ray",
             "lidardesign fit runs/face --like robot.sdf --name instead": "no more than a rig that there is",
             "lidardesign fit runs/warehouse --rays 12 --at x_m=0.37 --name here": "for one position of a robot",
         },
         about="Reads sensors off the learned density: a mixture is fitted to its samples, and its components are "
-        "sensors with a field of view and a gate.",
+        "sensors with a field of view and a gate. Their rays, and how many sensors there are, are chosen on training "
+        "scenes.",
         files=("RUN/samples.npz: the samples of the density", "RUN/designs/NAME.yaml: the design"),
         exits=FROM_A_RUN,
         see=("design-file.md", "selection.md", "importance.md"),
@@ -115,7 +117,7 @@ MANUALS: dict[str, Manual] = {
             "echo 'budget: {rays: 196}' | lidardesign constrain runs/face --constraints - --name few": "bounds from "
             "standard input",
         },
-        about="Answers what-if questions in seconds: the same samples, another fit. What is written satisfies every "
+        about="Answers what-if questions: the same samples, another fit. What is written satisfies every "
         "constraint: the finished file is checked again by code that the fit does not share.",
         files=(
             "--constraints FILE: YAML (schema: config schema constraints), - for standard input",

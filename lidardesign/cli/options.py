@@ -32,7 +32,7 @@ Layout = Annotated[
         "--layout",
         metavar="grid|density|scan|distributed|selected",
         help="Rays even in the field of view, by density, each its own sensor, starting across the origins, or chosen.",
-        show_default="the design's or the task's",
+        show_default="the design's, else selected; grid or scan where rays cannot be chosen",
     ),
 ]
 At = Annotated[
@@ -61,7 +61,7 @@ Level = Annotated[
         "--level",
         metavar="SHARE",
         help="Share of rays and returns that fields of view and gates hold, as 0.99.",
-        show_default="the design's or the task's",
+        show_default="the design's, else 0.999 for chosen rays and the task's for others",
     ),
 ]
 Gates = Annotated[
@@ -70,7 +70,7 @@ Gates = Annotated[
         "--gates",
         metavar="sensor|ray",
         help="One gate per sensor, or one per ray; in a scan every ray is a sensor.",
-        show_default="sensor; ray in the layout distributed",
+        show_default="sensor; ray where rays are distributed, or chosen along a condition",
     ),
 ]
 Sensors = Annotated[
@@ -167,7 +167,7 @@ def sensor_count(text: str | None) -> int | str | None:
     """The value of `--sensors`: a number from 1, `best`, `auto`, or None.
 
     Raises:
-        ConfigError: It is neither.
+        ConfigError: It is none of these.
     """
     if text in (None, "best", "auto"):
         return text

@@ -189,7 +189,8 @@ class ExportRequest:
         """What the export would do.
 
         Raises:
-            ConfigError: The design is nowhere at such a condition, or leaves its rays open without a run.
+            ConfigError: The design is nowhere at such a condition, leaves its rays open without a run, or so many were
+                not chosen.
         """
         source, design, exporter = self.source, self.source.specification, self.exporter
         if self.at or design.track is not None:
@@ -197,6 +198,9 @@ class ExportRequest:
         count = None if exporter.name in WITHOUT_RAYS else self.rays
         if count is None and exporter.name not in WITHOUT_RAYS:
             count = source.largest_budget() if source.leaves_rays_open else own_count(design)
+        if count is not None and layout_of(design).chosen_on_scenes:
+            # refuses a number of rays that was not chosen
+            lay_out(design, count, at=self.at or None)
         content = "its sensors" if count is None else f"its {count} rays"
         place = "".join(f" at {key} = {value:g}" for key, value in self.at.items())
         run = [] if source.folder is None else [source.folder / CONFIGURATION, source.folder / MANIFEST]

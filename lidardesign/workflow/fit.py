@@ -274,7 +274,8 @@ def _usual_layout(constraints: Constraints, base: DesignSpec | None, run: RunFol
         return layout.name if layout.chosen_on_scenes else layout.fitted_as
     if informs_rays(run.task) and not options.at and not options.weights:
         return "selected"
-    return "scan" if run.config.space.conditioned else "grid"
+    # a scan has as many sensors as rays
+    return "scan" if run.config.space.conditioned and options.sensors is None else "grid"
 
 
 def _own_gates(base: DesignSpec | None, layout: str) -> Gates | None:

@@ -155,10 +155,10 @@ CASES = [
     # options
     ("fit run --rays 0", 2, "rays"),
     ("fit run --rays -5", 2, "rays"),
-    ("fit run --sensors 0", 2, "from 1, or auto"),
-    ("fit run --sensors -2", 2, "from 1, or auto"),
-    ("fit run --sensors 2.5", 2, "from 1, or auto"),
-    ("fit run --sensors many", 2, "from 1, or auto"),
+    ("fit run --sensors 0", 2, "from 1, best or auto"),
+    ("fit run --sensors -2", 2, "from 1, best or auto"),
+    ("fit run --sensors 2.5", 2, "from 1, best or auto"),
+    ("fit run --sensors many", 2, "from 1, best or auto"),
     ("fit run --layout spiral", 2, "grid, density, scan"),
     ("fit run --gates one", 2, "sensor, ray"),
     ("fit run --name ../elsewhere", 2, "no name for a design"),
@@ -323,8 +323,8 @@ def test_a_design_whose_numbers_are_not_finite_is_refused(mistakes, lidardesign,
 
 
 COMMANDS = {
-    "fit": ("fit", "run", "--sensors", "1"),
-    "constrain": ("constrain", "run", "--set", "budget.rays=20"),
+    "fit": ("fit", "run", "--layout", "grid", "--sensors", "1"),
+    "constrain": ("constrain", "run", "--layout", "grid", "--set", "budget.rays=20"),
     "export": ("export", "good.yaml", "--format", "npz", "--out", "rays.npz"),
     "learn": ("learn", "flatland", "--preset", "draft", "--out", "new/run"),
 }

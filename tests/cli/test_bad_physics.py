@@ -100,9 +100,16 @@ CASES = [
     *(
         (f"learn flatland --set {key}={value}", 2, f"--set {key}={value}")
         for key, value in [
-            ("illuminance_lux", "-1"), ("illuminance_lux", "1e9"), ("light", "moon"), ("visibility_m", "0"),
-            ("visibility_m", "1e-300"), ("visibility_m", ".inf"), ("reflectance", "-0.1"), ("reflectance", "1.1"),
-            ("gloss", ".nan"), ("gloss", "2"),
+            ("illuminance_lux", "-1"),
+            ("illuminance_lux", "1e9"),
+            ("light", "moon"),
+            ("visibility_m", "0"),
+            ("visibility_m", "1e-300"),
+            ("visibility_m", ".inf"),
+            ("reflectance", "-0.1"),
+            ("reflectance", "1.1"),
+            ("gloss", ".nan"),
+            ("gloss", "2"),
         ]
     ),
     ("learn face --set speed_m_s=1e9", 2, "--set speed_m_s=1e9"),
@@ -163,7 +170,7 @@ def ready(mistakes, lidardesign, monkeypatch):
     """The program in the folder of mistakes, whose run has a design and whose scanner file is there."""
     monkeypatch.chdir(mistakes)
     if not (mistakes / "header.galvo.csv").exists():
-        assert lidardesign("fit", "run", "--sensors", 1).code == 0
+        assert lidardesign("fit", "run", "--layout", "grid", "--sensors", 1).code == 0
         assert lidardesign("export", "good.yaml", "--format", "galvo").code == 0
         header, *rows = (mistakes / "good.galvo.csv").read_text().splitlines(keepends=True)
         (mistakes / "header.galvo.csv").write_text(header)

@@ -11,7 +11,6 @@ from support.conditioned_runs import log_target, make_conditioned_run
 
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.registry import load_task
 
 
 @pytest.fixture
@@ -64,26 +63,21 @@ def test_a_scan_without_a_value_is_a_track_and_shown_as_one(lidardesign, run):
     assert "at x_m=0.25" in lidardesign("show", path, "--at", "x_m=0.25").out
 
 
-def test_a_scan_is_the_layout_where_the_task_says_so(lidardesign, run, monkeypatch):
-    from dataclasses import replace
-
-    task = type(load_task("flatland"))
-    monkeypatch.setattr(task, "defaults", replace(task.defaults, layout="scan", rays=(3, 5)))
-    assert lidardesign("fit", run).code == 0
+def test_without_a_layout_rays_are_chosen_along_the_condition(lidardesign, run):
+    result = lidardesign("fit", run, "--sensors", 1, "--rays", 4)
+    assert result.code == 0, result.err
     design = load_design(run / "designs" / "fit.yaml")
-    assert design.track is not None
-    assert design.rays == 5
+    assert design.layout == "selected"
+    assert len(design.track.azimuth_rad[0]) == design.rays == 4
 
 
-def test_a_layout_that_a_task_invented_is_refused(lidardesign, run, monkeypatch):
-    from dataclasses import replace
-
-    task = type(load_task("flatland"))
-    monkeypatch.setattr(task, "defaults", replace(task.defaults, layout="spiral"))
-    for command in ("fit", "constrain"):
-        result = lidardesign(command, run)
-        assert result.code == 2
-        assert "task flatland" in result.err
+@pytest.mark.parametrize(
+    ("arguments", "layout"),
+    [("--weight variation=1.5", "scan"), ("--at x_m=0.37", "scan"), ("--at x_m=0.37 --sensors 2", "grid")],
+)
+def test_where_rays_cannot_be_chosen_each_is_a_sensor_unless_sensors_are_counted(lidardesign, run, arguments, layout):
+    planned = lidardesign("fit", run, "--rays", 3, *arguments.split(), "--dry-run", "--json")
+    assert planned.json["settings"]["layout"] == layout
 
 
 def test_constraints_hold_along_a_track_and_at_a_value(lidardesign, run):
@@ -145,16 +139,17 @@ MISTAKES = [
     ("fit run --at x_m=1.01", 2, "0 to 1"),
     ("fit run --at y_m=0", 2, "x_m"),
     ("fit run --at speed=0", 2, "x_m"),
-    ("fit run", 2, "--layout scan, or --at x_m=VALUE"),
+    ("fit run --layout grid", 2, "--layout scan, or --at x_m=VALUE"),
     ("fit run --layout density --rays 4", 2, "--at x_m=VALUE"),
     ("fit run --layout distributed --rays 4", 2, "--at x_m=VALUE"),
     ("fit run --layout scan --rays 4 --sensors 2", 2, "--sensors"),
     ("constrain run --layout scan --rays 4 --sensors auto", 2, "--sensors"),
-    ("constrain run", 2, "--at x_m=VALUE"),
+    ("constrain run --layout grid", 2, "--at x_m=VALUE"),
     ("constrain run --at x_m=-0.1", 2, "0 to 1"),
     ("constrain run --layout scan --set origin.fixed_m=[0.5,0,0]", 4, "--at x_m=0.5"),
     ("fit plain --at x_m=0.5", 2, "no conditions"),
     ("constrain plain --at x_m=0.5", 2, "no conditions"),
+    ("fit two --sensors 1 --rays 4", 2, "--at x_m=VALUE --at azimuth_rad=VALUE"),
     ("fit two --layout scan --rays 4", 2, "--at x_m=VALUE --at azimuth_rad=VALUE"),
     ("fit turning --layout scan --rays 4", 2, "coordinate of the origin"),
 ]

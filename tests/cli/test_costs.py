@@ -73,7 +73,7 @@ def test_learning_says_what_it_cost_and_how_far_its_figures_may_be_off(lidardesi
 def test_fits_say_what_they_cost_and_write_the_same_bytes_whatever_the_time(lidardesign, flat):
     designs = []
     for name in ("one", "one"):
-        done = lidardesign(f"fit {flat} --rays 30 --name {name} --json")
+        done = lidardesign(f"fit {flat} --layout grid --rays 30 --name {name} --json")
         designs.append((flat / "designs" / "one.yaml").read_bytes())
         document = done.json
         assert adds_up(document) >= document["seconds"] - 0.01
@@ -84,12 +84,12 @@ def test_fits_say_what_they_cost_and_write_the_same_bytes_whatever_the_time(lida
     for name in ("log_likelihood", "ess", "admissible_mass"):
         assert estimates[name]["value"] == pytest.approx(document[name])
     assert estimates["rays"]["kind"] == "rounding"
-    lidardesign(f"constrain {flat} --set gate.width_m.max=0.4 --name two")
+    lidardesign(f"constrain {flat} --layout grid --set gate.width_m.max=0.4 --name two")
     assert set(read_manifest(flat)["timings"]) == {"fit", "constrain"}
 
 
 def test_reading_commands_keep_their_times_in_the_run_and_change_nothing_else_there(lidardesign, flat, tmp_path):
-    lidardesign(f"fit {flat} --sensors 2 --rays 20 --name one")
+    lidardesign(f"fit {flat} --layout grid --sensors 2 --rays 20 --name one")
     before = files_under(flat)
     evaluated = lidardesign(f"evaluate {flat} --rays 20 --set test=3 --json").json
     adds_up(evaluated)
@@ -106,7 +106,7 @@ def test_reading_commands_keep_their_times_in_the_run_and_change_nothing_else_th
 
 
 def test_a_run_that_cannot_be_written_is_still_read(lidardesign, flat, tmp_path):
-    lidardesign(f"fit {flat} --sensors 2 --rays 20 --name one")
+    lidardesign(f"fit {flat} --layout grid --sensors 2 --rays 20 --name one")
     with run_lock(flat):
         done = lidardesign(f"export {flat}/designs/one.yaml --format csv --out {tmp_path}/rays.csv")
     assert done.code == 0
@@ -116,12 +116,12 @@ def test_a_run_that_cannot_be_written_is_still_read(lidardesign, flat, tmp_path)
 
 
 def test_tables_are_for_people_who_did_not_ask_for_quiet(lidardesign, flat):
-    loud = lidardesign(f"fit {flat} --sensors 2 --name one")
+    loud = lidardesign(f"fit {flat} --layout grid --sensors 2 --name one")
     assert TITLE in loud.out
     assert "fitting" in loud.out
     assert "log-likelihood" in loud.out
     assert "+-" in loud.out
-    assert TITLE not in lidardesign(f"fit {flat} --sensors 2 --name one --quiet").out
+    assert TITLE not in lidardesign(f"fit {flat} --layout grid --sensors 2 --name one --quiet").out
     # what only looks something up does not tell people how long that took
     assert TITLE not in lidardesign(f"show {flat}/designs/one.yaml").out
     assert TITLE not in lidardesign("tasks list").out

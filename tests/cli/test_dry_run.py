@@ -22,7 +22,7 @@ def flat(tmp_path):
 @pytest.fixture
 def given_files(lidardesign, flat, tmp_path):
     """A design of two sensors, constraints and a configuration."""
-    lidardesign("fit", flat, "--sensors", 2)
+    lidardesign("fit", flat, "--layout", "grid", "--sensors", 2)
     (tmp_path / "few.yaml").write_text("budget: {rays: 40}\n")
     (tmp_path / "flat.yaml").write_text("task: {variation: 0.5}\n")
 
@@ -46,11 +46,11 @@ def announced(plan, tmp_path):
 
 
 COMMANDS = [
-    ("fit run --sensors 2 --name two", None),
-    ("constrain run --set gate.width_m.max=0.3 --name tight", None),
-    ("evaluate run --rays 9 --csv rows.csv", "fit run --sensors 1"),
-    ("export run/designs/fit.yaml --format csv --rays 9", "fit run --sensors 1"),
-    ("export run/designs/fit.yaml --format sensors-csv --out out/table.csv", "fit run --sensors 1"),
+    ("fit run --layout grid --sensors 2 --name two", None),
+    ("constrain run --layout grid --set gate.width_m.max=0.3 --name tight", None),
+    ("evaluate run --rays 9 --csv rows.csv", "fit run --layout grid --sensors 1"),
+    ("export run/designs/fit.yaml --format csv --rays 9", "fit run --layout grid --sensors 1"),
+    ("export run/designs/fit.yaml --format sensors-csv --out out/table.csv", "fit run --layout grid --sensors 1"),
 ]
 
 
@@ -108,6 +108,8 @@ REFUSED = [
     ("evaluate fitted --csv notes.txt/rows.csv", 3),
     ("evaluate fitted --report fitted", 3),
     ("export absent.yaml --format csv", 3),
+    ("evaluate fitted/designs/chosen.yaml --rays 9", 2),
+    ("export fitted/designs/chosen.yaml --format csv --rays 9", 2),
     ("export fitted/designs/fit.yaml --format jpeg", 2),
     ("export fitted/designs/fit.yaml --format csv --at hue=1", 2),
     ("export fitted/designs/fit.yaml --format csv --out fitted/designs/fit.yaml", 2),
@@ -128,7 +130,8 @@ def refusing(tmp_path_factory):
 def test_what_the_command_would_refuse_is_refused(capsys, monkeypatch, refusing, arguments, code):
     call = caller(capsys, refusing, monkeypatch)
     if not (refusing / "fitted" / "designs").exists():
-        call("fit", "fitted", "--sensors", 1)
+        call("fit", "fitted", "--layout", "grid", "--sensors", 1)
+        call("fit", "fitted", "--sensors", 1, "--rays", 8, "--name", "chosen")
     before = files_under(refusing)
     result = call(*arguments.split(), "--dry-run", "--json")
     assert result.code == code, result.out + result.err
@@ -145,7 +148,7 @@ def test_samples_that_were_changed_are_refused_before_anything_is_fitted(lidarde
 
 
 def test_people_are_told_in_words(lidardesign, flat, tmp_path):
-    lidardesign("fit", flat, "--sensors", 2)
+    lidardesign("fit", flat, "--layout", "grid", "--sensors", 2)
     result = lidardesign("fit", flat, "--sensors", 2, "--weight", "variation=1.5", "--dry-run")
     lines = result.out.splitlines()
     assert lines[0] == "fit would"

@@ -49,7 +49,7 @@ DETAILS = {"nothing": None, "a list": [1.0], "unnamed": {3: 1.0}, "text": {"seen
 @pytest.mark.parametrize("given", DETAILS)
 def test_details_of_a_score_that_are_no_numbers_by_name_are_the_tasks_fault(lidardesign, tmp_path, monkeypatch, given):
     run = make_run(tmp_path / "run", count=1000)
-    assert lidardesign("fit", run, "--sensors", 1).code == 0
+    assert lidardesign("fit", run, "--layout", "grid", "--sensors", 1).code == 0
     monkeypatch.setattr(FlatlandTask, "score", lambda *_: Score(1.0, details=DETAILS[given]))
     result = lidardesign("evaluate", run, "--rays", 4, "--json")
     assert result.code == 6, result.err

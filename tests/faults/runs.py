@@ -27,7 +27,7 @@ STAGED = [word.replace("steps=160", "steps=40") for word in LEARN] + ["--toleran
 FINISHED = (0, 1)
 COMMANDS = {
     "learn": LEARN,
-    "fit": ["fit", "run", "--sensors", "2", "--quiet"],
+    "fit": ["fit", "run", "--layout", "grid", "--sensors", "2", "--quiet"],
     "evaluate": ["evaluate", "run", "--rays", "8", "--csv", "run/rows.csv", "--report", "run/page.html", "--quiet"],
 }
 STATE = "checkpoint.safetensors"

@@ -363,7 +363,7 @@ def fitted(heads):
             samples,
             constraints=Constraints.from_mapping(values),
             rays=RAYS,
-            layout=task.defaults.layout,
+            layout="density",
             level=task.defaults.level,
             retarget=target.log_density,
         )

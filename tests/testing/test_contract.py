@@ -57,7 +57,6 @@ BROKEN = {
         (SCORE, METRIC_OF + "replace(self.metric, unit='m')\n\n" + SCORE, "it gave radius error [m]"),
     ],
     "defaults are accepted": [
-        (DEFAULTS, "Defaults(layout='spiral')", "defaults.layout is 'spiral'"),
         (DEFAULTS, "Defaults(rays=())", "defaults.rays is ()"),
         (DEFAULTS, "Defaults(rays=36)", "defaults.rays is 36"),
         (DEFAULTS, "Defaults(level=95)", "defaults.level is 95"),

@@ -102,7 +102,7 @@ def constrain(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """Fit sensors again under constraints: seconds, nothing is learned again."""
+    """Fit sensors again under constraints; nothing is learned again."""
     with command(json=json, quiet=quiet, debug=debug) as output:
         with phase("libraries"):
             from lidardesign.design.constraints.document import Constraints

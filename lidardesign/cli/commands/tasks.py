@@ -81,16 +81,11 @@ def show(
 def _show_task(document: Mapping[str, Any], rich: RichConsole) -> None:
     from rich.text import Text
 
-    from lidardesign.design.layouts.rays import LAYOUTS
-
     metric, defaults, space = document["metric"], document["defaults"], document["space"]
     rich.print(Text.assemble((document["name"], "bold"), f": {document['summary']}"))
     rich.print(f"metric: {metric['name']} [{metric['unit']}], {metric['better']} is better")
-    # a scan has as many sensors as rays
-    layout = LAYOUTS.get(defaults["layout"])
-    sensors = "" if layout is not None and layout.one_sensor_per_ray else f"{defaults['sensors']} sensors, "
-    usual = f"{sensors}layout {defaults['layout']}, level {defaults['level']:g}"
-    rich.print(f"defaults: {usual}, evaluated at {', '.join(map(str, defaults['rays']))} rays")
+    budgets = ", ".join(map(str, defaults["rays"]))
+    rich.print(f"defaults: level {defaults['level']:g}, evaluated at {budgets} rays")
     _show_keys(document["config"], "configuration (--set KEY=VALUE)", rich)
     if space:
         rich.print("design space (--set space.KEY=[LOW,HIGH])", style="italic")
