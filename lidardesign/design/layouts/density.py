@@ -55,7 +55,6 @@ class DensityLayout(Layout):
 
     name = "density"
     fitted_as = "density"
-    follows_from_sensors = False
     follows_from_samples = True
 
     def fit(self, request: FitProblem) -> FittedDesign:

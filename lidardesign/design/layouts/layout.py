@@ -233,7 +233,6 @@ class Layout(ABC):
         fitted_as: The layout in which sensors like a design's are fitted.
         usual_gates: Whether rays have their sensor's gate or their own, where nothing else is said.
         one_sensor_per_ray: Whether every ray is a sensor of its own: another number of rays is another fit.
-        follows_from_sensors: Whether the sensors alone say where rays go.
         follows_from_samples: Whether rays follow from samples of the density alone; None where only gates per ray do.
         starts_at_sensors: Whether rays start where their sensor stands.
         chosen_on_scenes: Whether rays are chosen by what a task says of scenes, which takes a run.
@@ -245,7 +244,6 @@ class Layout(ABC):
     fitted_as: ClassVar[LayoutName]
     usual_gates: ClassVar[Gates] = "sensor"
     one_sensor_per_ray: ClassVar[bool] = False
-    follows_from_sensors: ClassVar[bool] = True
     follows_from_samples: ClassVar[bool | None] = None
     starts_at_sensors: ClassVar[bool] = True
     chosen_on_scenes: ClassVar[bool] = False

@@ -31,7 +31,6 @@ class SelectedLayout(Layout):
 
     name = "selected"
     fitted_as = "density"
-    follows_from_sensors = False
     chosen_on_scenes = True
 
     def leaves_rays_open(self, gates: Gates | None) -> bool:
@@ -87,7 +86,6 @@ class FixedLayout(Layout):
     name = "fixed"
     # fixed rays are what they are: sensors like those of parts have even rays
     fitted_as = "grid"
-    follows_from_sensors = False
     follows_from_samples = False
 
     def check_constraints(self, constraints: Constraints) -> None:

@@ -1,9 +1,8 @@
 """The baseline `cma`: what direct optimisation of the metric finds, within a budget of time per number of rays.
 
 It varies the sensors that the first design has, under the design's constraints and with its layout of rays, and asks
-the task's metric on training scenes alone (see `lidardesign.evaluate.cma.search`). A design whose rays follow from
-samples of the density (layout `density`), were chosen (`selected`), or are the pattern of a part (`fixed`), is followed
-with even rays in its sensors' fields.
+the task's metric on training scenes alone (see `lidardesign.evaluate.cma.search`). A scan and a track are followed ray
+by ray, every other design with even rays from a point of each sensor in its field of view.
 """
 
 from __future__ import annotations
@@ -109,9 +108,6 @@ class SearchRecord:
             "value": found.value,
             "satisfied": not self.broken,
             "broken": list(self.broken),
-            "curve": [
-                dict(zip(("seconds", "evaluations", "scenes", "value"), point, strict=True)) for point in found.curve
-            ],
         }
 
 
@@ -206,12 +202,12 @@ class CmaCandidate:
 
     def _rules(self, rays: RayAllowance) -> SearchRules:
         design = self.followed
-        layout = design.layout if layout_of(design).follows_from_sensors else "grid"
         space = self.space
         if space.conditioned:
             bolted = self.conditions[len(self.conditions) // 2] if design.track is None else {}
             space = space.at({**bolted, **design.at})
-        return SearchRules(space, self._constraints(), design.level, layout, design.at, self._varies_gates(rays))
+        per_ray = design.track is not None or layout_of(design).one_sensor_per_ray
+        return SearchRules(space, self._constraints(), design.level, per_ray, design.at, self._varies_gates(rays))
 
     def _document(self) -> dict[str, Any]:
         """The followed design's constraints; the number of rays is that of the comparison."""
@@ -241,6 +237,8 @@ class CmaCandidate:
         """The number of rays of a scan: as asked, or what a bandwidth pays for at the followed design's gates."""
         if rays.count is not None:
             return rays.count
-        widths = np.array([end - start for start, end in (sensor.gate_m for sensor in self.followed.sensors)])
+        track = self.followed.track
+        gates_m = np.array([sensor.gate_m for sensor in self.followed.sensors]) if track is None else track.gate_m
+        widths = np.diff(gates_m)[..., 0].reshape(-1, gates_m.shape[-2]).mean(axis=0)
         affordable = math.floor(len(widths) * (rays.limit_mbps or 0.0) / rays.bandwidth.mbps_of_widths(widths))
         return int(np.clip(affordable, 1, min(MOST_RAYS, MOST_RAYS_FACTOR * len(widths))))

@@ -3,10 +3,8 @@
 A vector holds, per sensor and in steps that change a score about equally: the shift of its origin along the free
 axes, the turn of its boresight in the start's own tangent plane, the roll that is left when the frame is carried along,
 the logarithms of both angular spreads, the middle and the logarithm of the width of its gate, and the logarithm of its
-weight. Sensors whose origins are spread out also vary the matrix logarithm of their covariance, how far in front of
-the sensor its rays meet (0: nowhere, 1: at its mean range, in each tangent direction), and the share of the gate that
-is left for a ray whose origin is known. A scan has no spreads and weights to vary; a track is a scan at both ends of
-its way, linear in between. A vector beyond the constraints stands for the projected one.
+weight. A scan has no spreads and weights to vary; a track is a scan at both ends of its way, linear in between. A
+vector beyond the constraints stands for the projected one.
 """
 
 from __future__ import annotations
@@ -23,21 +21,18 @@ from lidardesign.design.constraints.feasibility import BIN_MARGIN, BandwidthBudg
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.track import boresight_azimuth
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec, Sensor, Track, interval_factor
-from lidardesign.evaluate.baselines.candidates import RaysPerCondition, mean_mbps
-from lidardesign.evaluate.cma.parameters import NARROWEST_RAD, SearchRules, SensorParameters, exp_matrix, log_matrix
-from lidardesign.numerics import TINY, safe_divide, sphere_exp, sphere_log
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition
+from lidardesign.evaluate.cma.parameters import NARROWEST_RAD, SearchRules, SensorParameters
+from lidardesign.numerics import TINY, sphere_exp, sphere_log
 from lidardesign.space import DIMENSIONS, angles
 
-# One unit of a vector: shares of the start's own field of view, gate and origin spread, or nats, or radians.
-DIRECTION_SHARE, GATE_SHARE, ORIGIN_SHARE = 0.15, 0.1, 0.5
-ROLL_RAD, LOG_SPREAD, LOG_WIDTH, LOG_WEIGHT, LOG_SHARE = 0.2, 0.15, 0.15, 0.2, 0.2
-LOG_COVARIANCE, FOCUS = 0.3, 0.15
-# A shift of an origin that is a point at the start, as a share of its box.
+# One unit of a vector: shares of the start's own field of view and gate, or nats, or radians.
+DIRECTION_SHARE, GATE_SHARE = 0.15, 0.1
+ROLL_RAD, LOG_SPREAD, LOG_WIDTH, LOG_WEIGHT = 0.2, 0.15, 0.15, 0.2
+# A shift of an origin, as a share of its box.
 BOX_SHARE = 0.05
 # The turn of a ray of a track, as a share of the angle that is its own where rays are even.
 TURN_SHARE = 0.5
-# Rays whose gates are their own cost less than their sensors' gates: so often is the number of rays raised.
-MOST_RAISES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +81,9 @@ def widest_bins(fits: Callable[[float], bool], widths_m: np.ndarray, read_out: B
 
 
 def with_gate(sensor: Sensor, start_m: float, end_m: float) -> Sensor:
-    """A sensor with another gate; what its coupling leaves of the gate's spread keeps its share."""
+    """A sensor with another gate."""
     spread = (end_m - start_m) / (2 * interval_factor(sensor.level))
-    coupling = sensor.coupling
-    if coupling is not None:
-        coupling = replace(coupling, spread_m=spread * safe_divide(coupling.spread_m, sensor.spread_range_m, 1.0))
-    return replace(sensor, range_m=(start_m + end_m) / 2, spread_range_m=spread, coupling=coupling)
+    return replace(sensor, range_m=(start_m + end_m) / 2, spread_range_m=spread)
 
 
 class DesignModel:
@@ -115,18 +107,11 @@ class DesignModel:
         way: Way | None = None,
     ) -> None:
         self.rules, self.conditions, self.way, self._document = rules, conditions, way, dict(document)
-        if rules.spread_axes:
-            # sensors are spread out, but do not leave the space
-            origin = dict(self._document.get("origin") or {})
-            low, high = (list(map(float, end[:3])) for end in (rules.space.low, rules.space.high))
-            origin["low_m"] = [max(pair) for pair in zip(low, origin.get("low_m", low), strict=True)]
-            origin["high_m"] = [min(pair) for pair in zip(high, origin.get("high_m", high), strict=True)]
-            self._document["origin"] = origin
         places = 1 if way is None else len(way.places)
         self._bounds = rules.bounds(len(start) // places)
         if way is not None:
             self._bounds = self._bounds.take(np.tile(np.arange(len(start) // places), places))
-        self._start = SensorParameters.of(start, rules).projected(rules, self._bounds)
+        self._start = SensorParameters.of(start).projected(rules, self._bounds)
         self._columns = self._make_columns()
         self.size = len(start) * sum(width for width, _ in self._columns.values())
         self.zero = self.projected(np.zeros(self.size))
@@ -134,11 +119,8 @@ class DesignModel:
     def _make_columns(self) -> dict[str, tuple[int, np.ndarray]]:
         """What one sensor's part of a vector holds, by name: its width, and one unit of it, shape (G or 1, any)."""
         start, rules, axes = self._start, self.rules, self.rules.axes
-        spread, gates, several = len(rules.spread_axes), int(axes.range and rules.gates), not rules.one_sensor_per_ray
+        gates, several = int(axes.range and rules.gates), not rules.one_sensor_per_ray
         shift = BOX_SHARE * (self._bounds.origin_high - self._bounds.origin_low)[:, list(axes.origin)]
-        if spread:
-            deviation = np.sqrt(np.einsum("gii->gi", start.covariance))
-            shift = np.where(deviation > 0, ORIGIN_SHARE * deviation, shift)
         field = 2 * rules.interval * np.maximum(start.spread.max(axis=1, keepdims=True), NARROWEST_RAD)
         turn = DIRECTION_SHARE * field
         if self.way is not None:
@@ -154,9 +136,6 @@ class DesignModel:
             "middle": (gates, GATE_SHARE * np.maximum(np.diff(start.gate, axis=1), TINY)),
             "width": (gates, LOG_WIDTH),
             "log_weight": (int(several and len(start) > 1), LOG_WEIGHT),
-            "covariance": (spread * (spread + 1) // 2, LOG_COVARIANCE),
-            "focus": (axes.angular * bool(spread), FOCUS),
-            "log_share": (gates * bool(spread), LOG_SHARE),
         }
         return {name: (width, np.atleast_2d(unit)) for name, (width, unit) in columns.items() if width}
 
@@ -173,13 +152,7 @@ class DesignModel:
             "middle": (found.gate.mean(axis=1) - start.gate.mean(axis=1))[:, None],
             "width": np.log(np.maximum(widths[0] / np.maximum(widths[1], TINY), TINY)),
             "log_weight": (found.log_weight - start.log_weight)[:, None],
-            "focus": (found.focus - start.focus)[:, free],
-            "log_share": (found.log_share - start.log_share)[:, None],
         }
-        if self.rules.spread_axes:
-            moved = log_matrix(found.covariance) - log_matrix(start.covariance)
-            rows, columns = np.triu_indices(moved.shape[1])
-            values["covariance"] = moved[:, rows, columns]
         parts = [values[name] / unit for name, (_, unit) in self._columns.items()]
         return np.concatenate(parts, axis=1).ravel() if parts else np.zeros(0)
 
@@ -206,15 +179,7 @@ class DesignModel:
             middle = start.gate.mean(axis=1) + parts["middle"][:, 0]
             half = np.diff(start.gate, axis=1)[:, 0] / 2 * np.exp(parts["width"][:, 0])
             changes["gate"] = np.stack([middle - half, middle + half], axis=1)
-        if "covariance" in parts:
-            upper, lower = np.triu_indices(len(axes.origin))
-            shift = np.zeros((len(start), len(axes.origin), len(axes.origin)))
-            shift[:, upper, lower] = shift[:, lower, upper] = parts["covariance"]
-            changes["covariance"] = exp_matrix(log_matrix(start.covariance) + shift)
-        if "focus" in parts:
-            changes["focus"] = start.focus.copy()
-            changes["focus"][:, free] += parts["focus"]
-        for name in ("roll", "log_weight", "log_share"):
+        for name in ("roll", "log_weight"):
             if name in parts:
                 changes[name] = getattr(start, name) + parts[name][:, 0]
         bounds = self._bounds if math.isinf(narrowed_m) else self._bounds.narrowed(narrowed_m)
@@ -227,20 +192,7 @@ class DesignModel:
         for read_out in budget.read_outs(self.rules):
             found = self._afforded(vector, found, count, read_out)
             count = count if self._fits(found, count, read_out) else 0
-        design = self._design(found, count)
-        if not (self.rules.extends_origins and budget.count is None and count):
-            return design
-        # more rays, where gates of their own leave bandwidth over
-        for _ in range(MOST_RAISES):
-            spent, limit = mean_mbps(self.laid_out(design), budget.bandwidth), budget.limit_mbps or 0.0
-            count = int((design.rays or 0) * limit / spent) if spent > 0 else 0
-            if count <= (design.rays or 0):
-                break
-            more = self._design(found, min(count, MOST_RAYS))
-            if mean_mbps(self.laid_out(more), budget.bandwidth) > limit:
-                break
-            design = more
-        return design
+        return self._design(found, count)
 
     def positions(self, vector: np.ndarray, budget: RayAllowance) -> RaysPerCondition:
         """The rays of that design at every condition value."""
@@ -273,8 +225,12 @@ class DesignModel:
         widths = np.diff(found.gate, axis=1)[:, 0]
         return widths if self.way is None else widths.reshape(len(self.way.places), -1).max(axis=0)
 
+    def _weights(self, found: SensorParameters) -> np.ndarray:
+        """Shares of the rays of each sensor, shape (G,); of a track every ray's, which are equal."""
+        return np.exp(found.log_weight)[: len(self._widths(found))]
+
     def _count(self, found: SensorParameters, budget: RayAllowance) -> int:
-        widths, weights = self._widths(found), np.exp(found.log_weight)
+        widths, weights = self._widths(found), self._weights(found)
         if self.rules.one_sensor_per_ray:
             return len(widths)
         if budget.count is not None:
@@ -282,11 +238,7 @@ class DesignModel:
         return min(*(one.affordable_rays(widths, weights) for one in budget.read_outs(self.rules)), MOST_RAYS)
 
     def _fits(self, found: SensorParameters, count: int, read_out: BandwidthBudget) -> bool:
-        widths = self._widths(found)
-        if self.rules.one_sensor_per_ray:
-            shares = np.full(len(widths), int(count > 0))
-            return read_out.model.mbps_of_widths(widths, shares) <= (read_out.limit_mbps or math.inf)
-        return read_out.fits(widths, np.exp(found.log_weight), count)
+        return read_out.fits(self._widths(found), self._weights(found), count)
 
     def _design(self, found: SensorParameters, count: int) -> DesignSpec:
         rules, track, at = self.rules, None, dict(self.rules.at)
@@ -294,11 +246,9 @@ class DesignModel:
             track, sensors = self._track(found, self.way)
             at.pop(track.dimension, None)
         else:
-            one_each = rules.one_sensor_per_ray and count
-            shares = np.ones(len(found)) if one_each else split_budget(np.exp(found.log_weight), count)
-            sensors = found.sensors(rules, [int(share) for share in shares])
+            sensors = found.sensors(rules, split_budget(np.exp(found.log_weight), count).tolist())
         return DesignSpec(
-            name="cma", sensors=sensors, layout=rules.layout if track is None else "scan", rays=count,
+            name="cma", sensors=sensors, layout="scan" if rules.one_sensor_per_ray else "grid", rays=count,
             constraints=self._document, level=rules.level, track=track, at=at,
         )  # fmt: skip
 

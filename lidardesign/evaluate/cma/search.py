@@ -45,7 +45,6 @@ STEP = 0.3  # the first standard deviation, in units of the parameters' own step
 # Beyond so many numbers a full covariance takes longer to learn than any budget lasts: variances alone are adapted.
 MOST_CORRELATED = 250
 MOST_POPULATION = 4  # times the usual one
-CURVE_POINTS = 200
 STARTS_AT_ONCE = 8
 # Of more starts than that, the best in so many scenes are looked at in more.
 START_SCENES = 2
@@ -167,8 +166,6 @@ class SearchResult:
         candidates, evaluations: Candidates that were scored, and scores of one candidate in one scene.
         scenes: The number of training scenes that the finalists were compared on.
         restarts: Searches that converged before the end.
-        curve: The best score so far, as (seconds, evaluations, scenes, value): falls within a stage, and may jump
-            where the next stage sees more scenes.
     """
 
     model: DesignModel
@@ -181,7 +178,6 @@ class SearchResult:
     evaluations: int
     scenes: int
     restarts: int
-    curve: Sequence[tuple[float, int, int, float]]
 
 
 @dataclass(eq=False)
@@ -223,7 +219,6 @@ class Search:
         self._last = min(len(objective.scenes), MOST_SCENES)
         self._stages = _stages(self._last)
         self._per_evaluation = 0.0
-        self._curve: list[tuple[float, int, int, float]] = []
         self._finalists: list[_Scored] = []
 
     def run(self) -> SearchResult:
@@ -241,7 +236,7 @@ class Search:
                 self._finalists.append(replace(best))
                 with contextlib.suppress(OutOfTimeError):
                     best = replace(best, value=float(self._values([best], self._stages[stage])[0]))
-                    self._note(best, self._stages[stage])
+                    self._tell(best)
             try:
                 self._step(strategy, best, self._stages[stage])
             except OutOfTimeError:
@@ -263,7 +258,7 @@ class Search:
         if len(starts) > STARTS_AT_ONCE:
             starts = self._ranked(starts, min(START_SCENES, scenes))[:STARTS_AT_ONCE]
         best = self._ranked(starts, scenes)[0]
-        self._note(best, scenes)
+        self._tell(best)
         return best
 
     def _ranked(self, starts: Sequence[_Scored], scenes: int) -> list[_Scored]:
@@ -289,7 +284,7 @@ class Search:
         first = int(values.argmin())
         if values[first] < best.value:
             best.model, best.vector, best.value = strategy.model, admitted[first].vector, float(values[first])
-        self._note(best, scenes)
+        self._tell(best)
 
     def _values(self, scored: Sequence[_Scored], scenes: int) -> np.ndarray:
         """Mean scores over the first scenes, lower is better, one each."""
@@ -324,22 +319,17 @@ class Search:
         scores = dict(zip(unique, values.tolist(), strict=True))
         best = min(scores, key=scores.__getitem__)
         sign = self._objective.sign
-        seconds = self._budget.clock() - self._began
-        self._curve.append((seconds, self._evaluations, scenes, sign * scores[best]))
-        # the last point stays
-        places = np.linspace(0, len(self._curve) - 1, min(len(self._curve), CURVE_POINTS)).round().astype(np.int64)
         return SearchResult(
             model=unique[best].model,
             vector=unique[best].vector,
             start_value=sign * scores[id(start.model), start.vector.tobytes()],
             value=sign * scores[best],
-            seconds=seconds,
+            seconds=self._budget.clock() - self._began,
             cpu_seconds=time.process_time() - self._worked,
             candidates=self._candidates,
             evaluations=self._evaluations,
             scenes=scenes,
             restarts=self._restarts,
-            curve=[self._curve[place] for place in np.unique(places)],
         )
 
     def _final_scenes(self, finalists: int) -> int:
@@ -349,12 +339,9 @@ class Search:
         affordable = min(in_time, (self._budget.evaluations - self._evaluations) / finalists)
         return int(np.clip(affordable, self._stages[0], self._last))
 
-    def _note(self, best: _Scored, scenes: int) -> None:
-        value = self._objective.sign * best.value
-        if not self._curve or self._curve[-1][2:] != (scenes, value):
-            self._curve.append((self._budget.clock() - self._began, self._evaluations, scenes, value))
+    def _tell(self, best: _Scored) -> None:
         if self._show is not None:
-            self._show(Progress(min(self._share(), 1.0), self._evaluations, value))
+            self._show(Progress(min(self._share(), 1.0), self._evaluations, self._objective.sign * best.value))
 
 
 def _stages(scenes: int) -> list[int]:

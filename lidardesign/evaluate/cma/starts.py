@@ -1,9 +1,8 @@
 """Where a direct search starts: what an engineer would try first, with as many sensors as the design has.
 
 All are built from where training returns are. Sensors at given origins tile the returns as they see them, in every
-arrangement of rows, with equal weights or weights by returns; another tiling covers the whole space. Sensors whose
-origins are spread out tile the origins, and look in parallel or at where the returns are. Scans are the even layouts
-that `bounding` and `uniform` take, with one gate, or with gates by the returns next to each ray.
+arrangement of rows, with equal weights or weights by returns; another tiling covers the whole space. Scans are the
+even layouts that `bounding` and `uniform` take, with one gate, or with gates by the returns next to each ray.
 """
 
 from __future__ import annotations
@@ -19,22 +18,20 @@ from scipy.spatial import cKDTree
 
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.mixture.bounds import Bounds
-from lidardesign.design.sensor import Coupling, Sensor, boresight_frame
-from lidardesign.evaluate.baselines.bounding import bounding, parallel_angles
+from lidardesign.design.sensor import Sensor, boresight_frame
+from lidardesign.evaluate.baselines.bounding import bounding
 from lidardesign.evaluate.baselines.candidates import LayoutSite, opened_gate, whole_range
 from lidardesign.evaluate.baselines.even import central, even_placement
 from lidardesign.evaluate.baselines.views import RAY_AXES, Observed, TrainingViews, dense_points, unrolled
 from lidardesign.evaluate.cma.model import with_gate
 from lidardesign.evaluate.cma.parameters import NARROWEST_RAD, SearchRules, admitted_origins
 from lidardesign.numerics import TINY, sphere_exp, sphere_log
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, angles
 
 # Returns further apart than this from their middle are tiled in azimuth and elevation, others in a tangent plane.
 TANGENT_RAD = math.radians(70)
 # A central 99 % means nothing from fewer returns.
 FEWEST_RETURNS = 20
-# The angular spread of sensors whose rays are parallel, to start with.
-PARALLEL_RAD = math.radians(2)
 
 Start = tuple[Sensor, ...]
 
@@ -57,9 +54,7 @@ def starts(rules: SearchRules, views: TrainingViews, count: int) -> list[Start]:
     observed = views.hits(dense_points(rules.space))
     if rules.one_sensor_per_ray:
         return scan_starts(rules, views, observed, count)
-    kinds = (_focused, _parallel) if rules.spread_axes else (_tilings,)
-    found = [start for kind in kinds if len(observed.points) for start in kind(rules, observed, count)]
-    found.append(_even(rules, count))
+    found = [*(_tilings(rules, observed, count) if len(observed.points) else ()), _even(rules, count)]
     if rules.gates:
         return found
     whole_m = whole_range(rules.space).tolist()
@@ -197,93 +192,29 @@ def _even(rules: SearchRules, count: int) -> Start:
     for index, tile in enumerate(tiles(low, high, count, rows)):
         azimuth, elevation = ((tile.low + tile.high) / 2).tolist()
         field = (tile.high - tile.low) * [math.cos(elevation), 1.0]
-        sensor = _sensor(rules, index, 1.0 / count, origins[index], (azimuth, elevation), field, whole_range(space))
-        if rules.spread_axes:
-            extent = (bounds.origin_high - bounds.origin_low)[index] / math.sqrt(count)
-            sensor = _spread_out(rules, sensor, extent, 0.0, sensor.spread_horizontal_rad, sensor.spread_vertical_rad)
-        sensors.append(sensor)
+        gate = whole_range(space)
+        sensors.append(_sensor(rules, index, 1.0 / count, origins[index], (azimuth, elevation), field, gate))
     return tuple(sensors)
 
 
-def _spread_out(rules: SearchRules, sensor: Sensor, extent_m: np.ndarray, focus: float, *spread_rad: float) -> Sensor:
-    """A sensor whose origins fill a box, with rays that meet at its mean range over the focus (0: parallel)."""
-    along = np.isin(np.arange(3), rules.spread_axes)
-    deviation = np.where(along, np.maximum(extent_m, 0.0) / (2 * rules.interval), 0.0)
-    slopes = -focus * sensor.frame[1:] / max(sensor.range_m, NARROWEST_RAD)
-    coupling = Coupling(slopes, np.zeros(3), np.zeros(2), np.array(spread_rad), sensor.spread_range_m)
-    whole = np.hypot(spread_rad, np.sqrt(np.square(slopes * deviation).sum(axis=1)))
-    return replace(
-        sensor,
-        origin_covariance_m2=np.diag(np.square(deviation)),
-        spread_horizontal_rad=float(whole[0]),
-        spread_vertical_rad=float(whole[1]),
-        coupling=coupling,
-    )
-
-
-def _origin_tiles(
-    rules: SearchRules, low: np.ndarray, high: np.ndarray, count: int
-) -> Iterator[list[tuple[np.ndarray, Tile]]]:
-    """Origins and the boxes (3,) about them: every arrangement of tiles along the two longest spread axes."""
-    axes = sorted(rules.spread_axes, key=lambda axis: low[axis] - high[axis])[:2]
-    pair = (axes * 2)[:2]
-    for rows in range(1, count + 1) if len(axes) == 2 else (1,):
-        plane = tiles(low[pair], high[pair], count, rows)
-        boxes = [Tile(low.copy(), high.copy()) for _ in plane]
-        for box, tile in zip(boxes, plane, strict=True):
-            for place, axis in enumerate(axes):
-                box.low[axis], box.high[axis] = tile.low[place], tile.high[place]
-        middles = np.array([(box.low + box.high) / 2 for box in boxes])
-        yield list(zip(admitted_origins(middles, rules.bounds(count), rules.constraints), boxes, strict=True))
-
-
-def _parallel(rules: SearchRules, observed: Observed, count: int) -> Iterator[Start]:
-    """Origins over the returns, looking straight down where that is admitted."""
-    azimuth, elevation = parallel_angles(rules.space, observed)
-    looking = direction(azimuth, elevation)
-    low, high = (np.clip(end, rules.space.low[:3], rules.space.high[:3]) for end in central(observed.hits_m))
-    field = 2 * rules.interval * np.full(2, PARALLEL_RAD)
-    for parts in _origin_tiles(rules, low, high, count):
-        start = []
-        for index, (origin, box) in enumerate(parts):
-            gate = _gate(rules, np.maximum((observed.hits_m - origin) @ looking, 0.0))
-            sensor = _sensor(rules, index, 1.0 / count, origin, (azimuth, elevation), field, gate)
-            start.append(_spread_out(rules, sensor, box.high - box.low, 0.0, PARALLEL_RAD, PARALLEL_RAD))
-        yield tuple(start)
-
-
-def _focused(rules: SearchRules, observed: Observed, count: int) -> Iterator[Start]:
-    """Origins over all that see returns, each part looking at the middle of what it sees, or half as focused."""
-    for parts in _origin_tiles(rules, *central(observed.points[:, :3]), count):
-        for focus in (1.0, 0.5):
-            yield tuple(
-                _looking_at(rules, observed, index, origin, box, count, focus)
-                for index, (origin, box) in enumerate(parts)
-            )
-
-
-def _looking_at(
-    rules: SearchRules, observed: Observed, index: int, origin: np.ndarray, box: Tile, count: int, focus: float
-) -> Sensor:
-    """The sensor whose origins fill a box, looking at what is seen from there."""
-    starts_m = observed.points[:, :3]
-    inside = ((starts_m >= box.low) & (starts_m <= box.high))[:, list(rules.spread_axes)].all(axis=1)
-    chosen = inside if inside.sum() >= FEWEST_RETURNS else np.ones(len(inside), dtype=bool)
-    hits, middle = observed.hits_m[chosen], observed.hits_m[chosen].mean(axis=0)
-    azimuth, elevation = (float(angle) for angle in angles(middle - origin))
-    gate = _gate(rules, np.linalg.norm(hits - origin, axis=1))
-    sensor = _sensor(rules, index, 1.0 / count, origin, (azimuth, elevation), np.zeros(2), gate)
-    across = (hits - middle) @ sensor.frame[1:].T / max(float(np.linalg.norm(middle - origin)), NARROWEST_RAD)
-    return _spread_out(
-        rules, sensor, box.high - box.low, focus, *np.maximum(across.std(axis=0), NARROWEST_RAD).tolist()
-    )
-
-
 def scan_starts(rules: SearchRules, views: TrainingViews, observed: Observed, count: int) -> list[Start]:
-    """Even rays with one gate, as the simple rivals have them, and with gates by the returns next to each ray."""
+    """Even rays as the simple rivals have them, with one gate, and with gates by the returns next to each ray.
+
+    They are those of `bounding`, the same at equal shares of the returns, and those of `uniform`.
+    """
+    space = rules.space
+    laid_out = [layout.lay_out(count, LayoutSite(space)) for layout in bounding(views)]
+    layouts = [(points, gates[0]) for points, gates in laid_out]
+    angular = [axis for axis in (AZIMUTH, ELEVATION) if axis in space.free]
+    if len(angular) == 1 and len(observed.points) and layouts:
+        points = layouts[0][0].copy()
+        points[:, angular[0]] = np.quantile(observed.points[:, angular[0]], (np.arange(count) + 0.5) / count)
+        layouts.append((points, layouts[0][1]))
+    low, high = np.array(space.low[:RAY_AXES]), np.array(space.high[:RAY_AXES])
+    layouts.append((even_placement(low, high, count), whole_range(space)))
     found = []
-    for points, gate in scan_layouts(rules.space, views, observed, count):
-        every = np.tile(gate if rules.gates else whole_range(rules.space), (count, 1))
+    for points, gate in layouts:
+        every = np.tile(gate if rules.gates else whole_range(space), (count, 1))
         for gates in (every, nearby_gates(rules, observed, points, every))[: 1 + rules.gates]:
             found.append(
                 tuple(
@@ -292,21 +223,6 @@ def scan_starts(rules: SearchRules, views: TrainingViews, observed: Observed, co
                 )
             )
     return found
-
-
-def scan_layouts(
-    space: DesignSpace, views: TrainingViews, observed: Observed, count: int
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Points (N, 5) and one gate (2,) each: those of `bounding`, at equal shares of the returns, and of `uniform`."""
-    laid_out = [layout.lay_out(count, LayoutSite(space)) for layout in bounding(views)]
-    found = [(points, gates[0]) for points, gates in laid_out]
-    angular = [axis for axis in (AZIMUTH, ELEVATION) if axis in space.free]
-    if len(angular) == 1 and len(observed.points) and found:
-        points = found[0][0].copy()
-        points[:, angular[0]] = np.quantile(observed.points[:, angular[0]], (np.arange(count) + 0.5) / count)
-        found.append((points, found[0][1]))
-    low, high = np.array(space.low[:RAY_AXES]), np.array(space.high[:RAY_AXES])
-    return [*found, (even_placement(low, high, count), whole_range(space))]
 
 
 def nearby_gates(rules: SearchRules, observed: Observed, points: np.ndarray, gates: np.ndarray) -> np.ndarray:
