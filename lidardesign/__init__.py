@@ -3,7 +3,7 @@
     import lidardesign as ld
 
     run = ld.learn("face", preset="draft", out="runs/face")     # or ld.open_run("runs/face")
-    design = run.fit(sensors=4, constraints={"gate": {"width_m": {"max": 0.1}}}, rays=576, name="kept")
+    design = run.fit(sensors=4, constraints={"gate": {"width_m": {"max": 0.1}}}, name="kept")
     design.save()
     print(run.evaluate([design], rays=[196, 361]).rows)
 

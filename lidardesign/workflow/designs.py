@@ -44,7 +44,7 @@ class Design(DesignSource):
         result: What the fit found: log-likelihood, checks of constraints, standard errors; None for a loaded one.
 
     Example:
-        >>> design = run.fit(sensors=2, rays=36, name="two")
+        >>> design = run.fit(sensors=2, rays=16, name="two")
         >>> [sensor.name for sensor in design.specification.sensors]
         ['s0', 's1']
         >>> design.rays(16).direction.shape

@@ -309,7 +309,7 @@ class Scores:
         request: What was asked for.
 
     Example:
-        >>> scores = run.evaluate([run.fit(sensors=2, rays=36, name="two")], rays=[16])
+        >>> scores = run.evaluate([run.fit(sensors=2, rays=16, name="two")], rays=[16])
         >>> [row.design for row in scores.rows]
         ['two', 'uniform', 'random', 'bounding', 'silhouette', 'greedy']
         >>> [pair.b for pair in scores.paired]

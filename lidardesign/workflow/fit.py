@@ -295,8 +295,8 @@ def _sensors(
         return asked if asked is not None else bounds.count
     if base is None:
         return None if layout.one_sensor_per_ray else BEST
-    usual = max(len(base.sensors), len(constraints.each))
-    return min(max(usual, bounds.min or usual), bounds.max or usual)
+    usual = max(len(base.sensors), len(constraints.each), bounds.min or 1)
+    return min(usual, bounds.max or usual)
 
 
 def _rays(asked: int | None, constraints: Constraints, base: DesignSpec | None, usual: int | None) -> int | None:

@@ -18,6 +18,7 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import ConstraintCheck, check_design
 from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import FitResult, rays_at
 from lidardesign.design.fit import fit as fit_samples
@@ -141,6 +142,8 @@ def _best_count(fitter: Fitter) -> int:
 
     request = fitter.request
     run = request.run
+    if request.constraints is not None:
+        check_feasible(request.constraints, run.config.space, rays=request.choices["rays"])
     scenes = {
         purpose: list(islice(selection_scenes(run, request.seed, purpose), information.FEW_SCENES))
         for purpose in ("choice", "held back")

@@ -23,9 +23,10 @@ from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_d
 from lidardesign.design.fit import fit, rays_at
 from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.layouts.track import TrackSamples, aimed_rays, interpolated, placed, travels
+from lidardesign.design.layouts.track import TrackSamples, aimed_rays, interpolated, placed, track_of, travels
 from lidardesign.design.sensor import DesignSpec, Sensor, Track
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.geometry.rays import Rays
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, angles
@@ -553,3 +554,73 @@ def test_the_error_of_a_tracks_likelihood_is_its_spread_over_other_samples(monke
     stated = np.mean([one.error_estimates["log_likelihood"].error for one in tracks])
     spread = np.std([one.log_likelihood for one in tracks])
     assert stated == pytest.approx(spread, rel=4 / math.sqrt(2 * repeats))
+
+
+# --- tracks of rays that are given at knots
+
+KNOTS, SENSOR = [-0.2, 0.5, 1.1, 2.0], np.array([0, 0, 0, 1, 1])
+
+
+def given_at(x, turn=0.0):
+    """Two sensors whose rays are well apart, and turn and listen further the farther the robot is."""
+    azimuth = np.array([-1.0, 0.0, 1.0, -0.5, 0.5]) + 0.1 * x + turn
+    elevation = np.array([0.1, 0.2, 0.3, 0.4, 0.5]) - 0.05 * x
+    start = np.array([1.0, 1.1, 1.2, 1.3, 1.4]) + 0.1 * x
+    return Rays.from_angles(np.zeros((5, 3)), azimuth, elevation, np.stack([start, start + 0.3], axis=1), SENSOR)
+
+
+def permuted(rays, seed):
+    """The same rays with those of each sensor in another order."""
+    generator = np.random.default_rng(seed)
+    return rays.subset(np.concatenate([generator.permutation(np.flatnonzero(index == SENSOR)) for index in (0, 1)]))
+
+
+def assert_track(track, tables, ends=(-0.5, 4.0)):
+    for x, rays in tables:
+        azimuth, elevation, gate = interpolated(track, x)
+        np.testing.assert_allclose(azimuth, rays.azimuth_rad, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(elevation, rays.elevation_rad)
+        np.testing.assert_array_equal(gate, rays.gate_m)
+    np.testing.assert_array_equal(track.sensor, SENSOR)
+    assert travels(track) == ends
+
+
+def test_a_track_of_given_rays_passes_through_them_exactly():
+    tables = [(x, given_at(x)) for x in KNOTS]
+    assert_track(track_of(0, KNOTS, [rays for _, rays in tables], (-0.5, 4.0)), tables)
+
+
+@given(st.integers(0, 1000), st.permutations(KNOTS))
+def test_rays_stay_themselves_in_whatever_order_knots_and_rays_come(seed, knots):
+    """The first knot says which ray is which; at the others tables are mixed up."""
+    mixed = {x: permuted(given_at(x), seed + number) for number, x in enumerate(knots)}
+    mixed[min(KNOTS)] = given_at(min(KNOTS))
+    assert_track(track_of(0, knots, [mixed[x] for x in knots], (-0.5, 4.0)), [(x, given_at(x)) for x in KNOTS])
+
+
+@each_row("ends, constant", [((-0.5, 4.0), True), ((KNOTS[0], KNOTS[-1]), False)])
+def test_beyond_the_ends_of_its_knots_rays_stay_as_they_are_there(ends, constant):
+    track = track_of(0, KNOTS, [given_at(x) for x in KNOTS], ends)
+    assert len(track.knots) == len(KNOTS) + 2 * constant
+    for beyond, knot in ((ends[0], KNOTS[0]), (ends[1], KNOTS[-1])):
+        for found, kept in zip(interpolated(track, beyond), interpolated(track, knot), strict=True):
+            np.testing.assert_array_equal(found, kept)
+
+
+def test_given_rays_pass_through_south_without_a_jump():
+    tables = [given_at(x, turn=math.pi - 0.05) for x in KNOTS]
+    wrapped = [Rays.from_angles(t.origin_m, *angles(t.direction), t.gate_m, t.sensor) for t in tables]
+    track = track_of(0, KNOTS, wrapped, (-0.5, 4.0))
+    assert np.abs(np.diff(track.azimuth_rad, axis=0)).max() < 0.2
+
+
+def test_a_ray_keeps_to_its_sensor_though_another_sensors_ray_is_nearer():
+    """The two sensors' rays change places; each stays one of its own sensor."""
+    sensor = np.array([0, 1])
+
+    def pair(first, second):
+        gate = np.tile([1.0, 1.2], (2, 1))
+        return Rays.from_angles(np.zeros((2, 3)), np.array([first, second]), np.zeros(2), gate, sensor)
+
+    track = track_of(0, [0.0, 1.0], [pair(-0.3, 0.3), pair(0.3, -0.3)], (0.0, 1.0))
+    np.testing.assert_allclose(track.azimuth_rad, [[-0.3, 0.3], [0.3, -0.3]], rtol=0, atol=1e-12)

@@ -1,0 +1,227 @@
+"""What a fit is where nobody says so: which layout, how many sensors, and what is said of those that were tried."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.command_line import make_run
+from support.tables import each_row
+
+from lidardesign.design.fit import fit
+from lidardesign.errors import InfeasibleError
+from lidardesign.samples import load_samples
+from lidardesign.workflow import fit as fit_choices
+from lidardesign.workflow import fit_design
+from lidardesign.workflow.fit import BEST, CHOSEN_LEVEL, FitOptions, FitRequest
+from lidardesign.workflow.fit_design import Trial, best_of, trials_of
+from lidardesign.workflow.run_folder import RunFolder
+from lidardesign.workflow.runs import open_run
+
+MOUNTS = {"origin": {"mounts_m": [[0.2, 0, 0], [0.8, 0, 0]]}}
+
+
+@pytest.fixture(scope="module")
+def flat(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("run") / "flat")
+
+
+@pytest.fixture(scope="module")
+def aisle(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("run") / "aisle", task="warehouse")
+
+
+def resolved(run, base=None, **options):
+    return FitRequest.resolve(RunFolder.open(run), FitOptions(**options), base).choices
+
+
+class TestWhatIsLeftOpen:
+    @each_row(
+        "options, layout, sensors",
+        [
+            ({}, "selected", BEST),
+            ({"constraints": {"gate": {"width_m": {"max": 0.3}}}}, "selected", BEST),
+            ({"constraints": {"sensors": {"min": 2, "max": 3}}}, "selected", BEST),
+            ({"constraints": {"sensors": {"count": 3}}}, "selected", 3),
+            ({"constraints": MOUNTS}, "selected", None),
+            ({"constraints": {**MOUNTS, "sensors": {"count": 1}}}, "selected", 1),
+            ({"constraints": {"snap": "catalog"}}, "grid", BEST),
+            ({"weights": ["variation=0.5"]}, "grid", BEST),
+            ({"layout": "grid"}, "grid", BEST),
+            ({"layout": "scan"}, "scan", None),
+            ({"sensors": 2}, "selected", 2),
+            ({"sensors": "auto"}, "selected", "auto"),
+            ({"sensors": 2, "layout": "density"}, "density", 2),
+        ],
+    )
+    def test_follows_from_what_is_asked_for(self, flat, options, layout, sensors):
+        choices = resolved(flat, **options)
+        assert (choices["layout"], choices["sensors"]) == (layout, sensors)
+
+    @each_row(
+        "options, layout",
+        [({}, "selected"), ({"at": {"x_m": 0.5}}, "scan"), ({"at": {"x_m": 0.5}, "layout": "grid"}, "grid")],
+    )
+    def test_along_a_condition_rays_are_chosen_but_not_for_one_place(self, aisle, options, layout):
+        assert resolved(aisle, **options)["layout"] == layout
+
+    def test_a_task_that_does_not_say_what_returns_tell_is_fitted_with_grids(self, flat, monkeypatch):
+        monkeypatch.setattr(fit_choices, "informs_rays", lambda task: False)
+        assert resolved(flat)["layout"] == "grid"
+
+    @each_row(
+        "options, level",
+        [
+            ({}, CHOSEN_LEVEL),
+            ({"layout": "grid"}, 0.95),
+            ({"level": 0.8}, 0.8),
+            ({"level": 0.8, "layout": "grid"}, 0.8),
+        ],
+    )
+    def test_chosen_rays_lie_in_wide_fields(self, flat, options, level):
+        assert resolved(flat, **options)["level"] == level
+
+    @each_row("layout", ["grid", "density", "selected"])
+    def test_is_the_designs_where_one_is_fitted_again(self, flat, layout):
+        base = open_run(flat).fit(layout=layout, sensors=2, rays=9, level=0.9).specification
+        again = resolved(flat, base)
+        assert (again["layout"], again["sensors"], again["rays"], again["level"]) == (layout, 2, 9, 0.9)
+        assert resolved(flat, base, constraints={"sensors": {"min": 3}})["sensors"] == 3
+        assert resolved(flat, base, constraints={"sensors": {"max": 1}})["sensors"] == 1
+
+
+@pytest.fixture(scope="module")
+def trying(flat):
+    """Which numbers of sensors are tried, in which bandwidth, where some of them are infeasible."""
+    samples = load_samples(flat)
+    some = fit(samples, sensors=1, layout="grid", rays=8, restarts=1, em_samples=1000)
+    scenes = RunFolder.open(flat).scenes("train", 5)[:2]
+
+    def tried(infeasible=(), **options):
+        asked, limits = [], []
+
+        def fitted(request):
+            asked.append(request.choices["sensors"])
+            limits.append(request.constraints and request.constraints.budget.bandwidth_mbps)
+            if asked[-1] in infeasible:
+                raise InfeasibleError(f"not {asked[-1]}", conflicts=["sensors.count"])
+            return some
+
+        request = FitRequest.resolve(RunFolder.open(flat), FitOptions(rays=8, **options))
+        trials = trials_of(request, samples, scenes, fitted)
+        return SimpleNamespace(asked=asked, limits=limits, trials=trials)
+
+    return tried
+
+
+@pytest.fixture
+def all_counts(monkeypatch):
+    monkeypatch.setattr(fit_choices, "COUNTS", (1, 2, 3, 4, 6, 8))
+
+
+@pytest.mark.usefixtures("all_counts")
+class TestNumbersOfSensorsThatAreTried:
+    @each_row(
+        "rules, counts",
+        [
+            ({}, [1, 2, 3, 4, 6, 8]),
+            ({"sensors": {"min": 3}}, [3, 4, 6, 8]),
+            ({"sensors": {"max": 2}}, [1, 2]),
+            ({"sensors": {"min": 5, "max": 7}}, [6]),
+            ({"sensors": {"min": 5, "max": 5}}, [5]),
+            ({"sensors": {"min": 9}}, [9]),
+            ({"each": [{}, {"gate": {"width_m": {"max": 0.5}}}]}, [2, 3, 4, 6, 8]),
+            ({"each": [{}, {}, {}], "sensors": {"max": 4}}, [3, 4]),
+        ],
+    )
+    def test_are_those_that_constraints_allow(self, trying, rules, counts):
+        assert trying(constraints=rules).asked == counts
+
+    @pytest.mark.parametrize("infeasible", [(1,), (2, 4), (6, 8), (1, 2, 3, 4, 6)])
+    def test_that_cannot_be_are_passed_over(self, trying, infeasible):
+        found = trying(infeasible)
+        assert found.asked == [1, 2, 3, 4, 6, 8]
+        assert [trial.sensors for trial in found.trials] == [n for n in found.asked if n not in infeasible]
+
+    def test_of_which_none_can_be_end_with_the_error_of_the_first(self, trying):
+        with pytest.raises(InfeasibleError, match="not 2"):
+            trying((2, 3, 4, 6, 8), constraints={"sensors": {"min": 2}})
+
+    @pytest.mark.parametrize("infeasible", [(), (1,), (1, 2, 3)])
+    def test_have_the_bandwidth_of_the_first_that_can_be(self, trying, infeasible):
+        found = trying(infeasible)
+        first = len(infeasible)
+        assert all(limit is None for limit in found.limits[: first + 1])
+        assert found.limits[first + 1 :] == [found.trials[0].mbps] * (len(found.asked) - first - 1)
+
+    def test_keep_the_bandwidth_that_is_asked_for(self, trying):
+        assert set(trying(constraints={"budget": {"bandwidth_mbps": 7.5}}).limits) == {7.5}
+
+
+SCENES = [SimpleNamespace(group=None)] * 4
+
+
+def trial(sensors, *scores):
+    return Trial(sensors, np.array(scores), 1.0)
+
+
+class TestTheBestNumber:
+    def test_has_the_lowest_scores(self):
+        assert best_of([trial(1, 5, 6, 7, 8), trial(2, 1, 2, 3, 4), trial(4, 3, 4, 5, 6)], SCENES).sensors == 2
+
+    @given(st.permutations([1.0, 2.0, 3.0, 4.0]), st.integers(2, 4))
+    def test_is_the_fewest_among_equals(self, scores, equals):
+        assert best_of([trial(n + 1, *scores) for n in range(equals)], SCENES).sensors == 1
+
+    def test_is_fewer_where_more_gain_less_than_their_standard_error(self):
+        # lost: -1, 1, -1, 2 with the mean 0.25 and the standard error 0.75
+        few, more = trial(1, 4, 6, 4, 7), trial(2, 5, 5, 5, 5)
+        assert best_of([few, more], SCENES).sensors == 1
+        # the same mean loss on every scene counts
+        assert best_of([trial(1, 5.25, 5.25, 5.25, 5.25), more], SCENES).sensors == 2
+
+    def test_counts_scenes_of_a_group_once(self):
+        together = [SimpleNamespace(group=name) for name in ("other", "one", "one", "one")]
+        few, more = trial(1, 4, 7, 7, 7), trial(2, 5, 5, 5, 5)
+        assert best_of([few, more], SCENES).sensors == 2
+        assert best_of([few, more], together).sensors == 1
+
+    def test_of_a_single_scene_is_the_lowest(self):
+        assert best_of([trial(1, 5), trial(2, 4)], SCENES[:1]).sensors == 2
+
+
+class TestTheCommand:
+    def test_says_what_was_tried_and_writes_the_bytes_that_the_number_gives_by_itself(self, lidardesign, flat):
+        done = lidardesign("fit", flat, "--rays", 9, "--json")
+        assert done.code == 0, done.err
+        said, count = " ".join(done.err.split()), len(done.json["sensors"])
+        assert f"sensors: {count}; Chamfer distance [mm] on 5 training scenes in " in said
+        assert "Mbit/s by their number: 1: " in said
+        path = flat / "designs" / "fit.yaml"
+        written = path.read_bytes()
+        for options in ((), ("--sensors", count)):
+            assert lidardesign("fit", flat, "--rays", 9, *options, "--quiet").code == 0
+            assert path.read_bytes() == written
+
+    def test_tries_nothing_where_the_number_is_given(self, lidardesign, flat, monkeypatch):
+        def never(*_):
+            raise AssertionError("numbers of sensors were tried")
+
+        monkeypatch.setattr(fit_design, "trials_of", never)
+        for options in (("--sensors", 1), ("--set", "sensors.count=1"), ("--layout", "scan")):
+            command = "constrain" if "--set" in options else "fit"
+            done = lidardesign(command, flat, *options, "--rays", 4)
+            assert done.code == 0, done.err
+            assert "sensors:" not in done.err
+
+    def test_refuses_contradictions_before_any_scene_is_drawn(self, lidardesign, flat, monkeypatch):
+        def never(*_):
+            raise AssertionError("scenes were drawn")
+
+        monkeypatch.setattr(RunFolder, "scenes", never)
+        done = lidardesign("constrain", flat, "--set", "gate.start_m.min=0.8", "--set", "gate.end_m.max=0.5", "--json")
+        assert done.code == 4
+        assert set(done.json["error"]["conflicts"]) == {"gate.start_m.min", "gate.end_m.max"}
