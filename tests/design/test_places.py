@@ -111,7 +111,7 @@ def test_a_rig_elsewhere_is_refused_with_what_to_learn(call, run, tmp_path, furt
 
 
 def test_an_origin_that_is_set_counts_as_the_place_next_to_it(call, run):
-    setting = ["--set", "origin.fixed_m=[0.5, 0.0008, 0]", "--sensors", 1]
+    setting = ["--set", "origin.fixed_m=[0.5, 0.0008, 0]", "--layout", "grid", "--sensors", 1]
     for further in ([], ["--dry-run"]):
         result = call("constrain", run, *setting, "--name", "set", "--json", *further)
         assert result.code == 0, result.err

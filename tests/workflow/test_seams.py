@@ -175,7 +175,7 @@ def aisle(tmp_path):
 
 
 def test_a_track_without_its_run_is_evaluated_at_its_own_number_of_rays_alone(lidardesign, aisle, tmp_path):
-    assert lidardesign("fit", aisle, "--rays", 6).code == 0
+    assert lidardesign("fit", aisle, "--layout", "scan", "--rays", 6).code == 0
     inside, away = aisle / "designs" / "fit.yaml", tmp_path / "away.yaml"
     away.write_text(inside.read_text().replace("name: fit", "name: away"))
     result = lidardesign("evaluate", aisle, away, "--rays", 6, "--json")
@@ -205,9 +205,9 @@ def test_a_design_for_one_position_drives_along_the_aisle_as_it_is(lidardesign, 
     np.testing.assert_array_equal(here.gate_m, there.gate_m)
 
 
-@pytest.mark.parametrize("kind", ["track", "here"])
-def test_every_format_is_written_at_a_position_and_tables_have_its_rays_there(lidardesign, aisle, tmp_path, kind):
-    assert lidardesign("fit", aisle, "--rays", 4, *(() if kind == "track" else ("--at", "x_m=0.37"))).code == 0
+@pytest.mark.parametrize("at", [(), ("--at", "x_m=0.37")], ids=["track", "here"])
+def test_every_format_is_written_at_a_position_and_tables_have_its_rays_there(lidardesign, aisle, tmp_path, at):
+    assert lidardesign("fit", aisle, "--layout", "scan", "--rays", 4, *at).code == 0
     path = aisle / "designs" / "fit.yaml"
     for name in EXPORTERS:
         # a table of sensors is read again by its ending
