@@ -228,9 +228,9 @@ class FitRequest:
         choices = self.choices
         rays = "rays left open" if choices["rays"] is None else f"{choices['rays']} rays"
         counted = {
-            None: "sensors as many as follow",
-            BEST: "sensors as many as score best on training scenes",
-            "auto": "sensors as many as held-out likelihood says",
+            None: "as many sensors as follow",
+            BEST: "as many sensors as score best on training scenes",
+            "auto": "as many sensors as held-out likelihood says",
         }
         sensors = counted.get(choices["sensors"], f"{choices['sensors']} sensors")
         sensors = "one sensor per ray" if LAYOUTS[choices["layout"]].one_sensor_per_ray else sensors

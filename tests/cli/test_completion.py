@@ -23,7 +23,9 @@ from lidardesign.cli import candidates
 from lidardesign.cli.candidates import BASELINES, FILE, FOLDER, PATH, BashCompletion, ShellCompletion, split_line
 from lidardesign.cli.commands.completion import VARIABLE
 from lidardesign.cli.main import app
+from lidardesign.cli.options import sensor_count
 from lidardesign.design.catalog.library import load_library
+from lidardesign.design.sensor import FITTED_LAYOUTS
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.simple import baseline_of
 from lidardesign.export.registry import EXPORTERS
@@ -104,6 +106,13 @@ def test_tasks_are_completed_where_one_is_wanted(root, line):
 def test_values_follow_their_option_with_a_blank_or_an_equals_sign(root):
     assert completed(root, "learn face --preset ") == ["draft", "standard", "fine"]
     assert completed(root, "learn face --preset=d") == ["--preset=draft"]
+
+
+def test_layouts_and_ways_to_count_sensors_are_those_of_the_program(root):
+    for command in ("fit", "constrain"):
+        assert set(completed(root, f"{command} run --layout ")) == set(FITTED_LAYOUTS)
+        words = completed(root, f"{command} run --sensors ")
+        assert [sensor_count(word) for word in words] == words == ["best", "auto"]
 
 
 def test_formats_parts_detectors_and_effects_are_those_of_the_program(root):
