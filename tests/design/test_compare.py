@@ -83,6 +83,9 @@ def test_what_a_design_costs_is_what_its_rays_cost():
 # ------------------------------------------------------------------- commands
 
 
+GRID = ("--layout", "grid", "--sensors", "2")
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = make_run(tmp_path_factory.mktemp("runs") / "flat", count=2000)
@@ -90,7 +93,7 @@ def run(tmp_path_factory):
 
     for name, rays in (("few", 8), ("more", 12)):
         with pytest.raises(SystemExit) as ended:
-            program(["fit", str(folder), "--sensors", "2", "--rays", str(rays), "--name", name, "--quiet"])
+            program(["fit", str(folder), *GRID, "--rays", str(rays), "--name", name, "--quiet"])
         assert not ended.value.code
     return folder
 
@@ -144,7 +147,7 @@ def test_without_a_run_there_are_no_scores_and_with_one_there_are(call, run, tmp
 
 def test_a_shown_design_says_how_tight_its_constraints_are(call, run):
     result = call(
-        "constrain", run, "--set", "gate.width_m.max=0.2", "--set", "budget.bandwidth_mbps=900", "--rays", "8"
+        "constrain", run, *GRID, "--set", "gate.width_m.max=0.2", "--set", "budget.bandwidth_mbps=900", "--rays", "8"
     )
     assert result.code == 0, result.err
     path = run / "designs" / "constrained.yaml"

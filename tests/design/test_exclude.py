@@ -371,21 +371,24 @@ def call(capsys, tmp_path, monkeypatch):
     return caller(capsys, tmp_path, monkeypatch)
 
 
+GRID = ("--layout", "grid", "--sensors", 2)
+
+
 def test_boxes_are_given_by_option_and_by_file(call, tmp_path):
     make_run(tmp_path / "run")
     box = "[{low_m: [-9, -9, -9], high_m: [0.5, 9, 9]}]"
-    result = call("constrain", "run", "--set", f"origin.exclude={box}", "--json", "--name", "right")
+    result = call("constrain", "run", *GRID, "--set", f"origin.exclude={box}", "--json", "--name", "right")
     assert result.code == 0, result.err
     rows = [row for row in result.json["constraints"] if "exclude" in row["name"]]
     assert rows
     assert all(row["satisfied"] and row["value"]["low_m"][0] >= 0.5 for row in rows)
     (tmp_path / "rules.yaml").write_text(f"origin:\n  exclude: {box}\n")
     options = ["--constraints", "rules.yaml", "--set", "origin.exclude.0.high_m=[0.6, 9, 9]"]
-    result = call("constrain", "run", *options, "--json")
+    result = call("constrain", "run", *GRID, *options, "--json")
     assert result.code == 0, result.err
     rows = [row for row in json.loads(result.out)["constraints"] if "exclude" in row["name"]]
     assert rows[0]["bound"]["high_m"] == [0.6, 9, 9]
-    shown = call("constrain", "run", "--constraints", "rules.yaml", "--set", "sensors.count=1")
+    shown = call("constrain", "run", "--layout", "grid", "--constraints", "rules.yaml", "--set", "sensors.count=1")
     assert "s0.origin.exclude[0]" in shown.out
     assert "low_m [-9, -9, -9], high_m [0.5, 9, 9]" in shown.out
     again = call("constrain", "run/designs/right.yaml", "--json")
