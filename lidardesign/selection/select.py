@@ -127,25 +127,39 @@ class SelectionProblem:
         return coverage.complete - worth, coverage.complete - worth - gap
 
 
-def _shared_gates(gate: np.ndarray, sensor: np.ndarray, bits: np.ndarray, limit_mbps: float) -> np.ndarray:
-    """For each sensor the gate that most of its chosen rays have, narrower where these cost too much, (S,).
+def _shared_gates(coverage: Coverage, choice: Choice, sensor: np.ndarray, limit_mbps: float) -> np.ndarray:
+    """For each sensor the gate that its chosen rays share best, (S,): one sensor's after the other, until none gains.
 
     Arguments:
-        gate: The gate of each candidate, -1 for those that do not fire, (N,).
-        sensor: The sensor of each, (N,).
-        bits: What its sensor's gates cost, from wide to narrow, (N, G) [Mbit/s].
-        limit_mbps: What all rays may cost.
+        coverage: What the candidates tell through their sensors' gates, from wide to narrow.
+        choice: Of rays with gates of their own, and the price of bandwidth.
+        sensor: The sensor of each candidate, (N,).
+        limit_mbps: What all rays may cost; narrower gates are taken where they cost more.
     """
-    chosen = np.flatnonzero(gate >= 0)
-    taken = np.zeros((int(sensor.max()) + 1, bits.shape[1]), dtype=np.intp)
-    np.add.at(taken, (sensor[chosen], gate[chosen]), 1)
-    found, first = np.unique(sensor, return_index=True)
-    cost = np.zeros(taken.shape)
-    cost[found] = bits[first] * taken.sum(axis=1)[found, None]
-    usual, sensors = taken.argmax(axis=1), np.arange(len(taken))
-    while cost[sensors, usual].sum() > (1 + SLACK) * limit_mbps and (usual < bits.shape[1] - 1).any():
-        usual[np.where(usual < bits.shape[1] - 1, cost[sensors, usual], -1.0).argmax()] += 1
-    return usual
+    gates, fires = coverage.shape[1], choice.gate >= 0
+    shared = np.zeros(int(sensor.max()) + 1, dtype=np.intp)
+
+    def worth(shared: np.ndarray) -> float:
+        gate = np.where(fires, shared[sensor], -1)
+        bits, harm = coverage.charge(gate)
+        return coverage.value_of(gate) - harm - choice.price * bits
+
+    best, is_better = worth(shared), True
+    while is_better:
+        is_better = False
+        for index in np.unique(sensor[fires]):
+            for gate in range(gates):
+                tried = shared.copy()
+                tried[index] = gate
+                found = worth(tried)
+                if found > best + SLACK * abs(best):
+                    shared, best, is_better = tried, found, True
+    rays = np.bincount(sensor[fires], minlength=len(shared))
+    first = np.array([np.argmax(sensor == index) for index in range(len(shared))])
+    while (coverage.bits[first, shared] * rays).sum() > limit_mbps and (shared[rays > 0] < gates - 1).any():
+        cost = np.where(shared < gates - 1, coverage.bits[first, shared] * rays, -1.0)
+        shared[cost.argmax()] += 1
+    return shared
 
 
 def _gate_of(choices: Sequence[Choice]) -> np.ndarray:
@@ -189,14 +203,14 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
                 where=problem.name,
                 hint="let sensors look at the targets: constrain less, or learn longer",
             )
-        gate = _gate_of(problem.choices(coverage, middle))
-        before, loss = loss, judged.loss_of(gate)
+        choices = problem.choices(coverage, middle)
+        before, loss = loss, judged.loss_of(_gate_of(choices))
         if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > problem.most_scenes:
             break
         wanted *= 2
     rays, shared = problem.rays, None
     if problem.one_gate:
-        shared = _shared_gates(gate, rays.sensor, coverage.bits, problem.limit_mbps)
+        shared = _shared_gates(coverage, replace(choices[0], gate=_gate_of(choices)), rays.sensor, problem.limit_mbps)
         own = shared[rays.sensor]
         coverage, judged = coverage.through(own), judged.through(own)
         gates_m = gates_m[np.arange(len(rays)), own][:, None]
