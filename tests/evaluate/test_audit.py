@@ -161,7 +161,7 @@ def run(tmp_path_factory):
 @pytest.fixture
 def fitted(lidardesign, run):
     if not (run / "designs" / "fit.yaml").exists():
-        assert lidardesign("fit", run, "--sensors", 2).code == 0
+        assert lidardesign("fit", run, "--layout", "grid", "--sensors", 2).code == 0
     return run
 
 

@@ -404,7 +404,7 @@ def call(capsys, tmp_path, monkeypatch):
 
 def test_evaluate_compares_with_a_part_and_refuses_what_is_none(call, tmp_path):
     run = make_run(tmp_path / "run", count=2000)
-    assert call("fit", run, "--sensors", 2).code == 0
+    assert call("fit", run, "--layout", "grid", "--sensors", 2).code == 0
     found = call("evaluate", run, "--rays", 9, "--baseline", "catalog:vl53l5cx", "--set", "test=2", "--json")
     assert found.code == 0, found.err
     document = json.loads(found.out)

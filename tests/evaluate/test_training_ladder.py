@@ -163,7 +163,7 @@ def test_runs_beside_this_one_that_cannot_be_measured_are_left_out(runs, tmp_pat
 def fitted(runs, lidardesign, tmp_path):
     """A copy of a run, with a design, in the current folder."""
     shutil.copytree(runs, tmp_path / "run")
-    assert lidardesign("fit", "run", "--sensors", "1", "--name", "one").code == 0
+    assert lidardesign("fit", "run", "--layout", "grid", "--sensors", "1", "--name", "one").code == 0
     return tmp_path / "run"
 
 
@@ -226,7 +226,7 @@ def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_r
     assert not document["goal"]["met"]
     assert f"{document['misplaced']:.3g}" in done.err
     assert "--tolerance" in done.err
-    assert lidardesign("fit", "run", "--sensors", "2").code == 0
+    assert lidardesign("fit", "run", "--layout", "grid", "--sensors", "2").code == 0
     again = lidardesign("learn", "flatland", "--out", "run", "--resume", "--tolerance", "0.3")
     assert again.code == 2
     assert "started with tolerance = 1e-06" in again.err

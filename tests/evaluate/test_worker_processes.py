@@ -158,7 +158,7 @@ def test_what_a_plugin_prints_and_raises_in_a_worker_arrives_whole(broken, pool,
 @pytest.fixture
 def run(lidardesign, tmp_path):
     folder = make_run(tmp_path / "run", count=1000)
-    assert lidardesign("fit", folder, "--sensors", 1).code == 0
+    assert lidardesign("fit", folder, "--layout", "grid", "--sensors", 1).code == 0
     return folder
 
 

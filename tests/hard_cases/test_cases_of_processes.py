@@ -103,10 +103,10 @@ READ_ONLY = """
 import contextlib, os
 from lidardesign.cli.main import run
 with contextlib.suppress(SystemExit), contextlib.redirect_stdout(sys.stderr):
-    run(["fit", sys.argv[1], "--sensors", "1", "--json"])
+    run(["fit", sys.argv[1], "--layout", "grid", "--sensors", "1", "--json"])
 if os.geteuid() == 0:
     os.setuid(65534)
-run(["fit", sys.argv[2], "--sensors", "1", "--json"])
+run(["fit", sys.argv[2], "--layout", "grid", "--sensors", "1", "--json"])
 """
 
 
@@ -170,7 +170,7 @@ class TestKillsFullDisksAndTwoWriters:
         run = make_run(tmp_path / "run", count=1000)
         before = files_under(run)
         with run_lock(run):
-            result = lidardesign("fit", run, "--sensors", 1, "--json")
+            result = lidardesign("fit", run, "--layout", "grid", "--sensors", 1, "--json")
             assert result.code == 2
             assert f"process {os.getpid()} on" in result.json["error"]["message"]
             assert "wait for it" in result.json["error"]["hint"]
@@ -257,7 +257,7 @@ class TestKillsFullDisksAndTwoWriters:
     @pytest.mark.parametrize("damage", ["cut between sensors", "cut inside", "one digit"])
     def test_a_design_that_is_not_as_it_was_written_says_so_wherever_it_is_used(self, tmp_path, lidardesign, damage):
         run = make_run(tmp_path / "run", count=1000)
-        assert lidardesign("fit", run, "--sensors", 2).code == 0
+        assert lidardesign("fit", run, "--layout", "grid", "--sensors", 2).code == 0
         design = run / "designs" / "fit.yaml"
         text = design.read_text()
         second = text.index("- name", text.index("- name") + 1)
@@ -534,7 +534,7 @@ class TestStreamsLocalesAndSignals:
 
     def test_notes_that_nobody_reads_any_more_do_not_end_the_work(self, tmp_path):
         make_run(tmp_path / "run", count=1000)
-        process = program("fit", "run", "--sensors", 2, "--json", cwd=tmp_path)
+        process = program("fit", "run", "--layout", "grid", "--sensors", 2, "--json", cwd=tmp_path)
         process.stderr.close()
         out, _ = process.stdout.read(), process.stdout.close()
         assert process.wait() == 0
@@ -549,9 +549,8 @@ class TestStreamsLocalesAndSignals:
     @pytest.mark.parametrize("closed", [(0, 1), (1, 2)])
     def test_streams_that_were_never_open_are_no_place_for_files(self, tmp_path, closed):
         make_run(tmp_path / "run", count=1000)
-        process = program(
-            "fit", "run", "--sensors", 1, cwd=tmp_path, stdin=subprocess.DEVNULL, before=CLOSED.format(*closed)
-        )
+        fit = ("fit", "run", "--layout", "grid", "--sensors", 1)
+        process = program(*fit, cwd=tmp_path, stdin=subprocess.DEVNULL, before=CLOSED.format(*closed))
         out, err = process.communicate()
         assert process.returncode == 0, err
         assert b"Traceback" not in out + err
@@ -583,7 +582,7 @@ class TestStreamsLocalesAndSignals:
         name = os.fsdecode("with spaces, größe 測 and no UTF-8 ".encode() + b"\xff")
         run = make_run(tmp_path / "made", count=1000).rename(tmp_path / name)
         environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-        command = [sys.executable, "-m", "lidardesign", "fit", name, "--sensors", "1", "--json"]
+        command = [sys.executable, "-m", "lidardesign", "fit", name, "--layout", "grid", "--sensors", "1", "--json"]
         ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=False)
         assert ended.returncode == 0, ended.stderr
         assert json.loads(ended.stdout)["design"].endswith("/designs/fit.yaml")
@@ -592,7 +591,7 @@ class TestStreamsLocalesAndSignals:
     def test_a_report_of_a_folder_whose_name_is_no_utf_8_is_written(self, tmp_path, lidardesign, monkeypatch):
         name = os.fsdecode(b"no utf-8 \xff")
         make_run(tmp_path / "made", count=1000).rename(tmp_path / name)
-        assert lidardesign("fit", name, "--sensors", 1).code == 0
+        assert lidardesign("fit", name, "--layout", "grid", "--sensors", 1).code == 0
         monkeypatch.setattr(sys, "argv", ["lidardesign", "evaluate", name])
         result = lidardesign("evaluate", name, "--rays", 4, "--set", "test=1", "--report", f"{name}/page.html")
         assert result.code == 0, result.err

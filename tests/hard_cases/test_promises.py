@@ -60,6 +60,7 @@ FLATLAND = (
     ) for word in ("--set", setting)),
 )  # fmt: skip
 BYTES = ("flow.safetensors", "samples.npz")
+GRID, DENSITY = (("--layout", name, "--sensors", "2") for name in ("grid", "density"))
 NOT_NUMBERS = (math.nan, math.inf, -math.inf)
 
 
@@ -120,7 +121,7 @@ class TestTheSameBytes:
         """All files of learning, fitting, constraining and exporting but times, and the scores."""
         assert lidardesign(*FLATLAND, "--out", run).code == 0
         assert lidardesign("fit", run, "--sensors", 2, "--rays", 20, "--layout", "density").code == 0
-        assert lidardesign("constrain", run, "--set", "gate.width_m.max=0.4", "--name", "tight").code == 0
+        assert lidardesign("constrain", run, *DENSITY, "--set", "gate.width_m.max=0.4", "--name", "tight").code == 0
         assert lidardesign("export", f"{run}/designs/tight.yaml", "--format", "csv", "--rays", 20).code == 0
         rows = lidardesign("evaluate", run, "--rays", 20, "--json").json["rows"]
         files = files_under(Path(run))
@@ -136,9 +137,9 @@ class TestTheSameBytes:
         assert first == second
 
     def test_another_process_with_another_hash_seed_and_more_threads_writes_the_same_design(self, lidardesign, flat):
-        assert lidardesign("fit", flat, "--sensors", 3, "--name", "here").code == 0
+        assert lidardesign("fit", flat, *GRID, "--name", "here").code == 0
         environment = {**os.environ, "PYTHONHASHSEED": "12345", "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
-        command = [sys.executable, "-m", "lidardesign", "fit", str(flat), "--sensors", "3", "--name", "there"]
+        command = [sys.executable, "-m", "lidardesign", "fit", str(flat), *GRID, "--name", "there"]
         subprocess.run(command, env=environment, check=True, capture_output=True)
         here, there = ((flat / "designs" / f"{name}.yaml").read_text() for name in ("here", "there"))
         assert here.replace("here", "there") == there
@@ -260,8 +261,8 @@ class TestNoNaNLeaves:
 
     def test_every_number_that_the_commands_print_is_finite(self, lidardesign, flat):
         made = [
-            lidardesign("fit", flat, "--sensors", 2, "--name", "one", "--json"),
-            lidardesign("constrain", flat, "--set", "budget.rays=9", "--layout", "density", "--name", "two", "--json"),
+            lidardesign("fit", flat, *GRID, "--name", "one", "--json"),
+            lidardesign("constrain", flat, "--set", "budget.rays=9", *DENSITY, "--name", "two", "--json"),
             lidardesign("show", flat / "designs" / "two.yaml", "--json"),
             lidardesign("export", flat / "designs" / "two.yaml", "--format", "csv", "--json"),
             lidardesign("evaluate", flat, "--rays", 9, "--json"),
@@ -490,7 +491,7 @@ class TestEveryFigureHasItsError:
             assert (estimate["unit"] == "nats") == (name in ("kl_nats", "log_z"))
 
     def test_what_fits_report_has_unit_method_and_error(self, lidardesign, flat):
-        document = lidardesign("fit", flat, "--sensors", 2, "--rays", 20, "--json").json
+        document = lidardesign("fit", flat, *GRID, "--rays", 20, "--json").json
         assert set(document["error_estimates"]) >= FIGURES["fit"]
         for name, estimate in document["error_estimates"].items():
             self.complete(estimate)
@@ -500,7 +501,7 @@ class TestEveryFigureHasItsError:
             assert {"name", "bound", "value", "satisfied"} == set(check)
 
     def test_every_score_and_every_difference_has_unit_method_and_error(self, lidardesign, flat):
-        assert lidardesign("fit", flat, "--name", "one").code == 0
+        assert lidardesign("fit", flat, *GRID, "--name", "one").code == 0
         document = lidardesign("evaluate", flat, "--rays", 8, "--rays", 12, "--set", "test=4", "--json").json
         estimates, unit = document["error_estimates"], document["metric"]["unit"]
         for row in document["rows"]:
@@ -516,7 +517,7 @@ class TestEveryFigureHasItsError:
             assert estimate["error"] == pair["half_width"]
 
     def test_every_number_in_an_exported_file_has_the_error_of_its_rounding(self, lidardesign, flat):
-        assert lidardesign("fit", flat, "--rays", 8, "--layout", "density", "--name", "one").code == 0
+        assert lidardesign("fit", flat, "--rays", 8, *DENSITY, "--name", "one").code == 0
         for kind in ("csv", "npz"):
             document = lidardesign("export", flat / "designs" / "one.yaml", "--format", kind, "--json").json
             assert set(document["error_estimates"]) == {"origin_m", "direction_rad", "gate_m", "time_s"}
@@ -525,7 +526,7 @@ class TestEveryFigureHasItsError:
                 assert estimate["kind"] == "rounding"
 
     def test_tables_print_errors_and_units_beside_the_figures(self, lidardesign, flat):
-        assert "+-" in lidardesign("fit", flat, "--name", "one").out
+        assert "+-" in lidardesign("fit", flat, *GRID, "--name", "one").out
         table = lidardesign("evaluate", flat, "--rays", 8, "--set", "test=4").out
         assert "mm" in table
         assert "95 %" in table
@@ -590,8 +591,9 @@ class TestDesignsKeepTheirConstraints:
         path.write_text(json.dumps(rules))
         if layout == "density" and "budget" not in rules:
             layout = "grid"
+        options = ("--layout", layout, *(() if "sensors" in rules else ("--sensors", "2")))
         with pytest.raises(SystemExit) as ended:
-            run_program(["constrain", str(folder), "--constraints", str(path), "--layout", layout, "--name", "d", "-q"])
+            run_program(["constrain", str(folder), "--constraints", str(path), *options, "--name", "d", "-q"])
         written = folder / "designs" / "d.yaml"
         assert (ended.value.code or 0) in (0, 4)
         assert written.exists() == (ended.value.code in (0, None))
@@ -605,7 +607,7 @@ class TestDesignsKeepTheirConstraints:
         dump = fit_design.dump_yaml
         # as if a gate had been written a little too long
         monkeypatch.setattr(fit_design, "dump_yaml", lambda document: dump(longer_gates(document)))
-        done = lidardesign("constrain", flat, "--set", "gate.width_m.max=0.4", "--name", "never", "--json")
+        done = lidardesign("constrain", flat, *GRID, "--set", "gate.width_m.max=0.4", "--name", "never", "--json")
         assert done.code == 4
         assert any("gate" in name for name in done.json["error"]["conflicts"])
         assert not (flat / "designs" / "never.yaml").exists()
