@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.coverages import scene_of
 from support.rays import random_fan, rays_along
 
 from lidardesign.selection.candidates import SENSOR_LEVELS, gate_choices, sensor_gates
-from lidardesign.selection.coverage import InformedScene
+from lidardesign.selection.coverage import LARGEST, InformedScene, gather
 from lidardesign.selection.select import _shared_gates
 from lidardesign.task import Information
 
@@ -79,39 +81,52 @@ class TestGatesOfASensor:
         assert (fewer[rays.sensor == 1] == rays.gate_m[rays.sensor == 1][:, None]).all()
 
 
-def chosen(seed):
-    """What rays of three sensors chose for themselves, and what gates cost, from wide to narrow."""
+SENSOR = np.repeat([0, 1, 2], 4)
+GATES_M = np.array([[[0.0, 3.0], [1.0, 2.0], [1.2, 1.8], [1.4, 1.6]], [[0.5, 2.5], [1.0, 1.9], [1.3, 1.7], [1.5, 1.6]]])
+
+
+def chosen(seed, price):
+    """What rays of three sensors tell through their sensors' gates, and a choice of some of them."""
     generator = np.random.default_rng(seed)
-    sensor = np.repeat([0, 1, 2], 5)
-    bits = np.sort(generator.uniform(0.1, 1, (3, 4)), axis=1)[:, ::-1][sensor]
-    return generator.integers(-1, 4, 15), sensor, bits
+    gates_m = GATES_M[[0, 1, 0]][SENSOR]
+    scenes = [scene_of(generator, 12, 15, 60, LARGEST) for _ in range(3)]
+    coverage = gather(scenes, gates_m, gates_m[..., 1] - gates_m[..., 0])
+    gate = generator.integers(-1, 4, 12)
+    return coverage, SimpleNamespace(gate=gate, price=price)
 
 
-def cost(shared, gate, sensor, bits):
-    return bits[np.arange(len(gate)), shared[sensor]][gate >= 0].sum()
+def worth(coverage, choice, shared):
+    """What chosen rays are worth through shared gates, and what they cost."""
+    gate = np.where(choice.gate >= 0, shared[SENSOR], -1)
+    bits, _ = coverage.charge(gate)
+    return coverage.value_of(gate) - choice.price * bits, bits
 
 
+@pytest.mark.parametrize("price", [0.0, 0.003, 1.0])
 class TestTheGateThatRaysShare:
-    @given(seeds)
-    def test_is_what_most_rays_of_the_sensor_chose(self, seed):
-        gate, sensor, bits = chosen(seed)
-        for index, shared in enumerate(_shared_gates(gate, sensor, bits, np.inf)):
-            votes = np.bincount(gate[(sensor == index) & (gate >= 0)], minlength=4)
-            assert votes[shared] == votes.max()
+    @given(seed=seeds)
+    def test_is_such_that_no_other_gate_of_one_sensor_gains(self, seed, price):
+        coverage, choice = chosen(seed, price)
+        shared = _shared_gates(coverage, choice, SENSOR, np.inf)
+        best, _ = worth(coverage, choice, shared)
+        for index, gate in itertools.product(range(3), range(4)):
+            other = shared.copy()
+            other[index] = gate
+            assert worth(coverage, choice, other)[0] <= best + 1e-6
 
-    @given(seeds, st.floats(0, 1.2))
-    def test_is_narrower_only_where_rays_cost_too_much(self, seed, share):
-        gate, sensor, bits = chosen(seed)
-        free = _shared_gates(gate, sensor, bits, np.inf)
-        limit = share * cost(free, gate, sensor, bits)
-        shared = _shared_gates(gate, sensor, bits, limit)
-        narrowest = cost(np.full(3, 3), gate, sensor, bits)
+    @given(seed=seeds, share=st.floats(0, 1.2))
+    def test_is_narrower_only_where_rays_cost_too_much(self, seed, share, price):
+        coverage, choice = chosen(seed, price)
+        free = _shared_gates(coverage, choice, SENSOR, np.inf)
+        limit = share * worth(coverage, choice, free)[1]
+        shared = _shared_gates(coverage, choice, SENSOR, limit)
+        narrowest = worth(coverage, choice, np.full(3, 3))[1]
         assert (shared >= free).all()
-        assert cost(shared, gate, sensor, bits) <= max(limit, narrowest) * (1 + 1e-8)
-        if share >= 1:
+        assert worth(coverage, choice, shared)[1] <= max(limit, narrowest) * (1 + 1e-8)
+        if share > 1 + 1e-9:
             np.testing.assert_array_equal(shared, free)
 
-    def test_of_a_sensor_that_fires_no_ray_costs_nothing_and_stays_as_it_is(self):
-        sensor = np.array([0, 0, 2])
-        shared = _shared_gates(np.array([0, 0, -1]), sensor, np.array([[2.0, 1.0]] * 3), 2.5)
-        np.testing.assert_array_equal(shared, [1, 0, 0])
+    def test_of_no_price_and_no_limit_is_open(self, price):
+        coverage, choice = chosen(0, price)
+        shared = _shared_gates(coverage, choice, SENSOR, np.inf)
+        assert (shared == 0).all() == (price == 0)
