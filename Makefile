@@ -1,4 +1,4 @@
-# make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about three minutes
+# make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about five minutes
 # make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 400 MB there
 # make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes

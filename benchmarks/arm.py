@@ -13,21 +13,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from common import (
-    fitted,
-    learned,
-    lidardesign,
-    parser,
-    report,
-    robot_option,
-    robot_settings,
-    run_options,
-    run_process,
-    verdict,
-)
+from common import learned, parser, report, robot_option, robot_settings, run_options, scored, verdict
 
-BASELINES = ("uniform", "random", "bounding", "occupancy", "no-visibility")
 FURTHER = ("occupancy", "no-visibility")  # that evaluate only scores when asked
+BASELINES = ("uniform", "random", "bounding", "silhouette", "greedy", *FURTHER)
 SPARSE = ("uniform", "random")
 MOST_OF_THEIR_BANDWIDTH = 0.5
 
@@ -106,28 +95,18 @@ def main() -> None:
     options = made.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         run = learned("arm", Path(folder), options, robot_settings(options.robot))
-        designs, fits = [], []
-        for sensors in options.sensors:
-            design = fitted(run, f"benchmark-{sensors}", sensors=sensors, rays=max(options.rays))
-            designs.append(design.path)
-            fits.append([sensors, design.result.seconds, design.result.log_likelihood, design.result.ess])
-        words = ["evaluate", *designs, "--json"]
-        for name in FURTHER:
-            words += ["--baseline", name]
-        for rays in options.rays:
-            words += ["--rays", str(rays)]
-        results = [run_process(lidardesign(*words)) for _ in range(options.rounds)]
-        found = results[0].document()
+        designs = {f"benchmark-{sensors}": {"sensors": sensors} for sensors in options.sensors}
+        found, times, fits = scored(run, designs, options.rays, options.rounds, FURTHER)
     metric = f"{found['metric']['name']} {found['metric']['unit']}"
     columns = ["rays", "design", metric, "95 % interval", "tracked", "failures", "Mbit/s", "of uniform's"]
     report(
         "Tracking with the arm",
         {
-            "Fits": (["sensors", "s", "log-likelihood", "ESS"], fits),
-            "evaluate as a whole process": (
-                ["wall s", "CPU s", "peak MiB"],
-                [[one.wall, one.cpu, one.peak_mib] for one in results],
+            "Fits": (
+                ["design", "rays", "s", "log-likelihood", "ESS"],
+                [[*key, one.result.seconds, one.result.log_likelihood, one.result.ess] for key, one in fits.items()],
             ),
+            "evaluate as a whole process": (["rays", "wall s", "CPU s", "peak MiB"], times),
             f"Scores on {found['scenes']} held-out trajectories": (columns, score_rows(found)),
         },
         verdicts(found),

@@ -140,7 +140,8 @@ def measure(run_folder: Path, options: Any, folder: Path) -> None:
 
     run = open_run(run_folder)
     designs = [
-        fitted(run_folder, f"sensors-{count}", sensors=count, rays=laboratory.RAYS).path for count in laboratory.SENSORS
+        fitted(run_folder, f"sensors-{count}", sensors=count, rays=laboratory.RAYS, layout="grid").path
+        for count in laboratory.SENSORS
     ]
     figures: Figures = {}
     for scene in run.scenes("test", run.config.seed)[: options.heads]:

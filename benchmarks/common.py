@@ -198,6 +198,37 @@ def fitted(run: Path, name: str, **choices: Any) -> Any:
     return design
 
 
+def scored(
+    run: Path, designs: Mapping[str, Mapping[str, Any]], rays: Sequence[int], rounds: int, baselines: Sequence[str] = ()
+) -> tuple[dict[str, Any], list[list[object]], dict[tuple[str, int], Any]]:
+    """Designs that are fitted for each number of rays, since rays are chosen for a number, and their scores.
+
+    Arguments:
+        run: The run.
+        designs: Choices of `fit` by the name of a design.
+        rays: Numbers of rays.
+        rounds: How often each is evaluated.
+        baselines: Beside those that `evaluate` always has.
+
+    Returns:
+        What `evaluate` prints, with the rows of all numbers; numbers of rays with wall and processor time [s] and
+        memory [MiB]; designs by name and number.
+    """
+    fits, times, found, rows = {}, [], {}, []
+    words = [word for name in baselines for word in ("--baseline", name)]
+    for count in rays:
+        here = {name: fitted(run, f"{name}-{count}", rays=count, **choices) for name, choices in designs.items()}
+        paths = [design.path for design in here.values()]
+        results = [
+            run_process(lidardesign("evaluate", *paths, "--rays", str(count), *words, "--json")) for _ in range(rounds)
+        ]
+        found = results[0].document()
+        rows += [{**row, "design": row["design"].removesuffix(f"-{count}")} for row in found["rows"]]
+        times += [[count, one.wall, one.cpu, one.peak_mib] for one in results]
+        fits |= {(name, count): design for name, design in here.items()}
+    return {**found, "rows": rows}, times, fits
+
+
 def without_traceback(main: Callable[[], None]) -> None:
     """Run a benchmark; what the library refuses ends it with the library's message."""
     from lidardesign.errors import LidardesignError

@@ -158,7 +158,7 @@ def measure(run_folder: Path, options: Any) -> None:
     from lidardesign.evaluate.score import entries_of
 
     run = open_run(run_folder)
-    designs = [fitted(run_folder, f"sunlight-{n}", sensors=n).specification for n in options.sensors]
+    designs = [fitted(run_folder, f"sunlight-{n}", sensors=n, layout="grid").specification for n in options.sensors]
     request = request_of(run, designs, options)
     entries = entries_of(request)
     tallies, called = [Tally() for _ in entries], set()

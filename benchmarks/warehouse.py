@@ -15,10 +15,22 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from common import fitted, learned, lidardesign, parser, report, run_options, run_process, verdict, without_traceback
+from common import (
+    fitted,
+    learned,
+    lidardesign,
+    parser,
+    report,
+    run_options,
+    run_process,
+    scored,
+    verdict,
+    without_traceback,
+)
 
 SPARSE = ("uniform", "random")
-BASELINES = (*SPARSE, "bounding")
+BASELINES = (*SPARSE, "bounding", "silhouette", "greedy")
+TRACK = "benchmark-track"
 LEAST_FACTOR = 8.0
 BOUNDING_MISSES_PERCENT = 2.0  # below, there is nothing left to be better at
 PAPER_M = (0.0, 1.2, 2.4, 3.6)
@@ -152,12 +164,8 @@ def main() -> None:
     options = made.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         run = learned("warehouse", Path(folder), options, {})
-        track = fitted(run, "benchmark-track", rays=options.fit_rays)
-        words = ["evaluate", track.path, "--json"]
-        for rays in options.rays:
-            words += ["--rays", str(rays)]
-        results = [run_process(lidardesign(*words)) for _ in range(options.rounds)]
-        found = results[0].document()
+        found, times, fits = scored(run, {TRACK: {}}, options.rays, options.rounds)
+        track = fits.get((TRACK, options.fit_rays)) or fitted(run, TRACK, rays=options.fit_rays)
         positions = [position_row(run, track, x_m, options.fit_rays) for x_m in options.at]
         lines = [*verdicts(found), f"fit of the track: {track.result.seconds:.1f} s", refusal(run)]
     if set(options.at) & set(PAPER_M) and set(options.at) - set(PAPER_M):
@@ -166,10 +174,7 @@ def main() -> None:
     report(
         "Scanning shelves",
         {
-            "evaluate as a whole process": (
-                ["wall s", "CPU s", "peak MiB"],
-                [[one.wall, one.cpu, one.peak_mib] for one in results],
-            ),
+            "evaluate as a whole process": (["rays", "wall s", "CPU s", "peak MiB"], times),
             f"Scores on {found['scenes']} held-out shelves, all positions": (
                 ["rays", "design", missed, "95 % interval", "Mbit/s", "of the design's"],
                 score_rows(found),

@@ -96,7 +96,10 @@ def learned(run: Path, settings: Sequence[str]) -> Path:
 def fitted(run: Path, sensors: int) -> Path:
     """A design of the paper's kind: even rays in each sensor's field, one gate per sensor."""
     name = f"sensors-{sensors}"
-    step(f"Fit {sensors} sensors.", "fit", run, "--sensors", str(sensors), "--rays", str(RAYS), "--name", name)
+    step(
+        f"Fit {sensors} sensors.",
+        "fit", run, "--layout", "grid", "--sensors", str(sensors), "--rays", str(RAYS), "--name", name,
+    )  # fmt: skip
     return run / "designs" / f"{name}.yaml"
 
 

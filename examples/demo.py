@@ -17,10 +17,9 @@ from pathlib import Path
 import lidardesign
 
 CONSTRAINTS = """\
-# a sensor that one can buy: 20 degrees at most, a gate of 10 cm, 576 rays in all
+# a sensor that one can buy: 20 degrees at most, a gate of 10 cm
 field_of_view: {horizontal_deg: {max: 20}, vertical_deg: {max: 20}}
 gate: {width_m: {max: 0.10}}
-budget: {rays: 576}
 """
 
 
@@ -65,15 +64,14 @@ def main() -> None:
     started = time.perf_counter()
     step("Which tasks are there?", "tasks")
     step("Learn which rays are worth firing.", "learn", options.task, "--preset", "draft", "--out", run)
-    step("Fit four sensors to what was learned.", "fit", run, "--sensors", "4", "--name", "free")
+    step(
+        "Fit sensors to what was learned, as many as score best on training scenes, and choose their rays.",
+        "fit", run, "--name", "free",
+    )  # fmt: skip
     print(f"\n# The constraints of {constraints}:\n{CONSTRAINTS}", end="")
     step(
-        "Fit again under these constraints, in seconds and without learning again.",
-        "constrain", run, "--constraints", constraints, "--sensors", "4", "--name", "buyable",
-    )  # fmt: skip
-    step(
-        "Choose the rays, and a gate for each, that tell most together on training scenes.",
-        "fit", run, "--layout", "selected", "--gates", "ray", "--name", "chosen",
+        "Fit again under these constraints, without learning again.",
+        "constrain", run, "--constraints", constraints, "--name", "buyable",
     )  # fmt: skip
     step(
         "Score all on held-out scenes against what one would build without learning.",

@@ -76,7 +76,7 @@ def main() -> None:
         path = folder / f"{name}.yaml"
         path.write_text(text, encoding="utf-8")
         print(f"\n# {path}:\n{text}", end="")
-        step(explanation, "constrain", run, "--constraints", path, "--name", name)
+        step(explanation, "constrain", run, "--layout", "grid", "--constraints", path, "--name", name)
     designs = [run / "designs" / f"{name}.yaml" for name in EMITTERS]
     print("\n# Score them on held-out heads at equal rays; what the detector cannot see does not count.", flush=True)
     compare(evaluated(designs, folder / "report.html"))

@@ -113,7 +113,8 @@ def main() -> None:
         run = options.run or Path(folder) / "run"
         if options.run is None:
             command("learn", "arm", "--out", run)
-        command("fit", run, "--sensors", str(SENSORS), "--rays", str(RAYS), "--name", "picture")
+        words = ("--layout", "distributed", "--sensors", str(SENSORS), "--rays", str(RAYS))
+        command("fit", run, *words, "--name", "picture")
         opened = open_run(run)
         rays = lay_out(load_design(run / "designs" / "picture.yaml"), RAYS, load_samples(run))
         save(picture(opened.scenes("test", opened.config.seed), rays), options.out)

@@ -131,7 +131,7 @@ def main() -> None:
         run = options.run or Path(folder) / "run"
         if options.run is None:
             command("learn", "warehouse", "--out", run)
-        command("fit", run, "--rays", str(RAYS), "--name", "picture")
+        command("fit", run, "--layout", "scan", "--rays", str(RAYS), "--name", "picture")
         opened = open_run(run)
         scene = opened.scenes("test", opened.config.seed)[0]
         save(picture(scene, load_samples(run), load_design(run / "designs" / "picture.yaml")), options.out)

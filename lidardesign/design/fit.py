@@ -234,7 +234,8 @@ def fit_like(
         samples, rays, seed, restarts, em_samples, retarget: See `fit`.
         name: The new design's name; None is that of the given one.
     """
-    layout = layout_of(design)
+    # beside chosen rays only a scan has rays for all values of a condition
+    layout = LAYOUTS["scan"] if design.track is not None else layout_of(design)
     return fit(
         samples,
         sensors=None if layout.one_sensor_per_ray else len(design.sensors),
