@@ -27,6 +27,8 @@ sensors: {count: 4}
 origin: {spread_m: {max: 0.2}, thickness_m: {max: 0.002}}
 budget: {rays: 400}
 """
+# Rays follow from the density alone, in seconds; to choose them on training motions takes longer
+LAYOUT = ("--layout", "distributed")
 
 
 def main() -> None:
@@ -45,7 +47,7 @@ def main() -> None:
     )  # fmt: skip
     step(
         "Fit four sensors. Their rays start all over a region of the ceiling; `travel` says how long it is.",
-        "fit", run, "--sensors", "4", "--rays", "400", "--name", "free",
+        "fit", run, *LAYOUT, "--sensors", "4", "--rays", "400", "--name", "free",
     )  # fmt: skip
     for name, text, explanation in (
         ("mounted", MOUNTS, "Sensors that cannot move: the program picks the mounting points."),
@@ -54,7 +56,7 @@ def main() -> None:
         path = folder / f"{name}.yaml"
         path.write_text(text, encoding="utf-8")
         print(f"\n# {path}:\n{text}", end="")
-        step(explanation, "constrain", run, "--constraints", path, "--name", name)
+        step(explanation, "constrain", run, *LAYOUT, "--constraints", path, "--name", name)
     step(
         "Score all three on motions that were held out. `occupancy` aims at where the ball was in training, from "
         "anywhere;\n# `no-visibility` is the first design fitted without knowing that the arm hides the ball.",
