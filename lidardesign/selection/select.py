@@ -22,7 +22,7 @@ from lidardesign.scene import Scene
 from lidardesign.selection import information
 from lidardesign.selection.candidates import inform
 from lidardesign.selection.certificate import certify
-from lidardesign.selection.choice import Choice, RayCounts, choose, choose_within
+from lidardesign.selection.choice import MOST_PASSES, Choice, RayCounts, choose, choose_within
 from lidardesign.selection.coverage import Coverage, InformedScene, gather
 from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
@@ -83,8 +83,13 @@ class SelectionProblem:
         return gather(informed, gates_m, one_bin * self.bandwidth.bins(gates_m[..., 1] - gates_m[..., 0]))
 
     @phase("choice")
-    def choices(self, coverage: Coverage, count: int) -> list[Choice]:
+    def choices(self, coverage: Coverage, count: int, passes: int = MOST_PASSES) -> list[Choice]:
         """The choice of so many rays within the bandwidth, at each value of a condition.
+
+        Arguments:
+            coverage: What the candidates tell.
+            count: How many rays fire.
+            passes: How often each ray may be swapped.
 
         Raises:
             InfeasibleError: So many rays do not fit.
@@ -98,7 +103,10 @@ class SelectionProblem:
         choices = []
         for visit in self.visits:
             own, counts = coverage.of_rays(visit), self.counts(count, visit)
-            choice = choose(own, counts, price=price) if np.isinf(limit) else choose_within(own, counts, limit)
+            if np.isinf(limit):
+                choice = choose(own, counts, price=price, passes=passes)
+            else:
+                choice = choose_within(own, counts, limit, passes=passes)
             if len(choice.rays) < count:
                 raise InfeasibleError(
                     f"{len(choice.rays)} of {count} rays fit in {limit:g} Mbit/s",
@@ -156,9 +164,9 @@ def _shared_gates(coverage: Coverage, choice: Choice, sensor: np.ndarray, limit_
                     shared, best, is_better = tried, found, True
     rays = np.bincount(sensor[fires], minlength=len(shared))
     first = np.array([np.argmax(sensor == index) for index in range(len(shared))])
-    while (coverage.bits[first, shared] * rays).sum() > limit_mbps and (shared[rays > 0] < gates - 1).any():
-        cost = np.where(shared < gates - 1, coverage.bits[first, shared] * rays, -1.0)
-        shared[cost.argmax()] += 1
+    limit_mbps *= 1 + SLACK
+    while (cost := coverage.bits[first, shared] * rays).sum() > limit_mbps and (shared[rays > 0] < gates - 1).any():
+        shared[np.where(shared < gates - 1, cost, -1.0).argmax()] += 1
     return shared
 
 
@@ -203,7 +211,7 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
                 where=problem.name,
                 hint="let sensors look at the targets: constrain less, or learn longer",
             )
-        choices = problem.choices(coverage, middle)
+        choices = problem.choices(coverage, middle, passes=0)
         before, loss = loss, judged.loss_of(_gate_of(choices))
         if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > problem.most_scenes:
             break

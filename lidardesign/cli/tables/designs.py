@@ -35,6 +35,7 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
     """Print a design's sensors as a table, with angles in degrees; a place that all share stands above it."""
     if design.track is not None:
         _show_track(design, design.track, rich)
+        _show_certificates(design, rich)
         return
     rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
     sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
