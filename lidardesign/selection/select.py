@@ -28,7 +28,7 @@ from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
 
 PROXY = "mean over items of what the returns of the chosen rays leave unknown, by informs of the task"
-LOSS_PER_BANDWIDTH = 0.1  # where bandwidth has no limit: ten percent more of it must bring one percent less loss
+LOSS_PER_BANDWIDTH = 0.2  # where bandwidth has no limit: ten percent more of it must bring two percent less loss
 SMALLEST_GAIN = 0.01  # of the held-back loss: what twice the scenes must gain
 
 
@@ -117,7 +117,7 @@ class SelectionProblem:
         return choices
 
     def _price(self, coverage: Coverage, count: int) -> float:
-        """The price at which so much more bandwidth has to bring a tenth of that share of the loss."""
+        """The price at which more bandwidth has to bring so much less loss."""
         free = choose(coverage, self.counts(count), passes=0)
         loss = coverage.complete - (free.worth - free.harm)
         return LOSS_PER_BANDWIDTH * max(loss, 0.0) / free.bits if free.bits > 0 else 0.0
@@ -211,7 +211,7 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
                 where=problem.name,
                 hint="let sensors look at the targets: constrain less, or learn longer",
             )
-        choices = problem.choices(coverage, middle, passes=0)
+        choices = problem.choices(coverage, middle)
         before, loss = loss, judged.loss_of(_gate_of(choices))
         if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > problem.most_scenes:
             break

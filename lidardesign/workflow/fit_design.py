@@ -1,7 +1,7 @@
 """How a design is fitted, its rays chosen on scenes where that is asked for, and checked before anyone sees it.
 
 Where nobody says how many sensors it has, designs of a few and of more are fitted alike, at the middle number of rays
-and in the bandwidth of the first of them. The task scores them on training scenes that were held back; the fewest
+and in the bandwidth of those of most sensors. The task scores them on training scenes that were held back; the fewest
 sensors win that are no worse than the best by more than a standard error.
 """
 
@@ -159,7 +159,7 @@ def _best_count(fitter: Fitter) -> int:
     found = ", ".join(f"{trial.sensors}: {sign * trial.scores.mean():.4g}" for trial in trials)
     fitter.notes(
         f"sensors: {best.sensors}; {run.metric.name} [{run.metric.unit}] on {len(scenes['held back'])} training scenes "
-        f"in {trials[0].mbps:.3g} Mbit/s by their number: {found}"
+        f"in {trials[-1].mbps:.3g} Mbit/s by their number: {found}"
     )
     return best.sensors
 
@@ -176,7 +176,7 @@ class Trial(NamedTuple):
 def trials_of(
     request: FitRequest, samples: Samples, scenes: Sequence[Scene], fit: Callable[[FitRequest], FitResult]
 ) -> list[Trial]:
-    """Designs of ever more sensors.
+    """Designs of few sensors and of more, in the bandwidth of those of most: the gates of many fit best.
 
     Arguments:
         request: What is asked for, but for the number of sensors.
@@ -197,7 +197,7 @@ def trials_of(
     high = constraints.sensors.max or math.inf
     trials: list[Trial] = []
     refused = None
-    for count in [count for count in fit_choices.COUNTS if low <= count <= high] or [low]:
+    for count in reversed([count for count in fit_choices.COUNTS if low <= count <= high] or [low]):
         limited = _within(request.constraints, trials[0].mbps) if trials else request.constraints
         choices = {**request.choices, "sensors": count, "rays": rays}
         try:
@@ -213,7 +213,7 @@ def trials_of(
         trials.append(Trial(count, sign * np.array(scores), mean_mbps(fired, Bandwidth())))
     if not trials and refused is not None:
         raise refused
-    return trials
+    return trials[::-1]
 
 
 def best_of(trials: Sequence[Trial], scenes: Sequence[Scene]) -> Trial:
