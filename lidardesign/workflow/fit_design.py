@@ -185,7 +185,7 @@ def trials_of(
         fit: Fits the design of a request.
 
     Raises:
-        InfeasibleError: No number of sensors keeps the constraints.
+        InfeasibleError: No number of sensors keeps the constraints; says why the fewest do not.
     """
     run, constraints = request.run, request.constraints or Constraints()
     budgets = sorted(run.task.defaults.rays)
@@ -203,7 +203,7 @@ def trials_of(
         try:
             design = fit(replace(request, choices=choices, constraints=limited)).design
         except InfeasibleError as error:
-            refused = refused or error
+            refused = error
             continue
         fired = tuple(rays_at(design, rays, samples, at=at or None) for at in conditions)
         scores = [
