@@ -175,7 +175,6 @@ def choose_within(
     budget_mbps: float,
     *,
     full: bool = True,
-    passes: int = MOST_PASSES,
 ) -> Choice:
     """The best choice found that a bandwidth allows; as `choose`, with a budget [Mbit/s] for a price.
 
@@ -183,7 +182,7 @@ def choose_within(
     least price that keeps to the budget leaves over is spent at the next lower price, then at none.
     """
     budget_mbps *= 1 + SLACK  # the same bits added up in another order
-    free = choose(coverage, counts, full=full, passes=passes)
+    free = choose(coverage, counts, full=full)
     if free.bits <= budget_mbps:
         return free
     low, high = 0.0, free.worth / free.bits
@@ -203,5 +202,5 @@ def choose_within(
             low = middle
     search = _Search(coverage, counts)
     for price in (high, low, 0.0):
-        search.improve(price, budget_mbps, full=full, passes=passes)
+        search.improve(price, budget_mbps, full=full, passes=MOST_PASSES)
     return search.choice(high)

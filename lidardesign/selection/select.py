@@ -22,7 +22,7 @@ from lidardesign.scene import Scene
 from lidardesign.selection import information
 from lidardesign.selection.candidates import inform
 from lidardesign.selection.certificate import certify
-from lidardesign.selection.choice import MOST_PASSES, Choice, RayCounts, choose, choose_within
+from lidardesign.selection.choice import Choice, RayCounts, choose, choose_within
 from lidardesign.selection.coverage import Coverage, InformedScene, gather
 from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
@@ -83,13 +83,8 @@ class SelectionProblem:
         return gather(informed, gates_m, one_bin * self.bandwidth.bins(gates_m[..., 1] - gates_m[..., 0]))
 
     @phase("choice")
-    def choices(self, coverage: Coverage, count: int, passes: int = MOST_PASSES) -> list[Choice]:
+    def choices(self, coverage: Coverage, count: int) -> list[Choice]:
         """The choice of so many rays within the bandwidth, at each value of a condition.
-
-        Arguments:
-            coverage: What the candidates tell.
-            count: How many rays fire.
-            passes: How often each ray may be swapped.
 
         Raises:
             InfeasibleError: So many rays do not fit.
@@ -103,10 +98,7 @@ class SelectionProblem:
         choices = []
         for visit in self.visits:
             own, counts = coverage.of_rays(visit), self.counts(count, visit)
-            if np.isinf(limit):
-                choice = choose(own, counts, price=price, passes=passes)
-            else:
-                choice = choose_within(own, counts, limit, passes=passes)
+            choice = choose(own, counts, price=price) if np.isinf(limit) else choose_within(own, counts, limit)
             if len(choice.rays) < count:
                 raise InfeasibleError(
                     f"{len(choice.rays)} of {count} rays fit in {limit:g} Mbit/s",
