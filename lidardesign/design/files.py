@@ -57,19 +57,9 @@ WEIGHT_SUM_TOLERANCE = SLACK
 COVARIANCE_ROUNDING = SLACK
 
 OPTIONAL = (
-    "name",
-    "layout",
-    "level",
-    "rays",
-    "at",
-    "gates",
-    "ray_table",
-    "further_tables",
-    "track",
-    "further_tracks",
-    "constraints",
-    "provenance",
-)
+    "name", "layout", "level", "rays", "at", "gates", "ray_table", "further_tables", "track", "further_tracks",
+    "constraints", "provenance",
+)  # fmt: skip
 SENSOR_OPTIONAL = (
     "name", "part", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays",
 )  # fmt: skip

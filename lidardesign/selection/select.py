@@ -124,7 +124,8 @@ class SelectionProblem:
         for visit, choice in zip(self.visits, choices, strict=True):
             found = certify(coverage.of_rays(visit), self.counts(len(choice.rays), visit), choice, budget_mbps=limit)
             worth, gap = worth + choice.worth - choice.harm, gap + found.bound - found.value
-        return coverage.complete - worth, coverage.complete - worth - gap
+        loss = coverage.complete - worth
+        return loss, min(max(loss - gap, 0.0), loss)  # nothing loses less than nothing
 
 
 def _shared_gates(coverage: Coverage, choice: Choice, sensor: np.ndarray, limit_mbps: float) -> np.ndarray:

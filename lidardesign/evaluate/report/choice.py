@@ -26,7 +26,7 @@ FIGURE_PX = 320
 LEFT_PX = 78  # small losses have long labels
 EXPLAINED = (
     "Loss is what the chosen rays leave unknown of training scenes, by what the task says that returns tell: a proxy, "
-    "not the score. No choice of as many of these candidates, with any of their gates and in the same bandwidth, has a "
+    "not the score. No choice of as many of these candidates, through their gates and for no more bandwidth, has a "
     "loss that is less by more than the certificate says; the next column is the same against choices among twice as "
     "many candidates, on fewer scenes."
 )
@@ -44,7 +44,7 @@ def choice_section(designs: Sequence[DesignSpec], evaluation: Evaluation, looks:
     curves = {name: _curve(entries) for name, entries in chosen.items()}
     counts = {entry["rays"] for entries in chosen.values() for entry in entries if "curve" in entry}
     rays = " or ".join(map(str, sorted(counts)))
-    pairs = {name: _beside_scores(name, entries, scores) for name, entries in chosen.items()}
+    pairs = {name: _pair_with_scores(name, entries, scores) for name, entries in chosen.items()}
     metric = f"{evaluation.metric.name} [{evaluation.metric.unit}]"
     legend = "".join(
         f'<span class="switch">{swatch(looks[name].colour, looks[name].dash, looks[name].marker)}'
@@ -124,7 +124,7 @@ def _numbers(point: Sequence[Any]) -> bool:
     return len(point) == 2 and all(isinstance(value, int | float) and math.isfinite(value) for value in point)
 
 
-def _beside_scores(name: str, entries: Sequence[Mapping[str, Any]], scores: Mapping[tuple[str, int], Any]) -> Points:
+def _pair_with_scores(name: str, entries: Sequence[Mapping[str, Any]], scores: Mapping[tuple[str, int], Any]) -> Points:
     """The proxy on scenes held back from the choice, and the score of the same rays, at each number of rays."""
     pairs = [
         (entry["held_back_value"], scores[name, entry["rays"]].value)
