@@ -105,6 +105,22 @@ class Coverage:
             harm=self.harm[rays, gate][:, None],
         )
 
+    def grouped(self, groups: Sequence[np.ndarray]) -> Coverage:
+        """The table whose candidates are groups of rays that fire together, each through the gate of the same number.
+
+        A group tells of an item what its rays tell together; what its rays cost and spoil adds up.
+
+        Arguments:
+            groups: The rays of each; a ray may be in several, and in one several times, where it counts so often.
+        """
+        first = np.cumsum([0, *map(len, groups)])
+        members = np.concatenate([np.zeros(0, dtype=np.intp), *groups]).astype(np.intp)
+        begin = np.zeros(len(first), dtype=np.int64)
+        kernels.group_entries(self.entries, first, members, self.shape[1], begin, False)
+        item, worth, gates = kernels.group_entries(self.entries, first, members, self.shape[1], begin, True)
+        bits, harm = (np.array([values[rays].sum(axis=0) for rays in groups]) for values in (self.bits, self.harm))
+        return replace(self, start=begin, item=item, worth=worth, gates=gates, bits=bits, harm=harm)
+
     def known(self, gate: np.ndarray) -> np.ndarray:
         """What a choice of one gate per ray, -1 for none, (N,), knows about each item, (U,)."""
         known = np.empty(len(self.weight))

@@ -160,3 +160,57 @@ def count_exceeding(entries: ByRay, chosen: np.ndarray, threshold: np.ndarray, c
             for entry in range(entries.start[ray], entries.start[ray + 1]):
                 if entries.gates[entry] >> chosen[ray] & 1 and entries.worth[entry] > threshold[entries.item[entry]]:
                     count[entries.item[entry]] += 1
+
+
+@njit(cache=True, nogil=True)
+def group_entries(
+    entries: ByRay, first: np.ndarray, members: np.ndarray, gates: int, start: np.ndarray, fills: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The entries of groups of rays, one for each worth that some gates of a group have of an item.
+
+    Arguments:
+        entries: Those of the rays.
+        first, members: Where the rays of each group begin, (M + 1,), and all groups' rays.
+        gates: How many each ray has.
+        start: Where the entries of each group begin, (M + 1,); filled unless `fills`.
+        fills: Whether the entries are wanted; else only their number.
+
+    Returns:
+        Item, worth and gates of each entry, of no length unless `fills`.
+    """
+    count = start[-1] if fills else 0
+    item, worth = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.float32)
+    opens = np.empty(count, dtype=np.uint8)
+    told = np.zeros((len(entries.weight), gates))
+    touched, is_touched = np.empty(len(told), dtype=np.int32), np.zeros(len(told), dtype=np.bool_)
+    place = 0
+    for group in range(len(first) - 1):
+        if not fills:
+            start[group] = place
+        many = 0
+        for ray in members[first[group] : first[group + 1]]:
+            for entry in range(entries.start[ray], entries.start[ray + 1]):
+                about = entries.item[entry]
+                if not is_touched[about]:
+                    is_touched[about], touched[many] = True, about
+                    many += 1
+                for gate in range(gates):
+                    if entries.gates[entry] >> gate & 1:
+                        old, more = told[about, gate], entries.worth[entry]
+                        told[about, gate] = old + more if len(entries.table) else max(old, more)
+        for about in touched[:many]:
+            for gate in range(gates):
+                largest = told[about, gate]
+                if largest > 0.0:
+                    bit = 0
+                    for other in range(gate, gates):
+                        if told[about, other] == largest:
+                            bit |= 1 << other
+                            told[about, other] = 0.0
+                    if fills:
+                        item[place], worth[place], opens[place] = about, largest, bit
+                    place += 1
+            is_touched[about] = False
+    if not fills:
+        start[-1] = place
+    return item, worth, opens
