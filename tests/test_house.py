@@ -17,9 +17,9 @@ MOST_PARAMETERS = 12
 
 # From the ground up: a room imports its own modules and those of rooms before it.
 ROOMS = (
-    "errors", "numerics", "estimates", "run", "space", "scene", "geometry", "meshio", "samples", "task", "registry",
-    "config", "density", "design", "simulate", "selection", "evaluate", "export", "testing", "workflow", "cli",
-    "__main__",
+    "errors", "numerics", "estimates", "run", "space", "scene", "geometry", "meshio", "mujoco_model", "samples",
+    "task", "registry", "config", "density", "design", "simulate", "selection", "evaluate", "export", "testing",
+    "workflow", "cli", "__main__",
 )  # fmt: skip
 
 # Where a library may be imported, by the beginnings of module names; nowhere else.
@@ -29,7 +29,7 @@ HOMES = {
     "zuko": ("density.",),
     "embreex": ("geometry.triangles",),
     "cma": ("evaluate.cma.search",),
-    "mujoco": (),
+    "mujoco": ("mujoco_model.", "design.rigs.mjcf."),
     "mink": (),
     "typer": ("cli.",),
     "click": ("cli.",),

@@ -1,0 +1,305 @@
+"""MuJoCo models as bodies: MJCF and URDF files are read safely, and every visible geom becomes a `Body`.
+
+MuJoCo is imported when a model is read. A model may only read files of its own folder.
+"""
+
+from __future__ import annotations
+
+import warnings
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.meshio import check_mesh
+from lidardesign.scene import Body, Box, Capsule, Mesh, Role, Shape, Sphere, rigid
+
+if TYPE_CHECKING:
+    import mujoco
+
+LARGEST_XML_BYTES = 16_000_000
+LARGEST_ASSETS_BYTES = 2_000_000_000
+DIRECTORIES = ("meshdir", "texturedir", "assetdir")
+MAX_INCLUDES = 100
+# What MuJoCo's viewer shows unless told otherwise; Menagerie keeps what is seen in group 2, what collides in group 3.
+SHOWN_GROUPS = (0, 1, 2)
+ALLOWED = "an MJCF or URDF model that MuJoCo can load"
+
+FileState = tuple[str, int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelGeom:
+    """One visible piece of a model: a geom, or all meshes without a name of one of its bodies.
+
+    Arguments:
+        name: Of the body, with the geom's name or a number where the body has several pieces.
+        body_name: Of its MuJoCo body, `world` for what stands still.
+        geom_name: Of the geom, empty where it has none.
+        body: The number of its MuJoCo body.
+        shape: Its geometry; keep it between scenes, since what is cached about a mesh hangs on it.
+        pose: Of the shape in the body's frame, shape (4, 4).
+    """
+
+    name: str
+    body_name: str
+    geom_name: str
+    body: int
+    shape: Shape
+    pose: np.ndarray
+
+    def at(self, poses: np.ndarray, role: Role = "both") -> Body:
+        """The piece where `body_poses` (F, nbody, 4, 4) says; at rest where its body never moves."""
+        own = poses[:, self.body] @ self.pose
+        return Body(self.shape, self.name, role, own[0] if (own == own[0]).all() else own)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelBody:
+    """A body of a scene, and which MuJoCo body and geom it is."""
+
+    body: Body
+    body_name: str
+    geom_name: str
+
+
+def import_mujoco() -> Any:
+    """MuJoCo, the physics engine; raises ConfigError where it is missing."""
+    try:
+        return import_module("mujoco")
+    except ImportError as error:
+        raise ConfigError(
+            f"MuJoCo models need mujoco, which cannot be imported ({error})", hint="pip install mujoco"
+        ) from error
+
+
+@contextmanager
+def mujoco_warnings() -> Iterator[list[str]]:
+    """Collects MuJoCo's warnings, which would otherwise be written to MUJOCO_LOG.TXT in the working folder."""
+    mujoco = import_mujoco()
+    before, collected = mujoco.get_mju_user_warning(), []
+    mujoco.set_mju_user_warning(collected.append)
+    try:
+        yield collected
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def load_model(
+    path: str | Path, *, folder: Path | None = None, edit: Callable[[mujoco.MjSpec], None] | None = None
+) -> tuple[mujoco.MjModel, tuple[str, ...]]:
+    """The model of an MJCF or URDF file, and MuJoCo's warnings, one line each.
+
+    Arguments:
+        path: The file.
+        folder: All that it reads must lie here; None: in the file's own folder.
+        edit: What changes its specification before it is compiled.
+
+    Raises:
+        DataError: A file is missing, unreadable, too large, outside the model's folder, or no model.
+        ConfigError: MuJoCo is not installed.
+    """
+    path = Path(path)
+    model_files(path, folder)
+    mujoco = import_mujoco()
+    with mujoco_warnings() as collected, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            spec = mujoco.MjSpec.from_file(str(path))
+            if edit is not None:
+                edit(spec)
+            model = spec.compile()
+        except (ValueError, mujoco.FatalError) as error:
+            reason = " ".join(str(error).split())
+            raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from error
+    lines = dict.fromkeys(" ".join(str(line).split()) for line in (*collected, *(one.message for one in caught)))
+    return model, tuple(f"{path.name}: MuJoCo warns: {line}" for line in lines)
+
+
+def bodies_from_mujoco(
+    model: mujoco.MjModel, qpos: np.ndarray, *, groups: Sequence[int] | None = None, clip_m: float | None = None
+) -> list[ModelBody]:
+    """Every visible geom of a model as a body that moves with its joints.
+
+    Arguments:
+        model: From `load_model` or from MuJoCo itself.
+        qpos: Joint configurations, one per frame, shape (F, nq), or one for a scene at rest, shape (nq,).
+        groups: Of the geoms that are seen; None: 0, 1 and 2, as MuJoCo shows them.
+        clip_m: Planes reach at most so far from their middle [m]; None: as far as their own size.
+
+    Raises:
+        DataError: No geom is visible, or `qpos` does not fit the model.
+    """
+    poses = body_poses(model, qpos)
+    geoms, _ = visible_geoms(model, groups=groups, clip_m=clip_m)
+    return [ModelBody(geom.at(poses), geom.body_name, geom.geom_name) for geom in geoms]
+
+
+def body_poses(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """The poses of all bodies of a model, body to world, shape (F, nbody, 4, 4).
+
+    Arguments:
+        model: The MuJoCo model.
+        qpos: Joint configurations, shape (F, nq) or (nq,).
+
+    Raises:
+        DataError: `qpos` has another shape, or is not finite.
+    """
+    qpos = np.atleast_2d(np.asarray(qpos, dtype=np.float64))
+    if qpos.ndim != 2 or qpos.shape[1] != model.nq or not len(qpos) or not np.isfinite(qpos).all():
+        raise DataError(f"joint configurations of shape {qpos.shape}", allowed=f"(frames, {model.nq}), finite")
+    mujoco = import_mujoco()
+    data, poses = mujoco.MjData(model), np.tile(np.eye(4), (len(qpos), model.nbody, 1, 1))
+    for frame, configuration in enumerate(qpos):
+        data.qpos[:] = configuration
+        mujoco.mj_kinematics(model, data)
+        poses[frame, :, :3, :3] = data.xmat.reshape(-1, 3, 3)
+        poses[frame, :, :3, 3] = data.xpos
+    return poses
+
+
+def visible_geoms(
+    model: mujoco.MjModel, *, groups: Sequence[int] | None = None, clip_m: float | None = None
+) -> tuple[tuple[ModelGeom, ...], tuple[str, ...]]:
+    """The visible pieces of a model, body by body, and notes on what was mended or left out.
+
+    Arguments:
+        model, groups, clip_m: As of `bodies_from_mujoco`.
+
+    Raises:
+        DataError: No geom is visible, or the mesh of one cannot be used.
+    """
+    shown = np.isin(model.geom_group, SHOWN_GROUPS if groups is None else list(groups))
+    # MuJoCo's rays pass through what is fully transparent, too
+    alpha = np.where(model.geom_matid < 0, model.geom_rgba[:, 3], 1.0)
+    alpha[model.geom_matid >= 0] = model.mat_rgba[model.geom_matid[model.geom_matid >= 0], 3]
+    chosen = np.flatnonzero(shown & (alpha > 0))
+    if not len(chosen):
+        used = ", ".join(str(group) for group in np.unique(model.geom_group)) or "none"
+        raise DataError("the model has no visible geoms", allowed=f"groups that it uses: {used}")
+    pieces: list[ModelGeom] = []
+    for body in np.unique(model.geom_bodyid[chosen]).tolist():
+        name = model.body(body).name or f"body {body}"
+        geoms = chosen[model.geom_bodyid[chosen] == body].tolist()
+        nameless = [geom for geom in geoms if _is_mesh(model, geom) and not model.geom(geom).name]
+        parts = [(geom, [geom]) for geom in geoms if geom not in nameless[1:]]
+        parts = [(geom, nameless if geom in nameless else own) for geom, own in parts]
+        for number, (geom, own) in enumerate(parts, 1):
+            label = model.geom(geom).name
+            full = name if len(parts) == 1 else f"{name} {label or number}"
+            shape, pose = _piece(model, full, own, clip_m)
+            pieces.append(ModelGeom(full, name, label, body, shape, pose))
+    meshes = ((piece.name, piece.shape) for piece in pieces if isinstance(piece.shape, Mesh))
+    notes = [f"{name}: {note}" for name, mesh in meshes for note in mesh.notes]
+    if model.nflex or model.nskin:
+        notes.append(f"flexible bodies and skins are left out: {model.nflex + model.nskin}")
+    return tuple(pieces), tuple(notes)
+
+
+def _kind(model: mujoco.MjModel, geom: int) -> str:
+    """The type of a geom, as "mesh" or "sphere"."""
+    return import_mujoco().mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
+
+
+def _is_mesh(model: mujoco.MjModel, geom: int) -> bool:
+    return _kind(model, geom) in ("mesh", "sdf")
+
+
+def _piece(model: mujoco.MjModel, name: str, geoms: list[int], clip_m: float | None) -> tuple[Shape, np.ndarray]:
+    """The shape of a geom, or of several meshes as one, and its pose in the body's frame."""
+    pose, kind, size = _geom_pose(model, geoms[0]), _kind(model, geoms[0]), model.geom_size[geoms[0]].tolist()
+    if _is_mesh(model, geoms[0]):
+        return _merged(model, name, geoms), np.eye(4)
+    if kind == "sphere":
+        return Sphere(size[0]), pose
+    if kind == "box":
+        return Box((size[0], size[1], size[2])), pose
+    if kind == "capsule":
+        return Capsule(size[0], size[1]), pose
+    raise DataError(f"{name} has a geom of type {kind}", allowed="mesh, box, sphere, capsule")
+
+
+def _geom_pose(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    matrix = np.zeros(9)
+    import_mujoco().mju_quat2Mat(matrix, model.geom_quat[geom])
+    return rigid(matrix.reshape(3, 3), model.geom_pos[geom])
+
+
+def _merged(model: mujoco.MjModel, name: str, geoms: list[int]) -> Mesh:
+    """Mesh geoms of a body as one mesh in the body's frame."""
+    vertices, faces, count = [], [], 0
+    for geom in geoms:
+        mesh, pose = int(model.geom_dataid[geom]), _geom_pose(model, geom)
+        first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        first_face, face_number = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+        points = np.array(model.mesh_vert[first : first + number], dtype=np.float64)
+        vertices.append(points @ pose[:3, :3].T + pose[:3, 3])
+        faces.append(np.array(model.mesh_face[first_face : first_face + face_number], dtype=np.int64) + count)
+        count += len(points)
+    return check_mesh(np.concatenate(vertices), np.concatenate(faces), where=name)
+
+
+def model_files(path: Path, folder: Path | None = None) -> tuple[FileState, ...]:
+    """Name, time of change [ns] and size of every file of an MJCF or URDF model, the XML files first.
+
+    Raises:
+        DataError: A file is missing, unreadable, no model, or lies outside the model's folder.
+    """
+    own, allowed_folder = path.resolve().parent, (folder or path.parent).resolve()
+    documents, assets, directories = [path.resolve()], [], {""}
+
+    def inside(directory: str, name: str) -> Path:
+        """The file that the model names, links followed."""
+        found = (own / directory / name).resolve()
+        if not found.is_relative_to(allowed_folder):
+            what = f"reads {(Path(directory) / name).as_posix()!r}, which is outside {allowed_folder}"
+            hint = "copy the file into the model's folder, or say which folder holds all its files"
+            raise DataError(what, where=str(path), hint=hint)
+        return found
+
+    for document in documents:  # grows while included files are found
+        if len(documents) > MAX_INCLUDES:
+            raise DataError(f"includes more than {MAX_INCLUDES} files", where=str(path))
+        root = _parse(document)
+        if document == documents[0] and root.tag not in ("mujoco", "robot"):
+            allowed = "<mujoco>, an MJCF model, or <robot>, a URDF model"
+            raise DataError(f"its root element is <{root.tag}>", where=str(path), allowed=allowed)
+        # MuJoCo takes the meshes of a URDF by their bare names unless told otherwise
+        kept = any(element.get("strippath") == "false" for element in root.iter("compiler"))
+        bare = root.tag == "robot" and not kept
+        for element in root.iter():
+            directories |= {element.get(name, "") for name in DIRECTORIES if element.tag == "compiler"}
+            names = [value for key, value in element.attrib.items() if key == "file" or key.startswith("file")]
+            if element.tag in ("include", "model"):
+                documents += [found for name in names if (found := inside("", name)) not in documents]
+            else:
+                assets += [name.replace("\\", "/").rpartition("/")[2] if bare else name for name in names if name]
+    found = {inside(directory, name) for directory in directories for name in ["", *assets]}
+    states = tuple(_state(file) for file in [*documents, *sorted(found)] if file.is_file())
+    if sum(size for _, _, size in states) > LARGEST_ASSETS_BYTES:
+        raise DataError("its files are too large", where=str(path), allowed=f"{LARGEST_ASSETS_BYTES} bytes in all")
+    return states
+
+
+def _parse(path: Path) -> ElementTree.Element:
+    try:
+        if path.exists() and not path.is_file():
+            raise DataError("is no regular file", where=str(path), allowed=ALLOWED)
+        if path.stat().st_size > LARGEST_XML_BYTES:
+            raise DataError(f"has {path.stat().st_size} bytes", where=str(path), allowed=f"{LARGEST_XML_BYTES}")
+        return ElementTree.fromstring(path.read_bytes())
+    except OSError as error:
+        raise DataError(f"cannot be read ({error.strerror})", where=str(path), allowed=ALLOWED) from error
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise DataError(f"is no XML ({error})", where=str(path), allowed=ALLOWED) from error
+
+
+def _state(path: Path) -> FileState:
+    state = path.stat()
+    return str(path), state.st_mtime_ns, state.st_size
