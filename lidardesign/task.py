@@ -139,7 +139,8 @@ class Task(Protocol):
     `returns` are as in `score`, of all candidate rays through open gates. Rays of a task without it are not chosen.
 
     A task may also give `metric_of(config) -> Metric`, where the worst value or the tolerance follow from its
-    configuration; `metric` then has those that are usual, and both have the same name, unit and direction.
+    configuration; `metric` then has those that are usual. Name, unit and direction are those of `metric`, or of one of
+    `metrics`, further ones that a key of the configuration chooses.
 
     A task may also give `notes(config, space) -> Sequence[str]`, what a user should know of a configuration before
     anything is learned of it: lengths that look like another unit, splits that share their objects.
@@ -202,7 +203,7 @@ def metric_of(task: Task, config: Any) -> Metric:
     """What a task's scores mean with a configuration; that of every configuration where it has no `metric_of`.
 
     Raises:
-        PluginError: The task gave something else, or another quantity than its `metric`.
+        PluginError: The task gave something else, or another quantity than its `metric` and `metrics`.
     """
     if not hasattr(task, "metric_of"):
         return task.metric
@@ -210,14 +211,14 @@ def metric_of(task: Task, config: Any) -> Metric:
     where = f"task {task.name}, metric_of"
     if not isinstance(found, Metric):
         raise PluginError(f"it gave {type(found).__name__}", where=where, allowed="lidardesign.task.Metric")
-    usual = task.metric
-    if (found.name, found.unit, found.better) != (usual.name, usual.unit, usual.better):
-        raise PluginError(
-            f"it gave {found.name} [{found.unit}], {found.better} is better",
-            where=where,
-            allowed=f"{usual.name} [{usual.unit}], {usual.better} is better, as in its metric",
-        )
+    usual = [_quantity(metric) for metric in (task.metric, *getattr(task, "metrics", ()))]
+    if _quantity(found) not in usual:
+        raise PluginError(f"it gave {_quantity(found)}", where=where, allowed=f"{' or '.join(usual)}, as in its metric")
     return found
+
+
+def _quantity(metric: Metric) -> str:
+    return f"{metric.name} [{metric.unit}], {metric.better} is better"
 
 
 def notes_of(task: Task, config: Any, space: DesignSpace) -> list[str]:

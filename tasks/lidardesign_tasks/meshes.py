@@ -9,7 +9,6 @@ and looks at them. With a CSV of poses over time objects and occluders move, and
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -22,9 +21,8 @@ from pydantic import Field, model_validator
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.meshio import COLOURS, Painted, list_mesh_files, load_mesh
-from lidardesign.numerics import circular_difference
 from lidardesign.scene import Body, Mesh, Scene, Sign
-from lidardesign.space import DesignSpace, aim
+from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
@@ -39,6 +37,7 @@ from lidardesign_tasks.surface import (
 )
 from lidardesign_tasks.surroundings import any_direction, moving
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
+from lidardesign_tasks.view import space_around
 
 Vector = tuple[float, float, float]
 Axis = Literal["x", "y", "z"]
@@ -291,10 +290,7 @@ def _bounds(boxes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 def derived_space(
     config: MeshesConfig, named: Sequence[tuple[str, Mesh]], motion: Motion | None = None
 ) -> DesignSpace:
-    """The directions and ranges in which the sphere around all meshes lies wherever they move, from every origin.
-
-    An origin inside that sphere looks everywhere.
-    """
+    """The directions and ranges in which the sphere around all meshes lies wherever they move, from every origin."""
     meshes = [mesh for _, mesh in named]
     low, high = _bounds(
         [moved_bounds_m(mesh, None if motion is None else motion.of_object(name)) for name, mesh in named]
@@ -304,26 +300,4 @@ def derived_space(
     ahead = centre + np.array([max(SENSOR_DISTANCE * extent_m(meshes), 2 * radius), 0.0, 0.0])
     origin = ahead if config.origin_m is None else np.array(config.origin_m)
     half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
-    corners = origin + half * np.array([(0, 0, 0), *itertools.product((-1, 1), repeat=3)])
-    seen = aim(corners, centre)
-    azimuth, elevation, distance = seen[:, 3], seen[:, 4], seen[:, 5]
-    nearest = float(distance.min())
-    box = [*(origin - half).tolist()], [*(origin + half).tolist()]
-    if nearest <= radius:
-        return DesignSpace(
-            low=(*box[0], 0.0, -math.pi / 2, 0.0),
-            high=(*box[1], 2 * math.pi, math.pi / 2, float(distance.max()) + radius),
-        )
-    angle = math.asin(radius / nearest)
-    bottom = max(float(elevation.min()) - angle, -math.pi / 2)
-    top = min(float(elevation.max()) + angle, math.pi / 2)
-    turn = circular_difference(azimuth, azimuth[0])
-    # seen from above or below, a sphere covers more azimuth than its angle; over the pole, all of it
-    steepest = math.cos(max(abs(bottom), abs(top)))
-    widest = math.asin(math.sin(angle) / steepest) if math.sin(angle) < steepest else math.pi
-    left = max(float(azimuth[0] + turn.min()) - widest, float(azimuth[0]) - math.pi)
-    right = min(float(azimuth[0] + turn.max()) + widest, float(azimuth[0]) + math.pi)
-    return DesignSpace(
-        low=(*box[0], left, bottom, nearest - radius),
-        high=(*box[1], right, top, float(distance.max()) + radius),
-    )
+    return space_around(centre, radius, origin, half)

@@ -72,11 +72,18 @@ def test_scenes_at_any_scale_are_scored_up_to_their_own_worst_value(balls, moves
     ],
 )
 def test_a_metric_of_a_configuration_is_the_same_quantity(found, said):
-    task = SimpleNamespace(
-        name="case", metric=Metric("miss", "mm", "lower", 5.0, 0.1), metric_of=lambda config: found
-    )
+    task = SimpleNamespace(name="case", metric=Metric("miss", "mm", "lower", 5.0, 0.1), metric_of=lambda config: found)
     with pytest.raises(PluginError, match=said):
         metric_of(task, None)
+
+
+def test_a_configuration_may_choose_among_the_metrics_of_a_task():
+    usual, further = Metric("miss", "mm", "lower", 5.0, 0.1), Metric("seen", "%", "higher", 0.0, 1.0)
+    task = SimpleNamespace(name="case", metric=usual, metrics=(further,), metric_of=lambda config: config)
+    assert metric_of(task, further) is further
+    assert metric_of(task, usual) is usual
+    with pytest.raises(PluginError, match=r"allowed: miss \[mm\], lower is better or seen \[%\]"):
+        metric_of(task, Metric("seen", "%", "lower", 0.0, 1.0))
 
 
 def test_a_task_without_it_has_one_metric_for_every_configuration():
