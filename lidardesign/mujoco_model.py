@@ -258,7 +258,7 @@ def model_files(path: Path, folder: Path | None = None) -> tuple[FileState, ...]
         """The file that the model names, links followed."""
         found = (own / directory / name).resolve()
         if not found.is_relative_to(allowed_folder):
-            what = f"reads {(Path(directory) / name).as_posix()!r}, which is outside {allowed_folder}"
+            what = f"reads {(Path(directory) / name).as_posix()!r}, which is outside the model's folder"
             hint = "copy the file into the model's folder, or say which folder holds all its files"
             raise DataError(what, where=str(path), hint=hint)
         return found

@@ -6,13 +6,13 @@ import ast
 from pathlib import Path
 
 import pytest
-from lidardesign_tasks.arm_files import model_files
 from lidardesign_tasks.arm_robot import load_robot
 from support.tables import each_row
 
 from lidardesign.design.files import load_design
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.meshio import load_mesh
+from lidardesign.mujoco_model import model_files
 from lidardesign.simulate.detector.files import load_detector
 
 ROOT = Path(__file__).parents[1]

@@ -10,8 +10,8 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.meshio import check_mesh
+from lidardesign.mujoco_model import import_mujoco
 from lidardesign.scene import Box, Capsule, Mesh, Shape, Sphere, rigid
-from lidardesign_tasks.arm_engine import import_mujoco
 
 if TYPE_CHECKING:
     import mujoco

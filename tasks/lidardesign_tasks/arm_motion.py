@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import DataError
+from lidardesign.mujoco_model import import_mujoco, mujoco_warnings
 from lidardesign.scene import Box, Capsule, Mesh, Sphere
-from lidardesign_tasks.arm_engine import import_mink, import_mujoco, mujoco_warnings
+from lidardesign_tasks.arm_engine import import_mink
 from lidardesign_tasks.arm_links import BALL
 from lidardesign_tasks.arm_robot import BALL_RADIUS_M, Robot
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import as_file, files
@@ -12,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign_tasks.arm_engine import import_mujoco, mujoco_warnings
-from lidardesign_tasks.arm_files import FileState, model_files
+from lidardesign.mujoco_model import FileState, import_mujoco, load_model, model_files
 from lidardesign_tasks.arm_links import BALL, TOOL, VISUAL_GROUP, Link, seen_links
 
 if TYPE_CHECKING:
@@ -66,22 +64,10 @@ def load_robot(path: Path | None, tool_m: float) -> Robot:
 @lru_cache(maxsize=4)
 def _read_once(path: Path, states: tuple[FileState, ...], tool_m: float) -> Robot:
     """`states`, of all files of the model, only tells a changed model from the one in memory."""
-    mujoco = import_mujoco()
-    with mujoco_warnings() as warned, warnings.catch_warnings(record=True) as also_warned:
-        warnings.simplefilter("always")
-        try:
-            spec = mujoco.MjSpec.from_file(str(path))
-            _add_tool(_flange(spec, path), tool_m)
-            model = spec.compile()
-        except (ValueError, mujoco.FatalError) as error:
-            reason = " ".join(str(error).split())
-            allowed = "an MJCF model of one arm"
-            raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=allowed) from error
+    model, warnings = load_model(path, edit=lambda spec: _add_tool(_flange(spec, path), tool_m))
     _check_chain(model, path)
     links, notes = seen_links(model, path)
-    lines = dict.fromkeys(" ".join(str(line).split()) for line in (*warned, *(one.message for one in also_warned)))
-    said = [f"{path.name}: MuJoCo warns: {line}" for line in lines]
-    return Robot(model, links, _home(model), (*said, *notes))
+    return Robot(model, links, _home(model), (*warnings, *notes))
 
 
 def _flange(spec: Any, path: Path) -> Any:

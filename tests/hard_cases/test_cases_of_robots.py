@@ -16,8 +16,6 @@ import numpy as np
 import pytest
 from lidardesign_tasks import arm_motion
 from lidardesign_tasks.arm import ArmTask
-from lidardesign_tasks.arm_engine import mujoco_warnings
-from lidardesign_tasks.arm_files import MAX_INCLUDES, model_files
 from lidardesign_tasks.arm_links import BALL
 from lidardesign_tasks.arm_motion import PENETRATION_M, POSITION_RESIDUAL_M, TRIES, Arm, RejectedError, draw_waypoints
 from lidardesign_tasks.arm_robot import load_robot
@@ -26,6 +24,7 @@ from support.robots import TOOL_M, mjcf, written
 from support.tables import each_row
 
 from lidardesign.errors import DataError
+from lidardesign.mujoco_model import MAX_INCLUDES, model_files, mujoco_warnings
 
 TASK = ArmTask()
 FREE = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"

@@ -108,7 +108,7 @@ REFUSED = {
         + "]><mujoco model='&j;'/>",
         "is no XML",
     ),
-    "another format": ("<robot name='x'/>", "<robot>"),
+    "another format": ("<sdf name='x'/>", "<sdf>"),
     "an unknown element": ("<mujoco><worldbody><bogus/></worldbody></mujoco>", "unrecognized element"),
     "no joints": (mjcf(0), "has 0 joints"),
     "six hinges": (mjcf(6), "has 6 joints"),
