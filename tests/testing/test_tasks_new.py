@@ -28,17 +28,19 @@ from lidardesign.testing.scaffold import LONGEST_NAME, new_task
 pytest_plugins = ["pytester"]
 ROOT = Path(__file__).parents[2]
 TEMPLATES = ROOT / "lidardesign" / "testing" / "template"
-EXAMPLE = ROOT / "examples" / "third_party_task"
+EXAMPLE, STREET = ROOT / "examples" / "third_party_task", ROOT / "examples" / "street"
 NAME = "landmark"
 
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory):
-    """A virtual environment of its own with a new package and the example in it; packages by name."""
+    """A virtual environment of its own with a new package and the examples in it; packages by name."""
     pytest.importorskip("setuptools", minversion="77", reason="building a wheel offline needs setuptools")
     root = tmp_path_factory.mktemp("environment")
     new_task(NAME, root / "new")
-    shutil.copytree(EXAMPLE, root / "example", ignore=shutil.ignore_patterns("__pycache__", "*.egg-info", "build"))
+    folders = {"new": root / "new", "example": root / "example", "street": root / "street"}
+    for name, source in (("example", EXAMPLE), ("street", STREET)):
+        shutil.copytree(source, folders[name], ignore=shutil.ignore_patterns("__pycache__", "*.egg-info", "build"))
     venv.create(root / "venv", with_pip=False)
     python = root / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
     # what is installed for these tests, this package too, is there as it is here
@@ -46,8 +48,8 @@ def environment(tmp_path_factory):
     lines = [f"import site; site.addsitedir({place!r})" for place in site.getsitepackages()]
     (own / "installed_for_tests.pth").write_text("\n".join(lines) + "\n")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", "--python", str(python), "install"]
-    done(*pip, "--no-deps", "--no-build-isolation", str(root / "new"), str(root / "example"), cwd=root)
-    return python, {"new": root / "new", "example": root / "example"}
+    done(*pip, "--no-deps", "--no-build-isolation", *map(str, folders.values()), cwd=root)
+    return python, folders
 
 
 def done(*command: str, cwd: Path) -> str:
@@ -61,7 +63,7 @@ def done(*command: str, cwd: Path) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("package", ["new", "example"])
+@pytest.mark.parametrize("package", ["new", "example", "street"])
 def test_the_package_passes_its_own_tests_untouched_in_its_own_environment(environment, package):
     python, folders = environment
     shutil.rmtree(folders[package] / "build", ignore_errors=True)

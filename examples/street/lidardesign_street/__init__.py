@@ -1,0 +1,1 @@
+"""The task street for lidardesign."""
