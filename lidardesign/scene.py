@@ -86,6 +86,27 @@ class Capsule:
 
 
 @dataclass(frozen=True)
+class Cylinder:
+    """A cylinder around the z axis from -half_length to +half_length, flat at both ends."""
+
+    radius_m: float
+    half_length_m: float
+
+    def __post_init__(self) -> None:
+        _check_lengths(self, self.radius_m, self.half_length_m)
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """An ellipsoid centred on the body's origin, by its semi-axes along x, y, z."""
+
+    semi_axes_m: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        _check_lengths(self, *self.semi_axes_m)
+
+
+@dataclass(frozen=True)
 class Plane:
     """The half space z <= 0, whose surface is the infinite plane z = 0 with the normal +z."""
 
@@ -159,7 +180,8 @@ class Mesh:
         return replace(self, vertices=self.vertices @ pose[:3, :3].T + pose[:3, 3])
 
 
-Shape = Sphere | Box | Capsule | Plane | Mesh
+Round = Sphere | Capsule | Cylinder | Ellipsoid
+Shape = Round | Box | Plane | Mesh
 Vector = tuple[float, float, float]
 
 

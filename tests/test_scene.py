@@ -13,7 +13,7 @@ from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.geometry.surface import sample_body, sample_triangles, surface_area_m2
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid, rigid
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, inverse_rigid, rigid
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, 0, -1, 0), (0, 0, 0, 1, 1, 3))
@@ -50,7 +50,13 @@ def test_an_unknown_role_is_refused():
 
 @pytest.mark.parametrize("length", [0.0, -1.0, math.nan, math.inf])
 def test_primitives_have_positive_finite_sizes(length):
-    for build in (Sphere, lambda a: Box((1.0, a, 1.0)), lambda a: Capsule(a, 1.0)):
+    for build in (
+        Sphere,
+        lambda a: Box((1.0, a, 1.0)),
+        lambda a: Capsule(a, 1.0),
+        lambda a: Cylinder(1.0, a),
+        lambda a: Ellipsoid((1.0, 1.0, a)),
+    ):
         with pytest.raises(DataError, match="length"):
             build(length)
 
@@ -81,6 +87,9 @@ SHAPES = {
     "sphere": (Sphere(0.7), 4 * math.pi * 0.49),
     "box": (Box((0.2, 0.5, 1.0)), 8 * (0.1 + 0.5 + 0.2)),
     "capsule": (Capsule(0.3, 0.8), 4 * math.pi * 0.3 * 1.1),
+    "cylinder": (Cylinder(0.3, 0.8), 2 * math.pi * 0.3 * 1.9),
+    "ellipsoid": (Ellipsoid((0.7, 0.7, 0.7)), 4 * math.pi * 0.49),
+    "spheroid": (Ellipsoid((0.5, 0.5, 1.0)), 2 * math.pi * 0.5 * (0.5 + math.asin(0.75**0.5) / 0.75**0.5)),
     "plane": (Plane(), 36.0),
     "mesh": (Mesh(TRIANGLE, [[0, 1, 2]]), 0.5),
 }
@@ -96,13 +105,22 @@ def test_surface_points_lie_on_the_surface_and_areas_are_right(name):
     assert np.abs(references.shape_distance(shape)(local)).max() < 1e-12
 
 
-@pytest.mark.parametrize(("name", "height"), [("box", 0.5), ("capsule", 0.4), ("sphere", 0.35)])
-def test_surface_points_are_even_in_area(name, height):
-    shape, area = SHAPES[name]
+# Of the band |z| < height, away from caps and lids: its half height and its area by perimeter, of the spheroid by
+# integrating its perimeter along its profile.
+BANDS = {
+    "box": (0.5, 4 * (0.2 + 0.5)),
+    "capsule": (0.4, 0.8 * 2 * math.pi * 0.3),
+    "cylinder": (0.4, 0.8 * 2 * math.pi * 0.3),
+    "sphere": (0.35, 0.7 * 2 * math.pi * 0.7),
+    "spheroid": (0.5, 2 * math.pi * 0.5 * (0.5 * (1 - 0.75 / 4) ** 0.5 + math.asin(0.75**0.5 / 2) / 0.75**0.5)),
+}
+
+
+@each_row("name", BANDS)
+def test_surface_points_are_even_in_area(name):
+    (shape, area), (height, band) = SHAPES[name], BANDS[name]
     z = sample_body([Body(shape)], SPACE, 20_000, np.random.default_rng(1)).points[:, 2]
-    # the band |z| < height, away from caps and lids, by the surface's own perimeter
-    perimeter = {"box": 4 * (0.2 + 0.5), "capsule": 2 * math.pi * 0.3, "sphere": 2 * math.pi * 0.7}[name]
-    expected = perimeter * 2 * height / area
+    expected = band / area
     error = math.sqrt(expected * (1 - expected) / 20_000)
     assert abs((np.abs(z) < height).mean() - expected) < references.STANDARD_ERRORS * error
 

@@ -1,4 +1,4 @@
-"""Rays against spheres, boxes, capsules and planes in closed form, all of one kind at a time."""
+"""Rays against primitives in closed form, all of one kind at a time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from lidardesign.geometry.rays import Crossings, Hits
 from lidardesign.numerics import ROUNDING, unit_vectors
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Sphere, inverse_rigid
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Shape, Sphere, inverse_rigid
 
 GROUP_CHUNK = 200_000  # ray-primitive pairs at a time: the temporaries stay below some 50 MB
 # Relative rounding of squared distances, doubled many times over: bounding balls are never missed.
@@ -44,7 +44,7 @@ class PrimitiveGroup:
         self._crossed, self._normal = _CROSSED[kind], _NORMALS[kind]
         self._body = np.array([index for index, _ in members], dtype=np.int64)
         self._sizes = np.array([SIZES[kind](body.shape) for _, body in members])
-        self._radii_m = np.array([_RADII[kind](body.shape) for _, body in members])
+        self._radii_m = np.array([bounding_radius_m(body.shape) for _, body in members])
         poses = np.stack([body.pose(frame) for _, body in members])
         self._rotation = poses[:, :3, :3]
         self._middle = poses[:, :3, 3].mean(axis=0)
@@ -189,6 +189,43 @@ def _capsule_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
     return unit_vectors(points - axis_point)
 
 
+def _cylinder(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A line is in the cylinder where it is both between the planes of its ends and in the endless cylinder."""
+    radius_m, half_length_m = sizes[:, 0], sizes[:, 1]
+    across = _dot(directions[:, :2], directions[:, :2])
+    upright = across == 0
+    along = np.where(upright, 0.0, _dot(origins[:, :2], directions[:, :2]) / across)
+    perpendicular = origins[:, :2] - along[:, None] * directions[:, :2]
+    half_chord = np.sqrt((radius_m**2 - _dot(perpendicular, perpendicular)) / across)
+    height, climb = origins[:, 2], directions[:, 2]
+    ends = (-half_length_m - height) / climb, (half_length_m - height) / climb
+    level = (climb == 0) & (np.abs(height) <= half_length_m)
+    near = np.maximum(-along - half_chord, np.where(level, -np.inf, np.minimum(*ends)))
+    far = np.minimum(half_chord - along, np.where(level, np.inf, np.maximum(*ends)))
+    hit = near <= far
+    return np.where(hit, near, np.nan), np.where(hit, far, np.nan)
+
+
+def _cylinder_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    radial = np.hypot(points[:, 0], points[:, 1])
+    normal = points.copy()
+    on_end = np.abs(points[:, 2]) * sizes[:, 0] > radial * sizes[:, 1]
+    normal[on_end, :2], normal[~on_end, 2] = 0.0, 0.0
+    return unit_vectors(normal)
+
+
+def _ellipsoid(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stretched along its axes it is a ball of radius 1."""
+    stretched = directions / sizes
+    length = np.linalg.norm(stretched, axis=1)
+    near, far = _ball(origins / sizes, stretched / length[:, None], np.ones(len(sizes)))
+    return near / length, far / length
+
+
+def _ellipsoid_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return unit_vectors(points / sizes**2)
+
+
 def _plane(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """One crossing, and no second one."""
     range_m = -origins[:, 2] / directions[:, 2]
@@ -204,12 +241,16 @@ _CROSSED: dict[type, Callable[..., tuple[np.ndarray, np.ndarray]]] = {
     Sphere: _sphere,
     Box: _box,
     Capsule: _capsule,
+    Cylinder: _cylinder,
+    Ellipsoid: _ellipsoid,
     Plane: _plane,
 }
 _NORMALS: dict[type, Callable[..., np.ndarray]] = {
     Sphere: _sphere_normal,
     Box: _box_normal,
     Capsule: _capsule_normal,
+    Cylinder: _cylinder_normal,
+    Ellipsoid: _ellipsoid_normal,
     Plane: _plane_normal,
 }
 # Their lengths, as closed forms and compiled loops take them; planes and meshes have none.
@@ -217,12 +258,33 @@ SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
     Sphere: lambda shape: (shape.radius_m, 0.0, 0.0),
     Box: lambda shape: shape.half_extents_m,
     Capsule: lambda shape: (shape.radius_m, shape.half_length_m, 0.0),
+    Cylinder: lambda shape: (shape.radius_m, shape.half_length_m, 0.0),
+    Ellipsoid: lambda shape: shape.semi_axes_m,
     Plane: lambda shape: (0.0, 0.0, 0.0),
     Mesh: lambda shape: (0.0, 0.0, 0.0),
 }
-_RADII: dict[type, Callable[..., float]] = {
-    Sphere: lambda shape: shape.radius_m,
-    Box: lambda shape: math.hypot(*shape.half_extents_m),
-    Capsule: lambda shape: shape.radius_m + shape.half_length_m,
-    Plane: lambda shape: math.inf,
-}
+
+
+def half_extents_m(shape: Shape) -> tuple[float, float, float]:
+    """Half the sides of the box around a primitive in its own frame, infinite around a plane [m]."""
+    match shape:
+        case Sphere(radius_m=radius_m):
+            return radius_m, radius_m, radius_m
+        case Capsule(radius_m=radius_m, half_length_m=half_length_m):
+            return radius_m, radius_m, radius_m + half_length_m
+        case Cylinder(radius_m=radius_m, half_length_m=half_length_m):
+            return radius_m, radius_m, half_length_m
+        case Box(half_extents_m=half) | Ellipsoid(semi_axes_m=half):
+            return half
+    return math.inf, math.inf, math.inf
+
+
+def bounding_radius_m(shape: Shape) -> float:
+    """The radius of the ball around a primitive's origin that holds it, infinite for a plane [m]."""
+    half = half_extents_m(shape)
+    match shape:
+        case Box():
+            return math.hypot(*half)
+        case Cylinder():
+            return math.hypot(*half[1:])
+    return max(half)

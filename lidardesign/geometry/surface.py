@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import elliprg
 
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
+from lidardesign.geometry.primitives import half_extents_m
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Round, Scene, Sphere
 from lidardesign.space import RANGE, DesignSpace
 
 
@@ -66,6 +68,11 @@ def surface_area_m2(body: Body, space: DesignSpace) -> float:
             return 8 * (x * y + y * z + z * x)
         case Capsule(radius_m=radius_m, half_length_m=half_length_m):
             return 4 * math.pi * radius_m * (radius_m + half_length_m)
+        case Cylinder(radius_m=radius_m, half_length_m=half_length_m):
+            return 2 * math.pi * radius_m * (radius_m + 2 * half_length_m)
+        case Ellipsoid(semi_axes_m=(x, y, z)):
+            # Carlson's integral R_G (DLMF 19.33.1)
+            return 4 * math.pi * x * y * z * float(elliprg(x**-2, y**-2, z**-2))
         case Plane():
             return (2 * _reach_m(space)) ** 2
         case Mesh(vertices=vertices, faces=faces):
@@ -81,9 +88,7 @@ def _reach_m(space: DesignSpace) -> float:
     return space.high[RANGE] + float(np.linalg.norm(np.array(space.high[:3]) - np.array(space.low[:3]))) / 2
 
 
-def _on_body(
-    body: Body, space: DesignSpace, count: int, generator: np.random.Generator, frame: int
-) -> Sampled:
+def _on_body(body: Body, space: DesignSpace, count: int, generator: np.random.Generator, frame: int) -> Sampled:
     pose = body.pose(frame)
     if isinstance(body.shape, Mesh):
         mesh = body.shape
@@ -100,17 +105,54 @@ def _on_body(
     return Sampled(points, np.repeat(points[:, None], 3, axis=1))
 
 
-def _on_primitive(shape: Sphere | Box | Capsule, count: int, generator: np.random.Generator) -> np.ndarray:
+def grid_faces(rows: int, columns: int) -> np.ndarray:
+    """Two triangles per cell of a grid of vertices, shape (2 (rows - 1) (columns - 1), 3)."""
+    first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, up = first + 1, first + columns
+    return np.concatenate([np.stack([first, right, up], axis=1), np.stack([right, up + 1, up], axis=1)])
+
+
+def round_triangles(shape: Round, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) [m] and outward faces (F, 3) of a round shape with so many steps round its z axis."""
+    turn = np.linspace(0.0, 2 * np.pi, steps + 1)
+    half = np.linspace(0.0, np.pi / 2, steps // 4 + 1)
+    latitude = np.concatenate([half[::-1], -half])
+    radius, height = np.cos(latitude), np.sin(latitude)
+    if isinstance(shape, Cylinder):
+        radius, height = np.array([0.0, 1.0, 1.0, 0.0]), np.array([1.0, 1.0, -1.0, -1.0])
+    ring = np.stack([np.outer(radius, np.cos(turn)), np.outer(radius, np.sin(turn)), np.outer(height, turn**0)], axis=2)
+    vertices = ring * half_extents_m(shape)
+    if isinstance(shape, Capsule):
+        ends = np.repeat([shape.half_length_m, -shape.half_length_m], len(half))
+        vertices[..., 2] = shape.radius_m * height[:, None] + ends[:, None]
+    return vertices.reshape(-1, 3), grid_faces(len(radius), len(turn))
+
+
+def _on_primitive(shape: Round | Box, count: int, generator: np.random.Generator) -> np.ndarray:
     if isinstance(shape, Box):
         half = np.array(shape.half_extents_m)
         points, area = generator.uniform(-half, half, (count, 3)), half.prod() / half
         axis = generator.choice(3, count, p=area / area.sum())
         points[np.arange(count), axis] = half[axis] * generator.choice([-1.0, 1.0], count)
         return points
+    if isinstance(shape, Cylinder):
+        turn, on_end = generator.uniform(0, 2 * math.pi, count), generator.random(count)
+        on_end = on_end * (shape.radius_m + 2 * shape.half_length_m) < shape.radius_m
+        radius = shape.radius_m * np.where(on_end, np.sqrt(generator.random(count)), 1.0)
+        height = generator.uniform(-shape.half_length_m, shape.half_length_m, count)
+        height = np.where(on_end, np.copysign(shape.half_length_m, height), height)
+        return np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
     direction = generator.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     if isinstance(shape, Sphere):
         return shape.radius_m * direction
+    if isinstance(shape, Ellipsoid):
+        axes = np.array(shape.semi_axes_m)
+        # a ball that is stretched to it grows by |direction / axes| there, at most by 1 / the smallest axis
+        growth = np.linalg.norm(direction / axes, axis=1) * axes.min()
+        accepted = axes * direction[generator.random(count) < growth]
+        rest = count - len(accepted)
+        return np.concatenate([accepted, _on_primitive(shape, rest, generator)]) if rest else accepted
     # a capsule is a sphere cut at its equator with a cylinder in between
     ends = shape.radius_m * direction + np.sign(direction[:, 2:]) * np.array([0, 0, shape.half_length_m])
     turn = generator.uniform(0, 2 * math.pi, count)

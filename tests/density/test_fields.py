@@ -13,7 +13,7 @@ from support.meshes import icosphere
 from lidardesign.density.fields import grids
 from lidardesign.density.fields.distance import BodyField, UnionField, build_field
 from lidardesign.errors import ConfigError
-from lidardesign.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Plane, Scene, Sphere, rigid
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -28,19 +28,15 @@ def random_pose(generator):
 
 
 PRIMITIVES = {
-    "sphere": (Sphere(0.7), lambda q: np.linalg.norm(q, axis=1) - 0.7),
-    "plane": (Plane(), lambda q: q[:, 2]),
-    "capsule": (
-        Capsule(0.3, 0.8),
-        lambda q: np.linalg.norm(q - np.c_[0 * q[:, :2], np.clip(q[:, 2], -0.8, 0.8)], axis=1) - 0.3,
-    ),
-    "box": (
-        Box((0.3, 0.5, 0.9)),
-        lambda q: (
-            np.linalg.norm(np.maximum(np.abs(q) - [0.3, 0.5, 0.9], 0), axis=1)
-            + np.minimum((np.abs(q) - [0.3, 0.5, 0.9]).max(axis=1), 0)
-        ),
-    ),
+    "sphere": Sphere(0.7),
+    "plane": Plane(),
+    "capsule": Capsule(0.3, 0.8),
+    "box": Box((0.3, 0.5, 0.9)),
+    "cylinder": Cylinder(0.3, 0.8),
+    "ellipsoid": Ellipsoid((0.3, 0.5, 0.9)),
+    "disc": Ellipsoid((0.7, 0.7, 0.02)),
+    "needle": Ellipsoid((1.5, 0.01, 0.01)),
+    "ball": Ellipsoid((0.5, 0.5, 0.5)),
 }
 
 
@@ -48,18 +44,18 @@ PRIMITIVES = {
 @pytest.mark.parametrize("name", PRIMITIVES)
 def test_posed_primitives_have_their_closed_form_distance(name):
     generator = np.random.default_rng(1)
-    shape, closed_form = PRIMITIVES[name]
+    shape = PRIMITIVES[name]
     pose = random_pose(generator)
     points = generator.normal(scale=1.5, size=(500, 3))
     field = field_of(Scene((Body(shape, poses=pose),)))
     local = (points - pose[:3, 3]) @ pose[:3, :3]
-    np.testing.assert_allclose(field.distances(points)[:, 0], closed_form(local), atol=1e-12)
+    np.testing.assert_allclose(field.distances(points)[:, 0], references.shape_distance(shape)(local), atol=1e-12)
 
 
 @pytest.mark.parametrize("name", PRIMITIVES)
 def test_gradients_of_primitives_have_unit_length_and_match_differences(name):
     generator = np.random.default_rng(2)
-    shape, _ = PRIMITIVES[name]
+    shape = PRIMITIVES[name]
     field = field_of(Scene((Body(shape, poses=random_pose(generator)),)))
     points = generator.normal(scale=1.5, size=(300, 3))
     gradient = field.gradient(points, np.ones((300, 1)))
@@ -67,6 +63,26 @@ def test_gradients_of_primitives_have_unit_length_and_match_differences(name):
     smooth = np.abs(np.linalg.norm(numerical, axis=1) - 1) < 1e-5
     assert smooth.mean() > 0.95
     np.testing.assert_allclose(gradient[smooth], numerical[smooth], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "axes", [(0.3, 0.5, 0.9), (0.7, 0.7, 0.02), (1.5, 0.01, 0.01), (1e3, 1e-3, 1.0), (0.5, 0.5, 0.5)]
+)
+def test_an_ellipsoid_is_as_far_from_a_point_as_its_nearest_point_and_zero_on_itself(axes):
+    generator = np.random.default_rng(5)
+    turned = generator.normal(size=(400, 3))
+    normal = (on := np.array(axes) * turned / np.linalg.norm(turned, axis=1, keepdims=True)) / np.array(axes) ** 2
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    field = field_of(Scene((Body(Ellipsoid(axes)),)))
+    # along a normal outward, the foot stays the nearest point of a convex body
+    for away_m in (0.0, 1e-6, 0.1, 10.0):
+        places = on + away_m * normal
+        np.testing.assert_allclose(field.distances(places)[:, 0], away_m, atol=1e-12 * max(*axes, 1))
+        np.testing.assert_allclose(field.gradient(places, np.ones((400, 1))), normal, atol=1e-5)
+    # on the planes and axes of symmetry two or more points are nearest, the least semi-axis decides at the middle
+    middle = field.distances(np.zeros((1, 3)))[0, 0]
+    assert middle == pytest.approx(-min(axes), rel=1e-12)
+    assert np.isfinite(field.gradient(np.eye(3) * axes, np.ones((3, 1)))).all()
 
 
 @pytest.mark.parametrize("resolution", [24, 48, 96])

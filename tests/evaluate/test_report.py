@@ -60,7 +60,7 @@ from lidardesign.evaluate.report.view import (
 )
 from lidardesign.evaluate.results import Evaluation, leading_detail, verdict
 from lidardesign.geometry.rays import Outcome
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.task import Metric
 
 
@@ -228,7 +228,10 @@ def test_a_verdict_needs_an_interval_that_excludes_zero_and_the_metrics_directio
     assert "no clear difference from uniform" in summary_sentences(lower)[1]
 
 
-@each_row("shape", [Sphere(0.4), Box((0.1, 0.2, 0.3)), Capsule(0.1, 0.3), Plane()])
+EGG = Ellipsoid((0.1, 0.2, 0.3))
+
+
+@each_row("shape", [Sphere(0.4), Box((0.1, 0.2, 0.3)), Capsule(0.1, 0.3), Cylinder(0.1, 0.3), EGG, Plane()])
 def test_drawn_primitives_have_their_vertices_on_the_surface(shape):
     bounds = np.array([[-1.0, -1, -1], [1, 1, 1]])
     vertices, faces = body_triangles(Body(shape), 0, bounds)

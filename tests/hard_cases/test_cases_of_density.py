@@ -45,7 +45,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.registry import load_task
 from lidardesign.samples import Samples, load_samples
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.space import ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
 from lidardesign.task import TaskConfig
 
@@ -547,6 +547,8 @@ SOLIDS = {
     "ball": Sphere(0.5),
     "box": Box((0.5, 0.5, 0.5)),
     "capsule": Capsule(0.5, 0.3),
+    "cylinder": Cylinder(0.5, 0.5),
+    "ellipsoid": Ellipsoid((0.5, 0.6, 0.7)),
     "mesh": ball_of_triangles(),
 }
 OPTICS = Optics(0.005, 1000.0, 1000.0, 0.005)

@@ -21,7 +21,7 @@ from lidardesign.evaluate.score import slipped_notes
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.triangles import BESIDE_SHARE, SecondCasts, Triangles
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import simulate
 from lidardesign.task import Metric, Score
@@ -193,6 +193,8 @@ ONE_OF_EACH = {
     "sphere": Sphere(0.7),
     "box": Box((0.5, 0.6, 0.7)),
     "capsule": Capsule(0.5, 0.3),
+    "cylinder": Cylinder(0.5, 0.6),
+    "ellipsoid": Ellipsoid((0.5, 0.6, 0.7)),
     "plane": Plane(),
     "mesh": mesh_of(trimesh.creation.icosphere(subdivisions=2, radius=0.7)),
 }

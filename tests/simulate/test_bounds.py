@@ -27,7 +27,21 @@ from support.rays import rays_along
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.scene import (
+    Ambient,
+    Body,
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    Medium,
+    Mesh,
+    Plane,
+    Receiver,
+    Scene,
+    Sphere,
+    rigid,
+)
 from lidardesign.simulate.detector.detector import Physics, metres
 from lidardesign.simulate.effects.expected_counts import (
     Blindness,
@@ -290,6 +304,8 @@ MOVERS = {
     "sphere": Sphere(0.1),
     "box": Box((0.1, 0.05, 0.2)),
     "capsule": Capsule(0.05, 0.1),
+    "cylinder": Cylinder(0.05, 0.1),
+    "ellipsoid": Ellipsoid((0.1, 0.05, 0.2)),
     "plane": Plane(),
     "mesh": box_mesh(),
 }

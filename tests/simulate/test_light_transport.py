@@ -21,7 +21,7 @@ from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.shadowing import visible_echoes
 from lidardesign.simulate.light import Beams, Echoes, direct_echoes
@@ -133,7 +133,7 @@ def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitte
 
 
 @needs_simulator
-@each_row("shape", [Sphere(0.3), Box((0.2, 0.3, 0.25)), Capsule(0.2, 0.25), Plane()], ids=repr)
+@each_row("shape", [Sphere(0.3), Box((0.2, 0.3, 0.25)), Capsule(0.2, 0.25), Cylinder(0.2, 0.25), Plane()], ids=repr)
 @each_row("offset_m", [0.0, 1e5])
 def test_every_shape_is_exported_where_it_is(shape, offset_m):
     place = np.array([1.5 + offset_m, 0.2, 0.1])

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.effects.motion import Screw, moving_tracer, path_of
 from lidardesign.space import direction
 
@@ -38,6 +38,8 @@ SHAPES = {
     "sphere": Sphere(0.5),
     "box": Box((0.3, 0.5, 0.2)),
     "capsule": Capsule(0.2, 0.4),
+    "cylinder": Cylinder(0.2, 0.4),
+    "ellipsoid": Ellipsoid((0.3, 0.5, 0.2)),
     "plane": Plane(),
     "mesh": icosphere(),
 }

@@ -14,12 +14,14 @@ from typing import NamedTuple
 import numpy as np
 
 from lidardesign.density.fields.grids import Grid, cached_distance_grids, grid_around
-from lidardesign.geometry.primitives import SIZES
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid
+from lidardesign.geometry.primitives import SIZES, half_extents_m
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, inverse_rigid
 
 # Kinds of bodies, as the compiled loops know them.
-SPHERE, BOX, CAPSULE, PLANE, GRID = range(5)
-KINDS: dict[type, int] = {Sphere: SPHERE, Box: BOX, Capsule: CAPSULE, Plane: PLANE, Mesh: GRID}
+SPHERE, BOX, CAPSULE, PLANE, GRID, CYLINDER, ELLIPSOID = range(7)
+KINDS: dict[type, int] = {
+    Sphere: SPHERE, Box: BOX, Capsule: CAPSULE, Plane: PLANE, Mesh: GRID, Cylinder: CYLINDER, Ellipsoid: ELLIPSOID,
+}  # fmt: skip
 # Frames of one motion are close together: so many of them are looked at, or passed over, at once.
 GROUP_COLUMNS = 16
 BuildGrid = Callable[[Mesh], tuple[Grid, np.ndarray]]
@@ -108,7 +110,7 @@ class Bodies:
 
     Arguments:
         kinds: What each is (`SPHERE`, ...), shape (B,).
-        sizes: Radius, radius and half length, or half extents, shape (B, 3) [m].
+        sizes: Radius, radius and half length, or half extents or semi-axes, shape (B, 3) [m].
         to_body: Rows of the world-to-body transform, shape (B, 3, 4).
         grid: Row in `grids` of meshes, 0 for others, shape (B,).
         low, high: World bounding boxes, shape (B, 3); infinite for planes.
@@ -229,13 +231,9 @@ def place_bodies(entries: Sequence[Entry], columns: int, build_grid: BuildGrid) 
     kinds = np.array([KINDS[type(body.shape)] for _, body, _ in entries], dtype=np.int64)
     sizes = np.array([SIZES[type(body.shape)](body.shape) for _, body, _ in entries], dtype=np.float64).reshape(-1, 3)
     # World boxes around every body, shape (B, 3) each; of a mesh, around its whole grid
-    centre, half = np.zeros((len(kinds), 3)), sizes.copy()
-    sphere, capsule = kinds == SPHERE, kinds == CAPSULE
-    half[sphere] = sizes[sphere, :1]
-    half[capsule] = np.stack(
-        [sizes[capsule, 0], sizes[capsule, 0], sizes[capsule, 0] + sizes[capsule, 1]], axis=1
-    ).reshape(-1, 3)
-    mesh = kinds == GRID
+    mesh, sphere, plane = kinds == GRID, kinds == SPHERE, kinds == PLANE
+    half = np.array([half_extents_m(body.shape) for _, body, _ in entries], dtype=np.float64).reshape(-1, 3)
+    centre, half[plane] = np.zeros((len(kinds), 3)), 0.0
     centre[mesh] = (grids.lows[grid[mesh]] + grids.high[grid[mesh]]) / 2
     half[mesh] = (grids.high[grid[mesh]] - grids.lows[grid[mesh]]) / 2
     rotation = poses[:, :3, :3]
@@ -243,7 +241,7 @@ def place_bodies(entries: Sequence[Entry], columns: int, build_grid: BuildGrid) 
     reach = np.einsum("bij,bj->bi", np.abs(rotation), half)
     # a sphere is as wide in every turned frame
     reach[sphere] = half[sphere]
-    reach[kinds == PLANE] = np.inf
+    reach[plane] = np.inf
     return Bodies(
         kinds=kinds,
         sizes=sizes,

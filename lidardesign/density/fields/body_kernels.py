@@ -12,8 +12,9 @@ import math
 import numpy as np
 from numba import njit
 
-from lidardesign.density.fields.bodies import BOX, CAPSULE, GRID, GROUP_COLUMNS, PLANE, SPHERE
+from lidardesign.density.fields.bodies import BOX, CAPSULE, CYLINDER, ELLIPSOID, GRID, GROUP_COLUMNS, PLANE, SPHERE
 from lidardesign.density.fields.table_kernels import corners, locate, trilinear_slope
+from lidardesign.numerics import EPSILON
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -28,9 +29,86 @@ def to_frame(to_body, b, points, n, q):  # noqa: ANN001, ANN201
         )
 
 
+# A point is taken to be at least so far from the middle plane of an ellipsoid, as a share of its smallest semi-axis:
+# below it the two nearest points, above and below the plane, are one.
+OFF_MIDDLE = EPSILON
+MOST_NEWTON_STEPS = 60
+
+
+@njit(cache=True, nogil=True)
+def _ellipsoid_distance(axes, q, gradient):  # noqa: ANN001, ANN202
+    """Signed distance of an ellipsoid at a point in its own frame, with its gradient (3,).
+
+    The nearest point is e_i^2 q_i / (t + e_i^2), where t makes it lie on the surface (Eberly 2013, "Distance from a
+    point to an ellipse, an ellipsoid, or a hyperellipsoid"). With w = 1 + t / e^2 for the smallest semi-axis e, the
+    sum of squares is convex and falls in w > 0: Newton's steps from the left of its root never pass it.
+    """
+    least = min(axes[0], axes[1], axes[2])
+    w, inside = 0.0, 0.0
+    for k in range(3):
+        ratio = (axes[k] / least) * (axes[k] / least)
+        place = abs(q[k]) / axes[k]
+        inside += place * place
+        if axes[k] == least:
+            place = max(place, OFF_MIDDLE)
+        w = max(w, ratio * (place - 1.0) + 1.0)
+    for _ in range(MOST_NEWTON_STEPS):
+        value, slope = -1.0, 0.0
+        for k in range(3):
+            ratio = (axes[k] / least) * (axes[k] / least)
+            place = abs(q[k]) / axes[k]
+            if axes[k] == least:
+                place = max(place, OFF_MIDDLE)
+            below = w + (ratio - 1.0)
+            share = ratio * place / below
+            value += share * share
+            slope += 2.0 * share * share / below
+        step = value / slope
+        w += step
+        if step <= EPSILON * w:
+            break
+    squared, length = 0.0, 0.0
+    for k in range(3):
+        ratio = (axes[k] / least) * (axes[k] / least)
+        place = abs(q[k]) / axes[k]
+        if axes[k] == least:
+            place = max(place, OFF_MIDDLE)
+        # the nearest point as a share of the semi-axis
+        share = ratio * place / (w + (ratio - 1.0))
+        away = axes[k] * share - abs(q[k])
+        squared += away * away
+        gradient[k] = share / axes[k] * (1.0 if q[k] >= 0.0 else -1.0)
+        length += gradient[k] * gradient[k]
+    for k in range(3):
+        gradient[k] /= math.sqrt(length)
+    return math.sqrt(squared) * (-1.0 if inside < 1.0 else 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _cylinder_distance(radius, half_length, q, gradient):  # noqa: ANN001, ANN202
+    """Signed distance of a cylinder at a point in its own frame, with its gradient (3,)."""
+    radial = math.sqrt(q[0] * q[0] + q[1] * q[1])
+    side, end = radial - radius, abs(q[2]) - half_length
+    by_side, by_end = max(side, 0.0), max(end, 0.0)
+    distance = math.sqrt(by_side * by_side + by_end * by_end)
+    if distance > 0.0:
+        by_side, by_end = by_side / distance, by_end / distance
+    else:
+        distance = max(side, end)
+        by_side, by_end = (1.0, 0.0) if side > end else (0.0, 1.0)
+    gradient[0] = by_side * q[0] / radial if radial > 0.0 else 0.0
+    gradient[1] = by_side * q[1] / radial if radial > 0.0 else 0.0
+    gradient[2] = by_end if q[2] >= 0.0 else -by_end
+    return distance
+
+
 @njit(cache=True, nogil=True)
 def _primitive_distance(kind, size, q, gradient):  # noqa: ANN001, ANN202
-    """Signed distance of a box, capsule or plane at a point in its own frame, with its gradient (3,)."""
+    """Signed distance of any primitive but a sphere at a point in its own frame, with its gradient (3,)."""
+    if kind == CYLINDER:
+        return _cylinder_distance(size[0], size[1], q, gradient)
+    if kind == ELLIPSOID:
+        return _ellipsoid_distance(size, q, gradient)
     if kind == CAPSULE:
         z = q[2] - min(max(q[2], -size[1]), size[1])
         length = math.sqrt(q[0] * q[0] + q[1] * q[1] + z * z)
@@ -114,6 +192,8 @@ def _plain_distance(kinds, sizes, to_body, grid, values, grids, b, points, n, q)
         return _grid_distance(values, grids[grid[b]], q, np.zeros(3))
     if kind == PLANE:
         return q[2]
+    if kind in (CYLINDER, ELLIPSOID):
+        return _primitive_distance(kind, sizes[b], q, np.zeros(3))
     if kind == BOX:
         x, y, z = abs(q[0]) - sizes[b, 0], abs(q[1]) - sizes[b, 1], abs(q[2]) - sizes[b, 2]
         deepest = max(x, y, z)
@@ -353,9 +433,7 @@ def add_log_weight_gradients(bodies, values, points, row_starts, nearest, weight
 @njit(cache=True, nogil=True, inline="always")
 def _turn(to_body, b, vectors, n, out):  # noqa: ANN001, ANN202
     for k in range(3):
-        out[k] = (
-            to_body[b, k, 0] * vectors[n, 0] + to_body[b, k, 1] * vectors[n, 1] + to_body[b, k, 2] * vectors[n, 2]
-        )
+        out[k] = to_body[b, k, 0] * vectors[n, 0] + to_body[b, k, 1] * vectors[n, 1] + to_body[b, k, 2] * vectors[n, 2]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -418,6 +496,41 @@ def _capsule_roots(size, origin, direction, centred):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
+def _cylinder_roots(radius, half_length, origin, direction):  # noqa: ANN001, ANN202
+    """Where a line is both between the planes of the ends and in the endless cylinder (as in `primitives`)."""
+    near, far = -np.inf, np.inf
+    across = direction[0] * direction[0] + direction[1] * direction[1]
+    along = (origin[0] * direction[0] + origin[1] * direction[1]) / across if across > 0.0 else 0.0
+    x, y = origin[0] - along * direction[0], origin[1] - along * direction[1]
+    room = radius * radius - x * x - y * y
+    if room < 0.0:
+        return np.nan, np.nan
+    if across > 0.0:
+        half = math.sqrt(room / across)
+        near, far = -along - half, -along + half
+    if direction[2] != 0.0:
+        one, other = (-half_length - origin[2]) / direction[2], (half_length - origin[2]) / direction[2]
+        near, far = max(near, min(one, other)), min(far, max(one, other))
+    elif abs(origin[2]) > half_length:
+        return np.nan, np.nan
+    return (near, far) if near <= far else (np.nan, np.nan)
+
+
+@njit(cache=True, nogil=True)
+def _ellipsoid_roots(axes, origin, direction):  # noqa: ANN001, ANN202
+    """Stretched along its axes it is a ball of radius 1 (as in `primitives`)."""
+    start, along, length = np.empty(3), np.empty(3), 0.0
+    for k in range(3):
+        start[k], along[k] = origin[k] / axes[k], direction[k] / axes[k]
+        length += along[k] * along[k]
+    length = math.sqrt(length)
+    for k in range(3):
+        along[k] /= length
+    near, far = _ball_roots(start, along, 1.0)
+    return near / length, far / length
+
+
+@njit(cache=True, nogil=True)
 def _primitive_roots(kind, size, origin, direction, work):  # noqa: ANN001, ANN202
     if kind == SPHERE:
         return _ball_roots(origin, direction, size[0])
@@ -427,6 +540,10 @@ def _primitive_roots(kind, size, origin, direction, work):  # noqa: ANN001, ANN2
         return _box_roots(work, size, origin, direction)
     if kind == CAPSULE:
         return _capsule_roots(size, origin, direction, work)
+    if kind == CYLINDER:
+        return _cylinder_roots(size[0], size[1], origin, direction)
+    if kind == ELLIPSOID:
+        return _ellipsoid_roots(size, origin, direction)
     if direction[2] == 0.0:
         return np.nan, np.nan
     return -origin[2] / direction[2], np.nan
@@ -445,6 +562,16 @@ def _normal(kind, size, point, out):  # noqa: ANN001, ANN202
             if share > largest:
                 axis, largest = k, share
         out[axis] = 1.0 if point[axis] >= 0.0 else -1.0
+    elif kind == CYLINDER:
+        radial = math.sqrt(point[0] * point[0] + point[1] * point[1])
+        if abs(point[2]) * size[0] > radial * size[1]:
+            out[2] = 1.0 if point[2] >= 0.0 else -1.0
+        else:
+            out[0], out[1] = point[0] / radial, point[1] / radial
+    elif kind == ELLIPSOID:
+        x, y, z = point[0] / size[0] ** 2, point[1] / size[1] ** 2, point[2] / size[2] ** 2
+        length = math.sqrt(x * x + y * y + z * z)
+        out[0], out[1], out[2] = x / length, y / length, z / length
     else:
         z = point[2] - min(max(point[2], -size[1]), size[1]) if kind == CAPSULE else point[2]
         length = math.sqrt(point[0] * point[0] + point[1] * point[1] + z * z)

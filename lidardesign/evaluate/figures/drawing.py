@@ -9,11 +9,12 @@ import numpy as np
 from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.sensor import Sensor, interval_factor, tangent_directions
 from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.surface import grid_faces, round_triangles
 from lidardesign.numerics import TINY
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
+from lidardesign.scene import Body, Box, Mesh, Plane, Round, Scene
 
 MOST_FACES = 40_000  # of a scene's meshes, and of its round bodies; more would make the page large and slow to open
-STEPS = 24  # round a sphere or capsule
+STEPS = 24  # round a round body
 FEWEST_STEPS = 4  # where a scene has very many of them
 SHELL_STEPS = 8  # along each side of a gate's shell
 SMALLEST_SPREAD_M = 1e-3  # of origins; less looks like one place
@@ -39,14 +40,12 @@ def body_triangles(body: Body, frame: int, bounds_m: np.ndarray, share: float = 
 def own_triangles(
     body: Body, pose: np.ndarray, bounds_m: np.ndarray, share: float = 1.0, steps: int = STEPS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same in the body's own frame, with so many steps round spheres and capsules; the pose is for planes."""
+    """The same in the body's own frame, with so many steps round round bodies; the pose is for planes."""
     shape = body.shape
     if isinstance(shape, Mesh):
         vertices, faces = thinned(shape.vertices, shape.faces, math.ceil(share * len(shape.faces)))
-    elif isinstance(shape, Sphere):
-        vertices, faces = _capsule(shape.radius_m, 0.0, steps)
-    elif isinstance(shape, Capsule):
-        vertices, faces = _capsule(shape.radius_m, shape.half_length_m, steps)
+    elif isinstance(shape, Round):
+        vertices, faces = round_triangles(shape, steps)
     elif isinstance(shape, Box):
         vertices, faces = _box(np.asarray(shape.half_extents_m))
     else:
@@ -60,8 +59,8 @@ def own_triangles(
 
 
 def round_steps(scene: Scene) -> int:
-    """Steps round spheres and capsules: fewer where a scene has very many of them."""
-    count = sum(isinstance(body.shape, Sphere | Capsule) for body in scene.bodies)
+    """Steps round round bodies: fewer where a scene has very many of them."""
+    count = sum(isinstance(body.shape, Round) for body in scene.bodies)
     # a ball of n steps has about n (n + 2) triangles
     most = math.sqrt(MOST_FACES / max(count, 1)) - 1
     return int(np.clip(4 * (most // 4), FEWEST_STEPS, STEPS))
@@ -130,7 +129,7 @@ def gate_shell(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     """The two curved faces of a sensor's gate: vertices (V, 3) float32 [m] and faces (F, 3) int32."""
     side = np.linspace(-1.0, 1.0, SHELL_STEPS + 1)
     patch = _patch(sensor, side, side).reshape(-1, 3)
-    faces = _grid_faces(SHELL_STEPS + 1, SHELL_STEPS + 1)
+    faces = grid_faces(SHELL_STEPS + 1, SHELL_STEPS + 1)
     vertices = np.concatenate([sensor.origin_m + radius * patch for radius in sensor.gate_m])
     return vertices.astype(np.float32), np.concatenate([faces, faces + len(patch)]).astype(np.int32)
 
@@ -146,23 +145,6 @@ def _patch(sensor: Sensor, across: np.ndarray, up: np.ndarray) -> np.ndarray:
     horizontal, vertical = field_on_sphere(sensor)
     u, v = np.meshgrid(across * horizontal / 2, up * vertical / 2)
     return tangent_directions(sensor.frame, np.stack([u.ravel(), v.ravel()], axis=1)).reshape(*u.shape, 3)
-
-
-def _grid_faces(rows: int, columns: int) -> np.ndarray:
-    """Two triangles per cell of a grid of vertices, shape (2 (rows - 1) (columns - 1), 3)."""
-    first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    right, up = first + 1, first + columns
-    return np.concatenate([np.stack([first, right, up], axis=1), np.stack([right, up + 1, up], axis=1)])
-
-
-def _capsule(radius_m: float, half_length_m: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    turn = np.linspace(0.0, 2 * np.pi, steps + 1)
-    half = np.linspace(0.0, np.pi / 2, steps // 4 + 1)
-    latitude = np.concatenate([half[::-1], -half])[:, None]
-    height = radius_m * np.sin(latitude) + np.repeat([half_length_m, -half_length_m], len(half))[:, None]
-    ring = radius_m * np.cos(latitude)
-    vertices = np.stack(np.broadcast_arrays(ring * np.cos(turn), ring * np.sin(turn), height), axis=-1)
-    return vertices.reshape(-1, 3), _grid_faces(len(latitude), len(turn))
 
 
 def _box(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,6 @@ alone). A detector without any error or width, `ideal`, takes the whole frame at
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,11 +24,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lidardesign.geometry.primitives import BALL_SLACK, PrimitiveGroup
+from lidardesign.geometry.primitives import BALL_SLACK, PrimitiveGroup, bounding_radius_m
 from lidardesign.geometry.raycast import SceneCaster, shared_caster
 from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.geometry.triangles import SecondCasts, mesh_caster
-from lidardesign.scene import Body, Box, Mesh, Plane, Scene, Shape, inverse_rigid
+from lidardesign.scene import Body, Mesh, Scene, Shape, inverse_rigid
 from lidardesign.simulate.detector.detector import IDEAL, Detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits, edge_probability
@@ -268,11 +267,7 @@ def _ball(body: Body, frame: int) -> tuple[np.ndarray, float]:
     if isinstance(shape, Mesh):
         low, high = shape.bounds_m
         return pose[:3, :3] @ (low + high) / 2 + pose[:3, 3], float(np.linalg.norm(high - low)) / 2
-    if isinstance(shape, Plane):
-        return pose[:3, 3], math.inf
-    if isinstance(shape, Box):
-        return pose[:3, 3], float(np.linalg.norm(shape.half_extents_m))
-    return pose[:3, 3], shape.radius_m + getattr(shape, "half_length_m", 0.0)
+    return pose[:3, 3], bounding_radius_m(shape)
 
 
 def point_velocities(first_hits: FirstHits) -> np.ndarray:

@@ -52,7 +52,7 @@ from lidardesign.geometry.frames import in_view, path_windows
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.numerics import EPSILON_FLOAT32, safe_divide
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere
 from lidardesign.simulate.detector.detector import Detector, Physics, resolution_m
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
@@ -346,5 +346,9 @@ def _inside(body: Body, points: np.ndarray, pose: np.ndarray) -> np.ndarray:
         local[:, 2] -= np.clip(local[:, 2], -shape.half_length_m, shape.half_length_m)
     if isinstance(shape, Plane):
         return np.zeros(len(points), dtype=bool)
+    if isinstance(shape, Cylinder):
+        return (np.hypot(local[:, 0], local[:, 1]) < shape.radius_m) & (np.abs(local[:, 2]) < shape.half_length_m)
+    if isinstance(shape, Ellipsoid):
+        return np.linalg.norm(local / shape.semi_axes_m, axis=1) < 1
     assert isinstance(shape, Sphere | Capsule)
     return np.linalg.norm(local, axis=1) < shape.radius_m

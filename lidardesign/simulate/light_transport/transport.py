@@ -25,11 +25,13 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.frames import receiver_axes
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Hits, Rays
-from lidardesign.scene import Body, Box, Capsule, Plane, Receiver, Scene, Sphere
+from lidardesign.geometry.surface import round_triangles
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Plane, Receiver, Scene, Sphere
 from lidardesign.simulate.light_transport.process import ask
 
 # Half sizes of a plane's nested squares, in reaches. What lies further sends back less than 1e-4 of its light.
 PLANE_REACHES = (2.0, 10.0, 100.0)
+ROUND_STEPS = 96  # round cylinders and ellipsoids, which the renderer takes as meshes: 5e-4 of their radius
 _SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 _BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -74,6 +76,8 @@ def _shape(
         return {"kind": "mesh"}, {"vertices": vertices @ rotation.T + nearest, "faces": faces}
     if isinstance(shape, Box):
         vertices, faces = _CORNERS * np.array(shape.half_extents_m), _split(_BOX_QUADS)
+    elif isinstance(shape, Cylinder | Ellipsoid):
+        vertices, faces = round_triangles(shape, ROUND_STEPS)
     else:
         vertices, faces = shape.vertices, shape.faces
     return {"kind": "mesh"}, {"vertices": vertices @ rotation.T + place, "faces": faces}
