@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import re
 import textwrap
@@ -82,7 +83,8 @@ def describe_task(task: Task) -> dict[str, Any]:
 
 
 def _describe_keys(model: type[BaseModel], suggested: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The keys of a section; what a task suggests stands before the section's own defaults."""
+    """The keys of a section, those that it shares with others last, and what a task suggests instead of defaults."""
+    own = inspect.get_annotations(model)
     return [
         {
             "key": name,
@@ -91,7 +93,7 @@ def _describe_keys(model: type[BaseModel], suggested: Mapping[str, Any]) -> list
             "default": suggested.get(name, _default(info)),
             "description": info.description or "",
         }
-        for name, info in model.model_fields.items()
+        for name, info in sorted(model.model_fields.items(), key=lambda field: field[0] not in own)
     ]
 
 

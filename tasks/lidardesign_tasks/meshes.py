@@ -3,13 +3,15 @@
 Every file is one object of a class (or one scan). Files are split into training and held-out ones; each is
 shown in a few slightly different poses. With a single file the poses alone make the splits. The world's z
 axis is up, and unless told otherwise one sensor place is in front (+x) of the objects, at twice their extent,
-and looks at them. With a CSV of poses over time objects and occluders move, and every frame is judged.
+and looks at them. With a CSV of poses over time objects and occluders move, and every frame is judged. With
+clutter several objects lie in a bin or on a table, and the sensor looks down at them from the same side.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -27,6 +29,7 @@ from lidardesign.task import Defaults, Information, Metric, Score, Split, random
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
+from lidardesign_tasks.piles import Background, Kind, background_of, settled_poses
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import (
     METRIC,
@@ -37,7 +40,7 @@ from lidardesign_tasks.surface import (
 )
 from lidardesign_tasks.surroundings import any_direction, moving
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
-from lidardesign_tasks.view import space_around
+from lidardesign_tasks.view import space_around, space_around_box
 
 Vector = tuple[float, float, float]
 Axis = Literal["x", "y", "z"]
@@ -45,12 +48,14 @@ Axis = Literal["x", "y", "z"]
 WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 RELATIVE_JITTER = 0.02  # of the largest extent, where no shift is given
 SENSOR_DISTANCE = 2.0  # extents
+ABOVE_DEG = 45.0  # how far above the middle of a pile the sensor stands
 TOLERATED_SHARE = 4e-4  # of the longest extent: 0.1 mm of a head of 0.25 m
 SPLIT_SEED = 0  # of which meshes are held out, whatever the seed of a run
-SAME_MESH = (
-    "training and held-out scenes show the same one in other poses, so scores say nothing of other objects"
-)
+SAME_MESH = "training and held-out scenes show the same one in other poses, so scores say nothing of other objects"
 ROOM = 1.1  # around the bounding sphere, for the pose jitter
+MOST_NAMED = 6
+KNOWN = "known"  # what of a scene is removed before scoring
+ALONE = ("motion", "speed_m_s", "jitter_rotation_deg", "jitter_translation_m", "area_exponent")
 
 
 class MeshesConfig(Importance):
@@ -63,20 +68,22 @@ class MeshesConfig(Importance):
     centre: bool = Field(True, description="move the centre of each mesh's bounds to the origin")
     test_share: float = Field(0.5, gt=0, lt=1, description="share of the files that is held out")
     poses: int = Field(4, ge=1, le=1000, description="scenes per mesh")
+    clutter: int = Field(
+        0,
+        ge=0,
+        le=30,
+        description="objects per scene that are dropped until they rest; 0: one object alone, not dropped",
+    )
+    background: Kind = Field("bin", description="what they are dropped into, any way up: bin; or onto, upright: table")
+    background_returns: Literal["removed", "stay"] = Field(
+        "removed", description="whether returns where bin or table are known to be are removed before scoring"
+    )
     jitter_rotation_deg: float = Field(4.0, ge=0, le=180, description="standard deviation of the pose [deg]")
-    jitter_translation_m: float | None = Field(
-        None, ge=0, description="of the place [m]; 2 % of the extent if empty"
-    )
-    occluders: Path | None = Field(
-        None, description="folder of meshes that stand in front, in world coordinates"
-    )
+    jitter_translation_m: float | None = Field(None, ge=0, description="of the place [m]; 2 % of the extent if empty")
+    occluders: Path | None = Field(None, description="folder of meshes that stand in front, in world coordinates")
     origin_m: Vector | None = Field(None, description="sensor place [m]; if empty: in front, at 2 extents")
-    origin_box_m: float | Vector = Field(
-        0.0, description="half size of the box of sensor origins [m]; 0: fixed"
-    )
-    truth_points: int = Field(
-        5000, ge=100, le=200_000, description="points of the visible surface to judge by"
-    )
+    origin_box_m: float | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
+    truth_points: int = Field(5000, ge=100, le=200_000, description="points of the visible surface to judge by")
     motion: Path | None = Field(
         None,
         description="CSV of poses over time: columns time_s, body, x_m, y_m, z_m, and qw, qx, qy, qz or "
@@ -98,6 +105,16 @@ class MeshesConfig(Importance):
         return self
 
     @model_validator(mode="after")
+    def _what_lies_in_a_pile(self) -> MeshesConfig:
+        fields = type(self).model_fields
+        if not self.clutter and (self.background, self.background_returns) != ("bin", "removed"):
+            raise ValueError("background is that of a pile: set clutter=N too")
+        alone = [key for key in ALONE if self.clutter and getattr(self, key) != fields[key].default]
+        if alone:
+            raise ValueError(f"{alone[0]} is that of an object alone: leave it or clutter out")
+        return self
+
+    @model_validator(mode="after")
     def _one_way_to_move(self) -> MeshesConfig:
         if self.motion is not None and self.speed_m_s:
             raise ValueError("speed_m_s is that of objects without a motion: leave one of them out")
@@ -110,9 +127,7 @@ class MeshesTask:
     """Reconstruct the surface of your objects from few rays."""
 
     name: ClassVar[str] = "meshes"
-    summary: ClassVar[str] = (
-        "your own folder of meshes, with a design space in YAML or one derived from their size"
-    )
+    summary: ClassVar[str] = "your own folder of meshes, with a design space in YAML or one derived from their size"
     api_version: ClassVar[int] = 1
     weighing_keys: ClassVar[tuple[str, ...]] = (*WEIGHING_KEYS, "importance", "colour_contrast")
     Config: ClassVar[type[MeshesConfig]] = MeshesConfig
@@ -120,9 +135,7 @@ class MeshesTask:
     metric: ClassVar[Metric] = Metric(
         "Chamfer distance", "mm", "lower", worst=MILLIMETRES, tolerance=MILLIMETRES * TOLERATED_SHARE
     )
-    defaults: ClassVar[Defaults] = Defaults(
-        rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005}
-    )
+    defaults: ClassVar[Defaults] = Defaults(rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005})
 
     def space(self, config: MeshesConfig) -> DesignSpace:
         """A sensor in front of all meshes that sees every one of them whole."""
@@ -134,48 +147,64 @@ class MeshesTask:
     ) -> Sequence[Scene]:
         """Each mesh of the split in `poses` poses, its group; the occluders stand in every scene.
 
+        In a pile it lies among others of its split, and the group of a scene is the set of the meshes in it.
+
         Raises:
-            DataError: The folder or a file in it cannot be used, or no ray can reach a mesh.
+            DataError: The folder or a file in it cannot be used, no ray can reach a mesh, or piles do not come to rest.
             ConfigError: No folder is set, or one mesh without pose jitter would make both splits the same.
         """
         meshes = load_folder(config)
         motion = motion_of(config, meshes)
         space = space or derived_space(config, meshes, motion)
-        occluders = tuple(_occluder(name, mesh, motion) for name, mesh in load_occluders(config))
         shift, metric = jitter_m(config, [mesh for _, mesh in meshes]), self.metric_of(config)
-        if len(meshes) == 1 and config.jitter_rotation_deg == 0 and shift == 0:
+        if len(meshes) == 1 and not config.clutter and config.jitter_rotation_deg == 0 and shift == 0:
             raise ConfigError(
                 "one mesh without pose jitter makes training and held-out scenes the same",
                 where="task.jitter_rotation_deg",
                 hint="add meshes, or set jitter_rotation_deg or jitter_translation_m above 0",
             )
-        scenes = []
         config.refuse_empty_region([mesh.vertices for _, mesh in meshes])
-        chosen = [(name, weighted(mesh, config, space)) for name, mesh in split_meshes(meshes, config, split)]
+        chosen = split_meshes(meshes, config, split)
+        counting = {name: weighted(mesh, config, space) for name, mesh in chosen}
+        around = tuple(_occluder(name, mesh, motion) for name, mesh in load_occluders(config))
+        background = pile_of(config, meshes)
+        further = {METRIC: metric}
+        if background is not None:
+            around = (*background.bodies(), *around)
+            further |= {KNOWN: background} if config.background_returns == "removed" else {}
+        scenes = []
         for (name, mesh), pose in itertools.product(chosen, range(config.poses)):
             generator = random_generator(seed, "meshes", split, name, pose)
-            centre = mesh.bounds_m.mean(axis=0)
-            jitter = jittered_pose(generator, config.jitter_rotation_deg, shift, centre)
-            path = None if motion is None else motion.of_object(name)
-            placed = Body(mesh, name, "both", jitter if path is None else path @ jitter)
-            title = f"{split} {name} pose {pose}"
-            scene = Scene((placed, *occluders), title, frame_rate_hz=config.frame_rate_hz, group=name)
+            title, velocity = f"{split} {name} pose {pose}", None
+            if background is not None:
+                placed, group = _pile(name, chosen, counting, background, generator)
+            else:
+                jitter = jittered_pose(generator, config.jitter_rotation_deg, shift, mesh.bounds_m.mean(axis=0))
+                path = None if motion is None else motion.of_object(name)
+                placed, group = (Body(counting[name], name, "both", jitter if path is None else path @ jitter),), name
+                velocity = random_generator(seed, "meshes", split, name, pose, "velocity")
+            scene = Scene((*placed, *around), title, frame_rate_hz=config.frame_rate_hz, group=group)
             judge = with_visible_truth if motion is None else with_moving_truth
-            judged = judge(scene, space, config.truth_points, generator, metric)
-            if motion is not None:
-                scenes.append(config.around(judged))
-                continue
-            velocity = config.speed_m_s * any_direction(random_generator(seed, "meshes", split, name, pose, "velocity"))
-            scenes.append(config.around(replace(judged, bodies=(moving(placed, velocity), *occluders))))
+            judged = judge(scene, space, config.truth_points, generator, **further)
+            if config.speed_m_s:
+                moves = moving(placed[0], config.speed_m_s * any_direction(velocity))
+                judged = replace(judged, bodies=(moves, *around))
+            scenes.append(config.around(judged))
         return scenes
 
     def metric_of(self, config: MeshesConfig) -> Metric:
-        """At worst a scene is off by the longest extent of any of the meshes; a share of that does not matter."""
-        longest_mm = MILLIMETRES * max(extent_m([mesh]) for _, mesh in load_folder(config))
-        return replace(self.metric, worst=longest_mm, tolerance=TOLERATED_SHARE * longest_mm)
+        """At worst a scene is off by the longest extent of any of the meshes; a share of that does not matter.
+
+        A pile is at worst off by its own longest extent.
+        """
+        meshes = load_folder(config)
+        longest_mm = MILLIMETRES * max(extent_m([mesh]) for _, mesh in meshes)
+        background = pile_of(config, meshes)
+        worst_mm = longest_mm if background is None else MILLIMETRES * float(np.ptp(background.bounds_m, axis=0).max())
+        return replace(self.metric, worst=worst_mm, tolerance=TOLERATED_SHARE * longest_mm)
 
     def notes(self, config: MeshesConfig, space: DesignSpace) -> list[str]:
-        """Lengths that look like another unit, and a mesh that is trained on and held out."""
+        """What was read, what is held out, where sensors stand; lengths that look like another unit."""
         meshes = load_folder(config)
         extents_m = {name: extent_m([mesh]) for name, mesh in [*meshes, *load_occluders(config)]}
         motion = motion_of(config, meshes)
@@ -183,6 +212,7 @@ class MeshesTask:
             name: moved_bounds_m(mesh, motion.of_object(name)) for name, mesh in meshes
         }  # fmt: skip
         return [
+            *_what_was_read(config, meshes, space),
             *doubtful_meshes(extents_m, config.scale),
             *doubtful_motion(bounds_m, extent_m([mesh for _, mesh in meshes]), space),
             *(f"{name} is the only mesh: {SAME_MESH}" for name, _ in meshes if len(meshes) == 1),
@@ -191,12 +221,68 @@ class MeshesTask:
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the surface that could be seen."""
         score = moving_score if SURFACES in scene.truth else surface_score
-        return score(scene.truth.get(METRIC, self.metric), scene, returns)
+        return score(scene.truth.get(METRIC, self.metric), scene, _without_known(scene, returns))
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """What returns tell about points of the visible surface in each frame, the more the nearer they are."""
         informs = moving_informs if SURFACES in scene.truth else surface_informs
-        return informs(scene, returns)
+        return informs(scene, _without_known(scene, returns))
+
+
+def _without_known(scene: Scene, returns: Sequence[Returns]) -> Sequence[Returns]:
+    """The returns without those on a background that is known and to be removed."""
+    background = scene.truth.get(KNOWN)
+    return returns if background is None else [background.removed(frame) for frame in returns]
+
+
+def pile_of(config: MeshesConfig, meshes: Sequence[tuple[str, Mesh]]) -> Background | None:
+    """What objects are dropped into or onto; None where they stand alone."""
+    if not config.clutter:
+        return None
+    return background_of(config.background, [mesh for _, mesh in meshes], config.clutter)
+
+
+def _pile(
+    name: str,
+    chosen: Sequence[tuple[str, Mesh]],
+    counting: Mapping[str, Mesh],
+    background: Background,
+    generator: np.random.Generator,
+) -> tuple[tuple[Body, ...], str]:
+    """A mesh among others of its split at rest, each as often as any other, and the names of all as a group."""
+    rounds = -(-background.objects // len(chosen))
+    drawn = np.concatenate([generator.permutation(len(chosen)) for _ in range(rounds)])[: background.objects]
+    first = [index for index, (other, _) in enumerate(chosen) if other == name]
+    if first[0] not in drawn:
+        drawn[0] = first[0]
+    meshes = [chosen[index] for index in np.sort(drawn)]
+    poses = settled_poses(tuple(mesh for _, mesh in meshes), background, int(generator.integers(2**62)))
+    numbered = enumerate(zip(meshes, poses, strict=True), start=1)
+    bodies = tuple(Body(counting[own], f"{own} {number}", "both", pose) for number, ((own, _), pose) in numbered)
+    return bodies, ", ".join(sorted({own for own, _ in meshes}))
+
+
+def _what_was_read(config: MeshesConfig, meshes: Sequence[tuple[str, Mesh]], space: DesignSpace) -> list[str]:
+    """How many meshes of which size were read, which of them are held out, and where sensors may stand."""
+    lengths_m = sorted(extent_m([mesh]) for _, mesh in meshes)
+    sizes = " to ".join(dict.fromkeys(f"{length_m:.3g}" for length_m in (lengths_m[0], lengths_m[-1])))
+    held_out = [name for name, _ in split_meshes(meshes, config, "test")]
+    named = ", ".join(held_out[:MOST_NAMED]) + (
+        f" and {len(held_out) - MOST_NAMED} more" if held_out[MOST_NAMED:] else ""
+    )
+    low, high = space.low[:3], space.high[:3]
+    places = (f"{a:.3g}" if a == b else f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
+    count = "1 mesh" if len(meshes) == 1 else f"{len(meshes)} meshes"
+    lines = [f"{count} of {sizes} m; held out: {named}"]
+    background = pile_of(config, meshes)
+    if background is not None:
+        wide, objects = 2 * background.half_m, "1 object" if config.clutter == 1 else f"{config.clutter} objects"
+        lines.append(
+            f"{objects} per scene, dropped {'into a bin' if config.background == 'bin' else 'onto a table'} of "
+            f"{wide:.3g} by {wide:.3g} m around x = y = 0 at z = 0; in contact each is its convex hull"
+        )
+    named_places = (f"{axis} = {place}" for axis, place in zip("xyz", places, strict=True))
+    return [*lines, f"sensors at {', '.join(named_places)} m"]
 
 
 def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
@@ -287,10 +373,18 @@ def _bounds(boxes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return corners.min(axis=0), corners.max(axis=0)
 
 
-def derived_space(
-    config: MeshesConfig, named: Sequence[tuple[str, Mesh]], motion: Motion | None = None
-) -> DesignSpace:
-    """The directions and ranges in which the sphere around all meshes lies wherever they move, from every origin."""
+def derived_space(config: MeshesConfig, named: Sequence[tuple[str, Mesh]], motion: Motion | None = None) -> DesignSpace:
+    """The directions and ranges in which the sphere around all meshes lies wherever they move, from every origin.
+
+    Where objects lie in a pile, it is the box around that.
+    """
+    half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
+    background = pile_of(config, named)
+    if background is not None:
+        bounds_m, up = background.bounds_m, math.radians(ABOVE_DEG)
+        away_m = SENSOR_DISTANCE * float(np.ptp(bounds_m, axis=0).max())
+        above = bounds_m.mean(axis=0) + away_m * np.array([math.cos(up), 0.0, math.sin(up)])
+        return space_around_box(bounds_m, above if config.origin_m is None else np.array(config.origin_m), half)
     meshes = [mesh for _, mesh in named]
     low, high = _bounds(
         [moved_bounds_m(mesh, None if motion is None else motion.of_object(name)) for name, mesh in named]
@@ -299,5 +393,4 @@ def derived_space(
     radius = ROOM * (float(np.linalg.norm(high - low)) / 2 + 2 * jitter_m(config, meshes))
     ahead = centre + np.array([max(SENSOR_DISTANCE * extent_m(meshes), 2 * radius), 0.0, 0.0])
     origin = ahead if config.origin_m is None else np.array(config.origin_m)
-    half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
     return space_around(centre, radius, origin, half)

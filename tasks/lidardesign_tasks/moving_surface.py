@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -49,10 +50,10 @@ class MovingTruth(LazyTruth):
 
 
 def with_moving_truth(
-    scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator, metric: Metric | None = None
+    scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator, **further: Any
 ) -> Scene:
-    """The scene with what some admissible ray can see in each frame as its truth: `surfaces`."""
-    return replace(scene, truth=MovingTruth(scene, space, points, int(generator.integers(2**62)), metric))
+    """The scene with what some admissible ray can see in each frame as its truth: `surfaces`, and further keys."""
+    return replace(scene, truth=MovingTruth(scene, space, points, int(generator.integers(2**62)), further))
 
 
 def moving_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:

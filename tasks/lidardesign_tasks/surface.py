@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -32,14 +32,12 @@ STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps: with dense rays the
 class LazyTruth(Mapping[str, Any]):
     """The truth of a scene under one key, found when it is first asked for: learning never asks.
 
-    Under `metric` stands what scores mean, where that follows from the configuration.
-
     Arguments:
         scene: The scene without a truth.
         space: What the sensors may do.
         points: Points of a cloud.
         seed: Of their random places.
-        metric: What scores mean; None: what they mean in every configuration.
+        further: What is known without looking, by key, as what scores mean under `metric`.
     """
 
     key: ClassVar[str]
@@ -47,7 +45,7 @@ class LazyTruth(Mapping[str, Any]):
     space: DesignSpace
     points: int
     seed: int
-    metric: Metric | None = None
+    further: Mapping[str, Any] = field(default_factory=dict)
 
     @abstractmethod
     def find(self) -> Any:
@@ -59,17 +57,13 @@ class LazyTruth(Mapping[str, Any]):
         return self.find()
 
     def __getitem__(self, key: str) -> Any:
-        if key == METRIC and self.metric is not None:
-            return self.metric
-        if key != self.key:
-            raise KeyError(key)
-        return self.found
+        return self.found if key == self.key else self.further[key]
 
     def __iter__(self) -> Iterator[str]:
-        return iter((self.key,) if self.metric is None else (self.key, METRIC))
+        return iter((self.key, *self.further))
 
     def __len__(self) -> int:
-        return sum(1 for _ in self)
+        return 1 + len(self.further)
 
 
 class VisibleTruth(LazyTruth):
@@ -88,10 +82,10 @@ def fewer_points(truth: Mapping[str, Any], count: int) -> Mapping[str, Any]:
 
 
 def with_visible_truth(
-    scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator, metric: Metric | None = None
+    scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator, **further: Any
 ) -> Scene:
-    """The scene with what some admissible ray can see as its truth: `surface`, a `SurfaceCloud`."""
-    truth = VisibleTruth(scene, space, points, int(generator.integers(2**62)), metric)
+    """The scene with what some admissible ray can see as its truth: `surface`, a `SurfaceCloud`, and further keys."""
+    truth = VisibleTruth(scene, space, points, int(generator.integers(2**62)), further)
     return replace(scene, truth=truth)
 
 
@@ -158,9 +152,7 @@ def surface_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
     return information_of([fewer_points(scene.truth, ITEMS)["surface"]] * scene.frames, scene, returns)
 
 
-def information_of(
-    surfaces: Sequence[SurfaceCloud | None], scene: Scene, returns: Sequence[Returns]
-) -> Information:
+def information_of(surfaces: Sequence[SurfaceCloud | None], scene: Scene, returns: Sequence[Returns]) -> Information:
     """What returns tell about points of the visible surface of each frame, None where nothing is to be seen."""
     points = [np.zeros((0, 3)) if surface is None else surface.points for surface in surfaces]
     counts = [importance_at(scene, places, frame) for frame, places in enumerate(points)]

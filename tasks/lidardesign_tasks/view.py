@@ -45,3 +45,23 @@ def space_around(centre: np.ndarray, radius: float, origin: np.ndarray, half: np
         low=(*box[0], left, bottom, nearest - radius),
         high=(*box[1], right, top, float(distance.max()) + radius),
     )
+
+
+def space_around_box(bounds_m: np.ndarray, origin_m: np.ndarray, half_m: np.ndarray) -> DesignSpace:
+    """The directions and ranges in which a box (2, 3) [m] lies from every origin: as wide as corners of both make them.
+
+    An origin above or below the box looks all around.
+    """
+    # from an origin to a place in the box: a box again
+    low, high = bounds_m[0] - origin_m - half_m, bounds_m[1] - origin_m + half_m
+    nearest, farthest = np.clip(0.0, low, high), np.maximum(np.abs(low), np.abs(high))
+    across = np.hypot(nearest[0], nearest[1]), np.hypot(farthest[0], farthest[1])
+    elevation = [math.atan2(z, way) for z in (low[2], high[2]) for way in across]
+    ahead = math.atan2(low[1] + high[1], low[0] + high[0])
+    corners = np.array([math.atan2(y, x) for x in (low[0], high[0]) for y in (low[1], high[1])])
+    turn = circular_difference(corners, ahead) if across[0] > 0 else np.array([-math.pi, math.pi])
+    left, right = ahead + float(turn.min()), ahead + float(turn.max())
+    return DesignSpace(
+        low=(*(origin_m - half_m).tolist(), left, min(elevation), float(np.linalg.norm(nearest))),
+        high=(*(origin_m + half_m).tolist(), right, max(elevation), float(np.linalg.norm(farthest))),
+    )

@@ -46,6 +46,7 @@ CASES = {
     "emitter": (EmitterTask, SMALL),
     "meshes": (MeshesTask, {"folder": "three", "truth_points": 800, "poses": 2}),
     "one mesh": (MeshesTask, {"folder": "one", "truth_points": 800, "poses": 2}),
+    "meshes in a bin": (MeshesTask, {"folder": "three", "clutter": 4, "truth_points": 800, "poses": 2}),
     "meshes behind an occluder": (MeshesTask, {"folder": "three", "occluders": "front", "truth_points": 800}),
 }
 
