@@ -6,7 +6,7 @@ import ast
 from pathlib import Path
 
 import pytest
-from lidardesign_tasks.arm_robot import load_robot
+from lidardesign_tasks.robot.arm_robot import load_robot
 from support.tables import each_row
 
 from lidardesign.design.files import load_design

@@ -63,7 +63,7 @@ def module_name(path: Path) -> str:
 @cache
 def trees() -> dict[str, ast.Module]:
     """The modules of the package and of the shipped tasks by name."""
-    paths = sorted([*PACKAGE.rglob("*.py"), *TASKS.glob("*.py")])
+    paths = sorted([*PACKAGE.rglob("*.py"), *TASKS.rglob("*.py")])
     return {module_name(path): ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in paths}
 
 

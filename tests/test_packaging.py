@@ -73,7 +73,7 @@ def test_the_wheel_holds_every_module_and_data_file_and_no_tests(wheel):
 def test_the_installed_wheel_lists_its_tasks_from_outside_the_repository(installed, tmp_path):
     result = run_installed(installed, tmp_path, "tasks", "list")
     assert result.returncode == 0, result.stderr
-    for name in ("arm", "emitter", "face", "flatland", "meshes", "warehouse"):
+    for name in ("arm", "emitter", "face", "flatland", "meshes", "mujoco", "warehouse"):
         assert name in result.stdout
     assert "broken" not in result.stdout, result.stdout
 

@@ -106,7 +106,9 @@ def anchor_paths(values: Any, given: Any, model: type[BaseModel], base: Path) ->
         if isinstance(value, dict) and nested:
             anchor_paths(values[name], value, nested, base)
         elif any(isinstance(part, type) and issubclass(part, Path) for part in parts(info.annotation)):
-            values[name] = _absolute(values[name], base)
+            words = [part for part in parts(info.annotation) if typing.get_origin(part) is typing.Literal]
+            if not any(values[name] in typing.get_args(part) for part in words):
+                values[name] = _absolute(values[name], base)
 
 
 def _absolute(value: Any, base: Path) -> Any:

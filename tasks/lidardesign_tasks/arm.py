@@ -21,9 +21,9 @@ from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
-from lidardesign_tasks.arm_motion import Arm, Motion
-from lidardesign_tasks.arm_robot import BALL_RADIUS_M, Robot, load_robot
-from lidardesign_tasks.arm_tracking import FEWEST_FRAMES, filled_path, path_information, tracked_places
+from lidardesign_tasks.robot.arm_motion import Arm, Motion
+from lidardesign_tasks.robot.arm_robot import BALL_RADIUS_M, Robot, load_robot
+from lidardesign_tasks.robot.tracking import FEWEST_FRAMES, MEAN_DEPTH, filled_path, path_information, tracked_places
 from lidardesign_tasks.surroundings import Surroundings
 
 CEILING_M = 1.0
@@ -116,13 +116,18 @@ class ArmTask:
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
         """What returns on the ball tell about its place in their own and in neighbouring frames."""
-        return path_information(returns, _target(scene), scene.truth["ball_m"])
+        return path_information(returns, [np.array([_target(scene)])], scene.truth["ball_m"][None])
 
 
 def _tracked(scene: Scene, returns: Sequence[Returns]) -> tuple[np.ndarray, np.ndarray]:
-    """Frames in which the ball was seen, and its place in each [m], see `tracked_places`."""
+    """Frames in which the ball was seen, and its place in each [m], see `tracked_places`.
+
+    A robot knows where its own links are, so their returns are told apart; what a detector made of noise is not, and
+    counts as the ball.
+    """
     target = _target(scene)
-    return tracked_places(returns, target, scene.bodies[target].shape.radius_m)
+    taken = [(one.body == target) | (one.body < 0) for one in returns]
+    return tracked_places(returns, taken, MEAN_DEPTH * scene.bodies[target].shape.radius_m)
 
 
 def _target(scene: Scene) -> int:

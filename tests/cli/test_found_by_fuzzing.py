@@ -9,7 +9,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from lidardesign_tasks.arm_robot import load_robot
+from lidardesign_tasks.robot.arm_robot import load_robot
 from support.captures import make_capture
 from support.command_line import make_run
 from support.tables import each_row

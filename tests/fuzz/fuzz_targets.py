@@ -144,7 +144,7 @@ def read_capture(path: Path) -> object:
 
 def read_robot(path: Path) -> object:
     """As the task arm does."""
-    from lidardesign_tasks.arm_robot import load_robot
+    from lidardesign_tasks.robot.arm_robot import load_robot
 
     robot = load_robot(path, 0.15)
     return robot.home_rad, robot.links

@@ -14,11 +14,18 @@ import mink
 import mujoco
 import numpy as np
 import pytest
-from lidardesign_tasks import arm_motion
 from lidardesign_tasks.arm import ArmTask
-from lidardesign_tasks.arm_links import BALL
-from lidardesign_tasks.arm_motion import PENETRATION_M, POSITION_RESIDUAL_M, TRIES, Arm, RejectedError, draw_waypoints
-from lidardesign_tasks.arm_robot import load_robot
+from lidardesign_tasks.robot import arm_motion
+from lidardesign_tasks.robot.arm_links import BALL
+from lidardesign_tasks.robot.arm_motion import (
+    PENETRATION_M,
+    POSITION_RESIDUAL_M,
+    TRIES,
+    Arm,
+    RejectedError,
+    draw_waypoints,
+)
+from lidardesign_tasks.robot.arm_robot import load_robot
 from support.hard_cases import hard_case
 from support.robots import TOOL_M, mjcf, written
 from support.tables import each_row

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lidardesign_tasks.arm import ArmTask
-from lidardesign_tasks.arm_links import BALL
-from lidardesign_tasks.arm_motion import (
+from lidardesign_tasks.robot.arm_links import BALL
+from lidardesign_tasks.robot.arm_motion import (
     CLEARANCE_M,
     FINAL_DESCENT_M,
     HOVER_M,
@@ -23,11 +23,11 @@ from lidardesign_tasks.arm_motion import (
     ball_path,
     draw_waypoints,
     highest_m,
-    minimum_jerk,
     phase_shares,
 )
-from lidardesign_tasks.arm_robot import load_robot
-from lidardesign_tasks.arm_tracking import REACH_FRAMES, filled_path, tracked_places
+from lidardesign_tasks.robot.arm_robot import load_robot
+from lidardesign_tasks.robot.motion import minimum_jerk
+from lidardesign_tasks.robot.tracking import MEAN_DEPTH, REACH_FRAMES, filled_path, tracked_places
 from support.rays import rays_along, rays_of_points
 from support.references import recursive_frechet
 from support.tables import each_row
@@ -387,10 +387,15 @@ def even_disc_rays(origin, places, count, seed):
     return rays_along(axis, (0.0, 10.0), starts)
 
 
+def ball_places(returns):
+    """Frames with a return on body 1, the ball, and its places."""
+    return tracked_places(returns, [one.body == 1 for one in returns], MEAN_DEPTH * RADIUS_M)
+
+
 def test_the_place_of_a_ball_is_unbiased_when_its_disc_is_hit_evenly():
     place, count = np.array([[0.4, 0.1, 0.2]]), 4000
     returns = simulate(ball_scene(place), even_disc_rays(np.array([0.3, 0.5, 1.0]), place, count, 0))
-    frames, places = tracked_places(returns, 1, RADIUS_M)
+    frames, places = ball_places(returns)
     assert frames.tolist() == [0]
     assert np.abs(places - place).max() < STANDARD_ERRORS * RADIUS_M / 2 / np.sqrt(count)
 
@@ -404,10 +409,10 @@ def test_returns_from_other_bodies_and_lost_rays_do_not_move_the_ball():
     points = np.concatenate([ball, other])
     rays = rays_of_points(points, (0.0, 9.0))
     everything, alone = simulate(scene, rays), simulate(scene, rays.subset(np.arange(5)))
-    np.testing.assert_allclose(tracked_places(everything, 1, RADIUS_M)[1], tracked_places(alone, 1, RADIUS_M)[1])
+    np.testing.assert_allclose(ball_places(everything)[1], ball_places(alone)[1])
     (frame,) = everything
     lost = Returns(rays, np.full(8, Outcome.NOT_DETECTED), frame.range_m, frame.body, 0)
-    frames, places = tracked_places([lost], 1, RADIUS_M)
+    frames, places = ball_places([lost])
     assert frames.shape == (0,)
     assert places.shape == (0, 3)
 
@@ -416,7 +421,7 @@ def test_frames_that_were_not_seen_are_left_to_the_spline():
     places = np.column_stack([np.linspace(-0.3, 0.3, 7), np.full(7, 0.2), np.full(7, 0.1)])
     scene = ball_scene(places)
     rays = even_disc_rays(np.array([0.0, 0.4, 1.0]), places[[1, 4]], 60, 3)
-    frames, _ = tracked_places(simulate(scene, rays), 1, RADIUS_M)
+    frames, _ = ball_places(simulate(scene, rays))
     hits = [SceneCaster(scene, frame).first_hit(rays.origin_m, rays.direction).body == 1 for frame in range(7)]
     assert frames.tolist() == [frame for frame in range(7) if hits[frame].any()]
     assert {1, 4} <= set(frames.tolist()) < set(range(7))

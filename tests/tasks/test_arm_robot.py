@@ -9,10 +9,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from lidardesign_tasks import arm_engine
-from lidardesign_tasks.arm_engine import import_mink
-from lidardesign_tasks.arm_links import BALL
-from lidardesign_tasks.arm_robot import load_robot
+from lidardesign_tasks.robot import arm_motion
+from lidardesign_tasks.robot.arm_links import BALL
+from lidardesign_tasks.robot.arm_motion import import_mink
+from lidardesign_tasks.robot.arm_robot import load_robot
 from support.robots import PIECE, TOOL_M, mjcf, written
 from support.tables import each_row
 
@@ -163,7 +163,7 @@ def test_a_missing_package_is_named_with_what_to_install(monkeypatch):
     def missing(name):
         raise ModuleNotFoundError(f"No module named {name!r}")
 
-    monkeypatch.setattr(arm_engine, "import_module", missing)
+    monkeypatch.setattr(arm_motion, "import_module", missing)
     with pytest.raises(ConfigError, match="pip install mujoco mink"):
         import_mink()
 

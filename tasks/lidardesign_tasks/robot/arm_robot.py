@@ -12,7 +12,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.mujoco_model import FileState, import_mujoco, load_model, model_files
-from lidardesign_tasks.arm_links import BALL, TOOL, VISUAL_GROUP, Link, seen_links
+from lidardesign_tasks.robot.arm_links import BALL, TOOL, VISUAL_GROUP, Link, seen_links
 
 if TYPE_CHECKING:
     import mujoco

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from lidardesign.errors import DataError
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.mujoco_model import import_mujoco, mujoco_warnings
 from lidardesign.scene import Box, Capsule, Mesh, Sphere
-from lidardesign_tasks.arm_engine import import_mink
-from lidardesign_tasks.arm_links import BALL
-from lidardesign_tasks.arm_robot import BALL_RADIUS_M, Robot
+from lidardesign_tasks.robot.arm_links import BALL
+from lidardesign_tasks.robot.arm_robot import BALL_RADIUS_M, Robot
+from lidardesign_tasks.robot.motion import minimum_jerk
 
 HOVER_M = np.array([0.5, 0.0, 0.35])
 PICK_M = np.array([0.45, -0.35, 0.15])
@@ -38,6 +39,18 @@ class RejectedError(Exception):
     """A drawn motion that the arm cannot do; the message is the reason that is counted."""
 
 
+def import_mink() -> Any:
+    """mink, inverse kinematics for MuJoCo; raises ConfigError where it is missing."""
+    try:
+        return import_module("mink")
+    except ImportError as error:
+        raise ConfigError(
+            f"the arm task needs mink, which cannot be imported ({error})",
+            where="task arm",
+            hint="pip install mujoco mink",
+        ) from error
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """One pick-and-place cycle.
@@ -55,15 +68,6 @@ class Motion:
     ball_m: np.ndarray
     links: np.ndarray
     rejected: Counter[str]
-
-
-def minimum_jerk(share: np.ndarray) -> np.ndarray:
-    """The share of the way [0, 1] at a share of the time: rest to rest with the least integrated squared jerk.
-
-    Flash and Hogan, The coordination of arm movements, Journal of Neuroscience 5 (1985).
-    """
-    share = np.clip(share, 0.0, 1.0)
-    return share**3 * (10 - 15 * share + 6 * share**2)
 
 
 def draw_waypoints(jitter_m: float, generator: np.random.Generator) -> np.ndarray:

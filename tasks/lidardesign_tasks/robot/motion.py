@@ -1,0 +1,194 @@
+"""How a robot moves in each scene: windows of recordings, ways through keyframes, or random ways free of collisions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lidardesign.errors import DataError
+from lidardesign.mujoco_model import import_mujoco, mujoco_warnings
+from lidardesign.task import Split, random_generator
+from lidardesign_tasks.robot.recordings import Recording
+
+if TYPE_CHECKING:
+    import mujoco
+
+SPLIT_SEED = 0  # of which recordings are held out, whatever the seed of a run
+MOVE_S = 1.0  # from one configuration to the next
+FINEST_HZ = 100.0  # of the way through keyframes
+TRIES, NEARER = 40, 0.9  # a configuration that collides is drawn again, each time nearer to the one at rest
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One scene's motion.
+
+    Arguments:
+        name: Of the scene.
+        group: What was drawn independently: the recording, or the part of one.
+        qpos: Joint configurations, shape (F, nq).
+    """
+
+    name: str
+    group: str
+    qpos: np.ndarray
+
+
+def minimum_jerk(share: np.ndarray) -> np.ndarray:
+    """The share of the way [0, 1] at a share of the time: rest to rest with the least integrated squared jerk.
+
+    Flash and Hogan, The coordination of arm movements, Journal of Neuroscience 5 (1985).
+    """
+    share = np.clip(share, 0.0, 1.0)
+    return share**3 * (10 - 15 * share + 6 * share**2)
+
+
+def joined(model: mujoco.MjModel, start: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """The smooth way between two configurations (nq,) at shares (F,) of its time, shape (F, nq)."""
+    mujoco, way = import_mujoco(), np.zeros(model.nv)
+    mujoco.mj_differentiatePos(model, way, 1.0, start, end)
+    found = np.tile(start, (len(share), 1))
+    for qpos, along in zip(found, minimum_jerk(share), strict=True):
+        mujoco.mj_integratePos(model, qpos, way, float(along))
+    return found
+
+
+def keyframes(model: mujoco.MjModel, where: str) -> Recording:
+    """A way through all keyframes of a model, in their order and back to the first.
+
+    Raises:
+        DataError: It has less than two.
+    """
+    if model.nkey < 2:
+        raise DataError(
+            f"the model has {model.nkey} keyframes", where=where, allowed="2 or more", hint="motion=random, or a file"
+        )
+    frames = round(MOVE_S * FINEST_HZ)
+    share, keys = np.arange(frames) / frames, np.array(model.key_qpos)
+    ways = [joined(model, start, end, share) for start, end in zip(keys, np.roll(keys, -1, axis=0), strict=True)]
+    qpos = np.concatenate([*ways, keys[:1]])
+    return Recording("keyframes", np.arange(len(qpos)) / FINEST_HZ, qpos)
+
+
+def spans(recordings: Sequence[Recording], split: Split) -> list[tuple[Recording, float, float]]:
+    """The recordings of a split with the first and last moment that it may show [s].
+
+    Half of several recordings is held out; of one, its second half.
+    """
+    if len(recordings) == 1:
+        (one,) = recordings
+        first, middle, last = one.time_s[0], one.time_s[0] + one.seconds / 2, one.time_s[-1]
+        return [(one, first, middle) if split == "train" else (one, middle, last)]
+    order = random_generator(SPLIT_SEED, "mujoco", "split").permutation(len(recordings))
+    chosen = np.sort(order[: len(order) // 2] if split == "test" else order[len(order) // 2 :])
+    return [(recordings[i], recordings[i].time_s[0], recordings[i].time_s[-1]) for i in chosen]
+
+
+def window_frames(recordings: Sequence[Recording], frames: int, rate_hz: float) -> int:
+    """How many frames a window has: those asked for, or what fits into the shortest part that a split shows."""
+    shortest_s = min(last - first for split in ("train", "test") for _, first, last in spans(recordings, split))
+    return min(frames, int(shortest_s * rate_hz) + 1)
+
+
+def windows(
+    model: mujoco.MjModel, recordings: Sequence[Recording], split: Split, count: int, frames: int, rate_hz: float,
+    seed: int,
+) -> list[Trajectory]:  # fmt: skip
+    """So many windows of a split's recordings, in turn, that begin at random moments; see `spans`."""
+    frames, shown = window_frames(recordings, frames, rate_hz), spans(recordings, split)
+    length_s, found = (frames - 1) / rate_hz, []
+    for index in range(count):
+        recording, first, last = shown[index % len(shown)]
+        start = random_generator(seed, "mujoco", split, index).uniform(first, max(last - length_s, first))
+        times = start + np.arange(frames) / rate_hz
+        # of one recording, windows that may overlap are one group
+        part = "" if len(recordings) > 1 or not length_s else f" {int((start - recording.time_s[0]) / length_s)}"
+        name = f"{split} {index}: {recording.name} from {start:.2f} s"
+        found.append(Trajectory(name, recording.name + part, recording.at(model, times)))
+    return found
+
+
+class Wanderer:
+    """Random ways of a model that do not collide; contacts that it has at rest are no collisions."""
+
+    def __init__(self, model: mujoco.MjModel, where: str) -> None:
+        self.mujoco, self.model, self.where = import_mujoco(), model, where
+        self.data = self.mujoco.MjData(model)
+        rest = np.array(model.key_qpos[0] if model.nkey else model.qpos0)
+        kinds = self.mujoco.mjtJoint
+        self.straight = np.isin(model.jnt_type, (int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE)))
+        self.limited = self.straight & (model.jnt_limited != 0)
+        self.turning = self.straight & ~self.limited & (model.jnt_type == int(kinds.mjJNT_HINGE))
+        self.balls = np.flatnonzero(model.jnt_type == int(kinds.mjJNT_BALL))
+        places = model.jnt_qposadr[self.limited]
+        rest[places] = np.clip(rest[places], *model.jnt_range[self.limited].T)
+        self.rest = rest
+        self.allowed = self._contacts(rest)
+
+    def draw(self, frames: int, rate_hz: float, generator: np.random.Generator) -> np.ndarray:
+        """A way of so many frames from rest to rest, a configuration per `MOVE_S`, shape (F, nq).
+
+        Raises:
+            DataError: No way without collisions was found.
+        """
+        time_s = np.arange(frames) / rate_hz
+        moves = max(1, math.ceil(time_s[-1] / MOVE_S))
+        share = np.clip(time_s[None] / MOVE_S - np.arange(moves)[:, None], 0.0, 1.0)
+        here = self._next(self.rest, np.ones(1), generator)[-1]
+        found = np.tile(here, (frames, 1))
+        for move in range(moves):
+            now = (time_s >= move * MOVE_S) & ((time_s < (move + 1) * MOVE_S) | (move == moves - 1))
+            way = self._next(here, np.append(share[move, now], 1.0), generator)
+            found[now], here = way[:-1], way[-1]
+        return found
+
+    def _next(self, here: np.ndarray, share: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+        """A way to a random configuration that is free at all shares of its time."""
+        for attempt in range(TRIES):
+            way = joined(self.model, here, self._configuration(NEARER**attempt, generator), share)
+            if all(self._contacts(qpos) <= self.allowed for qpos in way):
+                return way
+        raise DataError(
+            f"{TRIES} random configurations collide", where=self.where, hint="motion=FILE.csv, or a model at rest "
+            "with room to move"
+        )  # fmt: skip
+
+    def _configuration(self, reach: float, generator: np.random.Generator) -> np.ndarray:
+        """Joints anywhere within a share of their limits around rest; what is free, or slides without end, rests."""
+        model, qpos = self.model, self.rest.copy()
+        low, high = model.jnt_range[self.limited].T
+        places, turning = model.jnt_qposadr[self.limited], model.jnt_qposadr[self.turning]
+        qpos[places] += reach * (generator.uniform(low, high) - qpos[places])
+        qpos[turning] += reach * generator.uniform(-math.pi, math.pi, len(turning))
+        way = np.zeros(model.nv)
+        for ball in self.balls:
+            axis = generator.normal(size=3)
+            largest = model.jnt_range[ball, 1] if model.jnt_limited[ball] else math.pi
+            angle = reach * generator.uniform(0.0, largest)
+            way[model.jnt_dofadr[ball] :][:3] = angle * axis / np.linalg.norm(axis)
+        self.mujoco.mj_integratePos(model, qpos, way, 1.0)
+        return qpos
+
+    def _contacts(self, qpos: np.ndarray) -> set[tuple[int, int]]:
+        """Pairs of geoms that are in each other."""
+        self.data.qpos[:] = qpos
+        with mujoco_warnings():
+            self.mujoco.mj_fwdPosition(self.model, self.data)
+        contact = self.data.contact
+        inside = contact.dist[: self.data.ncon] < 0
+        return set(map(tuple, np.sort(contact.geom[: self.data.ncon][inside], axis=1).tolist()))
+
+
+def wandering(
+    model: mujoco.MjModel, split: str, count: int, frames: int, rate_hz: float, seed: int, where: str
+) -> list[Trajectory]:
+    """So many random ways, each with a generator of its own."""
+    wanderer, found = Wanderer(model, where), []
+    for index in range(count):
+        qpos = wanderer.draw(frames, rate_hz, random_generator(seed, "mujoco", split, index))
+        found.append(Trajectory(f"{split} {index}", f"{split} {index}", qpos))
+    return found

@@ -1,0 +1,216 @@
+"""What of a model sensors are to find, what hides it, and where all of it is in the frames of a motion."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.surface import sample_body
+from lidardesign.mujoco_model import FileState, ModelGeom, body_poses, load_model, model_files, visible_geoms
+from lidardesign.numerics import SLACK
+from lidardesign.run.validation import suggest
+from lidardesign.scene import Body, Mesh, Plane, Scene, inverse_rigid
+from lidardesign.space import DesignSpace
+from lidardesign.task import random_generator
+
+if TYPE_CHECKING:
+    import mujoco
+
+MOST_SHOWN = 12
+OUTLINE_POINTS = 1000
+# How far a plane would count; no plane is a target.
+NEAR = DesignSpace((0.0,) * 6, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+Names = tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A body of the model that sensors are to find.
+
+    Arguments:
+        name: Of the body.
+        body: Its number in the model.
+        pieces: Which of the model's pieces it is, shape (K,).
+        box_m: Corners of a box around it, in the body's frame, shape (8, 3).
+        depth_m: How far behind its returns its middle is expected, see `mean_depth_m`.
+    """
+
+    name: str
+    body: int
+    pieces: np.ndarray
+    box_m: np.ndarray
+    depth_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A robot with all that stands around it, and what sensors are to find.
+
+    Arguments:
+        model: The MuJoCo model.
+        pieces: Its visible pieces without the ignored ones.
+        targets: What sensors are to find.
+        known: Which pieces' returns are told apart, as those of a robot's own links, shape (pieces,).
+        mount: The number of the body that sensors are on; None: they stand in the world.
+        notes: What reading it mended or left out, one line each.
+    """
+
+    model: mujoco.MjModel
+    pieces: tuple[ModelGeom, ...]
+    targets: tuple[Target, ...]
+    known: np.ndarray
+    mount: int | None
+    notes: Names
+
+    def poses(self, qpos: np.ndarray) -> np.ndarray:
+        """The poses (F, nbody, 4, 4) of all bodies in the frame of the mount, or in the world."""
+        poses = body_poses(self.model, qpos)
+        if self.mount is not None:
+            poses = inverse_rigid(poses[:, self.mount])[:, None] @ poses
+            poses[:, self.mount] = np.eye(4)
+        resting = np.abs(poses - poses[0]).max(axis=(0, 2, 3)) < SLACK
+        poses[:, resting] = poses[0, resting]
+        return poses
+
+    def bodies(self, poses: np.ndarray) -> tuple[Body, ...]:
+        """All pieces as the bodies of a scene, in the same order."""
+        wanted = {piece for target in self.targets for piece in target.pieces.tolist()}
+        return tuple(
+            piece.at(poses, "both" if number in wanted else "occluder") for number, piece in enumerate(self.pieces)
+        )
+
+    def places_m(self, poses: np.ndarray) -> np.ndarray:
+        """Where the middle of each target is, shape (targets, F, 3) [m]."""
+        return self.corners_m(poses).mean(axis=2)
+
+    def corners_m(self, poses: np.ndarray) -> np.ndarray:
+        """The corners of the box around each target, shape (targets, F, 8, 3) [m]."""
+        return np.stack([_moved(target.box_m, poses[:, target.body]) for target in self.targets])
+
+    def mount_top_m(self) -> np.ndarray:
+        """The middle of the top of the mount's geometry in its own frame, shape (3,); its origin if it has none."""
+        own = [outline_m(piece) for piece in self.pieces if piece.body == self.mount]
+        low, high = (pick(np.concatenate(own), axis=0) for pick in (np.min, np.max)) if own else np.zeros((2, 3))
+        return np.array([*(low + high)[:2] / 2, high[2]])
+
+
+def read_model(path: Path, targets: Names, ignored: Names, known: Names, groups: tuple[int, ...] | None,
+               mount: str | None) -> Model:  # fmt: skip
+    """A model, read once per process while its files stay the same.
+
+    Arguments:
+        path: The MJCF or URDF file.
+        targets, ignored, known: Patterns of the names of bodies and geoms, as `hand*`.
+        groups: Of geoms that are seen; None: as MuJoCo shows them.
+        mount: The body that sensors are on; None: the world.
+
+    Raises:
+        DataError: The file cannot be used.
+        ConfigError: A name or pattern is that of nothing visible; with the nearest.
+    """
+    return _read(path, model_files(path), targets, ignored, known, groups, mount)
+
+
+@lru_cache(maxsize=4)
+def _read(path: Path, states: tuple[FileState, ...], targets: Names, ignored: Names, known: Names,
+          groups: tuple[int, ...] | None, mount: str | None) -> Model:  # fmt: skip
+    """`states`, of all files of the model, only tells a changed model from the one in memory."""
+    model, said = load_model(path)
+    pieces, notes = visible_geoms(model, groups=groups)
+    gone = _named(pieces, ignored, "ignored")
+    # notes were handed over
+    pieces = tuple(
+        replace(piece, shape=replace(piece.shape, notes=())) if isinstance(piece.shape, Mesh) else piece
+        for piece, left_out in zip(pieces, gone, strict=True)
+        if not left_out
+    )
+    wanted = _named(pieces, targets, "targets")
+    names = [model.body(body).name for body in range(model.nbody)]
+    if mount is not None and mount not in names:
+        raise ConfigError(f"no body is called {mount!r}", where="task.mount_body", allowed=_listed(names[1:]),
+                          hint=suggest(mount, names))  # fmt: skip
+    found = [
+        _target(pieces, np.flatnonzero(wanted & np.array([piece.body == body for piece in pieces])))
+        for body in dict.fromkeys(piece.body for piece, is_target in zip(pieces, wanted, strict=True) if is_target)
+    ]
+    told_apart = _named(pieces, known, "known") & ~wanted
+    number = None if mount is None else names.index(mount)
+    return Model(model, pieces, tuple(found), told_apart, number, (*said, *notes))
+
+
+def _named(pieces: Sequence[ModelGeom], patterns: Names, key: str) -> np.ndarray:
+    """Which pieces a pattern names by their body or geom, shape (pieces,)."""
+    found, names = np.zeros(len(pieces), dtype=bool), [(piece.body_name, piece.geom_name) for piece in pieces]
+    for pattern in patterns:
+        fits = np.array([fnmatchcase(body, pattern) or fnmatchcase(geom, pattern) for body, geom in names], dtype=bool)
+        if not fits.any():
+            every = list(dict.fromkeys(name for pair in names for name in pair if name))
+            raise ConfigError(f"no visible body or geom is called {pattern!r}", where=f"task.{key}",
+                              allowed=_listed(every), hint=suggest(pattern.strip("*"), every))  # fmt: skip
+        found |= fits
+    return found
+
+
+def _target(pieces: Sequence[ModelGeom], chosen: np.ndarray) -> Target:
+    first = pieces[chosen[0]]
+    if any(isinstance(pieces[piece].shape, Plane) for piece in chosen):
+        raise ConfigError(f"{first.body_name!r} is a plane without an end", where="task.targets", hint="ignore it")
+    points = np.concatenate([outline_m(pieces[piece]) for piece in chosen])
+    box_m = np.array(list(itertools.product(*zip(points.min(axis=0), points.max(axis=0), strict=True))))
+    return Target(first.body_name, first.body, chosen, box_m, mean_depth_m(points))
+
+
+def outline_m(piece: ModelGeom) -> np.ndarray:
+    """Points of a piece's surface in its body's frame, none beyond it, shape (K, 3) [m]."""
+    if isinstance(piece.shape, Mesh):
+        points = piece.shape.vertices[np.unique(piece.shape.faces)]
+    else:
+        points = sample_body([Body(piece.shape)], NEAR, OUTLINE_POINTS, random_generator(0, "outline")).points
+        points = np.concatenate([points, -points])  # primitives are symmetric about their origin
+    return points @ piece.pose[:3, :3].T + piece.pose[:3, 3]
+
+
+def mean_depth_m(points_m: np.ndarray) -> float:
+    """Half the mean chord 4 V / S of the convex hull of points (K, 3): how far its middle is behind its returns [m].
+
+    Cauchy's mean chord; of a ball 2/3 of its radius, in the mean over its disc.
+    """
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(points_m, qhull_options="QJ")
+    return 2 * float(hull.volume) / float(hull.area)
+
+
+def _moved(points_m: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Points (K, 3) at poses (F, 4, 4), shape (F, K, 3)."""
+    return np.einsum("fij,kj->fki", poses[:, :3, :3], points_m) + poses[:, None, :3, 3]
+
+
+def refuse_sensors_inside(model: Model, poses: np.ndarray, origins_m: np.ndarray) -> None:
+    """Raises ConfigError where in some frame all of the places (K, 3) that sensors may be at are inside a piece."""
+    direction = np.array([0.36, 0.48, 0.8])  # parallel to nothing that models are built of
+    for piece in model.pieces:
+        if isinstance(piece.shape, Plane) or (isinstance(piece.shape, Mesh) and piece.shape.sign != "solid"):
+            continue
+        own = _moved(origins_m, inverse_rigid(poses[:, piece.body] @ piece.pose)).reshape(-1, 3)
+        caster, limits = SceneCaster(Scene((Body(piece.shape),))), np.full(len(own), np.inf)
+        passed = caster.crossings(own, np.tile(direction, (len(own), 1)), np.zeros(len(own)), limits).row
+        inside = (np.bincount(passed, minlength=len(own)) % 2 == 1).reshape(len(poses), -1).all(axis=1)
+        if inside.any():
+            raise ConfigError(
+                f"all places where sensors may be are inside {piece.name!r} (frame {int(np.argmax(inside))})",
+                where="task.origin_m", hint="move origin_m, or widen origin_box_m",
+            )  # fmt: skip
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:MOST_SHOWN]) + (", ..." if len(names) > MOST_SHOWN else "")

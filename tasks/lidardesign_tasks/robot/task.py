@@ -1,0 +1,198 @@
+"""Your robot: any model that MuJoCo loads, its motion, and sensors in the world or on one of its bodies.
+
+The frame is the model's world, z up, or that of the body that sensors are mounted on: then everything moves around the
+sensors. Without a motion of yours the robot wanders at random, free of collisions.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Returns
+from lidardesign.scene import Scene
+from lidardesign.space import DesignSpace
+from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
+from lidardesign_tasks.robot.measures import METRICS, TOLERATED_SHARE, Measure, informs, score, with_truth
+from lidardesign_tasks.robot.motion import (
+    Trajectory,
+    keyframes,
+    wandering,
+    window_frames,
+    windows,
+)
+from lidardesign_tasks.robot.recordings import Recording, read_recordings
+from lidardesign_tasks.robot.targets import Model, read_model, refuse_sensors_inside
+from lidardesign_tasks.surface import MILLIMETRES
+from lidardesign_tasks.surroundings import Surroundings
+from lidardesign_tasks.view import space_around
+
+Vector = tuple[float, float, float]
+SENSOR_DISTANCE = 2.0  # extents
+ROOM = 1.1  # around the sphere that holds the targets wherever they move
+ABOVE_MOUNT_M = 0.01
+# Of random motions, so many tell the space in which targets move; of recordings, so many moments.
+SPACE_MOTIONS, SPACE_MOMENTS = 12, 200
+
+
+class MujocoConfig(Surroundings):
+    """The model and its motion, what is to be found of it, where sensors are, and the surroundings."""
+
+    model: Path | None = Field(None, description="MJCF or URDF file of the robot and what stands around it")
+    targets: tuple[str, ...] = Field((), description="what to find: names of bodies or geoms, as [hand*]")
+    motion: Literal["random", "keyframes"] | Path = Field(
+        "random", description="CSV or NPZ of joint positions over time (time_s and a column per joint; NAME.x, .y, .z, "
+        ".qw, .qx, .qy, .qz of free ones), a folder of them, keyframes of the model, or random"
+    )  # fmt: skip
+    known: tuple[str, ...] = Field(
+        ("*",), description="bodies or geoms, none of targets, whose returns are told apart: by default all"
+    )
+    ignored: tuple[str, ...] = Field((), description="bodies or geoms that are left out")
+    groups: tuple[int, ...] | None = Field(None, description="groups of geoms that are seen; 0, 1 and 2 if empty")
+    mount_body: str | None = Field(None, description="the body that sensors are on; in the world if empty")
+    origin_m: Vector | None = Field(
+        None, description="sensor place, in the mount's frame [m]; if empty: in front at 2 extents, or on the mount"
+    )
+    origin_box_m: float | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
+    range_m: tuple[float, float] | None = Field(None, description="shortest and longest range [m]; of targets if empty")
+    metric: Measure = Field("position", description="position of targets [m], their surface [mm], or seen at all [%]")
+    frames: int = Field(20, ge=1, le=1000, description="time frames of a scene")
+    frame_rate_hz: float = Field(10.0, gt=0, le=10_000, description="frames per second [Hz]")
+    train: int = Field(40, ge=1, le=10_000, description="training scenes")
+    test: int = Field(40, ge=1, le=10_000, description="held-out scenes")
+
+
+class MujocoTask:
+    """Find parts of a robot, or things around it, that move as you say."""
+
+    name: ClassVar[str] = "mujoco"
+    summary: ClassVar[str] = "your own robot, as a MuJoCo model, with sensors in the world or on one of its bodies"
+    api_version: ClassVar[int] = 1
+    Config: ClassVar[type[MujocoConfig]] = MujocoConfig
+    metric: ClassVar[Metric] = METRICS["position"]
+    metrics: ClassVar[tuple[Metric, ...]] = (METRICS["surface"], METRICS["seen"])
+    defaults: ClassVar[Defaults] = Defaults(density={"sigma_m": 0.02})
+
+    def space(self, config: MujocoConfig) -> DesignSpace:
+        """All directions and ranges in which targets may be, from where sensors may be."""
+        model = model_of(config)
+        low, high = _bounds(config, model)
+        ahead = [max(SENSOR_DISTANCE * float((high - low).max()), 2 * _radius_m(low, high)), 0.0, 0.0]
+        usual = (low + high) / 2 + ahead
+        if config.mount_body is not None:
+            usual = model.mount_top_m() + np.array([0.0, 0.0, ABOVE_MOUNT_M])
+        origin = usual if config.origin_m is None else np.array(config.origin_m)
+        half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
+        space = space_around((low + high) / 2, _radius_m(low, high), origin, half)
+        if config.range_m is None:
+            return space
+        return replace(space, low=(*space.low[:5], config.range_m[0]), high=(*space.high[:5], config.range_m[1]))
+
+    def scenes(
+        self, config: MujocoConfig, split: Split, seed: int, space: DesignSpace | None = None
+    ) -> Sequence[Scene]:
+        """Windows of the recordings of a split, or random motions; see `spans` and `Wanderer`.
+
+        Raises:
+            DataError: A file cannot be used, or the robot cannot move as it should.
+            ConfigError: Names that are none, or sensors inside geometry.
+        """
+        model, metric, space = model_of(config), self.metric_of(config), space or self.space(config)
+        origins_m = np.array(list(itertools.product(*zip(space.low[:3], space.high[:3], strict=True))))
+        found = []
+        for index, motion in enumerate(_trajectories(config, model, split, seed)):
+            poses = model.poses(motion.qpos)
+            refuse_sensors_inside(model, poses, np.unique(origins_m, axis=0))
+            scene = Scene(model.bodies(poses), motion.name, frame_rate_hz=config.frame_rate_hz, notes=model.notes,
+                          group=motion.group)  # fmt: skip
+            generator = random_generator(seed, "mujoco", split, index, "truth")
+            found.append(config.around(with_truth(scene, model, poses, config.metric, metric, space, generator)))
+        return found
+
+    def metric_of(self, config: MujocoConfig) -> Metric:
+        """At worst a target is lost by the extent in which targets move, a surface by its own."""
+        metric, model = METRICS[config.metric], model_of(config)
+        if config.metric == "seen":
+            return metric
+        low, high = _bounds(config, model)
+        worst = float((high - low).max())
+        if config.metric == "surface":
+            worst = MILLIMETRES * max(float(np.ptp(target.box_m, axis=0).max()) for target in model.targets)
+        return replace(metric, worst=worst, tolerance=TOLERATED_SHARE * worst)
+
+    def mount_of(self, config: MujocoConfig) -> str | None:
+        """The body of the model that sensors are on; None: they stand in the world."""
+        return config.mount_body
+
+    def notes(self, config: MujocoConfig, space: DesignSpace) -> list[str]:
+        """What is found, by what, and how motions are split."""
+        model, recordings = model_of(config), _recordings(config)
+        names = ", ".join(target.name for target in model.targets)
+        found = [f"targets: {names}; {len(model.pieces)} visible pieces, {int(model.known.sum())} of them known"]
+        if len(recordings) > 1:
+            found.append(f"{len(recordings)} recordings, half of them held out")
+        elif recordings:
+            frames = window_frames(recordings, config.frames, config.frame_rate_hz)
+            found.append(
+                f"{recordings[0].name}: one recording of {recordings[0].seconds:.3g} s serves both splits: scenes are "
+                f"windows of {frames} frames, of its first half for training, of its second half held out"
+            )
+        return found
+
+    def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
+        """By the metric of the configuration; see `measures`."""
+        return score(scene, returns)
+
+    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+        """What returns tell, by the metric of the configuration."""
+        return informs(scene, returns)
+
+
+def model_of(config: MujocoConfig) -> Model:
+    """The model of a configuration; raises ConfigError where none is set, or nothing is to be found."""
+    if config.model is None:
+        raise ConfigError("no model is set", where="task.model", hint="--set model=robot.xml")
+    if not config.targets:
+        raise ConfigError("no targets are set", where="task.targets", hint="--set 'targets=[hand*]'")
+    return read_model(config.model, config.targets, config.ignored, config.known, config.groups, config.mount_body)
+
+
+def _recordings(config: MujocoConfig) -> list[Recording]:
+    """The recordings of a configuration; none where motions are random."""
+    if config.motion == "random":
+        return []
+    model = model_of(config).model
+    if config.motion == "keyframes":
+        return [keyframes(model, str(config.model))]
+    return read_recordings(model, Path(config.motion))
+
+
+def _trajectories(config: MujocoConfig, model: Model, split: Split, seed: int) -> list[Trajectory]:
+    count, recordings = config.train if split == "train" else config.test, _recordings(config)
+    if recordings:
+        return windows(model.model, recordings, split, count, config.frames, config.frame_rate_hz, seed)
+    where = f"task.model, {config.model}"
+    return wandering(model.model, split, count, config.frames, config.frame_rate_hz, seed, where)
+
+
+def _bounds(config: MujocoConfig, model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box around all targets wherever they move, (3,) each [m]; of random motions, of a few."""
+    recordings = _recordings(config)
+    if recordings:
+        thinned = [one.qpos[:: max(1, len(one.qpos) // SPACE_MOMENTS)] for one in recordings]
+    else:
+        few = config.model_copy(update={"train": SPACE_MOTIONS})
+        thinned = [one.qpos for one in _trajectories(few, model, "train", 0)]
+    corners = model.corners_m(model.poses(np.concatenate(thinned))).reshape(-1, 3)
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def _radius_m(low: np.ndarray, high: np.ndarray) -> float:
+    return ROOM * float(np.linalg.norm(high - low)) / 2

@@ -1,0 +1,327 @@
+"""Your own robot: laws of the task on small models that are written here, and on models that nobody here made."""
+
+from __future__ import annotations
+
+import itertools
+
+import mujoco
+import numpy as np
+import pytest
+from lidardesign_tasks.robot.motion import Wanderer, joined, spans, window_frames
+from lidardesign_tasks.robot.recordings import Recording, columns, read_recordings
+from lidardesign_tasks.robot.targets import mean_depth_m
+from lidardesign_tasks.robot.task import MujocoTask
+from support.rays import rays_of_points
+from support.robots import written
+from support.tables import each_row
+
+from lidardesign.config import resolve
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Returns
+from lidardesign.scene import Sphere
+from lidardesign.space import aim
+from lidardesign.testing import check_task
+
+TASK = MujocoTask()
+ROBOT = """<mujoco><worldbody>
+<geom name="ground" type="box" size="2 2 .1" pos="0 0 -.1"/>
+<body name="base" pos="0 0 .5"><geom name="trunk" type="box" size=".1 .1 .4"/>
+<body name="arm" pos=".15 0 .4"><joint name="lift" axis="0 1 0" range="-80 80"/>
+<geom name="upper" type="capsule" size=".04" fromto="0 0 0 .4 0 0"/>
+<body name="hand" pos=".5 0 0"><joint name="turn" axis="0 0 1" range="-90 90"/>
+<geom name="palm" type="sphere" size=".06"/></body></body></body>
+<body name="parcel" pos="1 0 .1"><freejoint name="parcel"/><geom name="lid" type="box" size=".1 .1 .1"/></body>
+</worldbody><keyframe><key qpos="0 0 1 0 .1 1 0 0 0"/><key qpos=".5 -1 1 0 .1 1 0 0 0"/></keyframe></mujoco>"""
+REST = [1, 0, 0.1, 1, 0, 0, 0]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    written(tmp_path, ROBOT, "robot.xml")
+    return tmp_path
+
+
+@pytest.fixture
+def configured(folder):
+    def configure(**keys):
+        return TASK.Config(**{"model": folder / "robot.xml", "targets": ("hand",), "train": 3, "test": 3, **keys})
+
+    return configure
+
+
+def table(lift, **more):
+    """A recording of the robot by columns."""
+    names = ["parcel.x", "parcel.y", "parcel.z", "parcel.qw", "parcel.qx", "parcel.qy", "parcel.qz"]
+    rest = {name: np.full(len(lift), value) for name, value in zip(names, REST, strict=True)}
+    return {"time_s": np.arange(len(lift)) / 10, "lift": lift, "turn": np.zeros(len(lift)), **rest, **more}
+
+
+def write_csv(path, table):
+    rows = [",".join(table), *(",".join(map(str, row)) for row in zip(*table.values(), strict=True))]
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+# The contract
+
+
+@pytest.mark.slow
+@each_row(
+    "keys",
+    [
+        "metric=position",
+        "metric=surface",
+        "metric=seen",
+        "motion=keyframes metric=seen",
+        "mount_body=base origin_m=[0,-.4,.3]",
+        "mount_body=hand targets=[parcel] origin_m=[.1,0,-.1] metric=seen",
+    ],
+)
+def test_the_task_keeps_the_contract(folder, keys):
+    usual = [f"model={folder / 'robot.xml'}", "train=3", "test=3", "frames=6", "targets=[hand]"]
+    check_task(TASK, overrides=[*usual, *keys.split()])
+
+
+# Motion
+
+
+def test_columns_are_called_as_their_joints(folder):
+    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    assert columns(model)[:3] == ["lift", "turn", "parcel.x"]
+    assert columns(model)[-4:] == ["parcel.qw", "parcel.qx", "parcel.qy", "parcel.qz"]
+    assert len(columns(model)) == model.nq
+
+
+def test_a_csv_and_an_npz_of_one_motion_are_one_motion(folder):
+    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    motion = table(np.linspace(-1, 1, 30))
+    write_csv(folder / "walk.csv", motion)
+    np.savez(folder / "walk.npz", **motion)
+    whole = np.stack([motion[name] for name in columns(model)], axis=1)
+    np.savez(folder / "whole.npz", time_s=motion["time_s"], qpos=whole)
+    (folder / "walks").mkdir()
+    for name in ("walk.csv", "walk.npz", "whole.npz"):
+        (folder / name).rename(folder / "walks" / name)
+    found = read_recordings(model, folder / "walks")
+    assert [one.name for one in found] == ["walk.csv", "walk.npz", "whole.npz"]
+    for one in found:
+        np.testing.assert_allclose(one.qpos, whole)
+        np.testing.assert_allclose(one.at(model, np.array([0.05])), (whole[:1] + whole[1:2]) / 2)
+
+
+def test_a_quaternion_is_unit_between_rows_whatever_its_sign_and_length(folder):
+    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    signs = np.where(np.arange(20) % 2, -3.0, 2.0)
+    angle = np.linspace(0, 3, 20)
+    turned = {"parcel.qw": signs * np.cos(angle / 2), "parcel.qz": signs * np.sin(angle / 2)}
+    (one,) = read_recordings(model, write_csv(folder / "turn.csv", table(np.zeros(20), **turned)))
+    qpos = one.at(model, np.linspace(0, 1.9, 77))
+    np.testing.assert_allclose(np.linalg.norm(qpos[:, 5:9], axis=1), 1.0)
+    found = 2 * np.arctan2(qpos[:, 8], qpos[:, 5])
+    np.testing.assert_allclose(found, np.interp(np.linspace(0, 1.9, 77), one.time_s, angle), atol=1e-4)
+
+
+BAD = {
+    "a joint by another name": (
+        lambda t: {("lft" if k == "lift" else k): v for k, v in t.items()},
+        "'lft' is no joint",
+    ),
+    "the nearest joint": (lambda t: {("lft" if k == "lift" else k): v for k, v in t.items()}, "did you mean 'lift'"),
+    "a joint that is missing": (lambda t: {k: v for k, v in t.items() if k != "turn"}, "joints are missing: turn"),
+    "no time": (lambda t: {k: v for k, v in t.items() if k != "time_s"}, "has no column time_s"),
+    "time that goes back": (lambda t: {**t, "time_s": -t["time_s"]}, "does not ascend"),
+    "a joint beyond its limits": (
+        lambda t: {**t, "turn": t["turn"] + 2.0},
+        "'turn' is at 2 at 0 s; allowed: -1.571",
+    ),
+    "degrees": (lambda t: {**t, "turn": t["turn"] + 45.0}, "are they degrees"),
+    "no number": (lambda t: {**t, "turn": ["x"] * len(t["lift"])}, "turn is 'x'"),
+    "NaN": (lambda t: {**t, "turn": [np.nan] * len(t["lift"])}, "NaN"),
+    "no quaternion": (lambda t: {**t, "parcel.qw": np.zeros(len(t["lift"]))}, "a quaternion of 'parcel' is 0"),
+    "one row": (lambda t: {k: v[:1] for k, v in t.items()}, "less than 2 rows"),
+}
+
+
+@each_row("case", BAD)
+def test_a_motion_that_cannot_be_used_is_refused_with_its_file(folder, configured, case):
+    change, said = BAD[case]
+    path = write_csv(folder / "walk.csv", change(table(np.zeros(10))))
+    with pytest.raises(DataError) as error:
+        TASK.scenes(configured(motion=path), "train", 0)
+    assert said in str(error.value).replace("\n  ", "; ")
+    assert "walk.csv" in str(error.value)
+
+
+def test_several_recordings_are_split_by_file_and_one_in_its_middle():
+    whole = [Recording(f"{i}.csv", np.arange(50) / 10, np.zeros((50, 1))) for i in range(5)]
+    parts = {split: [one.name for one, _, _ in spans(whole, split)] for split in ("train", "test")}
+    assert sorted(parts["train"] + parts["test"]) == [one.name for one in whole]
+    (_, first, end), (_, begin, last) = spans(whole[:1], "train")[0], spans(whole[:1], "test")[0]
+    assert (first, last) == (0.0, 4.9)
+    assert end == begin
+    assert window_frames(whole, 20, 10.0) == 20
+    assert window_frames(whole[:1], 40, 10.0) == 25
+
+
+def test_windows_of_one_recording_stay_in_the_half_of_their_split(folder, configured):
+    lift = np.linspace(-1, 1, 101)
+    config = configured(motion=write_csv(folder / "walk.csv", table(lift)), frames=10, train=8, test=8)
+    heights = {
+        split: [TASK.scenes(config, split, 0)[i].truth["places_m"][0, :, 2] for i in range(8)]
+        for split in ("train", "test")
+    }
+    assert min(map(np.min, heights["train"])) >= max(map(np.max, heights["test"])) - 1e-9
+    assert "one recording" in TASK.notes(config, TASK.space(config))[1]
+
+
+def test_keyframes_are_passed_at_rest(folder):
+    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    way = joined(model, model.key_qpos[0], model.key_qpos[1], np.linspace(0, 1, 101))
+    np.testing.assert_allclose(way[[0, -1]], model.key_qpos[:2])
+    assert np.abs(np.diff(way, axis=0)[[0, -1]]).max() < np.abs(np.diff(way, axis=0)).max() / 1000
+
+
+def test_random_ways_do_not_collide_and_contacts_at_rest_are_none(folder):
+    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    wanderer = Wanderer(model, "robot.xml")
+    data = mujoco.MjData(model)
+    ways = [wanderer.draw(20, 10.0, np.random.default_rng(seed)) for seed in range(10)]
+    for qpos in itertools.chain(*ways):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        names = {tuple(sorted(model.geom(geom).name for geom in pair)) for pair in data.contact.geom}
+        deep = {pair for pair, dist in zip(names, data.contact.dist, strict=False) if dist < 0}
+        assert deep <= {("ground", "lid")}
+    assert np.ptp(np.concatenate(ways)[:, 0]) > 1.0
+    limits = model.jnt_range[:2]
+    assert all(((way[:, :2] >= limits[:, 0]) & (way[:, :2] <= limits[:, 1])).all() for way in ways)
+
+
+def test_what_collides_at_rest_may_collide(tmp_path):
+    jammed = """<mujoco><worldbody><body name="wall"><geom type="box" size="1 1 .1"/></body>
+    <body pos="0 0 .2"><joint type="slide" axis="0 0 1" range="-1 -.05"/><geom name="head" type="sphere" size=".1"/>
+    </body></worldbody></mujoco>"""
+    config = TASK.Config(model=written(tmp_path, jammed, "jam.xml"), targets=("head",), train=1, test=1)
+    assert len(TASK.scenes(config, "train", 0)) == 1
+
+
+# Scenes
+
+
+def test_bodies_are_where_mujoco_puts_them_seen_from_the_world_or_from_a_body(folder, configured):
+    keys = {"motion": "keyframes", "frames": 5, "metric": "seen"}
+    world = TASK.scenes(configured(**keys), "train", 0)
+    there = TASK.scenes(configured(**keys, mount_body="arm", origin_m=(0, 0, 0.3)), "train", 0)
+    for one, other in zip(world, there, strict=True):
+        names = [body.name for body in one.bodies]
+        arm, base = names.index("arm"), names.index("base")
+        assert other.bodies[arm].poses.ndim == 2
+        assert other.bodies[base].poses.ndim == 3
+        for frame in range(5):
+            # whatever the frame, bodies are where they are to each other
+            for first, second in zip(one.bodies, other.bodies, strict=True):
+                there_to_arm = np.linalg.inv(other.bodies[arm].pose(frame)) @ second.pose(frame)
+                np.testing.assert_allclose(
+                    np.linalg.inv(one.bodies[arm].pose(frame)) @ first.pose(frame), there_to_arm, atol=1e-9
+                )
+
+
+def test_roles_and_groups_follow_the_names(configured):
+    (scene, *_) = TASK.scenes(configured(ignored=("ground",), targets=("pa*",)), "train", 0)
+    roles = {body.name: body.role for body in scene.bodies}
+    assert roles == {"base": "occluder", "arm": "occluder", "hand": "both", "parcel": "both"}
+    assert scene.group == "train 0"
+
+
+WRONG = {
+    "no model": ({"model": None}, "no model is set"),
+    "no targets": ({"targets": ()}, "no targets are set"),
+    "a target that is not there": ({"targets": ("hnad*",)}, "did you mean 'hand'"),
+    "a known part that is not there": ({"known": ("trnk",)}, "did you mean 'trunk'"),
+    "a mount that is not there": ({"mount_body": "bse"}, "did you mean 'base'"),
+    "sensors inside geometry": ({"origin_m": (0, 0, 0.5)}, "inside 'base'"),
+    "sensors inside the mount": ({"mount_body": "base", "origin_m": (0, 0, 0)}, "inside 'base'"),
+}
+
+
+@each_row("case", WRONG)
+def test_a_configuration_that_cannot_be_used_says_what_to_do(configured, case):
+    keys, said = WRONG[case]
+    with pytest.raises(ConfigError) as error:
+        TASK.scenes(configured(**keys), "train", 0)
+    assert said in str(error.value)
+    assert "task." in str(error.value.where)
+
+
+def test_words_for_motions_are_no_paths(folder, monkeypatch):
+    given = [f"model={folder / 'robot.xml'}", "targets=[hand]"]
+    walk = write_csv(folder / "walk.csv", table(np.zeros(10)))
+    assert resolve(TASK, overrides=[*given, "motion=keyframes"]).task.motion == "keyframes"
+    monkeypatch.chdir(folder)
+    assert resolve(TASK, overrides=[*given, "motion=walk.csv"]).task.motion == walk
+
+
+# Metrics
+
+
+def test_the_mean_depth_of_a_ball_is_two_thirds_of_its_radius():
+    points = np.random.default_rng(0).normal(size=(4000, 3))
+    points *= 0.3 / np.linalg.norm(points, axis=1, keepdims=True)
+    assert mean_depth_m(points) == pytest.approx(0.2, rel=0.01)
+
+
+def answers(scene, rays):
+    """What rays with open gates return in each frame."""
+    found = []
+    for frame in range(scene.frames):
+        hits = SceneCaster(scene, frame).first_hit(rays.origin_m, rays.direction)
+        outcome = np.where(hits.body >= 0, Outcome.RETURN, Outcome.MISS)
+        found.append(Returns(rays, outcome, np.where(hits.body >= 0, hits.range_m, np.nan), hits.body, frame))
+    return found
+
+
+def disc_rays(scene, target, origin, count=2000):
+    """Rays that cross the disc of a ball evenly, in the scene's first frame."""
+    generator, body = np.random.default_rng(0), scene.bodies[target]
+    assert isinstance(body.shape, Sphere)
+    places = body.pose(0)[:3, 3] + 0.06 * generator.uniform(-1, 1, (count, 3))
+    return rays_of_points(aim(np.tile(origin, (count, 1)), places), (0.0, 10.0))
+
+
+@pytest.fixture
+def resting(configured, folder):
+    """Scenes in which nothing moves, by keys of the configuration."""
+
+    def scenes(**keys):
+        motion = write_csv(folder / "rest.csv", table(np.zeros(50)))
+        return TASK.scenes(configured(motion=motion, frames=3, **keys), "train", 0)
+
+    return scenes
+
+
+def test_the_position_of_a_ball_is_found_by_returns_on_it(resting):
+    (scene, *_) = resting()
+    target = next(i for i, body in enumerate(scene.bodies) if body.is_target)
+    found = TASK.score(scene, answers(scene, disc_rays(scene, target, [0.65, -1.0, 0.9])))
+    assert found.value < 0.005
+    assert found.details["seen_percent"] == 100.0
+
+
+def test_what_is_not_known_is_mistaken_for_the_target(resting):
+    told_apart, mistaken = (resting(known=known)[0] for known in (("*",), ()))
+    target = next(i for i, body in enumerate(told_apart.bodies) if body.is_target)
+    rays = disc_rays(told_apart, target, [0.65, -0.5, 2.0])
+    assert (answers(told_apart, rays)[0].body != target).any()
+    assert TASK.score(told_apart, answers(told_apart, rays)).value < TASK.score(mistaken, answers(mistaken, rays)).value
+    assert TASK.informs(told_apart, answers(told_apart, rays)).harm.max() == 0
+    assert TASK.informs(mistaken, answers(mistaken, rays)).harm.max() > 0
+
+
+def test_seen_counts_targets_and_frames_with_a_return(resting):
+    (scene, *_) = resting(metric="seen", targets=("hand", "parcel"))
+    target = next(i for i, body in enumerate(scene.bodies) if body.name == "hand")
+    returns = answers(scene, disc_rays(scene, target, [0.65, -1.0, 0.9], 50))
+    assert TASK.score(scene, returns).value == pytest.approx(50.0)
+    nothing = [Returns(one.rays, np.full(50, Outcome.MISS), one.range_m, np.full(50, -1), one.frame) for one in returns]
+    assert TASK.score(scene, nothing).value == 0.0
