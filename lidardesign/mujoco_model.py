@@ -5,6 +5,7 @@ MuJoCo is imported when a model is read. A model may only read files of its own 
 
 from __future__ import annotations
 
+import os
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Sequence
@@ -17,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.geometry.surface import grid_faces
 from lidardesign.meshio import check_mesh
-from lidardesign.scene import Body, Box, Capsule, Mesh, Role, Shape, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Role, Shape, Sphere, rigid
 
 if TYPE_CHECKING:
     import mujoco
@@ -27,6 +29,7 @@ LARGEST_XML_BYTES = 16_000_000
 LARGEST_ASSETS_BYTES = 2_000_000_000
 DIRECTORIES = ("meshdir", "texturedir", "assetdir")
 MAX_INCLUDES = 100
+MESH_ENDINGS = (".obj", ".stl", ".msh")  # what MuJoCo reads
 # What MuJoCo's viewer shows unless told otherwise; Menagerie keeps what is seen in group 2, what collides in group 3.
 SHOWN_GROUPS = (0, 1, 2)
 ALLOWED = "an MJCF or URDF model that MuJoCo can load"
@@ -106,18 +109,24 @@ def load_model(
         ConfigError: MuJoCo is not installed.
     """
     path = Path(path)
-    model_files(path, folder)
+    root = _documents(path, folder)[1]
     mujoco = import_mujoco()
     with mujoco_warnings() as collected, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            spec = mujoco.MjSpec.from_file(str(path))
+            if root.tag == "robot":
+                spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+                spec.modelfiledir = str(path.parent)
+            else:
+                spec = mujoco.MjSpec.from_file(str(path))
             if edit is not None:
                 edit(spec)
             model = spec.compile()
         except (ValueError, mujoco.FatalError) as error:
             reason = " ".join(str(error).split())
             raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from error
+    if root.find("mujoco/compiler[@discardvisual='true']") is not None:
+        collected.append("visual shapes are discarded, those that collide are seen")
     lines = dict.fromkeys(" ".join(str(line).split()) for line in (*collected, *(one.message for one in caught)))
     return model, tuple(f"{path.name}: MuJoCo warns: {line}" for line in lines)
 
@@ -130,7 +139,8 @@ def bodies_from_mujoco(
     Arguments:
         model: From `load_model` or from MuJoCo itself.
         qpos: Joint configurations, one per frame, shape (F, nq), or one for a scene at rest, shape (nq,).
-        groups: Of the geoms that are seen; None: 0, 1 and 2, as MuJoCo shows them.
+        groups: Of the geoms that are seen; None: 0, 1 and 2, as MuJoCo shows them, without shapes that collide where
+            their body has others that are only seen.
         clip_m: Planes reach at most so far from their middle [m]; None: as far as their own size.
 
     Raises:
@@ -180,6 +190,16 @@ def visible_geoms(
     alpha = np.where(model.geom_matid < 0, model.geom_rgba[:, 3], 1.0)
     alpha[model.geom_matid >= 0] = model.mat_rgba[model.geom_matid[model.geom_matid >= 0], 3]
     chosen = np.flatnonzero(shown & (alpha > 0))
+    notes = []
+    if groups is None:
+        # what collides is a coarse double where its body has shapes in another group that are only seen
+        bodies = model.geom_bodyid[chosen]
+        places = bodies * import_mujoco().mjNGROUP + model.geom_group[chosen]
+        collides = (model.geom_contype[chosen] != 0) | (model.geom_conaffinity[chosen] != 0)
+        double = collides & (bodies > 0) & np.isin(bodies, bodies[~collides]) & ~np.isin(places, places[~collides])
+        chosen = chosen[~double]
+        if double.any():
+            notes.append(f"shapes that collide are left out where their body has others to be seen: {double.sum()}")
     if not len(chosen):
         used = ", ".join(str(group) for group in np.unique(model.geom_group)) or "none"
         raise DataError("the model has no visible geoms", allowed=f"groups that it uses: {used}")
@@ -196,7 +216,7 @@ def visible_geoms(
             shape, pose = _piece(model, full, own, clip_m)
             pieces.append(ModelGeom(full, name, label, body, shape, pose))
     meshes = ((piece.name, piece.shape) for piece in pieces if isinstance(piece.shape, Mesh))
-    notes = [f"{name}: {note}" for name, mesh in meshes for note in mesh.notes]
+    notes += [f"{name}: {note}" for name, mesh in meshes for note in mesh.notes]
     if model.nflex or model.nskin:
         notes.append(f"flexible bodies and skins are left out: {model.nflex + model.nskin}")
     return tuple(pieces), tuple(notes)
@@ -222,7 +242,17 @@ def _piece(model: mujoco.MjModel, name: str, geoms: list[int], clip_m: float | N
         return Box((size[0], size[1], size[2])), pose
     if kind == "capsule":
         return Capsule(size[0], size[1]), pose
-    raise DataError(f"{name} has a geom of type {kind}", allowed="mesh, box, sphere, capsule")
+    if kind == "cylinder":
+        return Cylinder(size[0], size[1]), pose
+    if kind == "ellipsoid":
+        return Ellipsoid((size[0], size[1], size[2])), pose
+    if kind == "hfield":
+        return _height_field(model, name, int(model.geom_dataid[geoms[0]])), pose
+    # a plane, endless where its size is 0
+    x, y = (min(half or np.inf, clip_m or np.inf) for half in size[:2])
+    if np.isinf(max(x, y)):
+        return Plane(), pose
+    return Mesh([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]], [[0, 1, 2], [0, 2, 3]], "unsigned"), pose
 
 
 def _geom_pose(model: mujoco.MjModel, geom: int) -> np.ndarray:
@@ -245,14 +275,39 @@ def _merged(model: mujoco.MjModel, name: str, geoms: list[int]) -> Mesh:
     return check_mesh(np.concatenate(vertices), np.concatenate(faces), where=name)
 
 
+def _height_field(model: mujoco.MjModel, name: str, number: int) -> Mesh:
+    """Terrain as a closed mesh in the geom's frame: the triangles that MuJoCo sees, sides and a flat bottom."""
+    rows, columns, start = (int(column[number]) for column in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
+    x_m, y_m, highest_m, base_m = model.hfield_size[number].tolist()
+    height = highest_m * model.hfield_data[start : start + rows * columns]
+    x, y = np.meshgrid(np.linspace(-x_m, x_m, columns), np.linspace(-y_m, y_m, rows))
+    top = np.stack([x.ravel(), y.ravel(), height], axis=1)
+    index = np.arange(rows * columns).reshape(rows, columns)
+    # MuJoCo cuts its cells along the other diagonal than `grid_faces`
+    faces = [index[:, ::-1].ravel()[grid_faces(rows, columns)][:, ::-1]]
+    rim = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
+    foot, middle = np.arange(len(rim)) + rows * columns, np.full(len(rim), rows * columns + len(rim))
+    after, after_foot = np.roll(rim, -1), np.roll(foot, -1)
+    for corners in ((foot, after_foot, after), (foot, after, rim), (after_foot, foot, middle)):
+        faces.append(np.stack(corners, axis=1))
+    feet = np.concatenate([top[rim, :2], [[0.0, 0.0]]])
+    vertices = np.concatenate([top, np.column_stack([feet, np.full(len(feet), -base_m)])])
+    return check_mesh(vertices, np.concatenate(faces), where=name)
+
+
 def model_files(path: Path, folder: Path | None = None) -> tuple[FileState, ...]:
     """Name, time of change [ns] and size of every file of an MJCF or URDF model, the XML files first.
 
     Raises:
         DataError: A file is missing, unreadable, no model, or lies outside the model's folder.
     """
+    return _documents(path, folder)[0]
+
+
+def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], ElementTree.Element]:
+    """The same, and the root of the first, a URDF's with its names settled."""
     own, allowed_folder = path.resolve().parent, (folder or path.parent).resolve()
-    documents, assets, directories = [path.resolve()], [], {""}
+    documents, assets, directories, roots = [path.resolve()], [], {""}, []
 
     def inside(directory: str, name: str) -> Path:
         """The file that the model names, links followed."""
@@ -270,21 +325,40 @@ def model_files(path: Path, folder: Path | None = None) -> tuple[FileState, ...]
         if document == documents[0] and root.tag not in ("mujoco", "robot"):
             allowed = "<mujoco>, an MJCF model, or <robot>, a URDF model"
             raise DataError(f"its root element is <{root.tag}>", where=str(path), allowed=allowed)
-        # MuJoCo takes the meshes of a URDF by their bare names unless told otherwise
-        kept = any(element.get("strippath") == "false" for element in root.iter("compiler"))
-        bare = root.tag == "robot" and not kept
+        roots.append(root)
+        if root.tag == "robot":
+            _settle_urdf(root, own, allowed_folder)
         for element in root.iter():
             directories |= {element.get(name, "") for name in DIRECTORIES if element.tag == "compiler"}
             names = [value for key, value in element.attrib.items() if key == "file" or key.startswith("file")]
             if element.tag in ("include", "model"):
                 documents += [found for name in names if (found := inside("", name)) not in documents]
             else:
-                assets += [name.replace("\\", "/").rpartition("/")[2] if bare else name for name in names if name]
+                assets += [name for name in names if name]
     found = {inside(directory, name) for directory in directories for name in ["", *assets]}
     states = tuple(_state(file) for file in [*documents, *sorted(found)] if file.is_file())
     if sum(size for _, _, size in states) > LARGEST_ASSETS_BYTES:
         raise DataError("its files are too large", where=str(path), allowed=f"{LARGEST_ASSETS_BYTES} bytes in all")
-    return states
+    return states, roots[0]
+
+
+def _settle_urdf(root: ElementTree.Element, own: Path, folder: Path) -> None:
+    """Keep the visual shapes and all links of a URDF, and name the meshes of its package from its own folder."""
+    extension = root.find("mujoco")
+    extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
+    compiler = extension.find("compiler")
+    compiler = ElementTree.SubElement(extension, "compiler") if compiler is None else compiler
+    names = [mesh.get("filename", "") for mesh in root.iterfind("link/visual/geometry/mesh")]
+    readable = all(name.lower().endswith(MESH_ENDINGS) for name in names)
+    for name, value in (("discardvisual", not readable), ("fusestatic", False), ("strippath", False)):
+        compiler.attrib.setdefault(name, str(value).lower())
+    for mesh in root.iter("mesh"):
+        _, package, name = mesh.get("filename", "").partition("package://")
+        bases = [base for base in (own, *own.parents) if base.is_relative_to(folder)]
+        places = [base / name.partition("/")[2] for base in bases] if package else []
+        found = next((place for place in places if place.is_file()), None)
+        if found is not None:
+            mesh.set("filename", os.path.relpath(found, own))
 
 
 def _parse(path: Path) -> ElementTree.Element:
