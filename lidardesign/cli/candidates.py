@@ -248,10 +248,9 @@ def _configuration_keys(context: Any, current: str) -> Items:
 
 
 def _constraint_keys(context: Any, current: str) -> Items:
-    from lidardesign.design.constraints.document import CATALOG, Constraints
+    from lidardesign.design.constraints.document import Constraints
 
-    items = [item for item in _keys(Constraints, "", current) if not item[0].startswith("each")]
-    return [(f"snap={CATALOG}", "every sensor becomes a real part"), *items]
+    return [item for item in _keys(Constraints, "", current) if not item[0].startswith("each")]
 
 
 def _keys(model: type[BaseModel], prefix: str, current: str) -> Iterator[tuple[str, str]]:

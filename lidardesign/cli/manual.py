@@ -99,6 +99,7 @@ MANUALS: dict[str, Manual] = {
             "lidardesign fit runs/face": "as many sensors as score best, their rays chosen",
             "lidardesign fit runs/face --sensors 4 --layout grid --name even": "four sensors, rays even and left open",
             "lidardesign fit runs/face --layout scan --rays 576 --name beams": "one steerable beam per ray",
+            "lidardesign fit runs/face --parts vl53l8cx,tmf8828 --sensors 2 --name bought": "which parts, and where",
             "lidardesign fit runs/face --like robot.sdf --name instead": "no more than a rig that there is",
             "lidardesign fit runs/warehouse --rays 12 --at x_m=0.37 --name here": "for one position of a robot",
         },
@@ -107,13 +108,12 @@ MANUALS: dict[str, Manual] = {
         "scenes.",
         files=("RUN/samples.npz: the samples of the density", "RUN/designs/NAME.yaml: the design"),
         exits=FROM_A_RUN,
-        see=("design-file.md", "selection.md", "importance.md"),
+        see=("design-file.md", "selection.md", "parts.md", "importance.md"),
     ),
     "constrain": Manual(
         {
             "lidardesign constrain runs/face --set gate.width_m.max=0.1 --name tight": "one bound",
             "lidardesign constrain runs/face --constraints buyable.yaml --name buyable": "bounds of a file",
-            "lidardesign constrain runs/face --set snap=catalog --name bought": "real parts instead of free sensors",
             "echo 'budget: {rays: 196}' | lidardesign constrain runs/face --constraints - --name few": "bounds from "
             "standard input",
         },

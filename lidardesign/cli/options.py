@@ -83,6 +83,16 @@ Sensors = Annotated[
         show_default="the design's, else best",
     ),
 ]
+Parts = Annotated[
+    str | None,
+    typer.Option(
+        "--parts",
+        metavar="NAME,NAME|catalog",
+        help="Make the design of real parts (catalog names, NAME:MODE, part files), chosen with their poses; "
+        "--sensors says how many.",
+        show_default=False,
+    ),
+]
 Weights = Annotated[
     list[str] | None,
     typer.Option(
@@ -174,3 +184,8 @@ def sensor_count(text: str | None) -> int | str | None:
     if not text.isdecimal() or int(text) < 1:
         raise ConfigError(f"{text!r}", where="--sensors", allowed="a whole number from 1, best or auto")
     return int(text)
+
+
+def part_names(text: str | None) -> list[str] | str | None:
+    """The value of `--parts`: names, or `catalog` for all parts that are shipped."""
+    return text if text in (None, "catalog") else [name.strip() for name in text.split(",")]

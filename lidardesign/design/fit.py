@@ -12,23 +12,19 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from lidardesign.design.constraints.check import ConstraintCheck, check_design
-from lidardesign.design.constraints.document import MOST_FITTED, Constraints, wants_parts
+from lidardesign.design.constraints.document import MOST_FITTED, Constraints
 from lidardesign.design.constraints.feasibility import BandwidthBudget, check_feasible
 from lidardesign.design.constraints.origins import placement_notes, snap_to_space
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.layout import (
     FitProblem,
-    FittedDesign,
     Layout,
-    fit_sensors,
-    likelihood_estimate,
     missing_samples,
 )
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, lay_out, layout_of, own_count
 from lidardesign.design.mixture.bounds import sensor_groups
-from lidardesign.design.mixture.support import Retarget, Support, conditioned, fixed_conditions
+from lidardesign.design.mixture.support import Retarget, Support, conditioned
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Gates, LayoutName, Sensor
-from lidardesign.design.snap.fit import fix_part_origins, snap_design
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import ROUNDING, Estimate, as_documents, effective_share_error
 from lidardesign.geometry.rays import Rays
@@ -39,7 +35,6 @@ from lidardesign.space import DIMENSIONS
 EM_SAMPLES = 20_000
 # Of 7 fits of 10 sensors the worst is then 0.005 nats below the best on held-out samples, with 4 seeds 0.03.
 RESTARTS = 12
-ONE_PLACE = "every part is at one place: sensors were fixed at the middle of their origins, and fitted anew there"
 
 # A design is asked for at many places of a track; the samples and the design decide what a refit finds.
 _REFITS: WeakKeyDictionary[Samples, WeakKeyDictionary[DesignSpec, dict[tuple[int, int], DesignSpec]]]
@@ -52,7 +47,7 @@ class FitResult:
 
     Arguments:
         design: The design; its provenance is for the caller to fill.
-        log_likelihood: Weighted mean log density of the samples [nats].
+        log_likelihood: Weighted mean log density of the samples [nats]; None for real parts.
         admissible_mass: The share of the density inside the constraints; None with pinned origins.
         ess: Effective share of the samples that were admitted, 0 to 1.
         satisfied: Whether every constraint holds on the finished design.
@@ -60,11 +55,10 @@ class FitResult:
         seconds: Wall time [s].
         notes: What happened to sensors, one line each.
         error_estimates: How far log_likelihood, ess and admissible_mass may be off, and the rays of sensors.
-        snap: What sensors lost that became parts, as plain values; None where none did.
     """
 
     design: DesignSpec
-    log_likelihood: float
+    log_likelihood: float | None
     admissible_mass: float | None
     ess: float
     satisfied: bool
@@ -72,7 +66,6 @@ class FitResult:
     seconds: float
     notes: tuple[str, ...] = field(default=())
     error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
-    snap: Mapping[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON keys; the path of the design is for the caller to fill."""
@@ -86,7 +79,6 @@ class FitResult:
             "constraints": [check.as_dict() for check in self.constraints],
             "seconds": self.seconds,
             "error_estimates": as_documents(self.error_estimates),
-            **({} if self.snap is None else {"snap": dict(self.snap)}),
         }
 
 
@@ -144,7 +136,7 @@ def fit(
         gates=gates or LAYOUTS[layout].usual_gates,
         retarget=retarget,
     )
-    fitted = _fit_parts(request) if wants_parts(constraints.rules) else LAYOUTS[layout].fit(request)
+    fitted = LAYOUTS[layout].fit(request)
     design, supports = fitted.design, fitted.supports
     with phase("checks"):
         checks = check_design(design_document(design), constraints, samples.space)
@@ -160,7 +152,6 @@ def fit(
         seconds=time.perf_counter() - started,
         notes=(*moved, *placement_notes(constraints.rules), *fitted.notes),
         error_estimates=_error_estimates(fitted.log_likelihood, supports, samples, design.sensors),
-        snap=fitted.snap,
     )
 
 
@@ -186,34 +177,6 @@ def _check_options(
     layout.check_constraints(constraints)
     count = sensors if isinstance(sensors, int) and not layout.one_sensor_per_ray else None
     check_feasible(constraints, samples.space, sensors=count, rays=rays)
-
-
-def _fit_parts(request: FitProblem) -> FittedDesign:
-    """Sensors, and the parts of the catalogue that they become."""
-    # the parts have gates of their own: the budget is theirs
-    free = replace(request, budget=replace(request.budget, limit_mbps=None, rays=None))
-    fitted, notes = fit_sensors(free), ()
-    fixed = fix_part_origins(request.rules, fitted.sensors)
-    if fixed is not None:
-        fitted = fit_sensors(replace(free, rules=fixed, sensors=len(fitted.sensors)))
-        notes = (ONE_PLACE,)
-    space = request.samples.space
-    parts = snap_design(
-        fitted.ensemble,
-        request.constraints,
-        space,
-        request.budget,
-        level=request.level,
-        seed=request.seed,
-        name=request.name,
-    )
-    return FittedDesign(
-        replace(parts.design, at=fixed_conditions(space)),
-        likelihood_estimate(parts.ensemble, fitted.supports),
-        fitted.supports,
-        (*parts.ensemble.notes, *notes, *parts.notes),
-        parts.report,
-    )
 
 
 def fit_like(

@@ -64,7 +64,7 @@ def certify(
         rounds: How many thresholds are tried at most.
     """
     value = choice.worth - choice.harm - (0.0 if budget_mbps is not None else choice.price * choice.bits)
-    dual = _Thresholds if len(coverage.table) == 0 else _Tangents
+    dual = Thresholds if len(coverage.table) == 0 else Tangents
     search = dual(coverage, _Admissible(coverage, counts, choice.price, budget_mbps), choice)
     bound, made = np.inf, 0
     while made < rounds:
@@ -128,7 +128,7 @@ class _Admissible:
         return self.coverage.charge(gate)[0]
 
 
-class _Thresholds:
+class Thresholds:
     """Subgradient descent of the bound for items that count their largest worth."""
 
     def __init__(self, coverage: Coverage, admissible: _Admissible, choice: Choice) -> None:
@@ -161,21 +161,21 @@ class _Thresholds:
         return bound
 
 
-class _Tangents:
+class Tangents:
     """Steps of Frank and Wolfe for concave sums: tangents at what a mixture of choices knows."""
 
     def __init__(self, coverage: Coverage, admissible: _Admissible, choice: Choice) -> None:
         self.coverage, self.admissible = coverage, admissible
         self.known, self.made = coverage.known(choice.gate), 0
         self.rises = np.append(np.diff(coverage.table), 0.0)
-        self.gains = np.zeros(coverage.shape)
+        self.excess = np.zeros(coverage.shape)
 
     def step(self, value: float) -> float:
         """The bound by tangents at the present mixture; moves it towards the best choice of the tangents."""
         coverage = self.coverage
         rise = self.rises[np.minimum(self.known.astype(np.intp), len(self.rises) - 1)]
-        kernels.weigh_excess(coverage.entries, coverage.weight * rise, np.zeros(len(rise)), self.gains)
-        total, taken = self.admissible.best(self.gains)
+        kernels.weigh_excess(coverage.entries, coverage.weight * rise, np.zeros(len(rise)), self.excess)
+        total, taken = self.admissible.best(self.excess)
         bound = float(coverage.weight @ (coverage.counted(self.known) - rise * self.known)) + total
         self.made += 1
         self.known += 2 / (self.made + 2) * (coverage.known(taken) - self.known)

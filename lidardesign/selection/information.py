@@ -8,7 +8,9 @@ located near their clients.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import numpy as np
 
@@ -25,6 +27,19 @@ CHOSEN_SHARE = 0.2
 # A return tells about what is nearer than so many mean spacings of the chosen ones: sqrt(5), so that on a surface it is
 # five of the candidates' spacings. Few places of a surface are further than this from all chosen returns.
 REACH_SPACINGS = math.sqrt(5.0)
+
+
+_chosen_share = ContextVar("chosen share", default=CHOSEN_SHARE)
+
+
+@contextmanager
+def choosing(share: float) -> Iterator[None]:
+    """What returns tell is asked for choices of another share of the candidates."""
+    token = _chosen_share.set(share)
+    try:
+        yield
+    finally:
+        _chosen_share.reset(token)
 
 
 def informs_rays(task: Task) -> bool:
@@ -141,10 +156,10 @@ def return_reach_m(size: float, count: int, dimensions: int = 2) -> float:
 
     Arguments:
         size: The area of the surface [m^2], the length of a curve [m].
-        count: How many of the candidates' returns lie on it; `CHOSEN_SHARE` of them are chosen.
+        count: How many of the candidates' returns lie on it; `CHOSEN_SHARE` of them, or as `choosing` says, are chosen.
         dimensions: 2 for a surface, 1 for a curve.
     """
-    return REACH_SPACINGS * (size / (CHOSEN_SHARE * count)) ** (1 / dimensions) if count else 0.0
+    return REACH_SPACINGS * (size / (_chosen_share.get() * count)) ** (1 / dimensions) if count else 0.0
 
 
 def scattered_area_m2(points_m: np.ndarray) -> float:

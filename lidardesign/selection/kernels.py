@@ -214,3 +214,26 @@ def group_entries(
     if not fills:
         start[-1] = place
     return item, worth, opens
+
+
+@njit(cache=True, nogil=True)
+def tell_by_parts(
+    entries: ByRay, range_m: np.ndarray, first: np.ndarray, members: np.ndarray, gate_m: np.ndarray, told: np.ndarray
+) -> None:
+    """What parts tell of each item: the largest worth of their rays' returns inside their gates, or the sum.
+
+    Arguments:
+        entries: Those of the rays.
+        range_m: The range of each entry's return, (E,) [m].
+        first, members: Where the rays of each part begin, (M + 1,), and all parts' rays.
+        gate_m: Of each part, (M, 2) [m].
+        told: Filled, (M, U).
+    """
+    told[:] = 0.0
+    for part in range(len(first) - 1):
+        low, high = gate_m[part]
+        for ray in members[first[part] : first[part + 1]]:
+            for entry in range(entries.start[ray], entries.start[ray + 1]):
+                if low <= range_m[entry] < high:
+                    old, more = told[part, entries.item[entry]], entries.worth[entry]
+                    told[part, entries.item[entry]] = old + more if len(entries.table) else max(old, more)

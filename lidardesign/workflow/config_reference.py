@@ -23,7 +23,7 @@ from lidardesign.config import (
     parse_override,
     resolve,
 )
-from lidardesign.design.constraints.document import CATALOG, Constraints
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import SCHEMA_FILE
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.registry import plugin_guard
@@ -247,8 +247,6 @@ def schema_of(kind: str, task: Task | None = None) -> dict[str, Any]:
             for name, value in part.get("properties", {}).items():
                 if name not in part.get("required", ()):
                     part["properties"][name] = {"anyOf": [value, NULL]}
-        snap = schema["$defs"]["Snap"]
-        schema["$defs"]["Snap"] = {"anyOf": [{"const": CATALOG}, snap], "description": snap.pop("description", "")}
         return {
             "$schema": DIALECT,
             "$id": "urn:lidardesign:constraints:1",

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 from lidardesign.config import apply_override, parse_override
-from lidardesign.design.constraints.document import CATALOG, Constraints, wants_parts
+from lidardesign.design.catalog.library import named_parts
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import is_mounted, snap_to_space
 from lidardesign.design.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
 from lidardesign.design.layouts.layout import Layout
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, layout_of
 from lidardesign.design.sensor import FITTED_LAYOUTS, LEVELS, DesignSpec, Gates
-from lidardesign.design.snap.parts import parts_of
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.manifest import verify
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
@@ -59,6 +59,7 @@ class FitOptions:
         level: The share of rays and returns that fields of view and gates hold.
         at: Values of conditions that the design is for, as {"x_m": 0.37}.
         weights: Settings of the task towards which the learned density is weighted.
+        parts: Real parts that the design is made of: names, `NAME:MODE`, paths of part files, or "catalog".
         like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
         name: The design's name.
         seed: Root of every random stream; the run's by default.
@@ -75,6 +76,7 @@ class FitOptions:
     level: float | None = None
     at: Mapping[str, float] = field(default_factory=dict)
     weights: Sequence[str] | Mapping[str, Any] = ()
+    parts: Sequence[str] | str | None = None
     like: Path | str | None = None
     name: str | None = None
     seed: int | None = None
@@ -144,7 +146,7 @@ class FitRequest:
         defaults, asked = run.task.defaults, load_constraints(options.constraints, notes=notes)
         if asked is None and base is not None:
             asked = Constraints()
-        constraints, layout, names = _with_rig(options, asked, run, notes)
+        constraints, layout, names = _with_rig(options, _with_parts(options, asked, run), run, notes)
         if constraints is not None:
             constraints, moved = snap_to_space(constraints, run.config.space)
             for note in moved:
@@ -154,7 +156,7 @@ class FitRequest:
         beside = {
             "--at": options.at or (base is not None and base.at),
             "--weight": options.weights,
-            "snap": wants_parts(rules.rules),
+            "parts": rules.parts,
         }
         if LAYOUTS[layout].chosen_on_scenes and any(beside.values()):
             raise ConfigError(
@@ -235,6 +237,8 @@ class FitRequest:
         sensors = counted.get(choices["sensors"], f"{choices['sensors']} sensors")
         sensors = "one sensor per ray" if LAYOUTS[choices["layout"]].one_sensor_per_ray else sensors
         place = "".join(f", {key} = {value:g}" for key, value in self.at.items())
+        if self.constraints is not None and self.constraints.parts is not None:
+            return [f"choose {sensors} among parts, with their poses, on training scenes, seed {self.seed}"]
         how = f"layout {choices['layout']}, {rays}, level {choices['level']:g}{place}, seed {self.seed}"
         steps = [f"fit {sensors}, {how}"]
         if self.weighting.settings:
@@ -265,9 +269,32 @@ def _with_rig(
     return constraints, layout, tuple(sensor.name for sensor in rig.sensors)
 
 
+def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) -> Constraints | None:
+    """The constraints with the parts that a user named, and how many where they say so."""
+    if options.parts is not None:
+        document = {} if asked is None else asked.as_document()
+        asked = Constraints.from_mapping({**document, "parts": {**document.get("parts", {}), "names": options.parts}})
+    if asked is None or asked.parts is None:
+        return asked
+    named_parts(asked.parts.names)
+    lacking = {
+        "how many parts is not said": not isinstance(options.sensors, int) and asked.parts.count is None,
+        "parts beside --at or --weight": options.at or options.weights,
+        "parts beside each, which bounds single sensors": asked.each,
+        f"parts in the layout {options.layout}": options.layout,
+        f"the task {run.task.name} does not say what returns tell": not informs_rays(run.task),
+    }
+    for fault, is_found in lacking.items():
+        if is_found:
+            raise ConfigError(
+                fault, where="--parts", allowed="--parts NAME,NAME --sensors N, or parts.names, parts.count"
+            )
+    return asked
+
+
 def _usual_layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, options: FitOptions) -> str:
     """The layout where none is named: the design's; else rays are chosen where scenes can say what they tell."""
-    if wants_parts(constraints.rules):
+    if constraints.parts is not None:
         return "grid"
     if base is not None:
         layout = layout_of(base)
@@ -291,6 +318,8 @@ def _sensors(
 ) -> int | str | None:
     """The number of sensors: the user's, then what the constraints ask for, the design's, the best."""
     bounds = constraints.sensors
+    if asked is None and constraints.parts is not None:
+        return constraints.parts.count
     if asked is not None or bounds.count is not None or is_mounted(constraints.rules):  # mounts say how many
         return asked if asked is not None else bounds.count
     if base is None:
@@ -301,7 +330,7 @@ def _sensors(
 
 def _rays(asked: int | None, constraints: Constraints, base: DesignSpec | None, usual: int | None) -> int | None:
     """The number of rays: the user's, then the constraints', the design's, the usual; parts bring their own."""
-    if asked is not None or wants_parts(constraints.rules):
+    if asked is not None or constraints.parts is not None:
         return asked
     if constraints.budget.rays is not None:
         return constraints.budget.rays
@@ -324,7 +353,7 @@ def load_constraints(
     if isinstance(given, Constraints) or (given is None and not overrides):
         return given
     if isinstance(given, Mapping):
-        return _check_parts(Constraints.from_mapping(given))
+        return Constraints.from_mapping(given)
     document = load_yaml(Path(given)) if given else Document({}, "constraints")
     values: dict[str, Any] = document.mapping
     if given and all(value in (None, {}, []) for _, value in leaves(values)):
@@ -332,9 +361,6 @@ def load_constraints(
     origins: dict[KeyPath, str] = {}
     for text in overrides:
         override = parse_override(text)
-        if len(override.path) > 1 and override.path[0] == "snap" and values.get("snap") == CATALOG:
-            # the short form of a mapping without keys
-            values["snap"] = {}
         origins[apply_override(values, override)] = override.where
 
     def locate(path: KeyPath, *, key: bool = False) -> str:
@@ -344,11 +370,4 @@ def load_constraints(
                 return where
         return document.locate(path, key=key)
 
-    return _check_parts(Constraints.from_mapping(values, where=document.where, locate=locate))
-
-
-def _check_parts(constraints: Constraints) -> Constraints:
-    for rules in constraints.rules:
-        if rules.snap is not None and rules.snap.parts is not None:
-            parts_of(rules.snap)
-    return constraints
+    return Constraints.from_mapping(values, where=document.where, locate=locate)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -36,6 +37,7 @@ from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scene import Scene, group_numbers
 from lidardesign.selection import information
+from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import conditions_of, random_generator
 from lidardesign.workflow import fit as fit_choices
@@ -243,6 +245,21 @@ def _fitted(fitter: Fitter, few: Callable[[str], Iterator[Scene]] | None = None)
         few: The only scenes to choose on, by purpose; None takes as many as it takes.
     """
     request, samples = fitter.request, fitter.samples
+    if request.constraints is not None and request.constraints.parts is not None:
+        from lidardesign.selection.part_design import choose_parts
+        from lidardesign.workflow.select_rays import selection_scenes
+
+        return choose_parts(
+            samples,
+            request.constraints,
+            count=request.choices["sensors"],
+            rays=request.choices["rays"],
+            informs=partial(checked_information, request.run.task),
+            scenes=partial(selection_scenes, request.run, request.seed),
+            seed=request.seed,
+            name=request.name,
+            notes=fitter.notes,
+        )
     if not LAYOUTS[request.choices["layout"]].chosen_on_scenes:
         return fitter.fit()
     from lidardesign.workflow.select_rays import near, select_rays

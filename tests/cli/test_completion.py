@@ -142,7 +142,7 @@ def test_keys_are_those_of_the_task_and_their_words_follow(root):
     assert completed(root, "learn face --set light=") == ["light=indoor", "light=sun"]
     assert completed(root, "learn meshes --set centre=") == ["centre=true", "centre=false"]
     assert completed(root, "constrain run --set gate.width_m.") == ["gate.width_m.min=", "gate.width_m.max="]
-    assert "snap=catalog" in completed(root, "constrain run --set snap")
+    assert "parts.power_w=" in completed(root, "constrain run --set parts.p")
 
 
 def test_keys_of_a_run_are_those_of_its_task(root, place, monkeypatch):

@@ -35,13 +35,12 @@ def test_a_file_without_constraints_is_told(call, work, text, empty):
 
 @pytest.mark.parametrize("further", [[], ["--dry-run"]])
 def test_a_misspelt_part_is_refused_before_anything_is_fitted(call, work, further):
-    (work / "parts.yaml").write_text("snap: {parts: [vl53l5xc]}\n")
+    (work / "parts.yaml").write_text("parts: {names: [vl53l5xc], count: 2}\n")
     result = call("constrain", "run", "--constraints", "parts.yaml", "--name", "parts", *further)
     assert result.code == 2
     assert "there is no part 'vl53l5xc'" in result.err
     assert "vl53l5cx" in result.err
-    (work / "each.yaml").write_text("each: [{snap: {parts: [vl53l5xc]}}]\n")
-    assert call("constrain", "run", "--constraints", "each.yaml", *further).code == 2
+    assert call("fit", "run", "--parts", "vl53l5xc", "--sensors", 2, *further).code == 2
     assert not (work / "run" / "designs" / "parts.yaml").exists()
 
 

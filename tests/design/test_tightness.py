@@ -23,7 +23,7 @@ def check(name, bound, value, satisfied=True):
         (check("a.space.range_m", [0.0, 2.0], [0.5, 1.9]), 0.1, 0.05),
         (check("a.boresight.azimuth_deg", [350.0, 30.0], 5.0), 15.0, 0.375),
         (check("a.boresight.azimuth_deg", [350.0, 30.0], 345.0, False), -5.0, -0.125),
-        (check("a.snap", "part", "part"), None, None),
+        (check("a.part", "part", "part"), None, None),
         (check("a.field_of_view.horizontal_deg.min", 0.0, 3.0), 3.0, None),
     ],
 )

@@ -64,7 +64,7 @@ def leaves_of(model, path=()):
     for name, field in model.model_fields.items():
         kinds = (field.annotation, *get_args(field.annotation))
         inner = next((kind for kind in kinds if hasattr(kind, "model_fields")), None)
-        if inner is None or name == "snap":
+        if inner is None or name == "parts":
             yield (*path, name)
         else:
             yield from leaves_of(inner, (*path, name))

@@ -14,8 +14,8 @@ from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.catalog.library import Pose, find_part, part_rays
+from lidardesign.design.catalog.shapes import PartShape, gate_inside, in_part_view, shapes_of, useful_ray_filter
 from lidardesign.design.sensor import boresight_frame
-from lidardesign.design.snap.parts import PartShape, gate_inside, in_part_view, shapes_of, useful_ray_filter
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.catalog import (
     CLUTTER,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.cli.tables.grids import RichConsole, number, text_table
@@ -50,7 +50,7 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
     figures = ("weight", "rays", *origin, "azimuth\n[deg]", "elevation\n[deg]", "field of view\n[deg]", "gate [m]")
     rows = [
         (
-            sensor.name,
+            sensor.name if sensor.part is None else f"{sensor.name} {sensor.part}",
             f"{sensor.weight:.3f}",
             number(sensor.rays),
             *(() if together else (place,)),
@@ -161,41 +161,13 @@ def _left(room: float | None, share: float | None) -> str:
 def show_fit(document: dict[str, Any], design: DesignSpec, checks: Sequence[Any], rich: RichConsole) -> None:
     """Print what `fit` and `constrain` made."""
     show_design(design, rich)
-    if "snap" in document:
-        _show_snap(document["snap"], rich)
     show_constraints(checks, rich)
     figures = {"log-likelihood": "log_likelihood", "ESS": "ess", "admissible mass": "admissible_mass"}
     estimates = document["error_estimates"]
     known = [f"{name} {with_error(estimates[key])}" for name, key in figures.items() if key in estimates]
-    rich.print(f"{', '.join(known)}, {number(document['seconds'], 3)} s (+- are standard errors)")
+    known.append(f"{number(document['seconds'], 3)} s" + (" (+- are standard errors)" if known else ""))
+    rich.print(", ".join(known))
     rays = estimates.get("rays")
     if rays is not None and rays["error"] > 0:
         rich.print(f"whole rays: {number(rays['error'], 2)} of {rays['value']:.0f} are not where the weights say")
     rich.print(f"design: {document['design']}", soft_wrap=True)
-
-
-def _show_snap(snap: Mapping[str, Any], rich: RichConsole) -> None:
-    """Print which part every sensor became; of each figure what was fitted, then what the part has."""
-
-    def both(figures: Mapping[str, Any], text: Callable[[Any], str]) -> str:
-        fitted, part = text(figures["fitted"]), text(figures["part"])
-        return fitted if fitted == part else f"{fitted} > {part}"
-
-    rows = [
-        (
-            row["sensor"],
-            "stays a sensor" if row["part"] is None else row["part"] + (", turned" if row["turned"] else ""),
-            f"{row['loss_nats']:.3f}",
-            both(row["field_of_view_rad"], lambda angles: " x ".join(f"{math.degrees(a):.1f}" for a in angles)),
-            both(row["gate_m"], lambda gate: " - ".join(f"{end:.2f}" for end in gate)),
-            both(row["rays"], str),
-            both(row["bandwidth_mbps"], number),
-        )
-        for row in snap["sensors"]
-    ]
-    title, figures = "sensors as parts of the catalogue: fitted > part", SNAP_FIGURES
-    rich.print(text_table(("sensor", "part", *figures), rows, title, figures, overflow="fold"))
-    fitted, parts = (snap["log_likelihood"][key] for key in ("fitted", "parts"))
-    rich.print(
-        f"log-likelihood as fitted {number(fitted)}, as parts {number(parts)} nats; losses are of one sensor alone"
-    )

@@ -8,6 +8,7 @@ more parts, whose rays share the number equally.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -135,6 +136,19 @@ def find_part(name_or_path: str | Path, own: Sequence[Path] = ()) -> Part:
     file = Path(path)
     name = part_name(file)
     return load_library([*own, file]).part(f"{name}:{mode}" if mode else name)
+
+
+def named_parts(names: Sequence[str] | str) -> list[Part]:
+    """Parts by `NAME`, `NAME:MODE`, or paths of part files and folders; `catalog` is all that are shipped.
+
+    Raises:
+        ConfigError: A name or path that is no part.
+    """
+    if names == "catalog":
+        library = load_library()
+        return [library.part(name) for name in library.names]
+    inside = [sorted(Path(text).glob(f"*{SUFFIX}")) if Path(text).is_dir() else [text] for text in names]
+    return [find_part(name) for name in dict.fromkeys(itertools.chain.from_iterable(inside))]
 
 
 @lru_cache(maxsize=1)

@@ -82,7 +82,6 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
         checks += _consistency(name, sensor, z)
         checks += _origin(name, sensor, own, bounds) + _boresight(name, sensor, own, bounds)
         checks += _excluded(name, sensor, own, z) + _intervals(name, sensor, own, z)
-        checks += _snap(name, index, document, own.get("snap"))
         if bounds is not None:
             checks += _inside_space(name, sensor, bounds)
     for table in (document.get("ray_table"), *document.get("further_tables", ())):
@@ -91,7 +90,8 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     for track in (document.get("track"), *document.get("further_tracks", ())):
         if track:
             checks += _excluded_travel(track, sensors, rules) + _track(track, rules, bounds)
-    return checks + _mounts(sensors, own_rules) + _budget(document, rules.get("budget") or {})
+    checks += _mounts(sensors, own_rules) + _parts(document, rules.get("parts"))
+    return checks + _budget(document, rules.get("budget") or {})
 
 
 def _over(common: Mapping[str, Any], special: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -402,21 +402,28 @@ def _table_widths(table: Mapping[str, Any]) -> list[tuple[float, int]]:
     return [(end - start, 1) for start, end in zip(table["gate_start_m"], table["gate_end_m"], strict=True)]
 
 
-def _snap(name: str, index: int, document: Mapping[str, Any], snap: Any) -> list[ConstraintCheck]:
-    """Whether a sensor is the part that it says to be; `snap` is what holds for it, None asks nothing."""
-    if snap is None:
+def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list[ConstraintCheck]:
+    """Whether every sensor is the part that it says to be, one that was asked for, and no part comes too often."""
+    if parts is None:
         return []
-    sensor = document["sensors"][index]
-    keys = snap if isinstance(snap, Mapping) else {}
-    named = keys.get("parts") or []
-    allowed = named or "the catalogue"
-    if sensor.get("part") is None:
-        return [ConstraintCheck(f"{name}.snap", allowed, "a sensor of its own", keys.get("otherwise") == "keep")]
-    part = _admitted_part(str(sensor["part"]), named)
-    if part is None:
-        return [ConstraintCheck(f"{name}.snap", allowed, sensor["part"], False)]
-    wrong = _differences(part, index, sensor, document.get("ray_table"))
-    return [ConstraintCheck(f"{name}.snap", part.name, wrong or part.name, wrong is None)]
+    named = [] if parts["names"] == "catalog" else list(parts["names"])
+    checks, found = [], []
+    for index, sensor in enumerate(document["sensors"]):
+        name, own = f"{sensor.get('name', index)}.part", sensor.get("part")
+        part = None if own is None else _admitted_part(str(own), named)
+        if part is None:
+            checks.append(ConstraintCheck(name, named or "the catalogue", own or "a sensor of its own", False))
+            continue
+        found.append(part)
+        wrong = _differences(part, index, sensor, document.get("ray_table"))
+        checks.append(ConstraintCheck(name, part.name, wrong or part.name, wrong is None))
+    for own, rule in (parts.get("each") or {}).items():
+        checks += _between(f"parts.each.{own}", sum(part.name == own for part in found), rule)
+    limit = parts.get("power_w")
+    if limit is not None:
+        power = sum(math.inf if part.value("power_w") is None else part.value("power_w") for part in found)
+        checks += _between("parts.power_w", power, {"max": limit})
+    return checks
 
 
 def _admitted_part(name: str, named: Sequence[str]) -> Part | None:

@@ -11,7 +11,7 @@ What the bounds mean, here and in `check`, which verifies them on the finished f
   each axis, and no start of a ray; samples are taken from outside them, and where one takes part of the origin box
   the intervals keep to that box too (see `origins`);
 - `boresight.azimuth_deg` is an interval on the circle: with `min` above `max` it passes through 0;
-- `snap` replaces sensors by real parts (see `snap`), whose fields of view and gates then keep these bounds;
+- `parts` names real parts that the design is made of, whose fields of view and gates then keep these bounds;
 - every gate stays inside the range bounds of the design space, whatever the file says.
 
 Entries of `each` apply to the first, second, ... sensor over the common keys.
@@ -28,8 +28,6 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     model_validator,
 )
 
@@ -42,8 +40,6 @@ Distance = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
 # The boxes between excluded ones grow faster than their number: with so many a fit still takes seconds.
 MOST_EXCLUDED = 32
-# The short form of `snap`.
-CATALOG = "catalog"
 # So many components of a mixture over all samples fill some 100 MB; a scan has its rays instead.
 MOST_FITTED = 1000
 Count = Annotated[int, Field(ge=1, le=MOST_FITTED)]
@@ -168,29 +164,26 @@ class Budget(_Keys):
     rate_hz: Annotated[float, Field(ge=0.001, le=1e12)] = 10.0
 
 
-class Snap(_Keys):
-    """Which parts sensors are replaced by; the text `catalog` says all that are shipped.
+class MostOfPart(_Keys):
+    """`{max: 1}`: how many of a part a design has at most."""
+
+    max: Count
+
+
+class Parts(_Keys):
+    """Real parts that the design is made of, chosen with their poses.
 
     Arguments:
-        parts: Names, `NAME:MODE`, or paths of part files and folders; None is the whole catalogue.
-        otherwise: What becomes of a sensor for which no part keeps its constraints: `refuse`, or `keep` it as fitted.
-        pose: Whether parts look where the sensors did (`fitted`), or where they are likeliest (`refitted`).
+        names: Names, `NAME:MODE`, or paths of part files and folders; `catalog` is all that are shipped.
+        count: How many parts; `--sensors` goes before.
+        each: By the name of a part how many of it there may be.
+        power_w: What all of them may consume [W]; parts of which no source says it are left out.
     """
 
-    parts: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | None = None
-    otherwise: Literal["refuse", "keep"] = "refuse"
-    pose: Literal["fitted", "refitted"] = "refitted"
-
-    @model_validator(mode="before")
-    @classmethod
-    def _short_form(cls, value: Any) -> Any:
-        if isinstance(value, str) and value != CATALOG:
-            raise ValueError(f"{value!r} is no mapping; the short form is {CATALOG!r}")
-        return {} if value == CATALOG else value
-
-    @model_serializer(mode="wrap")
-    def _short_text(self, handler: SerializerFunctionWrapHandler) -> Any:
-        return handler(self) or CATALOG
+    names: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | Literal["catalog"]
+    count: Count | None = None
+    each: dict[str, MostOfPart] = {}
+    power_w: Positive | None = None
 
 
 class SensorConstraints(_Keys):
@@ -200,7 +193,6 @@ class SensorConstraints(_Keys):
     boresight: Boresight = Boresight()
     field_of_view: FieldOfView = FieldOfView()
     gate: Gate = Gate()
-    snap: Snap | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +200,7 @@ class SensorRules:
     """What one sensor must keep, its entry of `each` laid over the common keys, and where the file says so.
 
     Arguments:
-        origin, boresight, field_of_view, gate, snap: The bounds.
+        origin, boresight, field_of_view, gate: The bounds.
         index: The sensor's place in the design; of the last rules, that of the first sensor beyond `each`.
         own_keys: The keys, as `gate.width_m.max`, that its own entry has.
     """
@@ -217,7 +209,6 @@ class SensorRules:
     boresight: Boresight
     field_of_view: FieldOfView
     gate: Gate
-    snap: Snap | None
     index: int
     own_keys: frozenset[str]
 
@@ -229,11 +220,6 @@ class SensorRules:
 def rules_of(rules: Sequence[SensorRules], sensor: int) -> SensorRules:
     """The rules of one sensor; all sensors beyond the entries of `each` have the last ones."""
     return rules[min(sensor, len(rules) - 1)]
-
-
-def wants_parts(rules: Sequence[SensorRules]) -> bool:
-    """Whether any sensor is to become a part."""
-    return any(one.snap is not None for one in rules)
 
 
 class Constraints(SensorConstraints):
@@ -253,6 +239,7 @@ class Constraints(SensorConstraints):
 
     sensors: SensorCount = SensorCount()
     budget: Budget = Budget()
+    parts: Parts | None = None
     each: list[SensorConstraints] = []
 
     @classmethod

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -215,14 +215,12 @@ class FittedDesign(NamedTuple):
         log_likelihood: Weighted mean log density of the samples [nats].
         supports: The samples that were admitted, of each group of sensors.
         notes: What happened to sensors, one line each.
-        snap: What sensors lost that became parts, as plain values; None where none did.
     """
 
     design: DesignSpec
     log_likelihood: Estimate
     supports: Sequence[Support]
     notes: tuple[str, ...] = ()
-    snap: Mapping[str, Any] | None = None
 
 
 class Layout(ABC):

@@ -29,7 +29,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.design.constraints.document import Constraints, SensorRules, wants_parts
+from lidardesign.design.constraints.document import Constraints, SensorRules
 from lidardesign.design.constraints.feasibility import BandwidthBudget, fit_within_budget
 from lidardesign.design.constraints.origins import free_boxes, is_mounted, origin_box
 from lidardesign.design.layouts.gates import admissible_gates, admitted_gates, central_intervals, rays_with_gates
@@ -83,11 +83,11 @@ class ScanLayout(Layout):
 
     def check_constraints(self, constraints: Constraints) -> None:
         """See `Layout`."""
-        if wants_parts(constraints.rules):
+        if constraints.parts is not None:
             raise ConfigError(
                 "every ray of a scan is a sensor of its own, and no part has a single steered ray",
-                where="snap",
-                hint="--layout grid --sensors N",
+                where="parts",
+                hint="leave out --layout",
             )
         if is_mounted(constraints.rules):
             raise ConfigError(

@@ -29,14 +29,7 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.catalog.library import Pose, find_part, interleaved, part_rays, parts_for, side_by_side
 from lidardesign.design.catalog.part import Part
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.layouts.grid import low_discrepancy
-from lidardesign.design.mixture.bounds import bounds_of
-from lidardesign.design.mixture.em import fit_mixture
-from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.mixture.mixture import Mixture
-from lidardesign.design.sensor import DEFAULT_LEVEL, interval_factor
-from lidardesign.design.snap.parts import (
+from lidardesign.design.catalog.shapes import (
     PartShape,
     gate_inside,
     in_part_view,
@@ -44,6 +37,13 @@ from lidardesign.design.snap.parts import (
     shapes_of,
     useful_ray_filter,
 )
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.layouts.grid import low_discrepancy
+from lidardesign.design.mixture.bounds import bounds_of
+from lidardesign.design.mixture.em import fit_mixture
+from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.mixture import Mixture
+from lidardesign.design.sensor import DEFAULT_LEVEL, interval_factor
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition, rays_within, whole_range
 from lidardesign.evaluate.baselines.views import TrainingViews, dense_points

@@ -1,1 +1,0 @@
-"""Fitted sensors replaced by real parts."""

@@ -1,0 +1,249 @@
+"""Which real parts to buy, and where to mount them: `fit --parts`.
+
+Parts are proposed at the mounts, or at places in the box of origins, facing what the density looks at, upright and
+turned. Training scenes that nothing was learned from say what each would tell, and the best few are chosen, with a
+bound of what any others of those proposed could tell.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lidardesign.design.bandwidth import split_budget
+from lidardesign.design.catalog.library import named_parts, part_rays, part_sensor
+from lidardesign.design.catalog.part import Part
+from lidardesign.design.catalog.shapes import broken_keys, shapes_of
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints, SensorRules
+from lidardesign.design.constraints.feasibility import BandwidthBudget
+from lidardesign.design.constraints.origins import inside_excluded, mounts_of, origin_box
+from lidardesign.design.files import MOST_TABLE_RAYS, design_document
+from lidardesign.design.fit import FitResult
+from lidardesign.design.layouts.grid import low_discrepancy
+from lidardesign.design.mixture.bounds import bounds_of, clip_azimuth
+from lidardesign.design.mixture.features import Axes
+from lidardesign.design.sensor import CERTIFICATES, DEFAULT_LEVEL, DesignSpec, interval_factor
+from lidardesign.errors import ConfigError, DataError, InfeasibleError
+from lidardesign.geometry.rays import Rays, Returns
+from lidardesign.numerics import TINY
+from lidardesign.run.clock import phase
+from lidardesign.samples import Samples
+from lidardesign.scene import Scene
+from lidardesign.selection import information
+from lidardesign.selection.parts import PartBundle, PlacedPart, part_table
+from lidardesign.selection.select import PROXY
+from lidardesign.selection.sets import SetLimits, choose_set
+from lidardesign.space import angles, observed_point
+from lidardesign.task import Information, random_generator
+
+MOST_POSES = 500  # of each kind of part, over all places
+MOST_PLACES = 25  # in a box of origins
+
+
+def choose_parts(
+    samples: Samples,
+    constraints: Constraints,
+    *,
+    count: int,
+    rays: int | None,
+    informs: Callable[[Scene, Sequence[Returns]], Information],
+    scenes: Callable[[str], Iterator[Scene]],
+    seed: int,
+    name: str,
+    notes: Callable[[str], None],
+) -> FitResult:
+    """The design of the best few parts at their best poses.
+
+    Arguments:
+        samples: Of the density, which parts look at.
+        constraints: What parts there are, and what they keep.
+        count: How many parts at most.
+        rays: How many rays they fire; None is all that they have.
+        informs: What a task says of a scene's returns.
+        scenes: Training scenes without end for a purpose, `choice` or `held back`.
+        seed: Root of the random streams.
+        name: The design's name.
+        notes: Called with every note.
+
+    Raises:
+        ConfigError: A part that is not there; a density with conditions.
+        InfeasibleError: No part keeps the constraints.
+        DataError: No part tells anything about the scenes.
+    """
+    started, space, wanted = perf_counter(), samples.space, constraints.parts
+    if space.conditioned:
+        raise ConfigError(
+            "the density has conditions", where="--parts", allowed="tasks whose sensors rest", hint="fit without parts"
+        )
+    every = named_parts(wanted.names)
+    names = [part.name for part in every]
+    if others := set(wanted.each) - set(names):
+        raise ConfigError(f"{min(others)} is none of the parts", where="parts.each", allowed=", ".join(names))
+    unknown = [part.name for part in every if part.value("power_w") is None]
+    if wanted.power_w is not None and unknown:
+        notes(f"no source says what {', '.join(unknown)} consume: left out, as parts.power_w is bounded")
+        every = [part for part in every if part.name not in unknown]
+    placed = proposed(every, constraints, samples, seed)
+    budget = BandwidthBudget.of(constraints, rays)
+    most = (budget.rays or MOST_TABLE_RAYS) // count
+    limits = _limits(placed, constraints, count, most, budget)
+    bundle = PartBundle(placed, most)
+    tables = [
+        part_table(bundle, itertools.islice(scenes(purpose), information.FEW_SCENES), informs, count, seed)
+        for purpose in ("choice", "held back")
+    ]
+    (coverage, unit), (judged, _) = tables
+    with phase("choice"):
+        chosen = choose_set(coverage, limits)
+    if not chosen.members:
+        raise DataError("none of the parts tells anything about the scenes", where="--parts")
+    if len(chosen.members) < count:
+        notes(f"{len(chosen.members)} of {count} parts: no other tells more, or fits the bounds")
+    gate = np.full(len(placed), -1)
+    gate[list(chosen.members)] = 0
+    loss = coverage.complete - chosen.value
+    certificate = {
+        "rays": 0,
+        "value": float(loss),
+        "bound": float(max(coverage.complete - chosen.bound, 0.0)),
+        "gap": float((chosen.bound - chosen.value) / loss) if loss > 0 else 0.0,
+        "held_back_value": float(judged.loss_of(gate)),
+        "candidates": len(placed),
+        "gates": 1,
+        "scenes": information.FEW_SCENES,
+        "proxy": PROXY,
+        "unit": unit,
+    }
+    design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays, certificate)
+    checks = check_design(design_document(design), constraints, space)
+    return FitResult(
+        design=design,
+        log_likelihood=None,
+        admissible_mass=None,
+        ess=samples.effective_sample_size,
+        satisfied=all(check.satisfied for check in checks),
+        constraints=checks,
+        seconds=perf_counter() - started,
+    )
+
+
+def _limits(
+    placed: Sequence[PlacedPart], constraints: Constraints, count: int, most_rays: int, budget: BandwidthBudget
+) -> SetLimits:
+    """How many parts, of which kind, one at each mount, and for what bandwidth and power."""
+    wanted = constraints.parts
+    names = list(dict.fromkeys(one.part.name for one in placed))
+    kinds = [
+        (
+            np.array([names.index(one.part.name) for one in placed]),
+            np.array([wanted.each[name].max if name in wanted.each else count for name in names]),
+        )
+    ]
+    if constraints.origin.mounts_m:
+        place = np.array([one.place for one in placed])
+        kinds.append((place, np.ones(place.max() + 1, dtype=np.intp)))
+    budgets = []
+    if budget.limit_mbps is not None:
+        bits = [budget.model.mbps_of_widths(np.diff(one.shape.gate_m), min(one.part.rays, most_rays)) for one in placed]
+        budgets.append((np.array(bits), budget.limit_mbps))
+    if wanted.power_w is not None:
+        budgets.append((np.array([one.part.value("power_w") for one in placed]), wanted.power_w))
+    return SetLimits(count, kinds, budgets)
+
+
+@phase("candidates")
+def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, seed: int) -> list[PlacedPart]:
+    """Parts at poses that constraints allow.
+
+    Raises:
+        InfeasibleError: None keeps the constraints.
+    """
+    rules, space = constraints.rules[0], samples.space
+    generator = random_generator(seed, "poses of parts")
+    places, axes = _places(rules, samples, generator), Axes.of(space)
+    shapes = [shape for part in parts for shape in shapes_of(part, space)]
+    broken = [broken_keys(shape, rules) for shape in shapes]
+    if (shapes and all(broken)) or not len(places):
+        keys = sorted(set().union(*broken)) if len(places) else ["origin"]
+        raise InfeasibleError(
+            f"no part keeps {', '.join(keys)}",
+            conflicts=[*keys, "parts"],
+            hint="loosen one of them, or name other parts",
+        )
+    if not shapes:
+        raise InfeasibleError("no part measures in the range of the design space", conflicts=["space.range_m", "parts"])
+    bounds = bounds_of(constraints.rules, space, (0,), interval_factor(DEFAULT_LEVEL))
+    placed, points = [], observed_point(samples.resample(MOST_POSES, generator))
+    for number, origin in enumerate(places):
+        offset = points - origin
+        # the middle of what is seen, and parts of it
+        looking = np.concatenate([offset.mean(axis=0, keepdims=True), offset[number :: len(places)][1:]])
+        azimuth, elevation = angles(looking / np.maximum(np.linalg.norm(looking, axis=1), TINY)[:, None])
+        azimuth = clip_azimuth(azimuth, bounds)
+        elevation = np.clip(elevation, bounds.elevation_low, bounds.elevation_high)
+        for shape in (shape for shape, keys in zip(shapes, broken, strict=True) if not keys):
+            for aim in zip(azimuth.tolist(), elevation.tolist(), strict=True):
+                placed.append(PlacedPart(shape, shape.pose(origin, *aim, 0.0, axes), number))
+    return placed
+
+
+def _places(rules: SensorRules, samples: Samples, generator: np.random.Generator) -> np.ndarray:
+    """Mounts, or the one origin that there is, or origins of the density and an even set of their box, (P, 3) [m]."""
+    if rules.origin.mounts_m:
+        return np.array(mounts_of(rules), dtype=np.float64).reshape(-1, 3)
+    low, high = origin_box(rules, samples.space)
+    free = np.flatnonzero(high > low)
+    if not len(free):
+        return low[None]
+    even = np.tile(low, (MOST_PLACES, 1))
+    even[:, free] += low_discrepancy(MOST_PLACES, len(free)) * (high - low)[free]
+    dense = samples.resample(MOST_POSES, generator)[:, :3]
+    inside = ((dense >= low) & (dense <= high)).all(axis=1)
+    kept = [one[~inside_excluded(one, rules)] for one in (dense[inside], even)]
+    return np.concatenate([kept[0][: MOST_PLACES // 2], kept[1]])[:MOST_PLACES]
+
+
+def _design(
+    name: str, constraints: Constraints, placed: Sequence[PlacedPart], rays: int | None, certificate: dict[str, Any]
+) -> DesignSpec:
+    """The design of chosen parts: explicit rays, of those of more than are asked for, or fit in a file, an even subset.
+
+    Raises:
+        InfeasibleError: The parts have fewer rays than are asked for.
+    """
+    patterns = [one.part.rays for one in placed]
+    total = min(sum(patterns), MOST_TABLE_RAYS) if rays is None else rays
+    if total > sum(patterns):
+        raise InfeasibleError(
+            f"the parts found have {sum(patterns)} rays, not {total}",
+            conflicts=["--rays", "parts"],
+            hint="fewer rays, more sensors, or parts with more rays",
+        )
+    counts = split_budget(np.array(patterns), total).tolist()
+    tables = [part_rays(one.part, one.pose, count) for one, count in zip(placed, counts, strict=True)]
+    sensors = []
+    for index, (one, count) in enumerate(zip(placed, counts, strict=True)):
+        start, end = one.shape.gate_m
+        sensor = part_sensor(one.part, one.pose, name=f"s{index}", weight=count / total, rays=count)
+        spread_m = (end - start) / (2 * interval_factor(sensor.level))
+        sensors.append(replace(sensor, range_m=(start + end) / 2, spread_range_m=spread_m))
+    gates = [np.tile(one.shape.gate_m, (count, 1)) for one, count in zip(placed, counts, strict=True)]
+    fired = [
+        replace(rays, gate_m=gate_m, sensor=np.full(len(rays), index), time_s=np.zeros(len(rays)))
+        for index, (rays, gate_m) in enumerate(zip(tables, gates, strict=True))
+    ]
+    return DesignSpec(
+        name=name,
+        sensors=tuple(sensors),
+        layout="fixed",
+        rays=total,
+        ray_table=Rays.joined(fired).as_angles(),
+        constraints=constraints.as_document(),
+        provenance={CERTIFICATES: [{**certificate, "rays": total}]},
+    )

@@ -1,0 +1,168 @@
+"""`fit --parts`: which real parts, and where; the design keeps its bounds and fires its parts' own rays."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from support.command_line import caller, make_run
+from support.tables import each_row
+
+from lidardesign.design.catalog.library import find_part, part_rays
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.files import design_document
+from lidardesign.design.layouts.rays import certificates_of, lay_out
+from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.samples import load_samples
+from lidardesign.selection import information, part_design
+from lidardesign.selection.parts import COARSE_CELL_RAD, PartBundle, cells_of, part_table
+from lidardesign.selection.sets import SetLimits, choose_set
+from lidardesign.simulate.simulate import simulate_many
+from lidardesign.task import Information
+from lidardesign.workflow.runs import open_run
+
+THREE = ["vl53l5cx", "vl53l5cx:4x4", "tmf8828"]
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("run") / "flat")
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    monkeypatch.setattr(information, "FEW_SCENES", 4)
+    monkeypatch.setattr(part_design, "MOST_POSES", 20)
+
+
+def bought(run, sensors=2, **constraints):
+    return open_run(run).fit(parts=THREE, sensors=sensors, constraints=constraints or None, name="bought").specification
+
+
+class TestDesignsOfParts:
+    def test_fire_the_rays_of_parts_that_were_named(self, run):
+        spec = bought(run)
+        assert [sensor.part in THREE for sensor in spec.sensors] == [True, True]
+        assert len(lay_out(spec)) == sum(find_part(sensor.part).rays for sensor in spec.sensors)
+        rules = {"parts": {"names": THREE}}
+        assert all(check.satisfied for check in check_design(design_document(spec), rules))
+
+    def test_are_the_same_for_the_same_seed(self, run):
+        assert design_document(bought(run)) == design_document(bought(run))
+
+    def test_say_how_far_from_the_best_they_may_be(self, run):
+        (certificate,) = certificates_of(bought(run))
+        assert 0 <= certificate["bound"] <= certificate["value"]
+        assert 0 <= certificate["gap"] <= 1
+        assert certificate["scenes"] == 4
+
+    def test_have_no_more_of_a_part_than_is_allowed(self, run):
+        each = {"vl53l5cx": {"max": 1}, "tmf8828": {"max": 1}}
+        spec = bought(run, sensors=3, parts={"names": "catalog", "each": each})
+        names = [sensor.part for sensor in spec.sensors]
+        assert max(names.count(name) for name in each) <= 1
+
+    def test_look_where_they_may(self, run):
+        middle = bought(run, sensors=1).sensors[0].azimuth_rad
+        bound = float(np.degrees(middle)) + 5.0
+        spec = bought(run, boresight={"azimuth_deg": {"min": bound, "max": bound + 20}})
+        away = np.mod(np.degrees([sensor.azimuth_rad for sensor in spec.sensors]) - bound, 360)
+        assert (away <= 20 + 1e-6).all()
+
+    def test_keep_a_bandwidth_and_a_number_of_rays(self, run):
+        spec = bought(run, budget={"rays": 30, "bandwidth_mbps": 10.0})
+        assert spec.rays == 30
+        with pytest.raises(InfeasibleError, match="rays, not 500"):
+            bought(run, budget={"rays": 500})
+
+    def test_fire_no_more_than_a_power_and_leave_unknown_ones_out(self, run):
+        notes = []
+        fitted = open_run(run).fit(
+            parts=["tmf8820", "tmf8828"],
+            sensors=3,
+            constraints={"parts": {"names": "catalog", "power_w": 0.3}},
+            name="frugal",
+            notes=notes.append,
+        )
+        assert [sensor.part for sensor in fitted.specification.sensors] == ["tmf8820"] * len(
+            fitted.specification.sensors
+        )
+        assert len(fitted.specification.sensors) <= 2
+        assert any("tmf8828" in note and "left out" in note for note in notes)
+
+
+@each_row(
+    "options, words",
+    [
+        ({"parts": ["vl53l8xc"], "sensors": 1}, "no part 'vl53l8xc'"),
+        ({"parts": ["vl53l8cx"]}, "how many parts"),
+        ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "grid"}, "parts in the layout grid"),
+        ({"parts": ["vl53l8cx"], "sensors": 1, "constraints": {"each": [{"gate": {"width_m": {"max": 1}}}]}}, "each"),
+        (
+            {"sensors": 1, "constraints": {"parts": {"names": ["vl53l8cx"], "each": {"vl53l5cx": {"max": 1}}}}},
+            "vl53l5cx is none of the parts",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(run, options, words):
+    with pytest.raises(ConfigError, match=words):
+        open_run(run).fit(name="none", **options)
+
+
+def test_bounds_that_no_part_keeps_are_named(run):
+    with pytest.raises(InfeasibleError, match=r"field_of_view\.horizontal_deg\.max"):
+        bought(run, field_of_view={"horizontal_deg": {"max": 1.0}})
+
+
+def test_fit_prints_parts_and_evaluate_takes_them(lidardesign, run):
+    result = lidardesign("fit", run, "--parts", "vl53l5cx,tmf8828", "--sensors", 2, "--name", "b", "--json")
+    assert result.code == 0, result.err
+    assert [sensor["part"] in ("vl53l5cx", "tmf8828") for sensor in json.loads(result.out)["sensors"]] == [True, True]
+    scored = lidardesign("evaluate", run / "designs" / "b.yaml", "--rays", 64, "--baseline", "uniform", "--json")
+    assert scored.code == 0, scored.err
+
+
+# what parts tell, without a task
+
+
+def every_return(scene, returns):
+    """Every ray tells about one item, its tenth of azimuth, by its range."""
+    rays = returns[0].rays
+    tenth = np.mod(np.arctan2(rays.direction[:, 1], rays.direction[:, 0]) * 10 / (2 * np.pi), 10).astype(int)
+    hit = np.flatnonzero(returns[0].returned)
+    return Information(hit, tenth[hit], 1.0 + 0 * hit, np.zeros(10, dtype=int))
+
+
+def test_cells_hold_directions_that_are_near():
+    directions = np.random.default_rng(0).normal(size=(4000, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    cell, cells = cells_of(directions, COARSE_CELL_RAD)
+    assert 0 <= cell.min() <= cell.max() < cells
+    assert cells == pytest.approx(4 * np.pi / COARSE_CELL_RAD**2, rel=0.05)
+    for one in np.unique(cell):
+        own = directions[cell == one]
+        assert (own @ own.T).min() > np.cos(1.6 * COARSE_CELL_RAD)
+
+
+def test_a_part_tells_what_its_own_rays_would(run):
+    opened = open_run(run)
+    parts = [find_part(name) for name in THREE]
+    placed = part_design.proposed(parts, part_design.Constraints(), load_samples(run), 0)
+    scene = opened.task.scenes(opened.config.task, "train", 0)[0]
+    coverage, _ = part_table(PartBundle(placed, 64), [scene], every_return, 2, 0)
+    for number in range(0, len(placed), 7):
+        one = placed[number]
+        rays = part_rays(one.part, one.pose)
+        ((returns,),) = simulate_many(scene, [rays])
+        told = every_return(scene, [returns])
+        gate = np.full(len(placed), -1)
+        gate[number] = 0
+        exact = len(np.unique(told.item)) / 10
+        assert coverage.value_of(gate) == pytest.approx(exact, abs=0.11)
+    assert choose_set(coverage, SetLimits(2)).value <= 1

@@ -1,0 +1,89 @@
+"""Small sets of candidates: the best there is where few are possible, and never above the bound."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.coverages import SUMS, relaxed_by_highs, small
+
+from lidardesign.selection import sets
+from lidardesign.selection.coverage import LARGEST
+from lidardesign.selection.sets import SetLimits, choose_set
+
+seeds = st.integers(0, 10_000)
+
+
+def candidates(seed, count, table=LARGEST):
+    """A random table of candidates with one gate."""
+    return small(seed, rays=count, items=12, table=table).through(np.zeros(count, dtype=np.intp))
+
+
+def random_limits(seed, count):
+    """At most three, one of each kind of mount, two of each kind of part, within a budget."""
+    generator = np.random.default_rng(seed)
+    mounts, parts = generator.integers(0, 4, count), generator.integers(0, 3, count)
+    cost = generator.uniform(0, 1, count)
+    return SetLimits(3, [(mounts, np.ones(4, dtype=int)), (parts, np.full(3, 2))], [(cost, 1.5)])
+
+
+def keeps(limits, members):
+    members = list(members)
+    return (
+        len(members) <= limits.count
+        and all((np.bincount(kind[members], minlength=len(most)) <= most).all() for kind, most in limits.kinds)
+        and all(cost[members].sum() <= limit for cost, limit in limits.budgets)
+    )
+
+
+def value_of(coverage, members):
+    gate = np.full(coverage.shape[0], -1)
+    gate[list(members)] = 0
+    return coverage.value_of(gate)
+
+
+def best_of_all(coverage, limits):
+    every = itertools.chain.from_iterable(
+        itertools.combinations(range(coverage.shape[0]), size) for size in range(limits.count + 1)
+    )
+    return max(value_of(coverage, members) for members in every if keeps(limits, members))
+
+
+@pytest.mark.parametrize("table", [LARGEST, SUMS], ids=["largest", "sums"])
+@given(seed=seeds)
+def test_of_few_sets_the_best_is_chosen_within_all_limits(table, seed):
+    coverage, limits = candidates(seed, 9, table), random_limits(seed, 9)
+    chosen = choose_set(coverage, limits)
+    assert keeps(limits, chosen.members)
+    assert chosen.value == pytest.approx(value_of(coverage, chosen.members), rel=1e-9)
+    assert chosen.value == pytest.approx(best_of_all(coverage, limits), rel=1e-9)
+    assert chosen.bound == chosen.value
+
+
+@pytest.mark.parametrize("table", [LARGEST, SUMS], ids=["largest", "sums"])
+@given(seed=seeds)
+def test_of_many_sets_none_exceeds_the_bound(table, seed):
+    coverage, limits = candidates(seed, 9, table), random_limits(seed, 9)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(sets, "FEW_SETS", 0)
+        patched.setattr(sets, "MOST_WORK", 0)
+        chosen = choose_set(coverage, limits)
+    assert keeps(limits, chosen.members)
+    best = best_of_all(coverage, limits)
+    assert value_of(coverage, chosen.members) <= best * (1 + 1e-9)
+    assert best <= chosen.bound * (1 + 1e-9)
+
+
+@given(seed=seeds)
+def test_the_best_set_is_that_of_a_solver(seed):
+    coverage = candidates(seed, 12)
+    chosen = choose_set(coverage, SetLimits(3))
+    assert chosen.value == pytest.approx(relaxed_by_highs(coverage, 3, 0.0, True), rel=1e-7)
+
+
+def test_no_candidate_that_tells_nothing_is_taken():
+    coverage = candidates(0, 4).grouped([np.array([], dtype=int), np.array([0]), np.array([], dtype=int)])
+    assert choose_set(coverage, SetLimits(3)).members == (1,)
