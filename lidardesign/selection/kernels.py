@@ -217,7 +217,7 @@ def group_entries(
 
 
 @njit(cache=True, nogil=True)
-def tell_by_parts(
+def gather_parts(
     entries: ByRay, range_m: np.ndarray, first: np.ndarray, members: np.ndarray, gate_m: np.ndarray, told: np.ndarray
 ) -> None:
     """What parts tell of each item: the largest worth of their rays' returns inside their gates, or the sum.

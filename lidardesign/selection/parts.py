@@ -156,7 +156,7 @@ def part_table(
             start, informed.item[order], informed.worth[order], np.zeros(0, np.uint8), informed.weight, informed.sums
         )
         every = np.empty((len(placed), len(informed.weight)), dtype=np.float32)
-        kernels.tell_by_parts(entries, informed.range_m[order], bundle.first, bundle.members, gate_m, every)
+        kernels.gather_parts(entries, informed.range_m[order], bundle.first, bundle.members, gate_m, every)
         if len(informed.sums):
             every *= times[:, None]
         part, item = np.nonzero(every)

@@ -205,13 +205,13 @@ def _searched(coverage: Coverage, limits: SetLimits, value: float) -> tuple[tupl
         gains = np.where(may, coverage.gains(known)[:, 0], 0.0)[order]
         gains[:first] = 0.0
         reached, left = float(coverage.weight @ coverage.counted(known)), limits.count - len(chosen)
-        if left == 1:
-            place = int(gains.argmax())
-            if reached + gains[place] > value * (1 + SLACK):
-                value, best = reached + float(gains[place]), (*chosen, int(order[place]))
-            continue
         if reached > value * (1 + SLACK):
             value, best = reached, chosen
+        if left == 1:
+            place = int(gains.argmax())
+            if gains[place] > 0 and reached + gains[place] > value * (1 + SLACK):
+                value, best = reached + float(gains[place]), (*chosen, int(order[place]))
+            continue
         # the largest gains of those that may follow each candidate
         for place in np.flatnonzero(gains)[::-1]:
             further = np.sort(gains[place + 1 :])[::-1][: left - 1].sum()
