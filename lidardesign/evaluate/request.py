@@ -21,6 +21,7 @@ from lidardesign.evaluate.baselines.catalog import Density
 from lidardesign.evaluate.baselines.greedy import GreedySource
 from lidardesign.evaluate.baselines.simple import ALWAYS, LayOut, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import CmaSettings
+from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.scene_scores import ScenePass, Scorer, score_here
 from lidardesign.registry import plugin_guard
 from lidardesign.samples import Samples
@@ -55,6 +56,7 @@ class EvaluationRequest:
         cma: How long the baseline `cma` searches, and who is told how it stands.
         planner: The detector, and how the effects that are simulated are chosen.
         audit: Whether all rows are scored under all effects too.
+        mount_error: How carelessly sensors are mounted in rows beside the exact ones; None: there are none.
         scorer: What scores the held-out scenes: this process, or workers (`evaluate.workers`) to the same numbers.
         scenes_seed: Root of the held-out scenes; None: `seed`.
     """
@@ -78,6 +80,7 @@ class EvaluationRequest:
     cma: CmaSettings = field(default_factory=CmaSettings)
     planner: Planner = field(default_factory=Planner)
     audit: bool = False
+    mount_error: MountError | None = None
     scorer: Scorer = score_here
     scenes_seed: int | None = None
 

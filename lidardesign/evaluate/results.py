@@ -18,6 +18,7 @@ import numpy as np
 
 from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
 from lidardesign.evaluate.accuracy.settings import Accuracy
+from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.statistics import paired_difference
 from lidardesign.run.files import write_atomic
 from lidardesign.simulate.detector.detector import EFFECTS
@@ -142,6 +143,40 @@ class Paired:
 
 
 @dataclass(frozen=True, eq=False)
+class Mounting:
+    """Rows at equal rays as they score when mounted carelessly.
+
+    Arguments:
+        error: How carelessly.
+        rows: The same designs and baselines, in the order of the exact rows.
+        costs: Each of them against itself, mounted exactly, scene by scene.
+    """
+
+    error: MountError
+    rows: Sequence[Row]
+    costs: Sequence[Paired]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`: rows, each with what its mounting costs."""
+        return {
+            "place_m": self.error.place_m,
+            "angle_rad": self.error.angle_rad,
+            "rows": [
+                {
+                    "design": row.design,
+                    "rays": row.rays,
+                    "value": row.value,
+                    "ci_low": row.ci_low,
+                    "ci_high": row.ci_high,
+                    "failures": row.failures,
+                    "cost": {name: getattr(cost, name) for name in ("difference", "ci_low", "ci_high")},
+                }
+                for row, cost in zip(self.rows, self.costs, strict=True)
+            ],
+        }
+
+
+@dataclass(frozen=True, eq=False)
 class Evaluation:
     """All rows of an evaluation.
 
@@ -157,6 +192,7 @@ class Evaluation:
         effects: What was simulated, and why.
         planning_seconds: Time to find that out [s].
         audit: The same rows under all effects, where that was asked for.
+        mounting: The rows with sensors that are mounted carelessly, where that was asked for.
         accuracy: What accuracy costs in time, where that was asked for.
         searches: How the rows of `cma` were found, where they were asked for.
         seeds: Of learning and fitting, where rows and differences are means over several.
@@ -173,6 +209,7 @@ class Evaluation:
     effects: Sequence[EffectSummary] = ()
     planning_seconds: float = 0.0
     audit: Audit | None = None
+    mounting: Mounting | None = None
     accuracy: Accuracy | None = None
     searches: Sequence[SearchRecord] = ()
     seeds: Sequence[int] = ()
@@ -200,7 +237,7 @@ class Evaluation:
 
         Beyond the contract: `groups` of scenes, `seeds`, `equal_bandwidth` rows name the design and rays that they are
         `matched_to`, `paired_equal_bandwidth` compares each design with them (`rays_b` are the baseline's), `notes`,
-        `detector`, `planning_seconds`, and `audit` where that was asked for.
+        `detector`, `planning_seconds`, and `audit` and `mounting` where those were asked for.
         """
         metric = self.metric
         values = {
@@ -225,7 +262,8 @@ class Evaluation:
             "cma": [search.as_dict() for search in self.searches],
             "error_estimates": as_documents(self.estimates()),
         }
-        return values if self.audit is None else {**values, "audit": self.audit.as_dict()}
+        asked = {"audit": self.audit, "mounting": self.mounting}
+        return values | {name: found.as_dict() for name, found in asked.items() if found is not None}
 
 
 def leading_detail(rows: Sequence[Row]) -> str | None:

@@ -29,10 +29,12 @@ from lidardesign.evaluate.baselines.simple import CMA, Baselines, Option, TwinCa
 from lidardesign.evaluate.baselines.views import TrainingViews
 from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
 from lidardesign.evaluate.cma.search import TrainingObjective
+from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out
 from lidardesign.evaluate.results import (
     Audit,
     Evaluation,
+    Mounting,
     Paired,
     Row,
     audit_rows,
@@ -274,11 +276,13 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     """
     request.check()
     entries = entries_of(request)
-    passes = 1 + request.audit
+    passes = 1 + request.audit + (request.mount_error is not None)
     scored = _score_all(request, entries, request.planner, _part(progress, 0, passes))
     rows = _rows(request, entries, scored)
     effects = summaries(scored.plans)
     audit = _audit(request, entries, rows, scored.plans, _part(progress, 1, passes)) if request.audit else None
+    last = _part(progress, passes - 1, passes)
+    mounting = request.mount_error and _mounting(request, request.mount_error, entries, rows, scored.plans, last)
     searches = [entry.search for entry in entries if entry.search is not None]
     plain = [row for row in rows if row.matched_to is None]
     matched = [row for row in rows if row.matched_to is not None]
@@ -301,6 +305,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         effects=effects,
         planning_seconds=scored.planning_seconds,
         audit=audit,
+        mounting=mounting,
         searches=searches,
     )
 
@@ -331,6 +336,31 @@ def _audit(
         skipped=[planned.name for planned, every in paired if every.scenes_on > planned.scenes_on],
         unavailable=[every.name for _, every in paired if every.missing is not None],
     )
+
+
+@phase("mounting")
+def _mounting(
+    request: EvaluationRequest,
+    error: MountError,
+    entries: Sequence[Entry],
+    rows: Sequence[Row],
+    plans: Sequence[EffectPlan],
+    progress: Progress | None,
+) -> Mounting:
+    """The entries at equal rays with misplaced sensors, under the same effects, and what that costs them."""
+    careless = [
+        replace(entry, name=str(number), redraw=partial(_misplaced, error, entry, request.seed))
+        for number, entry in enumerate(entries)
+        if entry.matched_to is None
+    ]
+    scored = _score_all(request, careless, request.planner, progress, plans)
+    exact = [row for row in rows if row.matched_to is None]
+    found = [replace(row, design=own.design) for row, own in zip(_rows(request, careless, scored), exact, strict=True)]
+    return Mounting(error, found, [_pair(row, own, request.seed) for row, own in zip(found, exact, strict=True)])
+
+
+def _misplaced(error: MountError, entry: Entry, seed: int, scene: int) -> RaysPerCondition:
+    return error.misplaced(entry.drawn(scene), seed, scene)
 
 
 @phase("held-out scenes")

@@ -9,14 +9,14 @@ Searle, Casella and McCulloch 1992, "Variance components", ch. 4). Its mean has 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from lidardesign.errors import NumericalError
-from lidardesign.evaluate.results import Evaluation, Paired, Row
+from lidardesign.evaluate.results import Evaluation, Mounting, Paired, Row
 from lidardesign.evaluate.statistics import LEVEL, Interval, student_interval
 
 # Design, rays, and what the bandwidth is matched to; rays at equal bandwidth differ between seeds.
@@ -95,7 +95,22 @@ def over_seeds(evaluations: Sequence[Evaluation], seeds: Sequence[int], scenes_s
         ],
         planning_seconds=sum(each.planning_seconds for each in evaluations),
         searches=[search for each in evaluations for search in each.searches],
+        mounting=_mean_mounting(evaluations, rows),
         seeds=tuple(seeds),
+    )
+
+
+def _mean_mounting(evaluations: Sequence[Evaluation], exact: Mapping[RowKey, Sequence[Row]]) -> Mounting | None:
+    mountings = [each.mounting for each in evaluations if each.mounting is not None]
+    if not mountings:
+        return None
+    by_key = [{_key(row): row for row in each.rows} for each in mountings]
+    careless = {key: [rows[key] for rows in by_key] for key in by_key[0] if key in exact}
+    costs = zip(mountings[0].costs, mountings[0].rows, strict=True)
+    return Mounting(
+        mountings[0].error,
+        [_mean_row(rows) for rows in careless.values()],
+        [_mean_pair(cost, careless[_key(row)], exact[_key(row)]) for cost, row in costs if _key(row) in careless],
     )
 
 

@@ -18,6 +18,7 @@ from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_r
 from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
+from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
 from lidardesign.evaluate.score import evaluate as score_designs
@@ -77,6 +78,7 @@ class ScoreOptions:
         accuracy: Whether what accuracy costs will be measured, too.
         scenes_seed: Root of the held-out scenes; `seed` by default.
         designs: Names of the designs that are scored; all by default.
+        mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
 
     Raises:
         ConfigError: One of them says nothing that can be done.
@@ -95,9 +97,11 @@ class ScoreOptions:
     accuracy: bool = False
     scenes_seed: int | None = None
     designs: Sequence[str] = ()
+    mount_error: str | None = None
 
     def __post_init__(self) -> None:
         check_workers(str(self.workers))
+        self.misplacement()
         for name in self.baselines:
             baseline_of(name, where="--baseline")
         seconds = self.cma_seconds
@@ -113,6 +117,10 @@ class ScoreOptions:
         for option, value in tolerances.items():
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"{value:g}", where=option, allowed="a finite number above 0")
+
+    def misplacement(self) -> MountError | None:
+        """How carelessly sensors are mounted in further rows."""
+        return None if self.mount_error is None else MountError.parse(self.mount_error)
 
     def planner(self) -> tuple[Planner, bool]:
         """How effects are chosen, and whether the choice is audited.
@@ -230,6 +238,7 @@ class ScoreRequest:
             "--effects": options.effects,
             "--detector": options.detector,
             "--set": list(settings_texts(options.settings)) or None,
+            "--mount-error": options.mount_error,
             "--accuracy": options.accuracy,
         }
         given = [f"{name} {value}" for name, value in settings.items() if value not in (None, (), [], False)]
@@ -271,7 +280,8 @@ class ScoreRequest:
             self.run, self.designs, self.rays, self.baselines, self.seed, self.options.scenes_seed
         )
         cma = CmaSettings(SearchBudget(self.cma_seconds), searching)
-        return replace(request, planner=self.planner, audit=self.audit, cma=cma)
+        misplaced = self.options.misplacement()
+        return replace(request, planner=self.planner, audit=self.audit, cma=cma, mount_error=misplaced)
 
     def score(self, progress: Progress | None = None, searching: Show | None = None) -> Scores:
         """Score every design and baseline on every held-out scene.

@@ -250,14 +250,14 @@ def evaluation(tmp_path_factory):
 
     printed("fit", flat, "--layout", "grid", "--sensors", 1, "--json")
     search = ("--baseline", "cma", "--cma-seconds", 0.1, "--set", "test=2")
-    audited = ("--effects", "audit")
+    audited = ("--effects", "audit", "--mount-error", "5mm")
     return printed("evaluate", flat, "--rays", 9, *search, *audited, "--json", "--quiet")
 
 
 def test_what_evaluate_prints_is_valid_and_complete(evaluation):
     schema = schema_of("evaluate")
     jsonschema.Draft202012Validator(schema).validate(evaluation)
-    for name in ("rows", "paired", "equal_bandwidth", "effects", "cma", "error_estimates", "audit"):
+    for name in ("rows", "paired", "equal_bandwidth", "effects", "cma", "error_estimates", "audit", "mounting"):
         assert evaluation[name]
     assert set(evaluation) == set(schema["properties"])
     for name in evaluation:

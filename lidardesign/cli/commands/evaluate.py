@@ -173,6 +173,16 @@ def evaluate(
             "this task and run, and the cheapest setting that is good enough. Takes minutes.",
         ),
     ] = False,
+    mount_error: Annotated[
+        str | None,
+        typer.Option(
+            "--mount-error",
+            metavar="LENGTH,ANGLE",
+            help="Also score all rows with every sensor misplaced at random in every scene, as 5mm,0.5deg: standard "
+            "deviations along and about each axis.",
+            show_default=False,
+        ),
+    ] = None,
     dry_run: options.DryRun = False,
     seed: options.Seed = None,
     scenes_seed: Annotated[
@@ -212,6 +222,7 @@ def evaluate(
             accuracy=accuracy,
             scenes_seed=scenes_seed,
             designs=designs or (),
+            mount_error=mount_error,
         )
         runs = differing_seeds(targets, output.remark)
         request: ScoreRequest | SeedsRequest = (

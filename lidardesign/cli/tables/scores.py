@@ -28,6 +28,8 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
     _show_errors(document, rich)
     designs = {row["design"] for row in document["rows"]} - {row["design"] for row in matched}
     against = [pair for pair in document["paired"] if pair["b"] not in designs]
+    if "mounting" in document:
+        _show_mounting(document, rich)
     title = f"difference to each baseline [{metric['unit']}], scene by scene, with its 95 % interval"
     cells = [
         f"{number(pair['difference'], 3)} ({interval_text(pair, ' to ', 3)})"
@@ -64,6 +66,18 @@ def _show_rows(document: Entry, rich: RichConsole) -> None:
     places = [(row["design"], row["rays"], f"seed {seed}") for row in rows for seed in seeds]
     cells = [number(value) for row in rows for value in row.get("per_seed", [])]
     _show_grid(f"value of each seed [{metric['unit']}]", places, cells, rich)
+
+
+def _show_mounting(document: Entry, rich: RichConsole) -> None:
+    found, unit, exact = document["mounting"], document["metric"]["unit"], document["rows"]
+    off = f"{MILLIMETRES * found['place_m']:.3g} mm and {math.degrees(found['angle_rad']):.3g} degrees"
+    lines = []
+    for row, own in zip(found["rows"], exact, strict=True):
+        cost = f"{number(row['cost']['difference'], 3)} ({interval_text(row['cost'], ' to ', 3)})"
+        figures = map(number, (row["rays"], own["value"], row["value"], row["failures"]))
+        lines.append([row["design"], *figures, cost])
+    headings = ("design", "rays", f"exact\n[{unit}]", f"careless\n[{unit}]", "failures", "difference (95 % interval)")
+    print_table(f"mounted carelessly: every sensor off by {off} per axis", headings, lines, rich)
 
 
 def _show_audit(audit: Entry, effects: Sequence[Entry], rich: RichConsole) -> None:
