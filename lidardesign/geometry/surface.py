@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import elliprg
 
 from lidardesign.geometry.primitives import half_extents_m
 from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Round, Scene, Sphere
@@ -71,6 +70,8 @@ def surface_area_m2(body: Body, space: DesignSpace) -> float:
         case Cylinder(radius_m=radius_m, half_length_m=half_length_m):
             return 2 * math.pi * radius_m * (radius_m + 2 * half_length_m)
         case Ellipsoid(semi_axes_m=(x, y, z)):
+            from scipy.special import elliprg
+
             # Carlson's integral R_G (DLMF 19.33.1)
             return 4 * math.pi * x * y * z * float(elliprg(x**-2, y**-2, z**-2))
         case Plane():

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from lidardesign_tasks.arm import ArmTask
 from lidardesign_tasks.robot import arm_motion
-from lidardesign_tasks.robot.arm_links import BALL
 from lidardesign_tasks.robot.arm_motion import (
     PENETRATION_M,
     POSITION_RESIDUAL_M,
@@ -25,7 +24,7 @@ from lidardesign_tasks.robot.arm_motion import (
     RejectedError,
     draw_waypoints,
 )
-from lidardesign_tasks.robot.arm_robot import load_robot
+from lidardesign_tasks.robot.arm_robot import BALL, load_robot
 from support.hard_cases import hard_case
 from support.robots import TOOL_M, mjcf, written
 from support.tables import each_row

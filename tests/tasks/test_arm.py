@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lidardesign_tasks.arm import ArmTask
-from lidardesign_tasks.robot.arm_links import BALL
 from lidardesign_tasks.robot.arm_motion import (
     CLEARANCE_M,
     FINAL_DESCENT_M,
@@ -25,7 +24,7 @@ from lidardesign_tasks.robot.arm_motion import (
     highest_m,
     phase_shares,
 )
-from lidardesign_tasks.robot.arm_robot import load_robot
+from lidardesign_tasks.robot.arm_robot import BALL, load_robot
 from lidardesign_tasks.robot.motion import minimum_jerk
 from lidardesign_tasks.robot.tracking import MEAN_DEPTH, REACH_FRAMES, filled_path, tracked_places
 from support.rays import rays_along, rays_of_points

@@ -7,7 +7,8 @@ import itertools
 import mujoco
 import numpy as np
 import pytest
-from lidardesign_tasks.robot.motion import Wanderer, joined, spans, window_frames
+import trimesh
+from lidardesign_tasks.robot.motion import DEPTH_M, Wanderer, joined, spans, window_frames
 from lidardesign_tasks.robot.recordings import Recording, columns, read_recordings
 from lidardesign_tasks.robot.targets import mean_depth_m
 from lidardesign_tasks.robot.task import MujocoTask
@@ -191,11 +192,43 @@ def test_random_ways_do_not_collide_and_contacts_at_rest_are_none(folder):
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
         names = {tuple(sorted(model.geom(geom).name for geom in pair)) for pair in data.contact.geom}
-        deep = {pair for pair, dist in zip(names, data.contact.dist, strict=False) if dist < 0}
+        deep = {pair for pair, dist in zip(names, data.contact.dist, strict=False) if dist < -DEPTH_M}
         assert deep <= {("ground", "lid")}
     assert np.ptp(np.concatenate(ways)[:, 0]) > 1.0
     limits = model.jnt_range[:2]
     assert all(((way[:, :2] >= limits[:, 0]) & (way[:, :2] <= limits[:, 1])).all() for way in ways)
+
+
+def test_what_stands_free_is_raised_out_of_the_ground(tmp_path):
+    standing = """<mujoco><worldbody><geom name="floor" type="plane" size="2 2 .1"/><body pos="0 0 .5"><freejoint/>
+    <geom type="box" size=".1 .1 .1"/><body><joint axis="0 1 0" range="-90 90"/>
+    <geom name="leg" type="capsule" size=".03" fromto=".2 0 0 .2 0 -.46"/></body></body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_path(str(written(tmp_path, standing, "leg.xml")))
+    data, wanderer = mujoco.MjData(model), Wanderer(model, "leg.xml")
+    way = np.concatenate([wanderer.draw(30, 10.0, np.random.default_rng(seed)) for seed in range(5)])
+    for qpos in way:
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        assert data.contact.dist.min(initial=0.0) > -2 * DEPTH_M
+    assert np.ptp(way[:, 2]) > 0.02
+    np.testing.assert_array_equal(way[:, :2], 0.0)
+
+
+def test_a_target_that_rests_in_all_scenes_is_named(configured):
+    config = configured(targets=("parcel",))
+    assert any("parcel: at the same place in all scenes" in note for note in TASK.notes(config, TASK.space(config)))
+
+
+def test_a_model_may_read_files_of_the_folder_that_is_named(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "robots").mkdir()
+    trimesh.creation.icosphere(subdivisions=2, radius=0.1).export(tmp_path / "parts" / "ball.stl")
+    text = """<mujoco><asset><mesh name="ball" file="../parts/ball.stl"/></asset><worldbody><body name="ball">
+    <joint type="slide" range="0 1"/><geom type="mesh" mesh="ball"/></body></worldbody></mujoco>"""
+    keys = {"model": written(tmp_path / "robots", text, "robot.xml"), "targets": ("ball",), "train": 1}
+    with pytest.raises(DataError, match="outside"):
+        TASK.scenes(TASK.Config(**keys), "train", 0)
+    assert TASK.scenes(TASK.Config(**keys, folder=tmp_path), "train", 0)
 
 
 def test_what_collides_at_rest_may_collide(tmp_path):

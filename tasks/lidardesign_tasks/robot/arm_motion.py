@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.geometry.surface import half_extents_m
 from lidardesign.mujoco_model import import_mujoco, mujoco_warnings
-from lidardesign.scene import Box, Capsule, Mesh, Sphere
-from lidardesign_tasks.robot.arm_links import BALL
-from lidardesign_tasks.robot.arm_robot import BALL_RADIUS_M, Robot
+from lidardesign.scene import Capsule, Mesh, Shape, Sphere
+from lidardesign_tasks.robot.arm_robot import BALL, BALL_RADIUS_M, Robot
 from lidardesign_tasks.robot.motion import minimum_jerk
 
 HOVER_M = np.array([0.5, 0.0, 0.35])
@@ -229,15 +229,12 @@ def _pointing_down(rotation: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(down, first), down], axis=1)
 
 
-def highest_m(shape: Any, poses: np.ndarray) -> float:
-    """At least the height of a shape's highest point over its poses (F, 4, 4); of a mesh its box's [m]."""
+def highest_m(shape: Shape, poses: np.ndarray) -> float:
+    """At least the height of a shape's highest point over its poses (F, 4, 4); by a box around it, if it is no ball or
+    capsule [m]."""
     middle, up = poses[:, 2, 3], poses[:, 2, :3]
-    if isinstance(shape, Sphere):
-        return float((middle + shape.radius_m).max())
-    if isinstance(shape, Capsule):
-        return float((middle + np.abs(up[:, 2]) * shape.half_length_m + shape.radius_m).max())
-    if isinstance(shape, Box):
-        return float((middle + np.abs(up) @ np.array(shape.half_extents_m)).max())
-    assert isinstance(shape, Mesh)
-    low, high = shape.bounds_m
+    if isinstance(shape, Sphere | Capsule):
+        along_m = shape.half_length_m if isinstance(shape, Capsule) else 0.0
+        return float((middle + np.abs(up[:, 2]) * along_m + shape.radius_m).max())
+    low, high = shape.bounds_m if isinstance(shape, Mesh) else np.outer((-1.0, 1.0), half_extents_m(shape))
     return float((middle + up @ (low + high) / 2 + np.abs(up) @ (high - low) / 2).max())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -11,12 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.mujoco_model import FileState, import_mujoco, load_model, model_files
-from lidardesign_tasks.robot.arm_links import BALL, TOOL, VISUAL_GROUP, Link, seen_links
+from lidardesign.mujoco_model import FileState, ModelGeom, import_mujoco, load_model, model_files, visible_geoms
+from lidardesign_tasks.robot.targets import without_notes
 
 if TYPE_CHECKING:
     import mujoco
 
+VISUAL_GROUP = 2  # MuJoCo Menagerie's convention: what is seen is in group 2, what collides in group 3
+GROUPS = 6  # of MuJoCo
+BALL, TOOL = "lidardesign_ball", "lidardesign_tool"
 JOINTS = 7
 CHAIN = f"a chain of {JOINTS} hinge joints and no others"
 CHAIN_HINT = "take the joints of a gripper out of the model: the task brings its own tool"
@@ -39,7 +43,7 @@ class Robot:
     """
 
     model: mujoco.MjModel
-    links: tuple[Link, ...]
+    links: tuple[ModelGeom, ...]
     home_rad: np.ndarray
     notes: tuple[str, ...]
 
@@ -68,6 +72,27 @@ def _read_once(path: Path, states: tuple[FileState, ...], tool_m: float) -> Robo
     _check_chain(model, path)
     links, notes = seen_links(model, path)
     return Robot(model, links, _home(model), (*warnings, *notes))
+
+
+def seen_links(model: mujoco.MjModel, path: Path) -> tuple[tuple[ModelGeom, ...], tuple[str, ...]]:
+    """What is seen of an arm without its ball, the tool last, and notes on what was mended or left out.
+
+    That is the visual group, or all geoms where only tool and ball are in it.
+
+    Raises:
+        DataError: The arm has no visible shapes.
+    """
+    visual = int((model.geom_group == VISUAL_GROUP).sum()) > len((BALL, TOOL))
+    pieces, notes = visible_geoms(model, groups=(VISUAL_GROUP,) if visual else range(GROUPS))
+    own = [piece for piece in pieces if piece.body and piece.geom_name not in (BALL, TOOL)]
+    if not own:
+        raise DataError("the arm has no visible shapes", where=str(path), allowed="geoms of group 2 on its links")
+    several = Counter(piece.body for piece in own)
+    links = [piece if several[piece.body] > 1 else replace(piece, name=piece.body_name) for piece in own]
+    links += [replace(piece, name="tool") for piece in pieces if piece.geom_name == TOOL]
+    in_world = sum(1 for piece in pieces if not piece.body)
+    left_out = [f"shapes that stand in the world, not on the arm, are left out: {in_world}"] if in_world else []
+    return tuple(map(without_notes, links)), tuple(f"{path.name}: {note}" for note in (*left_out, *notes))
 
 
 def _flange(spec: Any, path: Path) -> Any:

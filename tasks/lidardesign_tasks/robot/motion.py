@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 SPLIT_SEED = 0  # of which recordings are held out, whatever the seed of a run
 MOVE_S = 1.0  # from one configuration to the next
 FINEST_HZ = 100.0  # of the way through keyframes
-TRIES, NEARER = 40, 0.9  # a configuration that collides is drawn again, each time nearer to the one at rest
+TRIES, NEARER = 40, 0.85  # a configuration that collides is drawn again, each time nearer to the one at rest
+DEPTH_M = 1e-3  # bodies that are less in each other touch
+LIFTS, CHECKS = 4, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +115,10 @@ def windows(
 
 
 class Wanderer:
-    """Random ways of a model that do not collide; contacts that it has at rest are no collisions."""
+    """Random ways of a model that do not collide; contacts that it has at rest are no collisions.
+
+    What stands free is raised out of the ground.
+    """
 
     def __init__(self, model: mujoco.MjModel, where: str) -> None:
         self.mujoco, self.model, self.where = import_mujoco(), model, where
@@ -124,6 +129,8 @@ class Wanderer:
         self.limited = self.straight & (model.jnt_limited != 0)
         self.turning = self.straight & ~self.limited & (model.jnt_type == int(kinds.mjJNT_HINGE))
         self.balls = np.flatnonzero(model.jnt_type == int(kinds.mjJNT_BALL))
+        standing = model.jnt_type == int(kinds.mjJNT_FREE)
+        self.free, self.heights = model.jnt_bodyid[standing], model.jnt_qposadr[standing] + 2
         places = model.jnt_qposadr[self.limited]
         rest[places] = np.clip(rest[places], *model.jnt_range[self.limited].T)
         self.rest = rest
@@ -147,10 +154,11 @@ class Wanderer:
         return found
 
     def _next(self, here: np.ndarray, share: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """A way to a random configuration that is free at all shares of its time."""
+        """A way to a random configuration that is free at all shares of its time, and so is the one from rest to it."""
         for attempt in range(TRIES):
-            way = joined(self.model, here, self._configuration(NEARER**attempt, generator), share)
-            if all(self._contacts(qpos) <= self.allowed for qpos in way):
+            there = self._configuration(NEARER**attempt, generator)
+            way = self._way(here, there, share)
+            if self._free(way) and self._free(self._way(self.rest, there, np.linspace(0.0, 1.0, CHECKS))):
                 return way
         raise DataError(
             f"{TRIES} random configurations collide", where=self.where, hint="motion=FILE.csv, or a model at rest "
@@ -173,14 +181,37 @@ class Wanderer:
         self.mujoco.mj_integratePos(model, qpos, way, 1.0)
         return qpos
 
+    def _way(self, start: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
+        return np.stack([self._lifted(qpos) for qpos in joined(self.model, start, end, share)])
+
+    def _free(self, way: np.ndarray) -> bool:
+        return all(self._contacts(qpos) <= self.allowed for qpos in way)
+
+    def _lifted(self, qpos: np.ndarray) -> np.ndarray:
+        """The configuration with free bodies raised out of what stands in the world."""
+        model = self.model
+        for _ in range(LIFTS if len(self.free) else 0):
+            pairs, depth_m = self._inside(qpos)
+            roots = model.body_rootid[model.geom_bodyid[pairs]]
+            grounded = (model.body_weldid[model.geom_bodyid[pairs]] == 0).any(axis=1)
+            lifts = [depth_m[grounded & (roots == root).any(axis=1)].max(initial=0.0) for root in self.free]
+            if not any(lifts):
+                break
+            qpos[self.heights] += lifts
+        return qpos
+
     def _contacts(self, qpos: np.ndarray) -> set[tuple[int, int]]:
         """Pairs of geoms that are in each other."""
+        return set(map(tuple, self._inside(qpos)[0].tolist()))
+
+    def _inside(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of geoms that are in each other, (C, 2), and how deep, (C,) [m]."""
         self.data.qpos[:] = qpos
         with mujoco_warnings():
             self.mujoco.mj_fwdPosition(self.model, self.data)
-        contact = self.data.contact
-        inside = contact.dist[: self.data.ncon] < 0
-        return set(map(tuple, np.sort(contact.geom[: self.data.ncon][inside], axis=1).tolist()))
+        depth_m = -np.array(self.data.contact.dist[: self.data.ncon])
+        deep = depth_m > DEPTH_M
+        return np.sort(self.data.contact.geom[: self.data.ncon][deep], axis=1), depth_m[deep]
 
 
 def wandering(

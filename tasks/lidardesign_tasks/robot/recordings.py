@@ -94,16 +94,16 @@ def _checked(model: mujoco.MjModel, path: Path) -> Recording:
     table, names = dict(_read(path, state.st_mtime_ns, state.st_size)), columns(model)
     time_s = table.pop(TIME, None)
     if time_s is None:
-        raise DataError(f"has no column {TIME}", where=str(path), allowed=_listed([TIME, *names]))
+        raise DataError(f"has no column {TIME}", where=str(path), allowed=listed([TIME, *names]))
     if set(table) == {ALL} and np.shape(table[ALL]) == (len(time_s), model.nq):
         table = dict(zip(names, np.asarray(table[ALL]).T, strict=True))
     unknown, missing = [name for name in table if name not in names], [name for name in names if name not in table]
     if unknown:
         hint = suggest(unknown[0], missing or names)
-        raise DataError(f"{unknown[0]!r} is no joint", where=str(path), allowed=_listed([TIME, *names]), hint=hint)
+        raise DataError(f"{unknown[0]!r} is no joint", where=str(path), allowed=listed([TIME, *names]), hint=hint)
     if missing:
         raise DataError(
-            f"joints are missing: {_listed(missing)}", where=str(path), allowed=f"a column each of {_listed(names)}"
+            f"joints are missing: {listed(missing)}", where=str(path), allowed=f"a column each of {listed(names)}"
         )
     shapes = {np.shape(column) for column in (time_s, *table.values())}
     if len(shapes) > 1 or len(time_s) < 2 or np.ndim(time_s) != 1:
@@ -171,5 +171,6 @@ def _number(path: Path, name: str, line: int, cell: str) -> float:
         raise DataError(f"{name} is {cell.strip()[:60]!r}", where=f"{path}:{line}", allowed="a number") from None
 
 
-def _listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str]) -> str:
+    """The first of many names."""
     return ", ".join(names[:MOST_SHOWN]) + (", ..." if len(names) > MOST_SHOWN else "")

@@ -21,11 +21,11 @@ from lidardesign.run.validation import suggest
 from lidardesign.scene import Body, Mesh, Plane, Scene, inverse_rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
+from lidardesign_tasks.robot.recordings import listed
 
 if TYPE_CHECKING:
     import mujoco
 
-MOST_SHOWN = 12
 OUTLINE_POINTS = 1000
 # How far a plane would count; no plane is a target.
 NEAR = DesignSpace((0.0,) * 6, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
@@ -103,12 +103,13 @@ class Model:
         return np.array([*(low + high)[:2] / 2, high[2]])
 
 
-def read_model(path: Path, targets: Names, ignored: Names, known: Names, groups: tuple[int, ...] | None,
-               mount: str | None) -> Model:  # fmt: skip
+def read_model(path: Path, folder: Path | None, targets: Names, ignored: Names, known: Names,
+               groups: tuple[int, ...] | None, mount: str | None) -> Model:  # fmt: skip
     """A model, read once per process while its files stay the same.
 
     Arguments:
         path: The MJCF or URDF file.
+        folder: All that it reads must lie here; None: in the file's own folder.
         targets, ignored, known: Patterns of the names of bodies and geoms, as `hand*`.
         groups: Of geoms that are seen; None: as MuJoCo shows them.
         mount: The body that sensors are on; None: the world.
@@ -117,26 +118,21 @@ def read_model(path: Path, targets: Names, ignored: Names, known: Names, groups:
         DataError: The file cannot be used.
         ConfigError: A name or pattern is that of nothing visible; with the nearest.
     """
-    return _read(path, model_files(path), targets, ignored, known, groups, mount)
+    return _read(path, folder, model_files(path, folder), targets, ignored, known, groups, mount)
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path, states: tuple[FileState, ...], targets: Names, ignored: Names, known: Names,
-          groups: tuple[int, ...] | None, mount: str | None) -> Model:  # fmt: skip
+def _read(path: Path, folder: Path | None, states: tuple[FileState, ...], targets: Names, ignored: Names,
+          known: Names, groups: tuple[int, ...] | None, mount: str | None) -> Model:  # fmt: skip
     """`states`, of all files of the model, only tells a changed model from the one in memory."""
-    model, said = load_model(path)
+    model, said = load_model(path, folder=folder)
     pieces, notes = visible_geoms(model, groups=groups)
     gone = _named(pieces, ignored, "ignored")
-    # notes were handed over
-    pieces = tuple(
-        replace(piece, shape=replace(piece.shape, notes=())) if isinstance(piece.shape, Mesh) else piece
-        for piece, left_out in zip(pieces, gone, strict=True)
-        if not left_out
-    )
+    pieces = tuple(without_notes(piece) for piece, left_out in zip(pieces, gone, strict=True) if not left_out)
     wanted = _named(pieces, targets, "targets")
     names = [model.body(body).name for body in range(model.nbody)]
     if mount is not None and mount not in names:
-        raise ConfigError(f"no body is called {mount!r}", where="task.mount_body", allowed=_listed(names[1:]),
+        raise ConfigError(f"no body is called {mount!r}", where="task.mount_body", allowed=listed(names[1:]),
                           hint=suggest(mount, names))  # fmt: skip
     found = [
         _target(pieces, np.flatnonzero(wanted & np.array([piece.body == body for piece in pieces])))
@@ -155,7 +151,7 @@ def _named(pieces: Sequence[ModelGeom], patterns: Names, key: str) -> np.ndarray
         if not fits.any():
             every = list(dict.fromkeys(name for pair in names for name in pair if name))
             raise ConfigError(f"no visible body or geom is called {pattern!r}", where=f"task.{key}",
-                              allowed=_listed(every), hint=suggest(pattern.strip("*"), every))  # fmt: skip
+                              allowed=listed(every), hint=suggest(pattern.strip("*"), every))  # fmt: skip
         found |= fits
     return found
 
@@ -167,6 +163,11 @@ def _target(pieces: Sequence[ModelGeom], chosen: np.ndarray) -> Target:
     points = np.concatenate([outline_m(pieces[piece]) for piece in chosen])
     box_m = np.array(list(itertools.product(*zip(points.min(axis=0), points.max(axis=0), strict=True))))
     return Target(first.body_name, first.body, chosen, box_m, mean_depth_m(points))
+
+
+def without_notes(piece: ModelGeom) -> ModelGeom:
+    """The piece whose mesh has handed over its notes."""
+    return replace(piece, shape=replace(piece.shape, notes=())) if isinstance(piece.shape, Mesh) else piece
 
 
 def outline_m(piece: ModelGeom) -> np.ndarray:
@@ -210,7 +211,3 @@ def refuse_sensors_inside(model: Model, poses: np.ndarray, origins_m: np.ndarray
                 f"all places where sensors may be are inside {piece.name!r} (frame {int(np.argmax(inside))})",
                 where="task.origin_m", hint="move origin_m, or widen origin_box_m",
             )  # fmt: skip
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:MOST_SHOWN]) + (", ..." if len(names) > MOST_SHOWN else "")

@@ -40,12 +40,14 @@ ROOM = 1.1  # around the sphere that holds the targets wherever they move
 ABOVE_MOUNT_M = 0.01
 # Of random motions, so many tell the space in which targets move; of recordings, so many moments.
 SPACE_MOTIONS, SPACE_MOMENTS = 12, 200
+TOUCHING_M = 1e-3  # what moves less, rests
 
 
 class MujocoConfig(Surroundings):
     """The model and its motion, what is to be found of it, where sensors are, and the surroundings."""
 
     model: Path | None = Field(None, description="MJCF or URDF file of the robot and what stands around it")
+    folder: Path | None = Field(None, description="folder that holds all files of the model; its own if empty")
     targets: tuple[str, ...] = Field((), description="what to find: names of bodies or geoms, as [hand*]")
     motion: Literal["random", "keyframes"] | Path = Field(
         "random", description="CSV or NPZ of joint positions over time (time_s and a column per joint; NAME.x, .y, .z, "
@@ -83,7 +85,7 @@ class MujocoTask:
     def space(self, config: MujocoConfig) -> DesignSpace:
         """All directions and ranges in which targets may be, from where sensors may be."""
         model = model_of(config)
-        low, high = _bounds(config, model)
+        low, high = _bounds(_corners_m(config, model))
         ahead = [max(SENSOR_DISTANCE * float((high - low).max()), 2 * _radius_m(low, high)), 0.0, 0.0]
         usual = (low + high) / 2 + ahead
         if config.mount_body is not None:
@@ -121,7 +123,7 @@ class MujocoTask:
         metric, model = METRICS[config.metric], model_of(config)
         if config.metric == "seen":
             return metric
-        low, high = _bounds(config, model)
+        low, high = _bounds(_corners_m(config, model))
         worst = float((high - low).max())
         if config.metric == "surface":
             worst = MILLIMETRES * max(float(np.ptp(target.box_m, axis=0).max()) for target in model.targets)
@@ -136,6 +138,10 @@ class MujocoTask:
         model, recordings = model_of(config), _recordings(config)
         names = ", ".join(target.name for target in model.targets)
         found = [f"targets: {names}; {len(model.pieces)} visible pieces, {int(model.known.sum())} of them known"]
+        moved_m = np.ptp(_corners_m(config, model), axis=1).max(axis=(1, 2))
+        resting = [target.name for target, way_m in zip(model.targets, moved_m, strict=True) if way_m < TOUCHING_M]
+        if resting:
+            found.append(f"{', '.join(resting)}: at the same place in all scenes; free bodies move by recordings alone")
         if len(recordings) > 1:
             found.append(f"{len(recordings)} recordings, half of them held out")
         elif recordings:
@@ -161,7 +167,8 @@ def model_of(config: MujocoConfig) -> Model:
         raise ConfigError("no model is set", where="task.model", hint="--set model=robot.xml")
     if not config.targets:
         raise ConfigError("no targets are set", where="task.targets", hint="--set 'targets=[hand*]'")
-    return read_model(config.model, config.targets, config.ignored, config.known, config.groups, config.mount_body)
+    names = (config.targets, config.ignored, config.known)
+    return read_model(config.model, config.folder, *names, config.groups, config.mount_body)
 
 
 def _recordings(config: MujocoConfig) -> list[Recording]:
@@ -182,16 +189,20 @@ def _trajectories(config: MujocoConfig, model: Model, split: Split, seed: int) -
     return wandering(model.model, split, count, config.frames, config.frame_rate_hz, seed, where)
 
 
-def _bounds(config: MujocoConfig, model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box around all targets wherever they move, (3,) each [m]; of random motions, of a few."""
+def _corners_m(config: MujocoConfig, model: Model) -> np.ndarray:
+    """Where the corners of the targets' boxes are as they move, (targets, F, 8, 3) [m]; of random motions, a few."""
     recordings = _recordings(config)
     if recordings:
         thinned = [one.qpos[:: max(1, len(one.qpos) // SPACE_MOMENTS)] for one in recordings]
     else:
         few = config.model_copy(update={"train": SPACE_MOTIONS})
         thinned = [one.qpos for one in _trajectories(few, model, "train", 0)]
-    corners = model.corners_m(model.poses(np.concatenate(thinned))).reshape(-1, 3)
-    return corners.min(axis=0), corners.max(axis=0)
+    return model.corners_m(model.poses(np.concatenate(thinned)))
+
+
+def _bounds(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box around all targets wherever they move, (3,) each [m]."""
+    return corners_m.min(axis=(0, 1, 2)), corners_m.max(axis=(0, 1, 2))
 
 
 def _radius_m(low: np.ndarray, high: np.ndarray) -> float:
