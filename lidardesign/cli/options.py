@@ -30,8 +30,9 @@ Layout = Annotated[
     str | None,
     typer.Option(
         "--layout",
-        metavar="grid|density|scan|distributed|selected",
-        help="Rays even in the field of view, by density, each its own sensor, starting across the origins, or chosen.",
+        metavar="grid|density|scan|distributed|selected|spinning",
+        help="Rays even in the field of view, by density, each its own sensor, starting across the origins, chosen, or "
+        "rings that are chosen.",
         show_default="the design's, else selected; grid or scan where rays cannot be chosen",
     ),
 ]
@@ -53,6 +54,15 @@ RayCount = Annotated[
         max=1_000_000,
         help="Rays per frame, over all sensors.",
         show_default="left open, or the task's most",
+    ),
+]
+Channels = Annotated[
+    int | None,
+    typer.Option(
+        "--channels",
+        metavar="N",
+        help="Channels of each sensor of the layout spinning: rings that are chosen.",
+        show_default="the design's, else 16",
     ),
 ]
 Level = Annotated[

@@ -467,7 +467,7 @@ def _check_rays(
     if table is not None and track is not None:
         raise keys["track"].error("is given beside ray_table", hint="remove either of the two")
     layout = keys["layout"].value if "layout" in keys else None
-    if table is None and (layout == "fixed" or (layout == "selected" and track is None)):
+    if table is None and (layout in ("fixed", "spinning") or (layout == "selected" and track is None)):
         raise keys["layout"].error(f"is {layout}, but there is no ray_table", hint="the layout grid needs none")
     for name in ("further_tables", "further_tracks"):
         if name in keys and layout != "selected":

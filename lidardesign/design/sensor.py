@@ -27,9 +27,9 @@ DEFAULT_LEVEL = 0.95
 LEVELS = (0.01, 0.999999)
 # Returns of so many fill some 100 MB per scene; no scanner fires more in a frame.
 MOST_RAYS = 1_000_000
-LayoutName = Literal["grid", "density", "scan", "distributed", "selected", "fixed"]
+LayoutName = Literal["grid", "density", "scan", "distributed", "selected", "spinning", "fixed"]
 # Those in which sensors are fitted: the rays of real parts are what they are.
-FITTED_LAYOUTS: tuple[LayoutName, ...] = ("grid", "density", "scan", "distributed", "selected")
+FITTED_LAYOUTS: tuple[LayoutName, ...] = ("grid", "density", "scan", "distributed", "selected", "spinning")
 # Under this key of its provenance a design with chosen rays says how far from the best each choice may be.
 CERTIFICATES = "certificates"
 # Whether every ray has its sensor's gate or its own.
@@ -234,8 +234,8 @@ class DesignSpec:
     Arguments:
         name: The file's stem, the row's name in tables.
         sensors: At least one.
-        layout: `grid`, `density`, `scan`, `distributed`, `selected`: rays chosen on training scenes, or `fixed`: the
-            rays of its table, as real parts fire them.
+        layout: `grid`, `density`, `scan`, `distributed`, `selected`: rays chosen on training scenes, `spinning`: rings
+            chosen so, or `fixed`: the rays of its table, as real parts fire them.
         rays: Rays per frame that it was made for; None leaves the budget to `evaluate`.
         ray_table: The explicit rays of every layout but `grid`.
         further_tables, further_tracks: Of the layout `selected`, the rays that were chosen at other numbers of rays.

@@ -28,7 +28,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
+from lidardesign.export.common.even_grid import EvenGrid, by_channel, grid_of, grid_sensor_losses
 from lidardesign.export.common.poses import (
     Mount,
     Part,
@@ -60,6 +60,7 @@ def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Ban
     Raises:
         ConfigError: A frame rate at which CARLA's whole number of points per second is not the rays of a frame.
     """
+    design, rays = by_channel(design, rays)
     mounted = mounts(design, rays)
     for mount in mounted:
         grid = grid_of(mount)
@@ -92,6 +93,7 @@ def carla_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Esti
     Raises:
         DataError: The file holds no such sensors.
     """
+    design, rays = by_channel(design, rays)
     mounted = mounts(design, rays)
     try:
         document = json.loads(path.read_text(encoding="utf-8"))

@@ -31,7 +31,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
+from lidardesign.export.common.even_grid import EvenGrid, by_channel, grid_of, grid_sensor_losses
 from lidardesign.export.common.names import (
     distinct,
     element,
@@ -156,6 +156,7 @@ NEAREST_M = 0.001
 
 def write_sdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold."""
+    design, rays = by_channel(design, rays)
     mounted = mounts(design, rays)
     link = element("link", {"name": LINK}, [sensor_element(one, rate_hz, posed=True) for one in mounted])
     model = element("model", {"name": identifier(design.name)}, [element("static", text="true"), link])
@@ -165,6 +166,7 @@ def write_sdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandw
 
 def sdf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """How far the rays that Gazebo fires are from the design's."""
+    design, rays = by_channel(design, rays)
     mounted = mounts(design, rays)
     found = read_xml(path, "sdf").findall(f"model/link[@name='{LINK}']/sensor")
     return mounts_rounding(rays, mounted, [read_sensor(one, path) for one in found], path)
@@ -251,6 +253,7 @@ BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
 
 def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the description, atomically; returns notes of what the format cannot hold."""
+    design, rays = by_channel(design, rays)
     mounted = mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
     write_xml(path, element("robot", {"name": identifier(design.name)}, [*_base(), *parts]))
@@ -260,6 +263,7 @@ def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Band
 
 def urdf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """How far the rays of the described sensors are from the design's."""
+    design, rays = by_channel(design, rays)
     mounted = mounts(design, rays)
     return mounts_rounding(rays, mounted, read_sensors(read_xml(path, "robot"), path), path)
 
@@ -327,6 +331,7 @@ MACRO = "xacro:macro"
 
 def write_xacro(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the macro, atomically; returns how to use it and notes of what the format cannot hold."""
+    design, rays = by_channel(design, rays)
     name, mounted = identifier(design.name), mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent="${parent}", prefix="${prefix}")]
     macro = element(MACRO, {"name": name, "params": "parent prefix:=''"}, parts)
@@ -341,6 +346,7 @@ def xacro_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Esti
     Raises:
         DataError: The file holds no such macro.
     """
+    design, rays = by_channel(design, rays)
     mounted = mounts(design, rays)
     macro = next((part for part in read_xml(path, "robot") if part.tag == MACRO), None)
     if macro is None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.geometry.rays import Returns
+from lidardesign.numerics import SLACK
 from lidardesign.selection import kernels
 from lidardesign.selection.information import require_valid
 from lidardesign.task import Information
@@ -53,7 +54,7 @@ class Coverage:
     def __post_init__(self) -> None:
         """Raises `PluginError` where the table of sums is not concave, nondecreasing and 0 at 0."""
         rises = np.diff(self.table)
-        if len(self.table) and (self.table[0] != 0 or (rises < 0).any() or (np.diff(rises) > 0).any()):
+        if len(self.table) and (self.table[0] != 0 or (rises < 0).any() or (np.diff(rises) > SLACK * rises[0]).any()):
             raise PluginError(
                 f"the table of sums is {np.array2string(self.table)}",
                 where="informs",

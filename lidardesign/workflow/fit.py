@@ -38,6 +38,7 @@ from lidardesign.workflow.run_samples import Weighting
 
 BEST = "best"  # as many sensors as score best on training scenes
 COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
+CHANNELS = 16  # of a sensor that spins
 CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones would only leave candidates out
 # Of designs: names that a file may have everywhere.
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
@@ -53,8 +54,9 @@ class FitOptions:
         sensors: How many sensors, "best": as many as score best on training scenes, or "auto": as many as held-out
             likelihood says. A scan has one per ray.
         constraints: Constraints, a mapping of them, or a YAML file of them.
-        layout: grid, density, scan, distributed or selected.
+        layout: grid, density, scan, distributed, selected or spinning.
         rays: Rays per frame over all sensors.
+        channels: Rings of each sensor that spins.
         gates: "sensor" or "ray": one gate per sensor, or one per ray.
         level: The share of rays and returns that fields of view and gates hold.
         at: Values of conditions that the design is for, as {"x_m": 0.37}.
@@ -72,6 +74,7 @@ class FitOptions:
     constraints: Constraints | Mapping[str, Any] | Path | str | None = None
     layout: str | None = None
     rays: int | None = None
+    channels: int | None = None
     gates: str | None = None
     level: float | None = None
     at: Mapping[str, float] = field(default_factory=dict)
@@ -103,6 +106,7 @@ class FitRequest:
         at: Condition values that the design is for; without any, one for all of them.
         choices: sensors, layout, rays, gates and level, as `lidardesign.design.fit.fit` takes them.
         weighting: Settings of the task to whose scenes the density is weighted.
+        channels: Rings of each sensor that spins.
         names: What sensors are called, where there are as many; none numbers them.
         command: For the design's provenance.
         files: Files that were read for it.
@@ -115,6 +119,7 @@ class FitRequest:
     at: Mapping[str, float] = field(default_factory=dict)
     choices: Mapping[str, Any] = field(default_factory=dict)
     weighting: Weighting = field(default_factory=Weighting)
+    channels: int | None = None
     names: Sequence[str] = ()
     command: str = "fit"
     files: Sequence[Path] = ()
@@ -171,6 +176,11 @@ class FitRequest:
                 where="--sensors",
                 hint="give --rays N alone, or another --layout",
             )
+        channels = options.channels
+        if layout == "spinning":
+            channels = channels or (base.provenance.get("channels") if base else None) or CHANNELS
+        elif channels is not None:
+            raise ConfigError(f"{channels} channels in the layout {layout}", where="--channels", allowed="spinning")
         usual_level = CHOSEN_LEVEL if LAYOUTS[layout].chosen_on_scenes else defaults.level
         level = options.level if options.level is not None else base.level if base else usual_level
         if not LEVELS[0] <= level <= LEVELS[1]:
@@ -190,6 +200,7 @@ class FitRequest:
                 "level": level,
             },
             _weighting(settings_texts(options.weights), base),
+            channels,
             names,
             "fit" if asked is None else "constrain",
             tuple(files) if options.like is None else (*files, Path(options.like)),
@@ -211,6 +222,7 @@ class FitRequest:
             check_feasible(self.constraints, run.config.space, sensors=count, rays=choices["rays"])
         settings = {
             **choices,
+            **({} if self.channels is None else {"channels": self.channels}),
             "name": self.name,
             "seed": self.seed,
             "at": dict(self.at),
@@ -239,7 +251,8 @@ class FitRequest:
         place = "".join(f", {key} = {value:g}" for key, value in self.at.items())
         if self.constraints is not None and self.constraints.parts is not None:
             return [f"choose {sensors} among parts, with their poses, on training scenes, seed {self.seed}"]
-        how = f"layout {choices['layout']}, {rays}, level {choices['level']:g}{place}, seed {self.seed}"
+        layout = choices["layout"] + ("" if self.channels is None else f" with {self.channels} channels")
+        how = f"layout {layout}, {rays}, level {choices['level']:g}{place}, seed {self.seed}"
         steps = [f"fit {sensors}, {how}"]
         if self.weighting.settings:
             steps.append(f"weigh the density with {', '.join(self.weighting.settings)}")
@@ -320,10 +333,12 @@ def _sensors(
     bounds = constraints.sensors
     if asked is None and constraints.parts is not None:
         return constraints.parts.count
+    if layout.name == "spinning" and isinstance(asked, str):
+        raise ConfigError(f"{asked!r} sensors that spin", where="--sensors", allowed="a whole number")
     if asked is not None or bounds.count is not None or is_mounted(constraints.rules):  # mounts say how many
         return asked if asked is not None else bounds.count
     if base is None:
-        return None if layout.one_sensor_per_ray else BEST
+        return None if layout.one_sensor_per_ray else 1 if layout.name == "spinning" else BEST
     usual = max(len(base.sensors), len(constraints.each), bounds.min or 1)
     return min(usual, bounds.max or usual)
 

@@ -28,7 +28,7 @@ from lidardesign.design.layouts.rays import LAYOUTS
 from lidardesign.design.layouts.track import travelled
 from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import DataError, InfeasibleError
+from lidardesign.errors import ConfigError, DataError, InfeasibleError
 from lidardesign.evaluate.baselines.candidates import mean_mbps
 from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.run.clock import phase
@@ -262,8 +262,23 @@ def _fitted(fitter: Fitter, few: Callable[[str], Iterator[Scene]] | None = None)
         )
     if not LAYOUTS[request.choices["layout"]].chosen_on_scenes:
         return fitter.fit()
-    from lidardesign.workflow.select_rays import near, select_rays
+    from lidardesign.workflow.select_rays import near, select_rays, selection_scenes
 
+    run, layout = request.run, request.choices["layout"]
+    if not information.informs_rays(run.task):
+        raise ConfigError(
+            f"the task {run.task.name} does not say what returns tell",
+            where=f"--layout {layout}",
+            allowed="tasks with informs",
+            hint="another --layout, or give the task a method informs(scene, returns)",
+        )
+    if layout == "spinning":
+        from lidardesign.selection.spinning import choose_rings
+
+        informs = partial(information.checked_information, run.task)
+        scenes = partial(selection_scenes, run, request.seed)
+        fitted = fitter.fit(layout="grid", rays=None, gates=None)
+        return choose_rings(fitted, samples, request.channels, request.choices["rays"], informs, scenes)
     counts = sorted({request.choices["rays"]} if request.choices["rays"] else set(request.run.task.defaults.rays))
     if samples.space.conditioned:
         travelled(samples.space, "selected")
@@ -273,7 +288,7 @@ def _fitted(fitter: Fitter, few: Callable[[str], Iterator[Scene]] | None = None)
     # the gates of chosen rays keep a bandwidth; a sensor that moves along a condition looks everywhere the same way
     fitted = fitter.fit(near(samples, first, 1.0), layout="density", rays=counts[-1], gates="ray")
     fitted = replace(fitted, design=replace(fitted.design, gates=gates))
-    return select_rays(request.run, fitted, counts, samples, request.seed, few)
+    return select_rays(run, fitted, counts, samples, request.seed, few)
 
 
 def check_written(design: DesignSpec, request: FitRequest) -> list[ConstraintCheck]:

@@ -114,13 +114,13 @@ class Run(RunFolder):
                 likelihood says; by default the best.
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
-            layout: grid, density, scan, distributed or selected; by default selected, where the task says what
-                returns tell.
+            layout: grid, density, scan, distributed, selected or spinning; by default selected, where the task
+                says what returns tell.
             at: Values of conditions that the design is for, as {"x_m": 0.37}.
             name: The design's name.
             seed: Root of every random stream; the run's by default.
             notes: Called with every note; they are logged by default.
-            further: gates, level, weights and like, as of `FitOptions`.
+            further: channels, gates, level, weights and like, as of `FitOptions`.
 
         Raises:
             ConfigError: Choices that do not fit together.

@@ -31,7 +31,7 @@ from lidardesign.scene import Scene
 from lidardesign.selection import information
 from lidardesign.selection.candidates import CANDIDATES_PER_RAY, gate_choices, sensor_gates
 from lidardesign.selection.coverage import InformedScene
-from lidardesign.selection.information import checked_information, informs_rays
+from lidardesign.selection.information import checked_information
 from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import conditions_of, random_generator
 from lidardesign.workflow.run_folder import RunFolder
@@ -61,19 +61,12 @@ def select_rays(
         few: The only scenes to choose on, by purpose, for a trial; None takes as many as it takes.
 
     Raises:
-        ConfigError: The task does not say what returns tell, or more rays than can be chosen.
+        ConfigError: More rays than can be chosen.
         DataError: No ray inside the sensors tells anything about the training scenes.
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
     from lidardesign.selection.select import SelectionProblem, select
 
-    if not informs_rays(run.task):
-        raise ConfigError(
-            f"the task {run.task.name} does not say what returns tell",
-            where="--layout selected",
-            allowed="tasks with informs",
-            hint="another --layout, or give the task a method informs(scene, returns)",
-        )
     if counts[-1] > MOST_CHOSEN:
         raise ConfigError(f"{counts[-1]} rays in the layout selected", where="--rays", allowed=f"at most {MOST_CHOSEN}")
     spec = result.design

@@ -427,7 +427,7 @@ def test_a_fixed_layout_needs_its_rays_and_is_fitted_anew_as_a_grid():
     with pytest.raises(ConfigError, match="is fixed, but there is no ray_table"):
         design_from_document(document)
     others = {name: layout.fitted_as for name, layout in LAYOUTS.items() if name != layout.fitted_as}
-    assert others == {"fixed": "grid", "selected": "density"}
+    assert others == {"fixed": "grid", "selected": "density", "spinning": "grid"}
 
 
 def test_a_part_in_a_run_is_constrained_as_a_grid_of_its_sensors_and_cannot_be_fitted(call, tmp_path):

@@ -497,7 +497,7 @@ def test_no_table_and_one_ray_of_each_sensor_tell_nothing_of_gates_but_the_desig
     assert {name: gates_of(replace(single, layout=name)) for name in usual} == usual
     assert {name: gates_of(replace(design, layout=name)) for name in usual} == usual
     assert gates_of(replace(single, gates="ray")) == gates_of(replace(design, gates="ray")) == "ray"
-    assert set(LAYOUTS) == {"grid", "density", "scan", "distributed", "selected", "fixed"}
+    assert set(LAYOUTS) == {"grid", "density", "scan", "distributed", "selected", "spinning", "fixed"}
 
 
 def test_distributed_rays_have_gates_of_their_own_or_of_their_sensor():

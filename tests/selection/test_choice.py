@@ -162,6 +162,10 @@ def test_of_what_a_ray_tells_in_several_frames_the_largest_counts_that_a_gate_le
         assert coverage.gains(np.zeros(items))[one, gate] == pytest.approx(most.mean(), rel=1e-6)
 
 
+def test_tables_of_sums_are_concave_but_for_rounding():
+    assert small(0, table=np.arange(6) / 5).complete > 0
+
+
 @pytest.mark.parametrize(
     ("table", "says"), [([1.0, 2.0], "0 at 0"), ([0.0, 1.0, 0.5], "never falling"), ([0.0, 1.0, 3.0], "faster")]
 )

@@ -40,8 +40,8 @@ class SelectedLayout(Layout):
     def check_constraints(self, constraints: Constraints) -> None:
         """See `Layout`."""
         raise ConfigError(
-            "rays are chosen on scenes, and samples alone show none", where="--layout selected",
-            hint="lidardesign fit RUN --layout selected; in Python, Run.fit",
+            "rays are chosen on scenes, and samples alone show none", where=f"--layout {self.name}",
+            hint=f"lidardesign fit RUN --layout {self.name}; in Python, Run.fit",
         )  # fmt: skip
 
     def needs_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
@@ -115,9 +115,26 @@ class FixedLayout(Layout):
         return replace(table.subset(np.sort(np.concatenate(chosen))), time_s=fire_times(count, DEFAULT_RATE_HZ))
 
 
+class SpinningLayout(FixedLayout):
+    """The rays of sensors that turn, whose channels were chosen on training scenes; see `selection.spinning`."""
+
+    name = "spinning"
+    chosen_on_scenes = True
+    check_constraints = SelectedLayout.check_constraints
+    leaves_rays_open = SelectedLayout.leaves_rays_open
+
+
 LAYOUTS: Mapping[str, Layout] = {
     layout.name: layout
-    for layout in (GridLayout(), DensityLayout(), ScanLayout(), DistributedLayout(), SelectedLayout(), FixedLayout())
+    for layout in (
+        GridLayout(),
+        DensityLayout(),
+        ScanLayout(),
+        DistributedLayout(),
+        SelectedLayout(),
+        SpinningLayout(),
+        FixedLayout(),
+    )
 }
 
 

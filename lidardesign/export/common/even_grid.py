@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -130,6 +130,17 @@ def grid_of(mount: Mount) -> EvenGrid:
     return nearest_grid(mount.azimuth_rad, mount.elevation_rad)
 
 
+def by_channel(design: DesignSpec, rays: Rays) -> tuple[DesignSpec, Rays]:
+    """A design of sensors that spin with a sensor for each of their channels, whose rings are even grids; others."""
+    if design.layout != "spinning":
+        return design, rays
+    rings = np.column_stack([rays.sensor, rays.elevation_rad])
+    found, channel = np.unique(rings, axis=0, return_inverse=True)
+    owners = [design.sensors[int(owner)] for owner in found[:, 0]]
+    sensors = tuple(replace(one, name=f"{one.name} channel {number}") for number, one in enumerate(owners))
+    return replace(design, sensors=sensors), replace(rays, sensor=channel.reshape(-1))
+
+
 def grid_sensor_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
     """Notes of what sensors with one place, one gate and an even grid of rays cannot hold."""
     notes = [
@@ -138,6 +149,8 @@ def grid_sensor_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays)
         *origin_losses(mounted),
         *gate_losses(mounted),
     ]
+    if design.layout == "spinning":
+        notes.append("every channel is a sensor of its own: an even ring")
     return [*notes, "firing times are not held"]
 
 

@@ -1,0 +1,256 @@
+"""Spinning sensors of which scenes choose where they stand, and the elevation of each channel: the layout `spinning`.
+
+A candidate is a ring: the rays of one turn from one place at one elevation. Sensors stand upright. What a ring tells is
+what its rays tell together (`Coverage.grouped`), so rings are chosen as rays are, and with the same certificate. Every
+set of places is tried, and at each of its places as many rings are chosen as a sensor has channels.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.origins import PINNED_BOX_M, inside_excluded, mounts_of, origin_box
+from lidardesign.design.fit import FitResult
+from lidardesign.design.sensor import CERTIFICATES, MOST_RAYS, Sensor, interval_factor
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.geometry.rays import Rays, Returns
+from lidardesign.numerics import FULL_TURN
+from lidardesign.run.clock import phase
+from lidardesign.samples import Samples
+from lidardesign.scene import Scene
+from lidardesign.selection import information
+from lidardesign.selection.candidates import CANDIDATES_PER_RAY, inform
+from lidardesign.selection.certificate import certify
+from lidardesign.selection.choice import Choice, RayCounts, choose
+from lidardesign.selection.coverage import Coverage, gather
+from lidardesign.selection.select import PROXY
+from lidardesign.task import Information
+
+POINTS_PER_TURN = 1800  # of a channel: every fifth of a degree, as scanners do at ten turns per second
+EVEN_SHARE = 0.5  # of the candidate elevations that are even; the others lie where the density looks
+CORNERS = np.array([(0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 0)])  # of a box, no two on one edge
+MOST_SETS, MOST_BOUNDED = 500, 20  # of places: that are tried, and that are bounded one by one
+
+
+@dataclass(frozen=True, eq=False)
+class RingCandidates:
+    """Candidate rings: every place with every elevation.
+
+    Arguments:
+        places_m: Where sensors may stand, (P, 3) [m].
+        elevation_rad: Ascending, (E,).
+        points: Rays of a ring.
+        range_m: From where to where they listen [m].
+    """
+
+    places_m: np.ndarray
+    elevation_rad: np.ndarray
+    points: int
+    range_m: tuple[float, float]
+
+    def __len__(self) -> int:
+        return len(self.places_m) * len(self.elevation_rad)
+
+    @cached_property
+    def place(self) -> np.ndarray:
+        """The place of each ring, (P E,)."""
+        return np.repeat(np.arange(len(self.places_m)), len(self.elevation_rad))
+
+    def rays(self, rings: np.ndarray, sensor: np.ndarray) -> Rays:
+        """The rays of some rings, each ring of a sensor; a sensor's fire column by column, as a head turns."""
+        turn = np.tile(FULL_TURN * ((np.arange(self.points) + 0.5) / self.points - 0.5), len(rings))
+        column, ring = np.tile(np.arange(self.points), len(rings)), np.repeat(rings, self.points)
+        order = np.lexsort((ring, column, np.repeat(sensor, self.points)))
+        ring = ring[order]
+        return Rays.from_angles(
+            self.places_m[self.place[ring]],
+            turn[order],
+            self.elevation_rad[ring % len(self.elevation_rad)],
+            np.tile(self.range_m, (len(ring), 1)),
+            np.repeat(sensor, self.points)[order],
+        )
+
+    def coverage(
+        self, rings: np.ndarray, scenes: Iterator[Scene], informs: Callable[[Scene, Sequence[Returns]], Information]
+    ) -> tuple[Coverage, str]:
+        """What some rings tell about the next few scenes, and the unit of that."""
+        rays = self.rays(rings, np.arange(len(rings)))
+        few = itertools.islice(scenes, information.FEW_SCENES)
+        informed = [inform(scene, rays, [slice(0, len(rays))], informs) for scene in few]
+        table = gather(informed, rays.gate_m[:, None], np.zeros((len(rays), 1)))
+        grouped = table.grouped(np.arange(len(rays)).reshape(len(rings), self.points))
+        if len(table.table):
+            # what exceeds the table counts nothing, and would only loosen bounds
+            grouped = replace(grouped, worth=np.minimum(grouped.worth, np.float32(len(table.table) - 1)))
+        return grouped, informed[0].unit
+
+
+def choose_rings(
+    fitted: FitResult,
+    samples: Samples,
+    channels: int,
+    rays: int | None,
+    informs: Callable[[Scene, Sequence[Returns]], Information],
+    scenes: Callable[[str], Iterator[Scene]],
+) -> FitResult:
+    """As many spinning sensors as were fitted, in their stead.
+
+    Arguments:
+        fitted: Sensors fitted to the density; their places are candidates, beside corners of where sensors may be, or
+            mounts are.
+        samples: Of the density, near whose elevations half of the candidates lie.
+        channels: RingCandidates of each sensor.
+        rays: Of all sensors per turn; None fires `POINTS_PER_TURN` for each channel.
+        informs: What a task says of a scene's returns.
+        scenes: Training scenes without end for a purpose, `choice` or `held back`.
+
+    Raises:
+        ConfigError: Rays that rings cannot share, more channels than elevations, or more sets of places than can be
+            tried.
+        DataError: No ring tells anything about the scenes.
+    """
+    spec, count = fitted.design, len(fitted.design.sensors)
+    rings = count * channels
+    rays = POINTS_PER_TURN * rings if rays is None else rays
+    points = rays // rings
+    if points * rings != rays or not 0 < rays <= MOST_RAYS:
+        raise ConfigError(
+            f"{rays} rays of {count} sensors with {channels} channels",
+            where="--rays",
+            allowed=f"a multiple of {rings}, at most {MOST_RAYS}: as many for each channel",
+        )
+    constraints = Constraints.from_mapping(spec.constraints, where=f"constraints of {spec.name}")
+    space = samples.space
+    candidates = RingCandidates(
+        places_of(constraints, fitted, samples),
+        elevations_of(samples, CANDIDATES_PER_RAY * channels),
+        points,
+        (space.low[5], space.high[5]),
+    )
+    if channels > len(candidates.elevation_rad):
+        raise ConfigError(
+            f"{channels} channels", where="--channels",
+            allowed=f"at most {len(candidates.elevation_rad)}, as many as elevations of the design space",
+        )  # fmt: skip
+    with phase("what returns tell"):
+        every = np.arange(len(candidates))
+        coverage, unit = candidates.coverage(every, scenes("choice"), informs)
+    if not len(coverage.item):
+        raise DataError(
+            f"none of {len(candidates)} rings tells anything about {information.FEW_SCENES} training scenes"
+        )
+    with phase("choice"):
+        choice, loss, bound = chosen_rings(coverage, candidates.place, count, channels)
+    chosen = choice.rays
+    with phase("what returns tell"):
+        judged, _ = candidates.coverage(chosen, scenes("held back"), informs)
+    places, sensor = np.unique(candidates.place[chosen], return_inverse=True)
+    elevations = candidates.elevation_rad[chosen % len(candidates.elevation_rad)]
+    sensors = tuple(
+        _spinning(f"s{number}", candidates, candidates.places_m[place], elevations[sensor == number], spec.level)
+        for number, place in enumerate(places)
+    )
+    table = candidates.rays(chosen, sensor)
+    certificate = {
+        "rays": len(table),
+        "value": loss,
+        "bound": bound,
+        "gap": (loss - bound) / loss if loss > 0 else 0.0,
+        "held_back_value": judged.loss_of(np.zeros(len(chosen), dtype=np.intp)),
+        "candidates": len(candidates),
+        "gates": 1,
+        "scenes": information.FEW_SCENES,
+        "proxy": PROXY,
+        "unit": unit,
+    }
+    provenance = {**spec.provenance, "channels": channels, CERTIFICATES: [certificate]}
+    sensors = tuple(replace(one, weight=1 / count, rays=points * channels) for one in sensors)
+    design = replace(
+        spec, layout="spinning", sensors=sensors, rays=len(table), ray_table=table, gates=None, provenance=provenance
+    )
+    return replace(fitted, design=design)
+
+
+def places_of(constraints: Constraints, fitted: FitResult, samples: Samples) -> np.ndarray:
+    """Where spinning sensors may stand, (P, 3) [m]: all mounts, or where the fit has them and corners of their box."""
+    rules = constraints.rules[-1]
+    if mounts := mounts_of(rules):
+        return np.array(mounts)
+    low, high = origin_box(rules, samples.space)
+    if (high - low).max() <= PINNED_BOX_M:
+        return low[None]
+    corners = low + (high - low) * CORNERS
+    origins = np.array([sensor.origin_m for sensor in fitted.design.sensors])
+    return np.unique(np.concatenate([origins, corners[~inside_excluded(corners, rules)]]), axis=0)
+
+
+def elevations_of(samples: Samples, count: int) -> np.ndarray:
+    """Candidate elevations, ascending (E,) [rad]: some even over the design space, others where the density looks."""
+    even = round(EVEN_SHARE * count)
+    elevation = samples.points[:, 4]
+    order = np.argsort(elevation, kind="stable")
+    reached = np.cumsum(samples.weights[order])
+    share = reached[-1] * (np.arange(count - even) + 0.5) / (count - even)
+    seen = elevation[order][np.searchsorted(reached, share)]
+    return np.unique(np.append(np.linspace(samples.space.low[4], samples.space.high[4], even), seen))
+
+
+def chosen_rings(coverage: Coverage, place: np.ndarray, count: int, channels: int) -> tuple[Choice, float, float]:
+    """The best rings found at as many places as there are sensors, what they lose, and what any others lose at least.
+
+    Arguments:
+        coverage: What the rings tell.
+        place: The place of each, (N,).
+        count: How many sensors.
+        channels: RingCandidates of each.
+
+    Raises:
+        ConfigError: Fewer places than sensors, or too many sets of places.
+    """
+    places = int(place.max()) + 1
+    sets = [
+        RayCounts(place, np.where(np.isin(np.arange(places), chosen), channels, 0))
+        for chosen in itertools.islice(itertools.combinations(range(places), count), MOST_SETS + 1)
+    ]
+    if not 1 <= len(sets) <= MOST_SETS:
+        raise ConfigError(
+            f"{count} spinning sensors at {places} places", where="--sensors",
+            allowed=f"at most {places} sensors, and {MOST_SETS} sets of places", hint="fewer mounts, or fewer sensors",
+        )  # fmt: skip
+
+    def gained(counts: RayCounts) -> float:
+        found = choose(coverage, counts, passes=0)
+        return found.worth - found.harm
+
+    best = choose(coverage, max(sets, key=gained) if len(sets) > 1 else sets[0])
+    # all rings of all places together lose no more than those of the best places
+    bounded = sets if len(sets) <= MOST_BOUNDED else [RayCounts.of_one(len(place), count * channels)]
+    gain = max(certify(coverage, counts, best).bound for counts in bounded)
+    loss = coverage.complete - (best.worth - best.harm)
+    return best, loss, float(np.clip(coverage.complete - gain, 0.0, loss))
+
+
+def _spinning(name: str, rings: RingCandidates, place_m: np.ndarray, elevation_rad: np.ndarray, level: float) -> Sensor:
+    """A sensor that stands upright and looks along +x; its field is a full turn, as a part's (see `part_sensor`)."""
+    half, (near, far) = interval_factor(level), rings.range_m
+    return Sensor(
+        name=name,
+        weight=1.0,
+        origin_m=place_m,
+        origin_covariance_m2=np.zeros((3, 3)),
+        azimuth_rad=0.0,
+        elevation_rad=0.0,
+        roll_rad=0.0,
+        spread_horizontal_rad=FULL_TURN / (2 * half),
+        # as far up as down: so its own upright axis is that of its rings
+        spread_vertical_rad=float(np.abs(elevation_rad).max()) / half,
+        range_m=(near + far) / 2,
+        spread_range_m=(far - near) / (2 * half),
+        level=level,
+    )

@@ -1,0 +1,151 @@
+"""Spinning sensors: rings as candidates, which of them are chosen, where, and `fit --layout spinning`."""
+
+from __future__ import annotations
+
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.command_line import caller, make_run
+from support.coverages import SUMS, small
+
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.files import design_document, load_design, save_design
+from lidardesign.design.layouts.rays import certificates_of, lay_out
+from lidardesign.errors import ConfigError
+from lidardesign.numerics import FULL_TURN
+from lidardesign.samples import load_samples
+from lidardesign.selection import spinning
+from lidardesign.selection.coverage import LARGEST
+from lidardesign.selection.spinning import RingCandidates, chosen_rings, elevations_of, places_of
+from lidardesign.workflow.runs import open_run
+
+RINGS = RingCandidates(np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 2.0]]), np.radians([-20.0, -5.0, 3.0]), 8, (1.0, 60.0))
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("run") / "face", task="face")
+
+
+class TestRings:
+    def test_turn_evenly_at_their_elevation_about_their_place(self):
+        rays = RINGS.rays(np.array([1, 5]), np.array([0, 1]))
+        for sensor, (place, elevation) in enumerate((((0, 0, 2), -5.0), ((1, 0, 2), 3.0))):
+            own = rays.subset(rays.sensor == sensor)
+            np.testing.assert_array_equal(own.origin_m, np.tile(place, (8, 1)))
+            np.testing.assert_allclose(own.elevation_rad, np.radians(elevation))
+            np.testing.assert_allclose(np.diff(own.azimuth_rad), FULL_TURN / 8)
+            assert own.azimuth_rad.sum() == pytest.approx(0)
+
+    def test_of_one_sensor_fire_column_by_column(self):
+        rays = RINGS.rays(np.array([0, 2]), np.array([0, 0]))
+        np.testing.assert_allclose(rays.elevation_rad[:4], np.radians([-20, 3, -20, 3]))
+        assert (np.diff(rays.azimuth_rad)[::2] == 0).all()
+
+    @pytest.mark.parametrize("table", [LARGEST, SUMS], ids=["largest", "sums"])
+    @given(seed=st.integers(0, 10_000), count=st.integers(1, 3))
+    def test_are_as_good_as_the_best_of_all_sets_nearly_and_never_better_than_the_bound(self, table, seed, count):
+        coverage, place, channels = small(seed, rays=12, gates=1, table=table), np.repeat(np.arange(4), 3), 2
+        choice, loss, bound = chosen_rings(coverage, place, count, channels)
+        assert sorted(np.bincount(place[choice.rays], minlength=4).tolist())[-count:] == [channels] * count
+        least = min(
+            coverage.loss_of(np.where(np.isin(np.arange(12), np.concatenate(rings)), 0, -1))
+            for places in itertools.combinations(range(4), count)
+            for rings in itertools.product(*(list(itertools.combinations(range(3 * p, 3 * p + 3), 2)) for p in places))
+        )
+        assert bound - 1e-9 <= least <= loss + 1e-9
+        assert loss == pytest.approx(coverage.loss_of(choice.gate))
+        assert loss <= least + 0.05 * coverage.complete
+
+    def test_need_as_many_places_as_sensors_and_not_too_many_sets_of_them(self, monkeypatch):
+        coverage, place = small(0, rays=12, gates=1), np.repeat(np.arange(4), 3)
+        with pytest.raises(ConfigError, match="5 spinning sensors at 4 places"):
+            chosen_rings(coverage, place, 5, 2)
+        monkeypatch.setattr(spinning, "MOST_SETS", 5)
+        with pytest.raises(ConfigError, match="2 spinning sensors at 4 places"):
+            chosen_rings(coverage, place, 2, 2)
+
+
+class TestCandidates:
+    def test_lie_at_all_mounts_or_at_the_fit_and_corners_of_the_free_box(self, run):
+        samples = SimpleNamespace(space=SimpleNamespace(low=(0, 0, 1), high=(2, 1, 2), free=(0, 1, 2)))
+        fitted = SimpleNamespace(design=SimpleNamespace(sensors=[SimpleNamespace(origin_m=np.array([1, 0.5, 1.5]))]))
+
+        def places(**origin):
+            return places_of(Constraints.from_mapping({"origin": origin}), fitted, samples).tolist()
+
+        assert places(mounts_m=[[0, 0, 1], [1, 1, 2]]) == [[0, 0, 1], [1, 1, 2]]
+        assert places(fixed_m=[1, 0, 2]) == [[1, 0, 2]]
+        assert places() == [[0, 0, 1], [0, 1, 2], [1, 0.5, 1.5], [2, 0, 2], [2, 1, 1]]
+        assert [0, 0, 1] not in places(exclude=[{"low_m": [-1, -1, 0], "high_m": [1, 0.4, 1.5]}])
+
+    def test_are_even_in_elevation_and_where_the_density_looks(self, run):
+        samples = load_samples(run)
+        elevation = elevations_of(samples, 40)
+        low, high = samples.space.low[4], samples.space.high[4]
+        assert (np.diff(elevation) > 0).all()
+        assert np.isin(np.linspace(low, high, 20), elevation).all()
+        seen = np.setdiff1d(elevation, np.linspace(low, high, 20))
+        weights = samples.weights
+        below = [weights[samples.points[:, 4] < angle].sum() / weights.sum() for angle in seen]
+        np.testing.assert_allclose(below, (np.arange(len(seen)) + 0.5) / len(seen), atol=weights.max() / weights.sum())
+
+
+class TestDesigns:
+    def test_have_channels_that_files_and_other_numbers_of_rays_keep(self, run, tmp_path):
+        spec = open_run(run).fit(layout="spinning", channels=3, rays=150, name="spun").specification
+        table = spec.ray_table
+        assert (spec.layout, spec.rays, len(spec.sensors)) == ("spinning", 150, 1)
+        elevation, points = np.unique(table.elevation_rad, return_counts=True)
+        assert points.tolist() == [50, 50, 50]
+        _, vertical = spec.sensors[0].field_of_view_rad
+        assert vertical == pytest.approx(2 * np.abs(elevation).max())
+        assert np.ptp(table.azimuth_rad) == pytest.approx(FULL_TURN * 49 / 50)
+        save_design(spec, tmp_path / "spun.yaml")
+        again = load_design(tmp_path / "spun.yaml")
+        assert design_document(again) == design_document(spec)
+        np.testing.assert_array_equal(lay_out(again, 150).direction, table.direction)
+        assert len(lay_out(again, 75)) == 75
+        (entry,) = certificates_of(spec)
+        assert 0 <= entry["bound"] <= entry["value"]
+        assert (entry["rays"], entry["candidates"], entry["gates"]) == (150, 15, 1)
+
+    @pytest.mark.parametrize("form", ["sdf", "urdf", "xacro", "carla"])
+    def test_are_exported_exactly_where_formats_fire_even_grids(self, run, tmp_path, form):
+        design = open_run(run).fit(layout="spinning", channels=3, rays=150, name="spun")
+        exported = design.export(tmp_path / "spun", format=form)
+        assert any("every channel is a sensor of its own" in note for note in exported.notes)
+        assert exported.rounding["direction_rad"].error < 1e-9
+        assert exported.rounding["rays"].error == 0
+
+    def test_keep_their_channels_when_they_are_constrained(self, run):
+        design = open_run(run).fit(layout="spinning", channels=2, rays=60, name="spun")
+        again = design.constrain(constraints={"gate": {"end_m": {"max": 5.0}}})
+        assert (again.specification.layout, again.specification.provenance["channels"]) == ("spinning", 2)
+
+    @pytest.mark.parametrize(
+        ("options", "says"),
+        [
+            (("--layout", "spinning", "--channels", 4, "--rays", 30), "30 rays of 1 sensors with 4 channels"),
+            (("--layout", "spinning", "--sensors", "best"), "'best' sensors that spin"),
+            (("--layout", "grid", "--channels", 4), "4 channels in the layout grid"),
+        ],
+    )
+    def test_are_refused_where_options_contradict_each_other(self, lidardesign, run, options, says):
+        refused = lidardesign("fit", run, *options)
+        assert refused.code == 2
+        assert says in refused.err
+
+    def test_need_elevations_to_choose_among(self, lidardesign, tmp_path):
+        refused = lidardesign("fit", make_run(tmp_path / "flat"), "--layout", "spinning", "--rays", 16)
+        assert refused.code == 2
+        assert "16 channels" in refused.err
