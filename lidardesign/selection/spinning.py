@@ -32,6 +32,7 @@ from lidardesign.selection.coverage import Coverage, gather
 from lidardesign.selection.select import PROXY
 from lidardesign.task import Information
 
+CHANNELS = 16  # of a sensor, where nobody says how many
 POINTS_PER_TURN = 1800  # of a channel: every fifth of a degree, as scanners do at ten turns per second
 EVEN_SHARE = 0.5  # of the candidate elevations that are even; the others lie where the density looks
 CORNERS = np.array([(0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 0)])  # of a box, no two on one edge
@@ -138,9 +139,8 @@ def choose_rings(
             f"{channels} channels", where="--channels",
             allowed=f"at most {len(candidates.elevation_rad)}, as many as elevations of the design space",
         )  # fmt: skip
-    with phase("what returns tell"):
-        every = np.arange(len(candidates))
-        coverage, unit = candidates.coverage(every, scenes("choice"), informs)
+    with phase("what returns tell"), information.choosing(rings / len(candidates)):
+        coverage, unit = candidates.coverage(np.arange(len(candidates)), scenes("choice"), informs)
     if not len(coverage.item):
         raise DataError(
             f"none of {len(candidates)} rings tells anything about {information.FEW_SCENES} training scenes"
@@ -148,7 +148,7 @@ def choose_rings(
     with phase("choice"):
         choice, loss, bound = chosen_rings(coverage, candidates.place, count, channels)
     chosen = choice.rays
-    with phase("what returns tell"):
+    with phase("what returns tell"), information.choosing(1.0):
         judged, _ = candidates.coverage(chosen, scenes("held back"), informs)
     places, sensor = np.unique(candidates.place[chosen], return_inverse=True)
     elevations = candidates.elevation_rad[chosen % len(candidates.elevation_rad)]

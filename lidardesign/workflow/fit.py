@@ -38,7 +38,6 @@ from lidardesign.workflow.run_samples import Weighting
 
 BEST = "best"  # as many sensors as score best on training scenes
 COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
-CHANNELS = 16  # of a sensor that spins
 CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones would only leave candidates out
 # Of designs: names that a file may have everywhere.
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
@@ -178,7 +177,7 @@ class FitRequest:
             )
         channels = options.channels
         if layout == "spinning":
-            channels = channels or (base.provenance.get("channels") if base else None) or CHANNELS
+            channels = channels or (base.provenance.get("channels") if base else None)
         elif channels is not None:
             raise ConfigError(f"{channels} channels in the layout {layout}", where="--channels", allowed="spinning")
         usual_level = CHOSEN_LEVEL if LAYOUTS[layout].chosen_on_scenes else defaults.level

@@ -244,27 +244,13 @@ def _fitted(fitter: Fitter, few: Callable[[str], Iterator[Scene]] | None = None)
         fitter: Fits sensors.
         few: The only scenes to choose on, by purpose; None takes as many as it takes.
     """
-    request, samples = fitter.request, fitter.samples
-    if request.constraints is not None and request.constraints.parts is not None:
-        from lidardesign.selection.part_design import choose_parts
-        from lidardesign.workflow.select_rays import selection_scenes
-
-        return choose_parts(
-            samples,
-            request.constraints,
-            count=request.choices["sensors"],
-            rays=request.choices["rays"],
-            informs=partial(checked_information, request.run.task),
-            scenes=partial(selection_scenes, request.run, request.seed),
-            seed=request.seed,
-            name=request.name,
-            notes=fitter.notes,
-        )
-    if not LAYOUTS[request.choices["layout"]].chosen_on_scenes:
+    request, samples, run = fitter.request, fitter.samples, fitter.request.run
+    layout, rays = request.choices["layout"], request.choices["rays"]
+    wants_parts = request.constraints is not None and request.constraints.parts is not None
+    if not wants_parts and not LAYOUTS[layout].chosen_on_scenes:
         return fitter.fit()
     from lidardesign.workflow.select_rays import near, select_rays, selection_scenes
 
-    run, layout = request.run, request.choices["layout"]
     if not information.informs_rays(run.task):
         raise ConfigError(
             f"the task {run.task.name} does not say what returns tell",
@@ -272,13 +258,26 @@ def _fitted(fitter: Fitter, few: Callable[[str], Iterator[Scene]] | None = None)
             allowed="tasks with informs",
             hint="another --layout, or give the task a method informs(scene, returns)",
         )
-    if layout == "spinning":
-        from lidardesign.selection.spinning import choose_rings
+    informs, scenes = partial(checked_information, run.task), partial(selection_scenes, run, request.seed)
+    if wants_parts and request.constraints is not None:
+        from lidardesign.selection.part_design import choose_parts
 
-        informs = partial(information.checked_information, run.task)
-        scenes = partial(selection_scenes, run, request.seed)
+        return choose_parts(
+            samples,
+            request.constraints,
+            count=request.choices["sensors"],
+            rays=rays,
+            informs=informs,
+            scenes=scenes,
+            seed=request.seed,
+            name=request.name,
+            notes=fitter.notes,
+        )
+    if layout == "spinning":
+        from lidardesign.selection.spinning import CHANNELS, choose_rings
+
         fitted = fitter.fit(layout="grid", rays=None, gates=None)
-        return choose_rings(fitted, samples, request.channels, request.choices["rays"], informs, scenes)
+        return choose_rings(fitted, samples, request.channels or CHANNELS, rays, informs, scenes)
     counts = sorted({request.choices["rays"]} if request.choices["rays"] else set(request.run.task.defaults.rays))
     if samples.space.conditioned:
         travelled(samples.space, "selected")
