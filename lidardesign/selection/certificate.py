@@ -142,7 +142,7 @@ class Thresholds:
     def step(self, value: float) -> float:
         """The bound at the present thresholds; moves them along its subgradient (Polyak 1969)."""
         coverage = self.coverage
-        kernels.weigh_excess(coverage.entries, coverage.weight, self.threshold, self.excess)
+        kernels.weigh_excess(coverage.by_item, coverage.weight, self.threshold, self.excess)
         total, taken = self.admissible.best(self.excess)
         bound = float(coverage.weight @ self.threshold) + total
         self.stale += 1
@@ -174,7 +174,7 @@ class Tangents:
         """The bound by tangents at the present mixture; moves it towards the best choice of the tangents."""
         coverage = self.coverage
         rise = self.rises[np.minimum(self.known.astype(np.intp), len(self.rises) - 1)]
-        kernels.weigh_excess(coverage.entries, coverage.weight * rise, np.zeros(len(rise)), self.excess)
+        kernels.weigh_excess(coverage.by_item, coverage.weight * rise, np.zeros(len(rise)), self.excess)
         total, taken = self.admissible.best(self.excess)
         bound = float(coverage.weight @ (coverage.counted(self.known) - rise * self.known)) + total
         self.made += 1

@@ -96,11 +96,9 @@ class _Search:
 
     def best(self) -> tuple[int, int, float]:
         """The ray and gate that add most now, and what they add; -inf where none may be taken."""
-        may = ((self.gate < 0) & (self.left[self.sensor] > 0))[:, None]
-        may = may & (self.spent_mbps + self.coverage.bits <= self.limit_mbps)
-        net = np.where(may, self.gains - self.cost, -np.inf)
-        ray, gate = np.unravel_index(int(np.argmax(net)), net.shape)
-        return int(ray), int(gate), float(net[ray, gate])
+        may_fire = (self.gate < 0) & (self.left[self.sensor] > 0)
+        room_mbps = self.limit_mbps - self.spent_mbps
+        return kernels.best_gate(self.gains, self.cost, self.coverage.bits, may_fire, room_mbps)
 
     def take(self, ray: int, gate: int) -> None:
         """Fires a ray through a gate."""

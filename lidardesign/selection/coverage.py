@@ -78,13 +78,15 @@ class Coverage:
 
     @cached_property
     def by_item(self) -> kernels.ByItem:
-        """The table in the order of items."""
-        order = np.argsort(self.item, kind="stable")
+        """The table in the order of items, each from what tells most of it."""
         begin = _begins(self.item, len(self.weight))
-        return kernels.ByItem(begin, self.ray[order], self.worth[order], self.gates[order])
+        order = kernels.order_by_item(self.item, self.worth, begin)
+        return kernels.ByItem(begin, self.ray[order], self.worth[order], self.gates[order], self.weight, self.table)
 
     def of_rays(self, rays: slice) -> Coverage:
         """The table of some rays, one after the other."""
+        if rays == slice(0, len(self.bits)):
+            return self
         first, last = self.start[rays.start], self.start[rays.stop]
         return replace(
             self,
@@ -131,7 +133,7 @@ class Coverage:
     def gains(self, known: np.ndarray) -> np.ndarray:
         """What each gate of every ray would add to F, (N, G)."""
         gains = np.empty(self.shape)
-        kernels.gate_gains(self.entries, known, gains)
+        kernels.gate_gains(self.by_item, known, gains)
         return gains
 
     def value_of(self, gate: np.ndarray) -> float:

@@ -33,17 +33,35 @@ class ByRay(NamedTuple):
 
 
 class ByItem(NamedTuple):
-    """The same entries in the order of items.
+    """The same entries in the order of items, those of each item from the largest worth to the least.
+
+    Where an item's largest worth counts, only the first of its entries exceed what is known of it.
 
     Arguments:
         start: Where the entries of each item begin, (U + 1,).
         ray, worth, gates: Of each entry, (E,).
+        weight, table: As of `ByRay`.
     """
 
     start: np.ndarray
     ray: np.ndarray
     worth: np.ndarray
     gates: np.ndarray
+    weight: np.ndarray
+    table: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def order_by_item(item: np.ndarray, worth: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """The order (E,) of entries by item, and by falling worth; those of each item begin at `start`, (U + 1,)."""
+    order, place = np.empty(len(item), dtype=np.int64), start.copy()
+    for entry in range(len(item)):
+        order[place[item[entry]]] = entry
+        place[item[entry]] += 1
+    for index in range(len(start) - 1):
+        own = order[start[index] : start[index + 1]]
+        own[:] = own[np.argsort(-worth[own], kind="mergesort")]
+    return order
 
 
 @njit(cache=True, nogil=True)
@@ -66,18 +84,33 @@ def gain(known: float, worth: float, table: np.ndarray) -> float:
 
 
 @njit(cache=True, nogil=True)
-def gate_gains(entries: ByRay, known: np.ndarray, gains: np.ndarray) -> None:
+def gate_gains(items: ByItem, known: np.ndarray, gains: np.ndarray) -> None:
     """What each gate of every ray would add to what is known: fills `gains`, shape (N, G)."""
     gains[:] = 0.0
-    for ray in range(len(entries.start) - 1):
-        for entry in range(entries.start[ray], entries.start[ray + 1]):
-            more = entries.weight[entries.item[entry]] * gain(
-                known[entries.item[entry]], entries.worth[entry], entries.table
-            )
+    for place in range(len(known)):
+        for index in range(items.start[place], items.start[place + 1]):
+            more = items.weight[place] * gain(known[place], items.worth[index], items.table)
             if more > 0.0:
                 for gate in range(gains.shape[1]):
-                    if entries.gates[entry] >> gate & 1:
-                        gains[ray, gate] += more
+                    if items.gates[index] >> gate & 1:
+                        gains[items.ray[index], gate] += more
+            elif len(items.table) == 0:
+                break
+
+
+@njit(cache=True, nogil=True)
+def best_gate(
+    gains: np.ndarray, cost: np.ndarray, bits: np.ndarray, may_fire: np.ndarray, room_mbps: float
+) -> tuple[int, int, float]:
+    """The ray that may fire (N,) and the gate, for no more bits, that add most; and what they add, -inf for none."""
+    ray, gate, most = 0, 0, -np.inf
+    for one in range(gains.shape[0]):
+        if may_fire[one]:
+            for other in range(gains.shape[1]):
+                net = gains[one, other] - cost[one, other]
+                if net > most and bits[one, other] <= room_mbps and bits[one, other] < np.inf:
+                    ray, gate, most = one, other, net
+    return ray, gate, most
 
 
 @njit(cache=True, nogil=True)
@@ -109,13 +142,14 @@ def change_choice(
     `chosen` holds the gates of the other rays, -1 for none, (N,). Only items of which something else is known
     afterwards are followed to the rays that tell of them.
     """
+    sums = len(entries.table) > 0
     for own in range(entries.start[ray], entries.start[ray + 1]):
         if not entries.gates[own] >> gate & 1:
             continue
         place = entries.item[own]
         old = known[place]
         first, last = items.start[place], items.start[place + 1]
-        if len(entries.table) > 0:
+        if sums:
             new = old + entries.worth[own] if adding else max(old - entries.worth[own], 0.0)
         elif adding:
             new = max(old, entries.worth[own])
@@ -126,11 +160,16 @@ def change_choice(
             for index in range(first, last):
                 other = chosen[items.ray[index]]
                 if other >= 0 and items.gates[index] >> other & 1:
-                    new = max(new, items.worth[index])
+                    new = items.worth[index]
+                    break
         if new == old:
             continue
         known[place] = new
+        if sums and counted(min(old, new), entries.table) == entries.table[-1]:
+            continue
         for index in range(first, last):
+            if not sums and items.worth[index] <= min(old, new):
+                break
             more = gain(new, items.worth[index], entries.table) - gain(old, items.worth[index], entries.table)
             if more != 0.0:
                 for other in range(gains.shape[1]):
@@ -139,16 +178,17 @@ def change_choice(
 
 
 @njit(cache=True, nogil=True)
-def weigh_excess(entries: ByRay, weight: np.ndarray, threshold: np.ndarray, excess: np.ndarray) -> None:
+def weigh_excess(items: ByItem, weight: np.ndarray, threshold: np.ndarray, excess: np.ndarray) -> None:
     """By how much each gate's worths exceed the items' thresholds, weighted: fills `excess`, shape (N, G)."""
     excess[:] = 0.0
-    for ray in range(len(entries.start) - 1):
-        for entry in range(entries.start[ray], entries.start[ray + 1]):
-            over = entries.worth[entry] - threshold[entries.item[entry]]
-            if over > 0:
-                for gate in range(excess.shape[1]):
-                    if entries.gates[entry] >> gate & 1:
-                        excess[ray, gate] += weight[entries.item[entry]] * over
+    for place in range(len(threshold)):
+        for index in range(items.start[place], items.start[place + 1]):
+            over = items.worth[index] - threshold[place]
+            if over <= 0:
+                break
+            for gate in range(excess.shape[1]):
+                if items.gates[index] >> gate & 1:
+                    excess[items.ray[index], gate] += weight[place] * over
 
 
 @njit(cache=True, nogil=True)

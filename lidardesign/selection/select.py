@@ -49,6 +49,7 @@ class SelectionProblem:
         most_scenes: On how many scenes rays are chosen at most.
         name: Of the design, for messages.
         further: As many rays again, which may not be chosen: a certificate says what they would gain.
+        is_trial: Whether rays alone are wanted, of the first scenes and without certificates.
     """
 
     rays: Rays
@@ -63,6 +64,7 @@ class SelectionProblem:
     most_scenes: int
     name: str
     further: Rays | None = None
+    is_trial: bool = False
 
     @phase("what returns tell")
     def inform(self, scenes: Iterator[Scene], count: int) -> list[InformedScene]:
@@ -176,7 +178,7 @@ class Selected:
         rays: Those of each value of a condition, in the order of their sensors.
         certificate: `value` and `bound` of the loss on the scenes chosen on, `gap`, `held_back_value`, and the numbers
             of `rays`, `candidates`, `gates` and `scenes`; at the middle number of rays `gap_doubled`, the gap with
-            candidates doubled, and `curve`, the price curve as pairs of Mbit/s and loss.
+            candidates doubled, and `curve`, the price curve as pairs of Mbit/s and loss. A trial has none of it.
     """
 
     rays: Sequence[Rays]
@@ -191,13 +193,13 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
     middle = counts[len(counts) // 2]
-    held_back = problem.inform(problem.scenes("held back"), information.FEW_SCENES)
+    held_back = [] if problem.is_trial else problem.inform(problem.scenes("held back"), information.FEW_SCENES)
     informed: list[InformedScene] = []
     scenes, wanted, loss = problem.scenes("choice"), information.FEW_SCENES, np.inf
     while True:
         informed += problem.inform(scenes, wanted - len(informed))
         gates_m = problem.gates(problem.rays, problem.visits, informed)
-        coverage, judged = problem.coverage(informed, gates_m), problem.coverage(held_back, gates_m)
+        coverage = problem.coverage(informed, gates_m)
         if not len(coverage.item):
             raise DataError(
                 f"none of {len(problem.rays)} candidate rays tells anything about {len(informed)} training scenes",
@@ -205,8 +207,9 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
                 hint="let sensors look at the targets: constrain less, or learn longer",
             )
         choices = problem.choices(coverage, middle)
+        judged = coverage if problem.is_trial else problem.coverage(held_back, gates_m)
         before, loss = loss, judged.loss_of(_gate_of(choices))
-        if loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > problem.most_scenes:
+        if problem.is_trial or loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > problem.most_scenes:
             break
         wanted *= 2
     rays, shared = problem.rays, None
@@ -218,30 +221,32 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
     selected = []
     for count in counts:
         choices = problem.choices(coverage, count)
-        value, bound = problem.certified(coverage, choices)
         gate = _gate_of(choices)
         tables = []
         for visit, choice in zip(problem.visits, choices, strict=True):
             chosen = visit.start + choice.rays
             chosen = chosen[np.lexsort((chosen, rays.sensor[chosen]))]
             tables.append(replace(rays.subset(chosen), gate_m=gates_m[chosen, gate[chosen]]).as_angles())
-        document = {
-            "rays": count,
-            "value": float(value),
-            "bound": float(bound),
-            "gap": float((value - bound) / value) if value > 0 else 0.0,
-            "held_back_value": float(judged.loss_of(gate)),
-            "candidates": len(rays),
-            "gates": gates_m.shape[1],
-            "scenes": len(informed),
-            "proxy": PROXY,
-            "unit": informed[0].unit,
-        }
+        selected.append(Selected(tables, {}))
+        if problem.is_trial:
+            continue
+        value, bound = problem.certified(coverage, choices)
+        selected[-1].certificate.update(
+            rays=count,
+            value=float(value),
+            bound=float(bound),
+            gap=float((value - bound) / value) if value > 0 else 0.0,
+            held_back_value=float(judged.loss_of(gate)),
+            candidates=len(rays),
+            gates=gates_m.shape[1],
+            scenes=len(informed),
+            proxy=PROXY,
+            unit=informed[0].unit,
+        )
         if count == middle:
-            document["curve"] = price_curve(coverage, problem.counts(count), len(problem.visits))
+            selected[-1].certificate["curve"] = price_curve(coverage, problem.counts(count), len(problem.visits))
             if problem.further is not None:
-                document["gap_doubled"] = _gap_doubled(problem, problem.further, count, shared)
-        selected.append(Selected(tables, document))
+                selected[-1].certificate["gap_doubled"] = _gap_doubled(problem, problem.further, count, shared)
     return selected
 
 

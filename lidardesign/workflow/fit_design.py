@@ -8,9 +8,9 @@ sensors win that are no worse than the best by more than a standard error.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -47,7 +47,7 @@ from lidardesign.workflow.run_samples import KEY, RunTarget
 
 
 class Fitter:
-    """Fits the design of a request, to samples weighted by its settings of the task.
+    """Fits the designs of requests that differ in choices and constraints, to samples weighted by settings of the task.
 
     Raises:
         ConfigError: A setting that cannot be, or a name that is no condition of the density.
@@ -55,7 +55,7 @@ class Fitter:
     """
 
     def __init__(self, request: FitRequest, notes: Notes = log_note) -> None:
-        self.request, self.notes = request, notes
+        self.run, self.seed, self.notes = request.run, request.seed, notes
         self.target = RunTarget(request.run, weighting=request.weighting)
         request.run.config.space.at(request.at)
         with phase("samples"):
@@ -74,15 +74,25 @@ class Fitter:
         if effective < LEAST_SAMPLES:
             raise DataError(
                 f"the density is too rough: its {len(self.samples)} samples are worth {effective:.0f}",
-                where=str(self.request.run.folder),
+                where=str(self.run.folder),
                 allowed=f"at least {LEAST_SAMPLES}",
                 hint=hint,
             )
 
+    @cached_property
+    def first_scenes(self) -> dict[str, list[Scene]]:
+        """The first scenes that are chosen on, and that are held back, by purpose; what is found of them stays."""
+        from lidardesign.workflow.select_rays import selection_scenes
+
+        return {
+            purpose: list(islice(selection_scenes(self.run, self.seed, purpose), information.FEW_SCENES))
+            for purpose in ("choice", "held back")
+        }
+
     @phase("fitting")
-    def fit(self, samples: Samples | None = None, **choices: Any) -> FitResult:
+    def fit(self, request: FitRequest, samples: Samples | None = None, **choices: Any) -> FitResult:
         """The design, by the request's choices and these instead of some of them, to other samples if there are."""
-        request, samples = self.request, self.samples if samples is None else samples
+        samples = self.samples if samples is None else samples
         if request.at:
             count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (request.choices.get("rays") or 0))
             samples = at_condition(samples, request.at, self.target, count, random_generator(request.seed, "condition"))
@@ -115,9 +125,9 @@ def fit_design(request: FitRequest, *, notes: Notes = log_note) -> FitResult:
     """
     run, weighting, fitter = request.run, request.weighting, Fitter(request, notes)
     if request.choices["sensors"] == BEST:
-        count = _best_count(fitter)
-        request = fitter.request = replace(request, choices={**request.choices, "sensors": count})
-    result = _fitted(fitter)
+        count = _best_count(fitter, request)
+        request = replace(request, choices={**request.choices, "sensors": count})
+    result = _fitted(fitter, request)
     for note in result.notes:
         notes(note)
     design, further = result.design, {KEY: weighting.as_document()} if weighting.settings else {}
@@ -138,29 +148,17 @@ def fit_design(request: FitRequest, *, notes: Notes = log_note) -> FitResult:
     return replace(result, design=design, constraints=checks, satisfied=True)
 
 
-def _best_count(fitter: Fitter) -> int:
+def _best_count(fitter: Fitter, request: FitRequest) -> int:
     """The number of sensors that scores best on training scenes; says what was tried."""
-    from lidardesign.workflow.select_rays import selection_scenes
-
-    request = fitter.request
-    run = request.run
     if request.constraints is not None:
-        check_feasible(request.constraints, run.config.space, rays=request.choices["rays"])
-    scenes = {
-        purpose: list(islice(selection_scenes(run, request.seed, purpose), information.FEW_SCENES))
-        for purpose in ("choice", "held back")
-    }
-
-    def fit(trial: FitRequest) -> FitResult:
-        fitter.request = trial
-        return _fitted(fitter, lambda purpose: iter(scenes[purpose]))
-
-    trials = trials_of(request, fitter.samples, scenes["held back"], fit)
-    best = best_of(trials, scenes["held back"])
-    sign = 1.0 if run.metric.better == "lower" else -1.0
+        check_feasible(request.constraints, request.run.config.space, rays=request.choices["rays"])
+    scenes, metric = fitter.first_scenes["held back"], request.run.metric
+    trials = trials_of(request, fitter.samples, scenes, partial(_fitted, fitter, is_trial=True))
+    best = best_of(trials, scenes)
+    sign = 1.0 if metric.better == "lower" else -1.0
     found = ", ".join(f"{trial.sensors}: {sign * trial.scores.mean():.4g}" for trial in trials)
     fitter.notes(
-        f"sensors: {best.sensors}; {run.metric.name} [{run.metric.unit}] on {len(scenes['held back'])} training scenes "
+        f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(scenes)} training scenes "
         f"in {trials[-1].mbps:.3g} Mbit/s by their number: {found}"
     )
     return best.sensors
@@ -237,18 +235,19 @@ def _within(constraints: Constraints | None, mbps: float) -> Constraints:
     return Constraints.from_mapping({**document, "budget": {"bandwidth_mbps": mbps, **budget}})
 
 
-def _fitted(fitter: Fitter, few: Callable[[str], Iterator[Scene]] | None = None) -> FitResult:
-    """The design of a fitter's request; in layouts whose rays are chosen, for each number of rays.
+def _fitted(fitter: Fitter, request: FitRequest, *, is_trial: bool = False) -> FitResult:
+    """The design of a request; in layouts whose rays are chosen, for each number of rays.
 
     Arguments:
         fitter: Fits sensors.
-        few: The only scenes to choose on, by purpose; None takes as many as it takes.
+        request: What is asked for.
+        is_trial: Whether rays are chosen on the first scenes alone, without certificates.
     """
-    request, samples, run = fitter.request, fitter.samples, fitter.request.run
+    samples, run = fitter.samples, request.run
     layout, rays = request.choices["layout"], request.choices["rays"]
     wants_parts = request.constraints is not None and request.constraints.parts is not None
     if not wants_parts and not LAYOUTS[layout].chosen_on_scenes:
-        return fitter.fit()
+        return fitter.fit(request)
     from lidardesign.workflow.select_rays import near, select_rays, selection_scenes
 
     if not information.informs_rays(run.task):
@@ -276,18 +275,18 @@ def _fitted(fitter: Fitter, few: Callable[[str], Iterator[Scene]] | None = None)
     if layout == "spinning":
         from lidardesign.selection.spinning import CHANNELS, choose_rings
 
-        fitted = fitter.fit(layout="grid", rays=None, gates=None)
+        fitted = fitter.fit(request, layout="grid", rays=None, gates=None)
         return choose_rings(fitted, samples, request.channels or CHANNELS, rays, informs, scenes)
     counts = sorted({request.choices["rays"]} if request.choices["rays"] else set(request.run.task.defaults.rays))
     if samples.space.conditioned:
         travelled(samples.space, "selected")
     # the rays of a track have gates of their own, as those of a scan
     gates = request.choices["gates"] or ("ray" if samples.space.conditioned else LAYOUTS["selected"].usual_gates)
-    (first, *_) = conditions_of(request.run.task, request.run.config.task, samples.space)
+    (place, *_) = conditions_of(request.run.task, request.run.config.task, samples.space)
     # the gates of chosen rays keep a bandwidth; a sensor that moves along a condition looks everywhere the same way
-    fitted = fitter.fit(near(samples, first, 1.0), layout="density", rays=counts[-1], gates="ray")
+    fitted = fitter.fit(request, near(samples, place, 1.0), layout="density", rays=counts[-1], gates="ray")
     fitted = replace(fitted, design=replace(fitted.design, gates=gates))
-    return select_rays(run, fitted, counts, samples, request.seed, few)
+    return select_rays(run, fitted, counts, samples, request.seed, fitter.first_scenes, is_trial=is_trial)
 
 
 def check_written(design: DesignSpec, request: FitRequest) -> list[ConstraintCheck]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -48,7 +48,9 @@ def select_rays(
     counts: Sequence[int],
     samples: Samples,
     seed: int,
-    few: Callable[[str], Iterator[Scene]] | None = None,
+    first: Mapping[str, Sequence[Scene]],
+    *,
+    is_trial: bool = False,
 ) -> FitResult:
     """The design of a fit with rays that were chosen, one table or track for each number of rays.
 
@@ -58,7 +60,8 @@ def select_rays(
         counts: Numbers of rays, ascending; along a condition, at each of its values.
         samples: Of the density, at all values of its condition.
         seed: Root of the random streams.
-        few: The only scenes to choose on, by purpose, for a trial; None takes as many as it takes.
+        first: The first scenes to choose on, and to hold back, by purpose.
+        is_trial: Whether rays are chosen on these alone, without certificates.
 
     Raises:
         ConfigError: More rays than can be chosen.
@@ -82,13 +85,16 @@ def select_rays(
         shares=spec.weights if len(visits) > 1 else None,
         gates=partial(_gates, spec, constraints, samples.space, gate_margin_m(run)),
         informs=partial(checked_information, run.task),
-        scenes=few or partial(selection_scenes, run, seed),
-        most_scenes=information.FEW_SCENES if few else information.MOST_SCENES,
+        scenes=lambda purpose: itertools.chain(
+            first[purpose], itertools.islice(selection_scenes(run, seed, purpose), len(first[purpose]), None)
+        ),
+        most_scenes=information.MOST_SCENES,
         bandwidth=bandwidth_limit(constraints, len(rays))[0],
         limit_mbps=np.inf if limit is None else limit,
         one_gate=spec.gates != "ray",
         name=spec.name,
-        further=None if few or len(visits) > 1 else proposals.further(len(rays)),
+        further=None if is_trial or len(visits) > 1 else proposals.further(len(rays)),
+        is_trial=is_trial,
     )
     selected = select(problem, counts)
     provenance = {**spec.provenance, CERTIFICATES: [one.certificate for one in selected]}
