@@ -142,6 +142,9 @@ class Task(Protocol):
     configuration; `metric` then has those that are usual. Name, unit and direction are those of `metric`, or of one of
     `metrics`, further ones that a key of the configuration chooses.
 
+    A task may also give `mount_of(config) -> str | None`, the body of a robot that sensors are on, in whose frame its
+    scenes are; designs keep it.
+
     A task may also give `notes(config, space) -> Sequence[str]`, what a user should know of a configuration before
     anything is learned of it: lengths that look like another unit, splits that share their objects.
 
@@ -214,6 +217,18 @@ def metric_of(task: Task, config: Any) -> Metric:
     usual = [_quantity(metric) for metric in (task.metric, *getattr(task, "metrics", ()))]
     if _quantity(found) not in usual:
         raise PluginError(f"it gave {_quantity(found)}", where=where, allowed=f"{' or '.join(usual)}, as in its metric")
+    return found
+
+
+def mount_of(task: Task, config: Any) -> str | None:
+    """The body of a robot that a task's sensors are on; None: in the world, as where it has no `mount_of`.
+
+    Raises:
+        PluginError: The task gave no name.
+    """
+    found = task.mount_of(config) if hasattr(task, "mount_of") else None
+    if not isinstance(found, str | None) or found == "":
+        raise PluginError(f"it gave {found!r}", where=f"task {task.name}, mount_of", allowed="a name or None")
     return found
 
 

@@ -58,7 +58,7 @@ COVARIANCE_ROUNDING = SLACK
 
 OPTIONAL = (
     "name", "layout", "level", "rays", "at", "gates", "ray_table", "further_tables", "track", "further_tracks",
-    "constraints", "provenance",
+    "mount", "constraints", "provenance",
 )  # fmt: skip
 SENSOR_OPTIONAL = (
     "name", "part", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays",
@@ -138,6 +138,8 @@ def design_document(design: DesignSpec) -> dict[str, Any]:
         document["at"] = {name: float(value) for name, value in design.at.items()}
     if design.gates is not None and design.gates != design.table_gates:
         document["gates"] = design.gates
+    if design.mount is not None:
+        document["mount"] = {"body": design.mount}
     document["constraints"] = design.constraints
     document["provenance"] = design.provenance
     return document
@@ -275,6 +277,7 @@ def design_from_document(
         level=level,
         track=track,
         at={name: item.number() for name, item in keys["at"].mapping((), DIMENSIONS).items()} if "at" in keys else {},
+        mount=keys["mount"].mapping(("body",))["body"].text() if "mount" in keys else None,
         gates=keys["gates"].choice(get_args(Gates)) if "gates" in keys else None,  # type: ignore[arg-type]
         further_tables=tuple(_ray_table(item, len(sensors)) for item in keys["further_tables"].items())
         if "further_tables" in keys

@@ -246,6 +246,7 @@ class DesignSpec:
         at: The condition values that the design is for, where it is for one, as {"x_m": 0.37}.
         gates: Whether its rays have their sensor's gate or their own at any number of rays; None where its table of
             rays tells, or where it is as usual in its layout.
+        mount: The body of a robot that it is on, in whose frame places and directions are; None: in the world.
     """
 
     name: str
@@ -259,6 +260,7 @@ class DesignSpec:
     track: Track | None = None
     at: Mapping[str, float] = field(default_factory=dict)
     gates: Gates | None = None
+    mount: str | None = None
     further_tables: tuple[Rays, ...] = ()
     further_tracks: tuple[Track, ...] = ()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
@@ -31,6 +32,7 @@ class Exporter:
         checked: How the tests show that this program takes what is written.
         folder: Whether it writes a folder of files.
         rated: Whether it holds the frame rate, so that `write` takes `rate_hz` too.
+        robotic: Whether it can hold a robot's model with the sensors in it, so that `write` takes `robot` too.
     """
 
     name: str
@@ -42,8 +44,11 @@ class Exporter:
     checked: str
     folder: bool = False
     rated: bool = False
+    robotic: bool = False
 
-    def write(self, design: DesignSpec, rays: Rays, path: Path, rate_hz: float | None = None) -> list[str]:
+    def write(
+        self, design: DesignSpec, rays: Rays, path: Path, rate_hz: float | None = None, robot: Path | None = None
+    ) -> list[str]:
         """Write the file, atomically; returns notes of what the format cannot hold.
 
         Arguments:
@@ -51,15 +56,24 @@ class Exporter:
             rays: Its rays.
             path: The file or folder.
             rate_hz: Frames per second [Hz]; that of the read-out model by default.
+            robot: A model that the sensors are put into; None: they are written alone.
 
         Raises:
-            ConfigError: A frame rate for a format that holds none, or one that no sensor has.
+            ConfigError: A frame rate or a robot for a format that holds none, or a rate that no sensor has.
             DataError: The file cannot be written, or the format cannot hold such a design at all.
         """
         write = getattr(import_module(self.module), self.functions[0])
         self.check_rate(rate_hz)
-        rate = {"rate_hz": Bandwidth().rate_hz if rate_hz is None else rate_hz} if self.rated else {}
-        return write(design, rays, Path(path), **rate)
+        if robot is not None and not self.robotic:
+            raise ConfigError(f"{self.name} holds no robot", where="--robot", allowed="with mjcf")
+        options: dict[str, Any] = {} if robot is None else {"robot": robot}
+        if self.rated:
+            options["rate_hz"] = Bandwidth().rate_hz if rate_hz is None else rate_hz
+        notes = write(design, rays, Path(path), **options)
+        if design.mount is not None and robot is None:
+            hint = "; --robot MODEL puts the sensors on it" if self.robotic else ""
+            notes.append(f"places and directions are in the frame of the robot's body {design.mount!r}{hint}")
+        return notes
 
     def check_rate(self, rate_hz: float | None) -> None:
         """Refuse a frame rate [Hz] that no sensor has, or that the format cannot hold.
@@ -129,6 +143,7 @@ EXPORTERS: dict[str, Exporter] = {
             "a rangefinder site per ray",
             "lidardesign.export.robots",
             ("write_mjcf", "mjcf_rounding"),
+            robotic=True,
             reader="MuJoCo",
             checked="loaded and run in MuJoCo: its distances are ours",
         ),

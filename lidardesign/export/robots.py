@@ -5,7 +5,8 @@ MuJoCo: a body per sensor, a site per ray whose +z looks along it, and a rangefi
 `sensordata` has the rays in their own order: the distance [m], -1 where nothing is hit, and the gate's end where what
 is hit lies beyond (`cutoff`). The start of the gate, the sensor's number and the firing time stand in the rangefinder's
 user data, which MuJoCo keeps (`model.sensor_user`) and does not use. The file is a model of its own and may be
-included in another one. Rangefinders see neither geoms of their own body nor ones that are fully transparent.
+included in another one, or a copy of a robot's with the sensors on one of its bodies. Rangefinders see neither geoms of
+their own body, of which those of sensors have none, nor ones that are fully transparent.
 
 Gazebo and ROS: a gpu_lidar per sensor, in SDF 1.9, in a URDF, or in a xacro macro.
 
@@ -21,9 +22,12 @@ are relative to the parent.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
-from xml.etree.ElementTree import Element
+from typing import Any
+from xml.etree.ElementTree import Element, fromstring
 
 import numpy as np
 
@@ -54,25 +58,41 @@ from lidardesign.export.common.poses import (
 )
 from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
+from lidardesign.mujoco_model import load_model
 from lidardesign.numerics import SLACK, unit_vectors
 
 WORLD = "world"
 # Half of what a site of one ray is drawn as [m].
 SITE_SIZE_M = 0.002
+USER_VALUES = 4  # of a rangefinder: gate start and end, sensor, time
 
 
-def write_mjcf(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
-    """Write the model, atomically; returns notes of what the format cannot hold."""
+def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: Path | None = None) -> list[str]:
+    """Write the model, atomically; returns notes of what the format cannot hold.
+
+    Arguments:
+        design: The design; with a robot its sensors are on the body that it is mounted on, else in the world.
+        rays: Its rays.
+        path: The file.
+        robot: A MuJoCo model, MJCF or URDF, of which the file is a copy with the sensors in it.
+
+    Raises:
+        DataError: The robot's model cannot be read, or has no such body.
+    """
     mounted = mounts(design, rays)
-    bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=[WORLD])
+    place, sensors, notes = element("worldbody"), element("sensor"), design_losses(design, mounted)
+    model, taken = element("mujoco", {"model": design.name}, [place, sensors]), [WORLD]
+    if robot is not None:
+        model, place, sensors = _robot_with(design.mount, robot, path)
+        taken += [body.get("name", "") for body in model.iter("body")]
+        notes.append("MuJoCo's rays meet all geoms of the robot, also those that only collide")
+    bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
     site = np.empty(len(rays), dtype=object)
-    worldbody = element("worldbody")
     for mount, name in zip(mounted, bodies, strict=True):
         site[mount.ray] = [f"{name}_r{number}" for number in range(len(mount.ray))]
-        worldbody.append(_body(mount, name, rays, site[mount.ray]))
-    sensor = element("sensor", children=[_rangefinder(str(site[ray]), rays, ray) for ray in range(len(rays))])
-    write_xml(path, element("mujoco", {"model": design.name}, [worldbody, sensor]))
-    notes = design_losses(design, mounted)
+        place.append(_body(mount, name, rays, site[mount.ray]))
+    sensors.extend(_rangefinder(str(site[ray]), rays, ray) for ray in range(len(rays)))
+    write_xml(path, model)
     late = rays.gate_m[rays.gate_m[:, 0] > 0, 0]
     if len(late):
         notes.append(
@@ -82,8 +102,29 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     return [*notes, "a reading equal to the cutoff is a hit at or beyond the end of the gate; -1 is no hit"]
 
 
-def read_mjcf(path: Path) -> Rays:
-    """The rays of a file that `write_mjcf` made, in the order of its rangefinders.
+def _robot_with(mount: str | None, robot: Path, path: Path) -> tuple[Element, Element, Element]:
+    """A robot's model as MuJoCo writes it, for a file at a path, its body that sensors go into, and its sensors."""
+    specifications: list[Any] = []
+    load_model(robot, edit=specifications.append)
+    root = fromstring(specifications[0].to_xml())
+    for tag in ("compiler", "sensor", "size"):
+        if root.find(tag) is None:
+            root.append(element(tag))
+    compiler, sensors, size = (next(root.iter(tag)) for tag in ("compiler", "sensor", "size"))
+    for name in ("meshdir", "texturedir"):
+        folder = robot.resolve().parent / compiler.get(name, "")
+        compiler.set(name, os.path.relpath(folder, path.resolve().parent))
+    size.set("nuser_sensor", str(max(USER_VALUES, int(size.get("nuser_sensor", "0")))))
+    bodies = {body.get("name", ""): body for body in root.iter("body")}
+    place = next(root.iter("worldbody")) if mount is None else bodies.get(mount)
+    if place is None:
+        close = ", ".join(get_close_matches(str(mount), bodies, 3, 0.0))
+        raise DataError(f"has no body {mount!r}, which the design is mounted on", where=str(robot), allowed=close)
+    return root, place, sensors
+
+
+def read_mjcf(path: Path, count: int | None = None) -> Rays:
+    """The rays of a file that `write_mjcf` made, in the order of its rangefinders; beside a robot's, the last so many.
 
     Raises:
         DataError: The file cannot be read, or is no such model.
@@ -91,9 +132,12 @@ def read_mjcf(path: Path) -> Rays:
     root = read_xml(path, "mujoco")
     try:
         frames: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        for body in root.iterfind("worldbody/body"):
-            frames.update(_sites(body))
         found = list(root.iterfind("sensor/rangefinder"))
+        found = found if count is None else found[len(found) - count :]
+        names = {one.get("site") for one in found}
+        for body in root.iter("body"):
+            if any(site.get("name") in names for site in body.iterfind("site")):
+                frames.update(_sites(body))
         user = np.array([_floats(one, "user") for one in found]).reshape(len(found), -1)
         origin = np.array([frames[one.attrib["site"]][0] for one in found]).reshape(-1, 3)
         looking = np.array([frames[one.attrib["site"]][1] for one in found]).reshape(-1, 3)
@@ -104,7 +148,7 @@ def read_mjcf(path: Path) -> Rays:
 
 def mjcf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose."""
-    return rays_rounding(rays, read_mjcf(path) if len(rays) else rays, path)
+    return rays_rounding(rays, read_mjcf(path, len(rays)) if len(rays) else rays, path)
 
 
 def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:

@@ -138,6 +138,7 @@ class Design(DesignSource):
         at: Mapping[str, float] | None = None,
         rate_hz: float | None = None,
         seed: int = 0,
+        robot: Path | None = None,
         notes: Notes = log_note,
     ) -> Exported:
         """Write it for another program.
@@ -149,13 +150,14 @@ class Design(DesignSource):
             at: Values of conditions.
             rate_hz: Frames per second, in formats that hold them [Hz].
             seed: Root of the random streams.
+            robot: A robot's MuJoCo model that the sensors are put into (mjcf).
             notes: Called with every note.
         """
         check_frame_rate(rate_hz)
         out = None if path is None else Path(path)
         exporter = exporter_of(format, out)
         target = export_target(self.path, out, exporter)
-        return ExportRequest(self, exporter, target, rays, at or {}, rate_hz, seed).write(notes=notes)
+        return ExportRequest(self, exporter, target, rays, at or {}, rate_hz, seed, robot).write(notes=notes)
 
     def figure(self, count: int | None = None) -> Figure:
         """Its sensors in space, with fields of view and gates; with a number of rays these, too (plotly)."""

@@ -168,6 +168,7 @@ class ExportRequest:
         at: Condition values.
         rate_hz: Frames per second, in formats that hold it [Hz].
         seed: Root of the random streams.
+        robot: A robot's model that the sensors are put into; None: they are written alone.
     """
 
     source: DesignSource
@@ -177,6 +178,7 @@ class ExportRequest:
     at: Mapping[str, float] = field(default_factory=dict)
     rate_hz: float | None = None
     seed: int = 0
+    robot: Path | None = None
 
     def __post_init__(self) -> None:
         name, layout = self.exporter.name, layout_of(self.source.specification)
@@ -227,7 +229,7 @@ class ExportRequest:
         open_rays = exporter.name in WITHOUT_RAYS
         design, rays = self.source.lay_out(self.rays, self.at, self.seed, may_stay_open=open_rays, notes=notes)
         with phase("writing"):
-            lost = tuple(exporter.write(design, rays, file, self.rate_hz))
+            lost = tuple(exporter.write(design, rays, file, self.rate_hz, self.robot))
         with phase("reading back"):
             rounding = exporter.rounding(design, rays, file)
         for note in lost:

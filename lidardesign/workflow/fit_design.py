@@ -31,6 +31,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
 from lidardesign.evaluate.baselines.candidates import mean_mbps
 from lidardesign.evaluate.scene_scores import score_lists
+from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import versions
 from lidardesign.run.yaml import dump_yaml, parse_yaml
@@ -39,7 +40,7 @@ from lidardesign.scene import Scene, group_numbers
 from lidardesign.selection import information
 from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import build_casters
-from lidardesign.task import conditions_of, random_generator
+from lidardesign.task import conditions_of, mount_of, random_generator
 from lidardesign.workflow import fit as fit_choices
 from lidardesign.workflow.fit import BEST, FitRequest
 from lidardesign.workflow.run_folder import Notes, log_note, relative_folder
@@ -141,7 +142,9 @@ def fit_design(request: FitRequest, *, notes: Notes = log_note) -> FitResult:
         "seed": request.seed,
         "versions": versions(),
     }
-    design = replace(design, provenance={**design.provenance, **origin, **further})
+    with plugin_guard(run.task.name):
+        mount = mount_of(run.task, run.config.task)
+    design = replace(design, mount=mount, provenance={**design.provenance, **origin, **further})
     with phase("writing"):
         checks = check_written(design, request)
     # broken ones were refused

@@ -66,6 +66,7 @@ def designs(draw):
         name=draw(words), sensors=chosen, rays=total, ray_table=table, level=level,
         layout=draw(st.sampled_from(["grid", "density", "scan", "distributed"])),
         gates=None if table is not None else draw(st.sampled_from([None, "sensor", "ray"])),
+        mount=draw(st.sampled_from([None, "torso"])),
         constraints={"gate": {"width_m": {"max": draw(length)}}},
         provenance={"command": draw(anything), "seed": 7},
     )  # fmt: skip

@@ -1,8 +1,10 @@
 """What robots' tools make of an exported design: MuJoCo runs it, libsdformat, check_urdf and xacro parse it."""
 
+import importlib.util
 import shutil
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,11 +15,12 @@ from support.tables import each_row
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.export.common.names import identifier
 from lidardesign.export.common.poses import mounts
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.mujoco_model import bodies_from_mujoco, load_model
 from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
 
 ROBOTS = ("mjcf", "sdf", "urdf", "xacro", "carla", "isaac-json", "isaac-usd")
@@ -113,6 +116,72 @@ def test_mujoco_measures_our_distances(exported):
     np.testing.assert_array_equal(model.sensor_user[:, 3], RAYS.time_s)
     bodies = {model.body(int(model.site_bodyid[model.sensor_objid[ray]])).name for ray in range(len(RAYS))}
     assert bodies == {one.name for one in DESIGN.sensors}
+
+
+ROBOT = """<mujoco><compiler meshdir="parts"/><asset><mesh name="foot" file="foot.obj"/></asset>
+<default><site type="box" size="9 9 9" euler="10 20 30"/></default>
+<worldbody><geom type="plane" size="0 0 1" pos="0 0 -2"/>
+<body name="torso" pos="0 0 1" childclass="main"><freejoint/><geom type="ellipsoid" size=".6 .3 .2" pos="0 0 -.6"/>
+<site name="imu"/><body name="front_left" pos=".9 .2 -.3"><joint axis="0 1 0"/><geom type="cylinder" size=".2 .5"/>
+<body pos="0 0 -.6"><joint axis="1 0 0"/><geom type="mesh" mesh="foot"/></body></body>
+<body name="tail" pos="-1 0 0"><joint axis="0 0 1"/><geom type="capsule" size=".2 .4"/></body></body></worldbody>
+<sensor><rangefinder site="imu"/></sensor></mujoco>"""
+FOOT = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def quadruped():
+    """The model of a real one, where its package is installed, which is never imported."""
+    package = importlib.util.find_spec("dm_control")
+    if package is None:
+        pytest.skip("dm_control is not installed: pip install --no-deps dm_control")
+    return Path(package.submodule_search_locations[0]) / "suite" / "quadruped.xml"
+
+
+def own_robot(folder):
+    (folder / "parts").mkdir()
+    (folder / "parts" / "foot.obj").write_text(FOOT)
+    (folder / "robot.xml").write_text(ROBOT)
+    return folder / "robot.xml"
+
+
+@pytest.mark.parametrize("mount", [None, "torso"])
+@pytest.mark.parametrize("robot_of", [own_robot, lambda folder: quadruped()], ids=["small", "quadruped"])
+def test_sensors_on_a_robot_measure_our_distances_wherever_it_is(tmp_path, robot_of, mount):
+    import mujoco
+
+    robot = robot_of(tmp_path)
+    (tmp_path / "exports").mkdir()
+    path = tmp_path / "exports" / "with.xml"
+    design = replace(DESIGN, mount=mount)
+    EXPORTERS["mjcf"].write(design, RAYS, path, robot=robot)
+    assert max(one.error for one in EXPORTERS["mjcf"].rounding(design, RAYS, path).values()) < 1e-12
+    alone, _ = load_model(robot)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    assert (model.nq, model.nu) == (alone.nq, alone.nu)
+    data, generator = mujoco.MjData(model), np.random.default_rng(0)
+    data.qpos[:] = alone.qpos0 + generator.normal(0, 0.3, model.nq)
+    mujoco.mj_normalizeQuat(model, data.qpos)
+    mujoco.mj_forward(model, data)
+    scene = Scene(tuple(part.body for part in bodies_from_mujoco(alone, data.qpos)))
+    torso = rigid(data.body("torso").xmat.reshape(3, 3), data.body("torso").xpos)
+    pose = np.eye(4) if mount is None else torso
+    ours = SceneCaster(scene).first_hit(RAYS.origin_m @ pose[:3, :3].T + pose[:3, 3], RAYS.direction @ pose[:3, :3].T)
+    hit = ours.body >= 0
+    assert hit.sum() > 20
+    expected = np.where(hit, np.minimum(ours.range_m, RAYS.gate_m[:, 1]), -1.0)
+    found = data.sensordata[-len(RAYS) :]
+    # but for a ray that grazes an edge, which the six digits of MuJoCo's own files move
+    assert np.isclose(found, expected, rtol=0, atol=1e-4).mean() > 0.99
+    np.testing.assert_array_equal(model.sensor_user[-len(RAYS) :, 2], RAYS.sensor)
+
+
+def test_a_robot_without_the_body_that_carries_the_sensors_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"no body 'torsos'[\s\S]*torso"):
+        EXPORTERS["mjcf"].write(replace(DESIGN, mount="torsos"), RAYS, tmp_path / "a.xml", robot=own_robot(tmp_path))
+    with pytest.raises(ConfigError, match="holds no robot"):
+        EXPORTERS["csv"].write(DESIGN, RAYS, tmp_path / "a.csv", robot=tmp_path / "robot.xml")
+    notes = EXPORTERS["mjcf"].write(replace(DESIGN, mount="torso"), RAYS, tmp_path / "a.xml")
+    assert any("the robot's body 'torso'; --robot MODEL" in note for note in notes)
 
 
 def test_a_ray_along_any_axis_is_a_site_that_looks_there(tmp_path):

@@ -40,6 +40,15 @@ def export(
             show_default="10, as in the read-out model",
         ),
     ] = None,
+    robot: Annotated[
+        Path | None,
+        typer.Option(
+            "--robot",
+            metavar="MODEL",
+            help="MuJoCo model that the sensors are put into (mjcf).",
+            show_default="the sensors alone",
+        ),
+    ] = None,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
     dry_run: options.DryRun = False,
     seed: options.Seed = None,
@@ -69,7 +78,7 @@ def export(
         exporter = exporter_of(format_)
         source = DesignSource(read_design(design, output.remark), path=design)
         target = export_target(design, out, exporter)
-        request = ExportRequest(source, exporter, target, rays, place, rate_hz, seed or 0)
+        request = ExportRequest(source, exporter, target, rays, place, rate_hz, seed or 0, robot)
         note_new_folders([target], output)
         if dry_run:
             return show_plan(request.plan(), output)
