@@ -34,10 +34,13 @@ $(BIN)/.transport: $(BIN)/.ready
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[transport]' \
 		&& touch $@ || echo "It could not be installed; its tests are skipped"
 
+# Models of robots, alone: what runs them is not needed
+MODELS := dm-control==1.0.50 gymnasium-robotics==1.4.2 robosuite==1.5.2
 $(BIN)/.consumers: $(BIN)/.ready
-	@echo "Adding the readers of exported files: once, 200 MB"
+	@echo "Adding the readers of exported files and models of robots: once, 450 MB"
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[consumers]' \
-		&& touch $@ || echo "They could not be installed; their tests are skipped"
+		&& $(BIN)/python -m pip install --quiet --no-deps $(MODELS) && touch $@ \
+		|| echo "They could not be installed; their tests are skipped"
 
 # Programs of the system's packages: in CI and on demand alone. Tests that miss one are skipped and say why.
 system-programs: $(BIN)/.transport

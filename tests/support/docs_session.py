@@ -32,6 +32,7 @@ SMALL = {
     "face": (*QUICK, "learning.steps=80", "density.sigma_m=0.04", "truth_points=500"),
     "arm": (*QUICK, "learning.steps=100", "learning.samples=10000", "density.sigma_m=0.2", "frames=8"),
     "warehouse": (*QUICK, "learning.steps=120", "density.sigma_m=0.2"),
+    "mujoco": (*QUICK, "learning.steps=100", "density.sigma_m=0.1", "frames=4"),
     "meshes": (*QUICK[:-2], "learning.steps=100", "density.sigma_m=0.01", "poses=1", "truth_points=500"),
 }
 SEED = re.compile(r"(?<=\bseed=)\d+")
@@ -122,7 +123,7 @@ class Session:
         settings = [part for setting in SMALL[task] for part in ("--set", setting)]
         # what a page sets itself comes last and wins; files of a page are its own
         arguments = [*asked[:2], "--seed", str(shifted()), *settings, *asked[2:]]
-        own_files = task == "meshes" or "--config" in asked
+        own_files = task in ("meshes", "mujoco") or "--config" in asked
         key = (*arguments, str(self.folder)) if own_files else tuple(arguments)
         if key not in self.library.known:
             ran = in_process([*arguments, "--out", str(out)])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from importlib.util import find_spec
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -20,6 +22,7 @@ from lidardesign.config import resolve
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Returns
+from lidardesign.geometry.surface import sample_body
 from lidardesign.scene import Sphere
 from lidardesign.space import aim
 from lidardesign.testing import check_task
@@ -358,3 +361,43 @@ def test_seen_counts_targets_and_frames_with_a_return(resting):
     assert TASK.score(scene, returns).value == pytest.approx(50.0)
     nothing = [Returns(one.rays, np.full(50, Outcome.MISS), one.range_m, np.full(50, -1), one.frame) for one in returns]
     assert TASK.score(scene, nothing).value == 0.0
+
+
+# Models that nobody here made: `make consumers` installs them
+
+ASSETS = "envs/assets"
+REAL = {
+    "a quadruped, its own toes from its torso": ("dm_control", "suite/quadruped.xml", "", {
+        "targets": ("toe*",), "mount_body": "torso", "origin_m": (0.0, 0.0, -0.25), "metric": "seen",
+    }),
+    "a quadruped with a height field": ("dm_control", "suite/quadruped.xml", "", {"targets": ("terrain",)}),
+    "a humanoid": ("dm_control", "suite/humanoid.xml", "", {"targets": ("*hand",), "metric": "surface"}),
+    "a hand of meshes": ("gymnasium_robotics", f"{ASSETS}/hand/reach.xml", ASSETS, {"targets": ("*ffdistal",)}),
+    "an arm with a gripper": ("gymnasium_robotics", f"{ASSETS}/fetch/pick_and_place.xml", ASSETS, {
+        "targets": ("*finger_link",),
+    }),
+    "an arm with seven joints": ("robosuite", "models/assets/robots/panda/robot.xml", "", {
+        "targets": ("link7",), "groups": (1,),
+    }),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REAL)
+def test_targets_of_a_model_of_others_are_found_and_tell(name):
+    package, file, folder, keys = REAL[name]
+    home = find_spec(package)
+    if home is None:
+        pytest.skip(f"{package} is not installed: make consumers")
+    root = Path(next(iter(home.submodule_search_locations)))
+    config = TASK.Config(model=root / file, folder=root / folder if folder else None, train=2, frames=4, **keys)
+    (scene, _), space = TASK.scenes(config, "train", 0), TASK.space(config)
+    generator, wanted = np.random.default_rng(0), [body for body in scene.bodies if body.is_target]
+    seen = np.concatenate([sample_body(wanted, space, 500, generator, frame).points for frame in range(4)])
+    points = aim(generator.uniform(space.low[:3], space.high[:3], seen.shape), seen)
+    returns = answers(scene, rays_of_points(points, (0.0, 1e3)))
+    targets = {index for index, body in enumerate(scene.bodies) if body.is_target}
+    assert targets & set(np.concatenate([one.body for one in returns]).tolist())
+    informed = TASK.informs(scene, returns)
+    assert informed.worth.max() > 0
+    assert np.isfinite(TASK.score(scene, returns).value)
