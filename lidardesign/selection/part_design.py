@@ -85,35 +85,36 @@ def choose_parts(
     names = [part.name for part in every]
     if others := set(wanted.each) - set(names):
         raise ConfigError(f"{min(others)} is none of the parts", where="parts.each", allowed=", ".join(names))
-    unknown = [part.name for part in every if part.value("power_w") is None]
-    if wanted.power_w is not None and unknown:
-        notes(f"no source says what {', '.join(unknown)} consume: left out, as parts.power_w is bounded")
-        every = [part for part in every if part.name not in unknown]
+    nearest = [part.name for part in every if part.value("near_m") is None]
+    if nearest:
+        left_out = "left out" if wanted.names == "catalog" else "taken as 0"
+        notes(f"no source says from where {', '.join(nearest)} measure: {left_out}")
+    power = [] if wanted.power_w is None else [part.name for part in every if part.value("power_w") is None]
+    if power:
+        notes(f"no source says what {', '.join(power)} consume: left out, as parts.power_w is bounded")
+    unknown = {*power, *(nearest if wanted.names == "catalog" else ())}
+    every = [part for part in every if part.name not in unknown]
     placed = proposed(every, constraints, samples, seed)
     budget = BandwidthBudget.of(constraints, rays)
     most = (budget.rays or MOST_TABLE_RAYS) // count
     limits = _limits(placed, constraints, count, most, budget)
     bundle = PartBundle(placed, most)
-    tables = [
-        part_table(bundle, itertools.islice(scenes(purpose), information.FEW_SCENES), informs, count, seed)
-        for purpose in ("choice", "held back")
-    ]
-    (coverage, unit), (judged, _) = tables
+    held_back, proposing = (itertools.islice(scenes(name), information.FEW_SCENES) for name in ("held back", "choice"))
+    coverage, unit = part_table(bundle, proposing, informs, count, seed)
     with phase("choice"):
         chosen = choose_set(coverage, limits)
     if not chosen.members:
         raise DataError("none of the parts tells anything about the scenes", where="--parts")
     if len(chosen.members) < count:
         notes(f"{len(chosen.members)} of {count} parts: no other tells more, or fits the bounds")
-    gate = np.full(len(placed), -1)
-    gate[list(chosen.members)] = 0
+    judged, _ = part_table(bundle, held_back, informs, count, seed, chosen.members)
     loss = coverage.complete - chosen.value
     certificate = {
         "rays": 0,
         "value": float(loss),
         "bound": float(max(coverage.complete - chosen.bound, 0.0)),
         "gap": float((chosen.bound - chosen.value) / loss) if loss > 0 else 0.0,
-        "held_back_value": float(judged.loss_of(gate)),
+        "held_back_value": float(judged.loss_of(np.zeros(len(chosen.members), dtype=np.intp))),
         "candidates": len(placed),
         "gates": 1,
         "scenes": information.FEW_SCENES,
@@ -167,17 +168,18 @@ def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, 
     rules, space = constraints.rules[0], samples.space
     generator = random_generator(seed, "poses of parts")
     places, axes = _places(rules, samples, generator), Axes.of(space)
-    shapes = [shape for part in parts for shape in shapes_of(part, space)]
-    broken = [broken_keys(shape, rules) for shape in shapes]
-    if (shapes and all(broken)) or not len(places):
+    kept = [ways for part in parts if (ways := shapes_of(part, space))]
+    if not kept:
+        raise InfeasibleError("no part measures in the range of the design space", conflicts=["space.range_m", "parts"])
+    broken = [broken_keys(ways[0], rules) for ways in kept]
+    kept = [ways for ways, keys in zip(kept, broken, strict=True) if not keys]
+    if not kept or not len(places):
         keys = sorted(set().union(*broken)) if len(places) else ["origin"]
         raise InfeasibleError(
             f"no part keeps {', '.join(keys)}",
             conflicts=[*keys, "parts"],
             hint="loosen one of them, or name other parts",
         )
-    if not shapes:
-        raise InfeasibleError("no part measures in the range of the design space", conflicts=["space.range_m", "parts"])
     bounds = bounds_of(constraints.rules, space, (0,), interval_factor(DEFAULT_LEVEL))
     placed, points = [], observed_point(samples.resample(MOST_POSES, generator))
     for number, origin in enumerate(places):
@@ -187,9 +189,12 @@ def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, 
         azimuth, elevation = angles(looking / np.maximum(np.linalg.norm(looking, axis=1), TINY)[:, None])
         azimuth = clip_azimuth(azimuth, bounds)
         elevation = np.clip(elevation, bounds.elevation_low, bounds.elevation_high)
-        for shape in (shape for shape, keys in zip(shapes, broken, strict=True) if not keys):
-            for aim in zip(azimuth.tolist(), elevation.tolist(), strict=True):
-                placed.append(PlacedPart(shape, shape.pose(origin, *aim, 0.0, axes), number))
+        aims = list(zip(azimuth.tolist(), elevation.tolist(), strict=True))
+        for ways in kept:
+            for turn, shape in enumerate(ways):
+                # each way to mount a part has the middle, and its share of the others
+                for aim in (aims[0], *aims[1 + turn :: len(ways)]):
+                    placed.append(PlacedPart(shape, shape.pose(origin, *aim, 0.0, axes), number))
     return placed
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -31,7 +30,8 @@ from lidardesign.task import Information, random_generator
 
 MOST_CAST = 60_000  # rays of a scene, over all places
 MOST_PATTERN = 1000  # rays of a part's pattern that are told apart
-MOST_ITEMS = 100  # of a scene: the choice of a few parts needs few
+MOST_ITEMS = 60  # of a scene: the choice of a few parts needs few
+SIZED = 10  # one in so many parts says how large cells are, at first
 COARSE_CELL_RAD = math.radians(3.0)  # from which the size of cells is found
 
 
@@ -74,23 +74,24 @@ class PartBundle:
         placed: The parts.
         most_rays: As many rays as each fires at most, an even subset of its pattern.
 
-    `rays` are to be cast; those of part i are `members[first[i]:first[i + 1]]`, some more than once.
+    `rays` are to be cast; those of part i are `members[first[i]:first[i + 1]]`, some more than once. Of them a part
+    has `usual_rays` in the middle.
     """
 
     def __init__(self, placed: Sequence[PlacedPart], most_rays: int) -> None:
         self.placed, self.most_rays = placed, most_rays
         self._patterns: dict[str, np.ndarray] = {}
         size_rad = COARSE_CELL_RAD
-        keys = self._keys(size_rad)
-        size_rad *= math.sqrt(len(np.unique(np.concatenate(keys))) / MOST_CAST)
+        size_rad *= math.sqrt(len(np.unique(np.concatenate(self._keys(placed[::SIZED], size_rad)))) / MOST_CAST)
         while True:
-            keys = self._keys(size_rad)
+            keys = self._keys(placed, size_rad)
             cast, index, members = np.unique(np.concatenate(keys), return_index=True, return_inverse=True)
             if len(cast) <= MOST_CAST:
                 break
             size_rad *= max(math.sqrt(len(cast) / MOST_CAST), 1.05)
         self.first = np.cumsum([0, *map(len, keys)])
         self.members = members.astype(np.int32)
+        self.usual_rays = float(np.median([len(np.unique(key)) for key in keys[::SIZED]]))
         owner = np.searchsorted(self.first, index, side="right") - 1
         origin, looking = np.empty((len(cast), 3)), np.empty((len(cast), 3))
         for part in np.unique(owner):
@@ -108,19 +109,13 @@ class PartBundle:
             self._patterns[part.name] = rays[even_subset(rays, min(len(rays), self.most_rays, MOST_PATTERN))]
         return self._patterns[part.name] @ placed.pose.frame
 
-    def _keys(self, size_rad: float) -> list[np.ndarray]:
+    def _keys(self, placed: Sequence[PlacedPart], size_rad: float) -> list[np.ndarray]:
         """The number of the cell and place of each part's rays."""
         keys = []
-        for one in self.placed:
+        for one in placed:
             cell, cells = cells_of(self._looking(one), size_rad)
             keys.append(one.place * cells + cell)
         return keys
-
-    @cached_property
-    def usual_rays(self) -> float:
-        """How many different rays a part has in the middle."""
-        sizes = [len(np.unique(self.members[low:high])) for low, high in zip(self.first, self.first[1:], strict=False)]
-        return float(np.median(sizes))
 
 
 @phase("what returns tell")
@@ -130,6 +125,7 @@ def part_table(
     informs: Callable[[Scene, Sequence[Returns]], Information],
     count: int,
     seed: int,
+    among: Sequence[int] | None = None,
 ) -> tuple[Coverage, str]:
     """What every part tells about scenes, and in which unit; parts are the candidates.
 
@@ -139,8 +135,12 @@ def part_table(
         informs: What a task says of a scene's returns.
         count: How many parts a design has: what a return tells depends on how many there will be.
         seed: Root of the draws of items.
+        among: Some of the parts, where others are not asked for.
     """
-    placed, rays = bundle.placed, bundle.rays
+    rows, rays = np.arange(len(bundle.placed)) if among is None else np.array(among), bundle.rays
+    placed = [bundle.placed[row] for row in rows]
+    own = [bundle.members[bundle.first[row] : bundle.first[row + 1]] for row in rows]
+    first, members = np.cumsum([0, *map(len, own)]), bundle.members if among is None else np.concatenate(own)
     gate_m = np.array([one.shape.gate_m for one in placed])
     # of dense patterns each ray stands for many
     fired = np.minimum([one.part.rays for one in placed], bundle.most_rays)
@@ -156,7 +156,7 @@ def part_table(
             start, informed.item[order], informed.worth[order], np.zeros(0, np.uint8), informed.weight, informed.sums
         )
         every = np.empty((len(placed), len(informed.weight)), dtype=np.float32)
-        kernels.gather_parts(entries, informed.range_m[order], bundle.first, bundle.members, gate_m, every)
+        kernels.gather_parts(entries, informed.range_m[order], first, members, gate_m, every)
         if len(informed.sums):
             every *= times[:, None]
         part, item = np.nonzero(every)

@@ -24,7 +24,7 @@ from lidardesign.selection.choice import Choice
 from lidardesign.selection.coverage import Coverage
 
 FEW_SETS = 100_000  # are searched through, whatever it takes
-MOST_WORK = 3e9  # entries of the table that a search of more sets may read: some seconds
+MOST_WORK = 1e9  # entries of the table that a search of more sets may read: some seconds
 MOST_LEAVING = 2  # members of a set that are exchanged at once
 
 
