@@ -23,6 +23,7 @@ are relative to the parent.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -58,7 +59,7 @@ from lidardesign.export.common.poses import (
 )
 from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
-from lidardesign.mujoco_model import load_model
+from lidardesign.mujoco_model import load_model, mujoco_warnings
 from lidardesign.numerics import SLACK, unit_vectors
 
 WORLD = "world"
@@ -67,7 +68,9 @@ SITE_SIZE_M = 0.002
 USER_VALUES = 4  # of a rangefinder: gate start and end, sensor, time
 
 
-def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: Path | None = None) -> list[str]:
+def write_mjcf(
+    design: DesignSpec, rays: Rays, path: Path, robot: Path | None = None, folder: Path | None = None
+) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold.
 
     Arguments:
@@ -75,6 +78,7 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: Path | None = 
         rays: Its rays.
         path: The file.
         robot: A MuJoCo model, MJCF or URDF, of which the file is a copy with the sensors in it.
+        folder: Where all files of the robot are; None: in its own folder.
 
     Raises:
         DataError: The robot's model cannot be read, or has no such body.
@@ -83,7 +87,7 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: Path | None = 
     place, sensors, notes = element("worldbody"), element("sensor"), design_losses(design, mounted)
     model, taken = element("mujoco", {"model": design.name}, [place, sensors]), [WORLD]
     if robot is not None:
-        model, place, sensors = _robot_with(design.mount, robot, path)
+        model, place, sensors = _robot_with(design.mount, robot, folder, path)
         taken += [body.get("name", "") for body in model.iter("body")]
         notes.append("MuJoCo's rays meet all geoms of the robot, also those that only collide")
     bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
@@ -102,18 +106,20 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: Path | None = 
     return [*notes, "a reading equal to the cutoff is a hit at or beyond the end of the gate; -1 is no hit"]
 
 
-def _robot_with(mount: str | None, robot: Path, path: Path) -> tuple[Element, Element, Element]:
+def _robot_with(mount: str | None, robot: Path, folder: Path | None, path: Path) -> tuple[Element, Element, Element]:
     """A robot's model as MuJoCo writes it, for a file at a path, its body that sensors go into, and its sensors."""
     specifications: list[Any] = []
-    load_model(robot, edit=specifications.append)
-    root = fromstring(specifications[0].to_xml())
+    load_model(robot, folder=folder, edit=specifications.append)
+    with mujoco_warnings(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        root = fromstring(specifications[0].to_xml())
     for tag in ("compiler", "sensor", "size"):
         if root.find(tag) is None:
             root.append(element(tag))
     compiler, sensors, size = (next(root.iter(tag)) for tag in ("compiler", "sensor", "size"))
     for name in ("meshdir", "texturedir"):
-        folder = robot.resolve().parent / compiler.get(name, "")
-        compiler.set(name, os.path.relpath(folder, path.resolve().parent))
+        place_of_files = robot.resolve().parent / compiler.get(name, "")
+        compiler.set(name, os.path.relpath(place_of_files, path.resolve().parent))
     size.set("nuser_sensor", str(max(USER_VALUES, int(size.get("nuser_sensor", "0")))))
     bodies = {body.get("name", ""): body for body in root.iter("body")}
     place = next(root.iter("worldbody")) if mount is None else bodies.get(mount)

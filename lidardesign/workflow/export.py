@@ -168,7 +168,8 @@ class ExportRequest:
         at: Condition values.
         rate_hz: Frames per second, in formats that hold it [Hz].
         seed: Root of the random streams.
-        robot: A robot's model that the sensors are put into; None: they are written alone.
+        robot: A robot's model that the sensors are put into; None: that of the run of a design that is mounted on a
+            body of it, else they are written alone.
     """
 
     source: DesignSource
@@ -218,6 +219,14 @@ class ExportRequest:
             last_time(source.folder, "export"),
         )
 
+    def _robot(self) -> tuple[Path | None, Path | None]:
+        """The robot's model and the folder that holds all its files, as the run of the design names them."""
+        mounted = self.source.specification.mount is not None
+        run = self.source.opened_run() if self.exporter.robotic and (mounted or self.robot) else None
+        task = None if run is None else run.config.task
+        own = getattr(task, "model", None) if mounted else None
+        return self.robot or own, getattr(task, "folder", None)
+
     def write(self, file: Path | None = None, notes: Notes = log_note) -> Exported:
         """Write the design and read it back.
 
@@ -229,7 +238,7 @@ class ExportRequest:
         open_rays = exporter.name in WITHOUT_RAYS
         design, rays = self.source.lay_out(self.rays, self.at, self.seed, may_stay_open=open_rays, notes=notes)
         with phase("writing"):
-            lost = tuple(exporter.write(design, rays, file, self.rate_hz, self.robot))
+            lost = tuple(exporter.write(design, rays, file, self.rate_hz, *self._robot()))
         with phase("reading back"):
             rounding = exporter.rounding(design, rays, file)
         for note in lost:

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -22,6 +23,7 @@ from lidardesign.export.registry import EXPORTERS
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.mujoco_model import bodies_from_mujoco, load_model
 from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
+from lidardesign.workflow.export import DesignSource, ExportRequest
 
 ROBOTS = ("mjcf", "sdf", "urdf", "xacro", "carla", "isaac-json", "isaac-usd")
 GRIDS = ("sdf", "urdf", "xacro", "carla")
@@ -173,6 +175,17 @@ def test_sensors_on_a_robot_measure_our_distances_wherever_it_is(tmp_path, robot
     # but for a ray that grazes an edge, which the six digits of MuJoCo's own files move
     assert np.isclose(found, expected, rtol=0, atol=1e-4).mean() > 0.99
     np.testing.assert_array_equal(model.sensor_user[-len(RAYS) :, 2], RAYS.sensor)
+
+
+def test_a_mounted_design_goes_into_the_model_of_its_run(tmp_path):
+    config = SimpleNamespace(task=SimpleNamespace(model=own_robot(tmp_path), folder=tmp_path))
+    fixed = replace(DESIGN, mount="torso", layout="fixed", rays=len(RAYS), ray_table=RAYS)
+    source = DesignSource(fixed, SimpleNamespace(config=config, folder=tmp_path))
+    exported = ExportRequest(source, EXPORTERS["mjcf"], tmp_path / "with.xml").write()
+    assert exported.rays == len(RAYS)
+    model, data = simulated(exported.path)
+    assert model.body(model.body("front_left").parentid[0]).name == "torso"
+    assert len(data.sensordata) == len(RAYS) + 1
 
 
 def test_a_robot_without_the_body_that_carries_the_sensors_is_refused(tmp_path):

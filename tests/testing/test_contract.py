@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from support.tables import each_row
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import load_task
 from lidardesign.scene import Body, Medium, Mesh, Scene, Sphere
+from lidardesign.task import mount_of
 from lidardesign.testing import BrokenLawError, Limits, check_task, contract_of
 from lidardesign.testing.contract import LAWS
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
@@ -345,3 +347,12 @@ def test_what_is_watched_is_refused_outside_and_put_back(tmp_path, monkeypatch):
     assert watch.drawn == ["numpy's random in a test"]
     assert watch.changed == ["the working folder in a test"]
     (tmp_path / "after.txt").write_text("nobody watches")
+
+
+def test_sensors_are_on_a_body_with_a_name_or_in_the_world():
+    for found in (None, "torso"):
+        assert mount_of(SimpleNamespace(name="case", mount_of=lambda config, found=found: found), None) == found
+    assert mount_of(SimpleNamespace(name="case"), None) is None
+    for found in ("", 3):
+        with pytest.raises(PluginError, match="a name or None"):
+            mount_of(SimpleNamespace(name="case", mount_of=lambda config, found=found: found), None)

@@ -46,7 +46,7 @@ def export(
             "--robot",
             metavar="MODEL",
             help="MuJoCo model that the sensors are put into (mjcf).",
-            show_default="the sensors alone",
+            show_default="that of the run of a mounted design",
         ),
     ] = None,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
