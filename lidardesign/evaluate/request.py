@@ -28,7 +28,7 @@ from lidardesign.samples import Samples
 from lidardesign.scene import Scene
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.space import DesignSpace
-from lidardesign.task import Metric, Task, metric_of
+from lidardesign.task import Metric, Task, metric_of, mount_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +107,11 @@ class EvaluationRequest:
             raise ConfigError("there are no held-out scenes", where=where, allowed="1 or more")
         if not math.isfinite(self.metric.worst):
             raise PluginError(f"the worst value is {self.metric.worst}", where=where, allowed="finite")
+        mount = mount_of(self.task, self.config)
+        for design in self.designs:
+            if design.mount not in (None, mount):
+                there = "in the world" if mount is None else f"on {mount!r}"
+                raise ConfigError(f"{design.name} is mounted on the body {design.mount!r}", where=where, allowed=there)
         names = [design.name for design in self.designs]
         for name in names:
             if names.count(name) > 1 or is_baseline(name):

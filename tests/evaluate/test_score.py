@@ -264,6 +264,7 @@ def test_a_failure_has_the_worst_value_whatever_the_task_put_there():
         ({"test": []}, "no held-out scenes"),
         ({"designs": [design("a"), design("a")]}, "another design"),
         ({"designs": [design("uniform")]}, "a baseline"),
+        ({"designs": [replace(design("a"), mount="torso")]}, "mounted on the body 'torso'"),
         ({"baselines": ("nothing",)}, "unknown baseline"),
         ({"rays": (0,)}, "0 rays"),
     ],
