@@ -61,6 +61,7 @@ Channels = Annotated[
     typer.Option(
         "--channels",
         metavar="N",
+        min=1,
         help="Channels of each sensor of the layout spinning: rings that are chosen.",
         show_default="the design's, else 16",
     ),

@@ -11,13 +11,16 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from time import perf_counter
 
 import numpy as np
 
+from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.origins import PINNED_BOX_M, inside_excluded, mounts_of, origin_box
+from lidardesign.design.constraints.origins import inside_excluded, mounts_of, origin_box
+from lidardesign.design.files import MOST_TABLE_RAYS, design_document
 from lidardesign.design.fit import FitResult
-from lidardesign.design.sensor import CERTIFICATES, MOST_RAYS, Sensor, interval_factor
+from lidardesign.design.sensor import CERTIFICATES, DEFAULT_LEVEL, DesignSpec, Sensor, interval_factor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Rays, Returns
 from lidardesign.numerics import FULL_TURN
@@ -30,12 +33,13 @@ from lidardesign.selection.certificate import certify
 from lidardesign.selection.choice import Choice, RayCounts, choose
 from lidardesign.selection.coverage import Coverage, gather
 from lidardesign.selection.select import PROXY
+from lidardesign.space import DesignSpace
 from lidardesign.task import Information
 
 CHANNELS = 16  # of a sensor, where nobody says how many
 POINTS_PER_TURN = 1800  # of a channel: every fifth of a degree, as scanners do at ten turns per second
 EVEN_SHARE = 0.5  # of the candidate elevations that are even; the others lie where the density looks
-CORNERS = np.array([(0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 0)])  # of a box, no two on one edge
+PLACES = np.array([(0.5, 0.5, 0.5), (0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 0)])  # in a box, no corners on one edge
 MOST_SETS, MOST_BOUNDED = 500, 20  # of places: that are tried, and that are bounded one by one
 
 
@@ -93,69 +97,65 @@ class RingCandidates:
 
 
 def choose_rings(
-    fitted: FitResult,
     samples: Samples,
+    constraints: Constraints,
+    *,
+    count: int,
     channels: int,
     rays: int | None,
     informs: Callable[[Scene, Sequence[Returns]], Information],
     scenes: Callable[[str], Iterator[Scene]],
+    name: str,
 ) -> FitResult:
-    """As many spinning sensors as were fitted, in their stead.
+    """The design of a few spinning sensors with the best channels at the best places.
 
     Arguments:
-        fitted: Sensors fitted to the density; their places are candidates, beside corners of where sensors may be, or
-            mounts are.
         samples: Of the density, near whose elevations half of the candidates lie.
-        channels: RingCandidates of each sensor.
-        rays: Of all sensors per turn; None fires `POINTS_PER_TURN` for each channel.
+        constraints: Where sensors may stand, and what else the design keeps.
+        count: How many sensors.
+        channels: Rings of each.
+        rays: Of all sensors per turn; None fires `POINTS_PER_TURN` for each channel, or what a file
+            holds.
         informs: What a task says of a scene's returns.
         scenes: Training scenes without end for a purpose, `choice` or `held back`.
+        name: The design's name.
 
     Raises:
-        ConfigError: Rays that rings cannot share, more channels than elevations, or more sets of places than can be
-            tried.
+        ConfigError: Rays that rings cannot share, more channels than elevations, more sets of places than can be
+            tried, or a density with conditions.
         DataError: No ring tells anything about the scenes.
     """
-    spec, count = fitted.design, len(fitted.design.sensors)
-    rings = count * channels
-    rays = POINTS_PER_TURN * rings if rays is None else rays
-    points = rays // rings
-    if points * rings != rays or not 0 < rays <= MOST_RAYS:
-        raise ConfigError(
-            f"{rays} rays of {count} sensors with {channels} channels",
-            where="--rays",
-            allowed=f"a multiple of {rings}, at most {MOST_RAYS}: as many for each channel",
-        )
-    constraints = Constraints.from_mapping(spec.constraints, where=f"constraints of {spec.name}")
-    space = samples.space
+    started, space, rings = perf_counter(), samples.space, count * channels
+    points = min(POINTS_PER_TURN, MOST_TABLE_RAYS // rings) if rays is None else rays // rings
+    most = CANDIDATES_PER_RAY * channels
     candidates = RingCandidates(
-        places_of(constraints, fitted, samples),
-        elevations_of(samples, CANDIDATES_PER_RAY * channels),
-        points,
-        (space.low[5], space.high[5]),
+        places_of(constraints, space), elevations_of(samples, most), points, (space.low[5], space.high[5])
     )
-    if channels > len(candidates.elevation_rad):
-        raise ConfigError(
-            f"{channels} channels", where="--channels",
-            allowed=f"at most {len(candidates.elevation_rad)}, as many as elevations of the design space",
-        )  # fmt: skip
+    elevations = len(candidates.elevation_rad)
+    faults = {
+        ("the density has conditions", "--layout spinning", "tasks whose sensors rest"): space.conditioned,
+        (f"{channels} channels", "--channels", f"1 to {elevations}, as many as elevations to choose among"): not (
+            1 <= channels <= elevations
+        ),
+        (
+            f"{rays} rays of {count} sensors with {channels} channels",
+            "--rays",
+            f"a multiple of {rings}, at most {MOST_TABLE_RAYS}: as many for each channel",
+        ): points * rings != (rays or points * rings) or not 0 < points * rings <= MOST_TABLE_RAYS,
+    }
+    for (fault, where, allowed), is_found in faults.items():
+        if is_found:
+            raise ConfigError(fault, where=where, allowed=allowed)
     with phase("what returns tell"), information.choosing(rings / len(candidates)):
         coverage, unit = candidates.coverage(np.arange(len(candidates)), scenes("choice"), informs)
     if not len(coverage.item):
-        raise DataError(
-            f"none of {len(candidates)} rings tells anything about {information.FEW_SCENES} training scenes"
-        )
+        raise DataError(f"none of {len(candidates)} rings tells anything about the training scenes", where=name)
     with phase("choice"):
         choice, loss, bound = chosen_rings(coverage, candidates.place, count, channels)
     chosen = choice.rays
     with phase("what returns tell"), information.choosing(1.0):
         judged, _ = candidates.coverage(chosen, scenes("held back"), informs)
     places, sensor = np.unique(candidates.place[chosen], return_inverse=True)
-    elevations = candidates.elevation_rad[chosen % len(candidates.elevation_rad)]
-    sensors = tuple(
-        _spinning(f"s{number}", candidates, candidates.places_m[place], elevations[sensor == number], spec.level)
-        for number, place in enumerate(places)
-    )
     table = candidates.rays(chosen, sensor)
     certificate = {
         "rays": len(table),
@@ -169,25 +169,44 @@ def choose_rings(
         "proxy": PROXY,
         "unit": unit,
     }
-    provenance = {**spec.provenance, "channels": channels, CERTIFICATES: [certificate]}
-    sensors = tuple(replace(one, weight=1 / count, rays=points * channels) for one in sensors)
-    design = replace(
-        spec, layout="spinning", sensors=sensors, rays=len(table), ray_table=table, gates=None, provenance=provenance
+    reached = np.abs(candidates.elevation_rad[chosen % elevations])
+    design = DesignSpec(
+        name=name,
+        sensors=tuple(
+            replace(
+                _spinning(candidates, candidates.places_m[place], reached[sensor == number].max()),
+                name=f"s{number}",
+                weight=1 / count,
+                rays=points * channels,
+            )
+            for number, place in enumerate(places)
+        ),
+        layout="spinning",
+        rays=len(table),
+        ray_table=table,
+        constraints=constraints.as_document(),
+        provenance={"channels": channels, CERTIFICATES: [certificate]},
     )
-    return replace(fitted, design=design)
+    checks = check_design(design_document(design), constraints, space)
+    return FitResult(
+        design=design,
+        log_likelihood=None,
+        admissible_mass=None,
+        ess=samples.effective_sample_size,
+        satisfied=all(check.satisfied for check in checks),
+        constraints=checks,
+        seconds=perf_counter() - started,
+    )
 
 
-def places_of(constraints: Constraints, fitted: FitResult, samples: Samples) -> np.ndarray:
-    """Where spinning sensors may stand, (P, 3) [m]: all mounts, or where the fit has them and corners of their box."""
+def places_of(constraints: Constraints, space: DesignSpace) -> np.ndarray:
+    """Where spinning sensors may stand, (P, 3) [m]: all mounts, or the middle and corners of their box."""
     rules = constraints.rules[-1]
-    if mounts := mounts_of(rules):
-        return np.array(mounts)
-    low, high = origin_box(rules, samples.space)
-    if (high - low).max() <= PINNED_BOX_M:
-        return low[None]
-    corners = low + (high - low) * CORNERS
-    origins = np.array([sensor.origin_m for sensor in fitted.design.sensors])
-    return np.unique(np.concatenate([origins, corners[~inside_excluded(corners, rules)]]), axis=0)
+    if rules.origin.mounts_m:
+        return np.array(mounts_of(rules), dtype=np.float64).reshape(-1, 3)
+    low, high = origin_box(rules, space)
+    places = low + (high - low) * PLACES
+    return np.unique(places[~inside_excluded(places, rules)], axis=0)
 
 
 def elevations_of(samples: Samples, count: int) -> np.ndarray:
@@ -236,11 +255,11 @@ def chosen_rings(coverage: Coverage, place: np.ndarray, count: int, channels: in
     return best, loss, float(np.clip(coverage.complete - gain, 0.0, loss))
 
 
-def _spinning(name: str, rings: RingCandidates, place_m: np.ndarray, elevation_rad: np.ndarray, level: float) -> Sensor:
+def _spinning(rings: RingCandidates, place_m: np.ndarray, highest_rad: float) -> Sensor:
     """A sensor that stands upright and looks along +x; its field is a full turn, as a part's (see `part_sensor`)."""
-    half, (near, far) = interval_factor(level), rings.range_m
+    half, (near, far) = interval_factor(DEFAULT_LEVEL), rings.range_m
     return Sensor(
-        name=name,
+        name="",
         weight=1.0,
         origin_m=place_m,
         origin_covariance_m2=np.zeros((3, 3)),
@@ -249,8 +268,7 @@ def _spinning(name: str, rings: RingCandidates, place_m: np.ndarray, elevation_r
         roll_rad=0.0,
         spread_horizontal_rad=FULL_TURN / (2 * half),
         # as far up as down: so its own upright axis is that of its rings
-        spread_vertical_rad=float(np.abs(elevation_rad).max()) / half,
+        spread_vertical_rad=float(highest_rad) / half,
         range_m=(near + far) / 2,
         spread_range_m=(far - near) / (2 * half),
-        level=level,
     )

@@ -176,9 +176,9 @@ class FitRequest:
                 hint="give --rays N alone, or another --layout",
             )
         channels = options.channels
-        if layout == "spinning":
-            channels = channels or (base.provenance.get("channels") if base else None)
-        elif channels is not None:
+        if layout == "spinning" and channels is None and base is not None:
+            channels = base.provenance.get("channels")
+        elif layout != "spinning" and channels is not None:
             raise ConfigError(f"{channels} channels in the layout {layout}", where="--channels", allowed="spinning")
         usual_level = CHOSEN_LEVEL if LAYOUTS[layout].chosen_on_scenes else defaults.level
         level = options.level if options.level is not None else base.level if base else usual_level

@@ -278,8 +278,16 @@ def _fitted(fitter: Fitter, request: FitRequest, *, is_trial: bool = False) -> F
     if layout == "spinning":
         from lidardesign.selection.spinning import CHANNELS, choose_rings
 
-        fitted = fitter.fit(request, layout="grid", rays=None, gates=None)
-        return choose_rings(fitted, samples, request.channels or CHANNELS, rays, informs, scenes)
+        return choose_rings(
+            samples,
+            request.constraints or Constraints(),
+            count=request.choices["sensors"] or 1,
+            channels=CHANNELS if request.channels is None else request.channels,
+            rays=rays,
+            informs=informs,
+            scenes=scenes,
+            name=request.name,
+        )
     counts = sorted({request.choices["rays"]} if request.choices["rays"] else set(request.run.task.defaults.rays))
     if samples.space.conditioned:
         travelled(samples.space, "selected")

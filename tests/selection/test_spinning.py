@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from lidardesign.samples import load_samples
 from lidardesign.selection import spinning
 from lidardesign.selection.coverage import LARGEST
 from lidardesign.selection.spinning import RingCandidates, chosen_rings, elevations_of, places_of
+from lidardesign.space import DesignSpace
 from lidardesign.workflow.runs import open_run
 
 RINGS = RingCandidates(np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 2.0]]), np.radians([-20.0, -5.0, 3.0]), 8, (1.0, 60.0))
@@ -76,12 +76,11 @@ class TestRings:
 
 
 class TestCandidates:
-    def test_lie_at_all_mounts_or_at_the_fit_and_corners_of_the_free_box(self, run):
-        samples = SimpleNamespace(space=SimpleNamespace(low=(0, 0, 1), high=(2, 1, 2), free=(0, 1, 2)))
-        fitted = SimpleNamespace(design=SimpleNamespace(sensors=[SimpleNamespace(origin_m=np.array([1, 0.5, 1.5]))]))
+    def test_lie_at_all_mounts_or_in_the_middle_and_at_corners_of_the_free_box(self):
+        space = DesignSpace(low=(0, 0, 1, 0, -1, 1), high=(2, 1, 2, 6, 1, 60))
 
         def places(**origin):
-            return places_of(Constraints.from_mapping({"origin": origin}), fitted, samples).tolist()
+            return places_of(Constraints.from_mapping({"origin": origin}), space).tolist()
 
         assert places(mounts_m=[[0, 0, 1], [1, 1, 2]]) == [[0, 0, 1], [1, 1, 2]]
         assert places(fixed_m=[1, 0, 2]) == [[1, 0, 2]]

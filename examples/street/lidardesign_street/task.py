@@ -33,7 +33,9 @@ class StreetTask:
     api_version: ClassVar[int] = 1
     Config: ClassVar[type[StreetConfig]] = StreetConfig
     metric: ClassVar[Metric] = Metric("missed road users", "%", "lower", worst=PERCENT, tolerance=1.0)
-    defaults: ClassVar[Defaults] = Defaults(rays=(500, 1000, 2000), density={"sigma_m": 0.5})
+    defaults: ClassVar[Defaults] = Defaults(
+        rays=(500, 1000, 2000), density={"sigma_m": 2.0}, learning={"draft": {"steps": 500}}
+    )
 
     def space(self, config: StreetConfig) -> DesignSpace:
         """Rays from above the roof all around, from the street beside the car to a little above the horizon."""
