@@ -125,7 +125,7 @@ def choose_rings(
             tried, or a density with conditions.
         DataError: No ring tells anything about the scenes.
     """
-    started, space, rings = perf_counter(), samples.space, count * channels
+    started, space, rings = perf_counter(), samples.space, count * max(channels, 1)
     points = min(POINTS_PER_TURN, MOST_TABLE_RAYS // rings) if rays is None else rays // rings
     most = CANDIDATES_PER_RAY * channels
     candidates = RingCandidates(
