@@ -128,6 +128,19 @@ class TestAChoice:
         assert np.bincount(counts.sensor[choice.rays]).tolist() == [2, 3]
 
 
+@given(seed=seeds)
+def test_each_item_has_all_its_entries_from_what_tells_most_of_it(seed):
+    coverage = small(seed)
+    ordered = coverage.by_item
+    for item in range(len(coverage.weight)):
+        own = slice(ordered.start[item], ordered.start[item + 1])
+        told = coverage.item == item
+        assert (np.diff(ordered.worth[own]) <= 0).all()
+        found = zip(ordered.ray[own], ordered.worth[own], ordered.gates[own], strict=True)
+        entries = zip(coverage.ray[told], coverage.worth[told], coverage.gates[told], strict=True)
+        assert sorted(found) == sorted(entries)
+
+
 @pytest.mark.parametrize("price", [0.0, 0.002])
 def test_certificates_are_near_the_linear_program_that_they_relax(price):
     coverage, counts = small(3, rays=40, items=30, scenes=4), RayCounts.of_one(40, 8)
