@@ -32,6 +32,13 @@ MAX_INCLUDES = 100
 MESH_ENDINGS = (".obj", ".stl", ".msh")  # what MuJoCo reads
 # What MuJoCo's viewer shows unless told otherwise; Menagerie keeps what is seen in group 2, what collides in group 3.
 SHOWN_GROUPS = (0, 1, 2)
+PRIMITIVES: dict[str, Callable[[float, float, float], Shape]] = {
+    "sphere": lambda radius_m, *_: Sphere(radius_m),
+    "box": lambda *half_extents_m: Box(half_extents_m),
+    "capsule": lambda radius_m, half_length_m, _: Capsule(radius_m, half_length_m),
+    "cylinder": lambda radius_m, half_length_m, _: Cylinder(radius_m, half_length_m),
+    "ellipsoid": lambda *semi_axes_m: Ellipsoid(semi_axes_m),
+}
 ALLOWED = "an MJCF or URDF model that MuJoCo can load"
 
 FileState = tuple[str, int, int]
@@ -187,8 +194,8 @@ def visible_geoms(
     """
     shown = np.isin(model.geom_group, SHOWN_GROUPS if groups is None else list(groups))
     # MuJoCo's rays pass through what is fully transparent, too
-    alpha = np.where(model.geom_matid < 0, model.geom_rgba[:, 3], 1.0)
-    alpha[model.geom_matid >= 0] = model.mat_rgba[model.geom_matid[model.geom_matid >= 0], 3]
+    alpha, coated = model.geom_rgba[:, 3].copy(), model.geom_matid >= 0
+    alpha[coated] = model.mat_rgba[model.geom_matid[coated], 3]
     chosen = np.flatnonzero(shown & (alpha > 0))
     notes = []
     if groups is None:
@@ -236,16 +243,8 @@ def _piece(model: mujoco.MjModel, name: str, geoms: list[int], clip_m: float | N
     pose, kind, size = _geom_pose(model, geoms[0]), _kind(model, geoms[0]), model.geom_size[geoms[0]].tolist()
     if _is_mesh(model, geoms[0]):
         return _merged(model, name, geoms), np.eye(4)
-    if kind == "sphere":
-        return Sphere(size[0]), pose
-    if kind == "box":
-        return Box((size[0], size[1], size[2])), pose
-    if kind == "capsule":
-        return Capsule(size[0], size[1]), pose
-    if kind == "cylinder":
-        return Cylinder(size[0], size[1]), pose
-    if kind == "ellipsoid":
-        return Ellipsoid((size[0], size[1], size[2])), pose
+    if kind in PRIMITIVES:
+        return PRIMITIVES[kind](*size), pose
     if kind == "hfield":
         return _height_field(model, name, int(model.geom_dataid[geoms[0]])), pose
     # a plane, endless where its size is 0

@@ -153,6 +153,28 @@ def test_geoms_are_seen_by_their_group_and_keep_their_names():
     assert [(geom.name, geom.shape) for geom in hulls] == [("arm", Sphere(0.3))]
 
 
+@pytest.mark.parametrize("material", ["", 'material="clear"', 'material="solid"'])
+@pytest.mark.parametrize("colour", ["", 'rgba="1 0 0 0"', 'rgba="1 0 0 1"'])
+def test_what_rays_of_mujoco_pass_through_is_no_body(material, colour):
+    assets = '<asset><material name="clear" rgba="1 1 1 0"/><material name="solid" rgba="1 1 1 1"/></asset>'
+    model = model_of(f'<geom size="1" {material} {colour}/><geom name="other" size=".1" pos="5 5 5"/>', assets=assets)
+    (range_m,) = mujoco_ranges(model, model.qpos0, np.array([[3.0, 0, 0]]), np.array([[-1.0, 0, 0]]))
+    assert len(bodies_from_mujoco(model, model.qpos0)) == 1 + np.isfinite(range_m)
+
+
+def test_what_only_collides_is_left_out_where_its_body_has_other_shapes_to_be_seen():
+    hull, skin = '<geom name="hull" size=".3"/>', '<geom name="skin" size=".2" group="1" contype="0" conaffinity="0"/>'
+    for geoms, names in (
+        (hull + skin, ["skin"]),
+        (hull, ["hull"]),
+        (hull + skin.replace('group="1"', ""), ["hull", "skin"]),
+    ):
+        model = model_of(f"<geom size='.1'/><body>{geoms}</body>")
+        on_body = [part.geom_name for part in bodies_from_mujoco(model, model.qpos0) if part.body_name != "world"]
+        assert on_body == names
+        assert bool(visible_geoms(model)[1]) == (names == ["skin"])
+
+
 def test_poses_and_groups_that_a_model_does_not_have_are_refused():
     model = model_of('<body><freejoint/><geom size="1"/></body>')
     for qpos in (np.zeros(3), np.full((2, 7), np.nan), np.zeros((0, 7))):
