@@ -30,6 +30,7 @@ from lidardesign.task import Information
 PROXY = "mean over items of what the returns of the chosen rays leave unknown, by informs of the task"
 LOSS_PER_BANDWIDTH = 0.2  # where bandwidth has no limit: ten percent more of it must bring two percent less loss
 SMALLEST_GAIN = 0.01  # of the held-back loss: what twice the scenes must gain
+MOST_ENTRIES = 10_000_000  # of the table, some 200 MB: scenes of few items may be more
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +210,8 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
         choices = problem.choices(coverage, middle)
         judged = coverage if problem.is_trial else problem.coverage(held_back, gates_m)
         before, loss = loss, judged.loss_of(_gate_of(choices))
-        if problem.is_trial or loss > (1 - SMALLEST_GAIN) * before or 2 * wanted > problem.most_scenes:
+        is_large = 2 * wanted > problem.most_scenes or 2 * len(coverage.item) > MOST_ENTRIES
+        if problem.is_trial or is_large or loss > (1 - SMALLEST_GAIN) * before:
             break
         wanted *= 2
     rays, shared = problem.rays, None

@@ -36,7 +36,7 @@ from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import conditions_of, random_generator
 from lidardesign.workflow.run_folder import RunFolder
 
-MOST_CHOSEN = 5000  # rays: what candidates tell of 400 scenes then takes minutes and gigabytes
+MOST_CHOSEN = 5000  # rays: what candidates tell of scenes then takes minutes and gigabytes
 EVEN_SHARE = 0.25  # of the candidates that are even in the fields, where the density's samples may be sparse
 MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes returned, in the density's sigma
 NEAREST_SHARE = 0.1  # of the samples along a condition that propose rays at one of its values
