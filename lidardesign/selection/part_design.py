@@ -98,7 +98,7 @@ def choose_parts(
     budget = BandwidthBudget.of(constraints, rays)
     most = (budget.rays or MOST_TABLE_RAYS) // count
     limits = _limits(placed, constraints, count, most, budget)
-    bundle = PartBundle(placed, most)
+    bundle = PartBundle(placed, most, next(scenes("choice")).frames)
     held_back, proposing = (itertools.islice(scenes(name), information.FEW_SCENES) for name in ("held back", "choice"))
     coverage, unit = part_table(bundle, proposing, informs, count, seed)
     with phase("choice"):

@@ -29,6 +29,7 @@ from lidardesign.selection.information import choosing
 from lidardesign.task import Information, random_generator
 
 MOST_CAST = 60_000  # rays of a scene, over all places
+MOST_CASTS = 1_000_000  # of a scene, over all its frames
 MOST_PATTERN = 1000  # rays of a part's pattern that are told apart
 MOST_ITEMS = 60  # of a scene: the choice of a few parts needs few
 SIZED = 10  # one in so many parts says how large cells are, at first
@@ -73,22 +74,23 @@ class PartBundle:
     Arguments:
         placed: The parts.
         most_rays: As many rays as each fires at most, an even subset of its pattern.
+        frames: How often they are cast in a scene.
 
     `rays` are to be cast; those of part i are `members[first[i]:first[i + 1]]`, some more than once. Of them a part
     has `usual_rays` in the middle.
     """
 
-    def __init__(self, placed: Sequence[PlacedPart], most_rays: int) -> None:
+    def __init__(self, placed: Sequence[PlacedPart], most_rays: int, frames: int) -> None:
         self.placed, self.most_rays = placed, most_rays
         self._patterns: dict[str, np.ndarray] = {}
-        size_rad = COARSE_CELL_RAD
-        size_rad *= math.sqrt(len(np.unique(np.concatenate(self._keys(placed[::SIZED], size_rad)))) / MOST_CAST)
+        size_rad, most = COARSE_CELL_RAD, min(MOST_CAST, MOST_CASTS // frames)
+        size_rad *= math.sqrt(len(np.unique(np.concatenate(self._keys(placed[::SIZED], size_rad)))) / most)
         while True:
             keys = self._keys(placed, size_rad)
             cast, index, members = np.unique(np.concatenate(keys), return_index=True, return_inverse=True)
-            if len(cast) <= MOST_CAST:
+            if len(cast) <= most:
                 break
-            size_rad *= max(math.sqrt(len(cast) / MOST_CAST), 1.05)
+            size_rad *= max(math.sqrt(len(cast) / most), 1.05)
         self.first = np.cumsum([0, *map(len, keys)])
         self.members = members.astype(np.int32)
         self.usual_rays = float(np.median([len(np.unique(key)) for key in keys[::SIZED]]))

@@ -155,7 +155,7 @@ def test_a_part_tells_what_its_own_rays_would(run):
     parts = [find_part(name) for name in THREE]
     placed = part_design.proposed(parts, part_design.Constraints(), load_samples(run), 0)
     scene = opened.task.scenes(opened.config.task, "train", 0)[0]
-    coverage, _ = part_table(PartBundle(placed, 64), [scene], every_return, 2, 0)
+    coverage, _ = part_table(PartBundle(placed, 64, 1), [scene], every_return, 2, 0)
     for number in range(0, len(placed), 7):
         one = placed[number]
         rays = part_rays(one.part, one.pose)
