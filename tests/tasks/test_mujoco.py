@@ -290,6 +290,12 @@ def test_a_configuration_that_cannot_be_used_says_what_to_do(configured, case):
     assert "task." in str(error.value.where)
 
 
+def test_one_name_needs_no_list(folder):
+    given = [f"model={folder / 'robot.xml'}"]
+    alone, listed = (resolve(TASK, overrides=[*given, f"targets={names}"]).task for names in ("hand", "[hand]"))
+    assert alone == listed
+
+
 def test_words_for_motions_are_no_paths(folder, monkeypatch):
     given = [f"model={folder / 'robot.xml'}", "targets=[hand]"]
     walk = write_csv(folder / "walk.csv", table(np.zeros(10)))

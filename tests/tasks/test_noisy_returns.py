@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
+from lidardesign_tasks.robot.task import MujocoTask
 from lidardesign_tasks.surface import surface_score, with_visible_truth
 from lidardesign_tasks.warehouse import WarehouseTask
 from support.meshes import write_ball
@@ -27,11 +30,13 @@ from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.space import DIMENSIONS, RANGE, DesignSpace
 from lidardesign.task import Metric, Score, conditions_of, scenes_of
 
+ARM = Path(str(files("lidardesign_tasks") / "data" / "iiwa14.xml"))
 TASKS = {
     "arm": (ArmTask, {"train": 1, "test": 1, "frames": 12}),
     "emitter": (EmitterTask, {"train": 1, "test": 1, "truth_points": 800}),
     "face": (FaceTask, {"train": 1, "test": 1, "truth_points": 800}),
     "flatland": (FlatlandTask, {"train": 1, "test": 1}),
+    "mujoco": (MujocoTask, {"model": ARM, "targets": ("link7",), "train": 1, "test": 1, "frames": 6}),
     "meshes": (MeshesTask, {"folder": "balls", "truth_points": 800, "poses": 2}),
     "warehouse": (WarehouseTask, {"train": 1, "test": 1}),
 }

@@ -10,10 +10,10 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
@@ -35,6 +35,8 @@ from lidardesign_tasks.surroundings import Surroundings
 from lidardesign_tasks.view import space_around
 
 Vector = tuple[float, float, float]
+# names may be given alone or as a list
+Patterns = Annotated[tuple[str, ...], BeforeValidator(lambda given: [given] if isinstance(given, str) else given)]
 SENSOR_DISTANCE = 2.0  # extents
 ROOM = 1.1  # around the sphere that holds the targets wherever they move
 ABOVE_MOUNT_M = 0.01
@@ -48,15 +50,15 @@ class MujocoConfig(Surroundings):
 
     model: Path | None = Field(None, description="MJCF or URDF file of the robot and what stands around it")
     folder: Path | None = Field(None, description="folder that holds all files of the model; its own if empty")
-    targets: tuple[str, ...] = Field((), description="what to find: names of bodies or geoms, as [hand*]")
+    targets: Patterns = Field((), description="what to find: names of bodies or geoms, as [hand*]")
     motion: Literal["random", "keyframes"] | Path = Field(
         "random", description="CSV or NPZ of joint positions over time (time_s and a column per joint; NAME.x, .y, .z, "
         ".qw, .qx, .qy, .qz of free ones), a folder of them, keyframes of the model, or random"
     )  # fmt: skip
-    known: tuple[str, ...] = Field(
+    known: Patterns = Field(
         ("*",), description="bodies or geoms, none of targets, whose returns are told apart: by default all"
     )
-    ignored: tuple[str, ...] = Field((), description="bodies or geoms that are left out")
+    ignored: Patterns = Field((), description="bodies or geoms that are left out")
     groups: tuple[int, ...] | None = Field(None, description="groups of geoms that are seen; 0, 1 and 2 if empty")
     mount_body: str | None = Field(None, description="the body that sensors are on; in the world if empty")
     origin_m: Vector | None = Field(
