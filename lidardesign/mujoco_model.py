@@ -192,6 +192,35 @@ def visible_geoms(
     Raises:
         DataError: No geom is visible, or the mesh of one cannot be used.
     """
+    chosen, notes = seen_geoms(model, groups)
+    pieces: list[ModelGeom] = []
+    for body in np.unique(model.geom_bodyid[chosen]).tolist():
+        name = model.body(body).name or f"body {body}"
+        geoms = chosen[model.geom_bodyid[chosen] == body].tolist()
+        nameless = [geom for geom in geoms if _is_mesh(model, geom) and not model.geom(geom).name]
+        parts = [(geom, [geom]) for geom in geoms if geom not in nameless[1:]]
+        parts = [(geom, nameless if geom in nameless else own) for geom, own in parts]
+        for number, (geom, own) in enumerate(parts, 1):
+            label = model.geom(geom).name
+            full = name if len(parts) == 1 else f"{name} {label or number}"
+            shape, pose = _piece(model, full, own, clip_m)
+            pieces.append(ModelGeom(full, name, label, body, shape, pose))
+    meshes = ((piece.name, piece.shape) for piece in pieces if isinstance(piece.shape, Mesh))
+    notes += [f"{name}: {note}" for name, mesh in meshes for note in mesh.notes]
+    if model.nflex or model.nskin:
+        notes.append(f"flexible bodies and skins are left out: {model.nflex + model.nskin}")
+    return tuple(pieces), tuple(notes)
+
+
+def seen_geoms(model: mujoco.MjModel, groups: Sequence[int] | None = None) -> tuple[np.ndarray, list[str]]:
+    """The numbers of the visible geoms of a model, ascending, and notes on what was left out.
+
+    Arguments:
+        model, groups: As of `bodies_from_mujoco`.
+
+    Raises:
+        DataError: There are none.
+    """
     shown = np.isin(model.geom_group, SHOWN_GROUPS if groups is None else list(groups))
     # MuJoCo's rays pass through what is fully transparent, too
     alpha, coated = model.geom_rgba[:, 3].copy(), model.geom_matid >= 0
@@ -210,23 +239,7 @@ def visible_geoms(
     if not len(chosen):
         used = ", ".join(str(group) for group in np.unique(model.geom_group)) or "none"
         raise DataError("the model has no visible geoms", allowed=f"groups that it uses: {used}")
-    pieces: list[ModelGeom] = []
-    for body in np.unique(model.geom_bodyid[chosen]).tolist():
-        name = model.body(body).name or f"body {body}"
-        geoms = chosen[model.geom_bodyid[chosen] == body].tolist()
-        nameless = [geom for geom in geoms if _is_mesh(model, geom) and not model.geom(geom).name]
-        parts = [(geom, [geom]) for geom in geoms if geom not in nameless[1:]]
-        parts = [(geom, nameless if geom in nameless else own) for geom, own in parts]
-        for number, (geom, own) in enumerate(parts, 1):
-            label = model.geom(geom).name
-            full = name if len(parts) == 1 else f"{name} {label or number}"
-            shape, pose = _piece(model, full, own, clip_m)
-            pieces.append(ModelGeom(full, name, label, body, shape, pose))
-    meshes = ((piece.name, piece.shape) for piece in pieces if isinstance(piece.shape, Mesh))
-    notes += [f"{name}: {note}" for name, mesh in meshes for note in mesh.notes]
-    if model.nflex or model.nskin:
-        notes.append(f"flexible bodies and skins are left out: {model.nflex + model.nskin}")
-    return tuple(pieces), tuple(notes)
+    return chosen, notes
 
 
 def _kind(model: mujoco.MjModel, geom: int) -> str:

@@ -59,12 +59,13 @@ from lidardesign.export.common.poses import (
 )
 from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
-from lidardesign.mujoco_model import load_model, mujoco_warnings
+from lidardesign.mujoco_model import load_model, mujoco_warnings, seen_geoms
 from lidardesign.numerics import SLACK, unit_vectors
 
 WORLD = "world"
 # Half of what a site of one ray is drawn as [m].
 SITE_SIZE_M = 0.002
+UNSEEN = "lidardesign_unseen"
 USER_VALUES = 4  # of a rangefinder: gate start and end, sensor, time
 
 
@@ -89,7 +90,7 @@ def write_mjcf(
     if robot is not None:
         model, place, sensors = _robot_with(design.mount, robot, folder, path)
         taken += [body.get("name", "") for body in model.iter("body")]
-        notes.append("MuJoCo's rays meet all geoms of the robot, also those that only collide")
+        notes.append("geoms of the robot that are not shown are transparent, for MuJoCo's rays pass no others")
     bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
     site = np.empty(len(rays), dtype=object)
     for mount, name in zip(mounted, bodies, strict=True):
@@ -109,7 +110,13 @@ def write_mjcf(
 def _robot_with(mount: str | None, robot: Path, folder: Path | None, path: Path) -> tuple[Element, Element, Element]:
     """A robot's model as MuJoCo writes it, for a file at a path, its body that sensors go into, and its sensors."""
     specifications: list[Any] = []
-    load_model(robot, folder=folder, edit=specifications.append)
+    model, _ = load_model(robot, folder=folder, edit=specifications.append)
+    seen = set(seen_geoms(model)[0].tolist())
+    # the class of a geom may have a material, whose transparency counts more than the geom's own colour
+    specifications[0].add_material(name=UNSEEN, rgba=(0.5, 0.5, 0.5, 0.0))
+    for geom in specifications[0].geoms:
+        if geom.id not in seen:
+            geom.material = UNSEEN
     with mujoco_warnings(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         root = fromstring(specifications[0].to_xml())

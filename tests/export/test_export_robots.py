@@ -120,10 +120,13 @@ def test_mujoco_measures_our_distances(exported):
     assert bodies == {one.name for one in DESIGN.sensors}
 
 
-ROBOT = """<mujoco><compiler meshdir="parts"/><asset><mesh name="foot" file="foot.obj"/></asset>
-<default><site type="box" size="9 9 9" euler="10 20 30"/></default>
+ROBOT = """<mujoco><compiler meshdir="parts"/><asset><mesh name="foot" file="foot.obj"/><material name="skin"/></asset>
+<default><site type="box" size="9 9 9" euler="10 20 30"/>
+<default class="hull"><geom material="skin" group="3"/></default></default>
 <worldbody><geom type="plane" size="0 0 1" pos="0 0 -2"/>
-<body name="torso" pos="0 0 1" childclass="main"><freejoint/><geom type="ellipsoid" size=".6 .3 .2" pos="0 0 -.6"/>
+<body name="torso" pos="0 0 1" childclass="main"><freejoint/>
+<geom type="ellipsoid" size=".6 .3 .2" pos="0 0 -.6" material="skin"/>
+<geom size="3" class="hull"/>
 <site name="imu"/><body name="front_left" pos=".9 .2 -.3"><joint axis="0 1 0"/><geom type="cylinder" size=".2 .5"/>
 <body pos="0 0 -.6"><joint axis="1 0 0"/><geom type="mesh" mesh="foot"/></body></body>
 <body name="tail" pos="-1 0 0"><joint axis="0 0 1"/><geom type="capsule" size=".2 .4"/></body></body></worldbody>
