@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,20 +18,20 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints, Gate
+from lidardesign.design.constraints.origins import mounts_of
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition, opened_gate, whole_range
 from lidardesign.evaluate.baselines.simple import CMA
-from lidardesign.evaluate.baselines.views import TrainingViews, dense_points
-from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, Way
-from lidardesign.evaluate.cma.parameters import SearchRules
+from lidardesign.evaluate.baselines.views import TrainingViews
+from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, SearchRules
 from lidardesign.evaluate.cma.search import Progress, Search, SearchBudget, SearchResult, TrainingObjective
-from lidardesign.evaluate.cma.starts import scan_starts, starts
+from lidardesign.evaluate.cma.starts import starts
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.run.clock import phase
 from lidardesign.simulate.detector.detector import IDEAL
-from lidardesign.space import DIMENSIONS, DesignSpace
+from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, random_generator
 
 # A scan within a bandwidth has at most so many times the rays of the design that it follows.
@@ -63,16 +64,14 @@ class SearchRecord:
         limit_mbps: The bandwidth that it kept to; None: it was asked for this number of rays.
         found: What it found.
         broken: Names of constraints that the independent checker says are broken: none.
-        parameters: How many numbers it varied.
-        design: What it found, as a design.
+        sensors: How many sensors it varied.
     """
 
     rays: int
     limit_mbps: float | None
     found: SearchResult
     broken: Sequence[str]
-    parameters: int
-    design: DesignSpec
+    sensors: int
 
     def note(self, followed: str, metric: Metric) -> str:
         """What people are told of it.
@@ -85,7 +84,7 @@ class SearchRecord:
         limit = "" if self.limit_mbps is None else f" in {self.limit_mbps:.3g} Mbit/s"
         broken = f"; it breaks {', '.join(self.broken)}" if self.broken else ""
         return (
-            f"cma at {self.rays} rays{limit}: {self.parameters} numbers of the sensors of {followed} varied for "
+            f"cma at {self.rays} rays{limit}: {found.model.size} numbers of the sensors of {followed} varied for "
             f"{found.seconds:.0f} s, {found.candidates} candidates, {found.start_value:.4g} to {found.value:.4g} "
             f"{metric.unit} on {found.scenes} training scenes{broken}"
         )
@@ -96,8 +95,8 @@ class SearchRecord:
         return {
             "rays": self.rays,
             "limit_mbps": self.limit_mbps,
-            "sensors": len(self.design.sensors),
-            "parameters": self.parameters,
+            "sensors": self.sensors,
+            "parameters": found.model.size,
             "seconds": found.seconds,
             "cpu_seconds": found.cpu_seconds,
             "candidates": found.candidates,
@@ -156,9 +155,10 @@ class CmaCandidate:
             label = f"cma, {rays.count} rays" if rays.count else f"cma, {rays.limit_mbps:.3g} Mbit/s"
             show = None if show_search is None else (lambda progress: show_search(label, progress))
             found = Search(models, rays, self.objective, budget, generator, show, began).run()
+            positions = found.model.positions(found.vector, rays)
             if not self._varies_gates(rays):
-                found = self._cropped(found, rays)
-            self._known[key] = found.model.positions(found.vector, rays), self._record(found, rays)
+                positions = self._cropped(positions, found.scenes)
+            self._known[key] = positions, self._record(found, rays)
         return self._known[key][0]
 
     def record_of(self, positions: RaysPerCondition) -> SearchRecord | None:
@@ -167,48 +167,30 @@ class CmaCandidate:
 
     def _varies_gates(self, rays: RayAllowance) -> bool:
         """Whether a wider gate could be worse: where it costs, where it is bounded, or where light is counted."""
-        common = self._constraints()
+        common = self._constraints
         bounded = any(one.gate != Gate() for one in (common, *common.each))
         counted = self.objective.planner.detector != IDEAL
         return counted or bounded or rays.limit_mbps is not None or common.budget.bandwidth_mbps is not None
 
-    def _cropped(self, found: SearchResult, rays: RayAllowance) -> SearchResult:
+    def _cropped(self, positions: RaysPerCondition, scenes: int) -> RaysPerCondition:
         """The same rays with gates from the nearest to the furthest return that their sensor had."""
-        positions = found.model.positions(found.vector, rays)
-        sensor, range_m = self.objective.returned(positions, range(found.scenes))
+        sensor, range_m = self.objective.returned(positions, range(scenes))
         gates = np.tile(whole_range(self.space), (int(max(rays.sensor.max() for rays in positions)) + 1, 1))
         for index in np.unique(sensor):
             own = range_m[sensor == index]
-            # a gate goes through its mean and spread: rounding must not cut the outermost returns off
+            # rounding must not cut the outermost returns off
             gates[index] = opened_gate((1 - COARSE_SLACK) * float(own.min()), (1 + COARSE_SLACK) * float(own.max()))
-        model = found.model.with_gates(found.vector, gates)
-        return replace(found, model=model, vector=model.zero)
+        return tuple(replace(rays, gate_m=gates[rays.sensor]) for rays in positions)
 
     def _record(self, found: SearchResult, rays: RayAllowance) -> SearchRecord:
-        design = found.model.design(found.vector, rays)
-        space = self._rules(rays).space
-        checks = check_design(design_document(design), design.constraints, space) if design.rays else []
-        return SearchRecord(
-            design.rays or 0,
-            rays.limit_mbps,
-            found,
-            [check.name for check in checks if not check.satisfied],
-            found.model.size,
-            design,
-        )
+        designs, space = found.model.designs(found.vector, rays), self._rules(rays).space
+        checks = [
+            check for one in designs if one.rays for check in check_design(design_document(one), one.constraints, space)
+        ]
+        broken = list(dict.fromkeys(check.name for check in checks if not check.satisfied))
+        return SearchRecord(designs[0].rays or 0, rays.limit_mbps, found, broken, len(designs[0].sensors))
 
-    def _constraints(self) -> Constraints:
-        return Constraints.from_mapping(self._document(), where=f"constraints of {self.followed.name}")
-
-    def _rules(self, rays: RayAllowance) -> SearchRules:
-        design = self.followed
-        space = self.space
-        if space.conditioned:
-            bolted = self.conditions[len(self.conditions) // 2] if design.track is None else {}
-            space = space.at({**bolted, **design.at})
-        per_ray = design.track is not None or layout_of(design).one_sensor_per_ray
-        return SearchRules(space, self._constraints(), design.level, per_ray, design.at, self._varies_gates(rays))
-
+    @cached_property
     def _document(self) -> dict[str, Any]:
         """The followed design's constraints; the number of rays is that of the comparison."""
         document = dict(self.followed.constraints)
@@ -216,22 +198,40 @@ class CmaCandidate:
             document["budget"] = {key: value for key, value in document["budget"].items() if key != "rays"}
         return document
 
+    @cached_property
+    def _constraints(self) -> Constraints:
+        return Constraints.from_mapping(self._document, where=f"constraints of {self.followed.name}")
+
+    def _rules(self, rays: RayAllowance) -> SearchRules:
+        design, space = self.followed, self.space
+        if space.conditioned:
+            bolted = self.conditions[len(self.conditions) // 2] if design.track is None else {}
+            space = space.at({**bolted, **design.at})
+        standing = any(mounts_of(one) or one.origin.exclude for one in self._constraints.rules)
+        return SearchRules(
+            space,
+            self._constraints,
+            design.level,
+            design.track is not None or layout_of(design).one_sensor_per_ray,
+            design.at,
+            self._varies_gates(rays),
+            np.array([sensor.origin_m for sensor in design.sensors]) if standing else None,
+        )
+
     def _models(self, rays: RayAllowance) -> list[DesignModel]:
         """Every start as a model whose vector 0 it is."""
-        rules, views, document = self._rules(rays), self.views, self._document()
+        rules, views, track = self._rules(rays), self.views, self.followed.track
         if rules.space != views.space:
             views = TrainingViews(rules.space, views.train)
-        track, count = self.followed.track, len(self.followed.sensors)
-        if track is not None:
-            way = Way(DIMENSIONS.index(track.dimension), np.array([track.knots[0], track.knots[-1]]))
-            middle = replace(rules, space=rules.space.at({track.dimension: float(way.places.mean())}))
-            return [
-                DesignModel(rules, [*start] * len(way.places), self.conditions, document, way)
-                for start in scan_starts(middle, views, views.hits(dense_points(rules.space)), self._scan_rays(rays))
-            ]
-        if rules.one_sensor_per_ray:
-            count = self._scan_rays(rays)
-        return [DesignModel(rules, start, self.conditions, document) for start in starts(rules, views, count)]
+        if track is None:
+            count = self._scan_rays(rays) if rules.one_sensor_per_ray else len(self.followed.sensors)
+            return [DesignModel(rules, start, self.conditions, self._document) for start in starts(rules, views, count)]
+        way = track.dimension, float(track.knots[0]), float(track.knots[-1])
+        middle = replace(rules, space=rules.space.at({track.dimension: (way[1] + way[2]) / 2}))
+        return [
+            DesignModel(rules, [*start, *start], self.conditions, self._document, way)
+            for start in starts(middle, views, self._scan_rays(rays))
+        ]
 
     def _scan_rays(self, rays: RayAllowance) -> int:
         """The number of rays of a scan: as asked, or what a bandwidth pays for at the followed design's gates."""

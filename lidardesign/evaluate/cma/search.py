@@ -4,8 +4,8 @@ The best of some starts, by the metric on a few training scenes, is where the se
 are scored in the same scenes; their number doubles as the budget is used up until it takes in all that there are,
 and the last share is kept to compare the finalists (every start that a search began from, the best of every stage, and
 the mean of the last distribution) on all of them. A search that has converged begins anew at the best found so far,
-with twice the population. Vectors beyond the constraints stand for their projection, and are ranked behind it by how
-far they lie beyond.
+with twice the population. Vectors beyond the constraints are ranked behind what they stand for by how far they lie
+beyond.
 
 All candidates of a step see the same scenes and the same chance (common random numbers), so that what tells them apart
 is what they are. Casters, and what a scene calls for, are worked out once per scene and kept.
@@ -159,7 +159,7 @@ class SearchResult:
 
     Arguments:
         model: Of the parameters that were best.
-        vector: The best parameters, projected.
+        vector: The best parameters.
         start_value, value: Of the start and the best, on all scenes that finalists are compared on; in the metric's
             own direction.
         seconds, cpu_seconds: What it took, and what the processor worked for it: less where others use it too [s].
@@ -180,7 +180,7 @@ class SearchResult:
     restarts: int
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class _Scored:
     """Parameters, and their score in the scenes of the stage, lower is better."""
 
@@ -217,37 +217,28 @@ class Search:
         self._began, self._worked = budget.clock() if began is None else began, time.process_time()
         self._candidates = self._evaluations = self._restarts = 0
         self._last = min(len(objective.scenes), MOST_SCENES)
-        self._stages = _stages(self._last)
         self._per_evaluation = 0.0
         self._finalists: list[_Scored] = []
 
     def run(self) -> SearchResult:
         """Search until the budget is used up."""
-        stage = 0
-        best = self._best_start(self._stages[0])
-        start = replace(best)
+        stages = _stages(self._last)
+        start = best = self._best_start(stages[0])
         self._finalists = [start]
-        strategy = _Strategy(best.model, best.vector, self._generator)
-        while best.model.size and not self._over(strategy.evolution.popsize * self._stages[stage]):
-            # the number of the stage: each takes half as large a share of what is left as the one before had
-            wanted = min(int(-math.log2(max(1.0 - self._share(), TINY)) * STAGE_PACE), len(self._stages) - 1)
-            if wanted > stage:
-                stage = wanted
-                self._finalists.append(replace(best))
-                with contextlib.suppress(OutOfTimeError):
-                    best = replace(best, value=float(self._values([best], self._stages[stage])[0]))
-                    self._tell(best)
-            try:
-                self._step(strategy, best, self._stages[stage])
-            except OutOfTimeError:
-                break
-            if strategy.evolution.stop():
-                self._restarts += 1
-                strategy = _Strategy(best.model, best.vector, self._generator, self._restarts)
-        self._finalists.append(best)
-        if best.model.size:
-            self._finalists.append(_Scored(strategy.model, strategy.model.projected(strategy.evolution.mean)))
-        return self._chosen(start)
+        strategy = _Strategy(start.model, start.vector, self._generator)
+        with contextlib.suppress(OutOfTimeError):
+            for number, scenes in enumerate(stages, start=1):
+                until = 1.0 if scenes == self._last else 1.0 - 2.0 ** (-number / STAGE_PACE)
+                if number > 1 and self._share() < until:
+                    best = replace(best, value=float(self._values([best], scenes)[0]))
+                while start.model.size and self._share() < until and self._share(len(strategy) * scenes) < 1.0:
+                    best = self._step(strategy, best, scenes)
+                    if strategy.evolution.stop():
+                        self._restarts += 1
+                        strategy = _Strategy(best.model, best.vector, self._generator, self._restarts)
+                    # what was best so far stands for its stage
+                    self._finalists[number:] = [best]
+        return self._chosen([*self._finalists, replace(start, vector=np.asarray(strategy.evolution.mean))])
 
     def _best_start(self, scenes: int) -> _Scored:
         """The best of all starts: of many, the best on few scenes are compared on more.
@@ -263,34 +254,34 @@ class Search:
 
     def _ranked(self, starts: Sequence[_Scored], scenes: int) -> list[_Scored]:
         """Starts by their scores in the first scenes, the best first; those that are not scored come last."""
-        ranked = [replace(start, value=math.inf) for start in starts]
+        values = np.full(len(starts), math.inf)
         with contextlib.suppress(OutOfTimeError):
-            for first in range(0, len(ranked), STARTS_AT_ONCE):
-                group = ranked[first : first + STARTS_AT_ONCE]
-                for start, value in zip(group, self._values(group, scenes).tolist(), strict=True):
-                    start.value = value
-        return sorted(ranked, key=lambda start: start.value)
+            for first in range(0, len(starts), STARTS_AT_ONCE):
+                group = slice(first, first + STARTS_AT_ONCE)
+                values[group] = self._values(starts[group], scenes)
+        order = np.argsort(values, kind="stable")
+        return [replace(starts[index], value=float(values[index])) for index in order]
 
-    def _step(self, strategy: _Strategy, best: _Scored, scenes: int) -> None:
-        """One population: asked, scored, told; the best is kept.
+    def _step(self, strategy: _Strategy, best: _Scored, scenes: int) -> _Scored:
+        """One population: asked, scored, told; the best so far.
 
         Raises:
             OutOfTimeError: The budget ended before all were scored.
         """
-        vectors = strategy.evolution.ask()
-        admitted = [_Scored(strategy.model, strategy.model.projected(vector)) for vector in vectors]
-        values = self._values(admitted, scenes)
-        strategy.tell(vectors, [one.vector for one in admitted], values)
+        asked = [_Scored(strategy.model, vector) for vector in strategy.evolution.ask()]
+        values = self._values(asked, scenes)
+        strategy.tell([one.vector for one in asked], values)
         first = int(values.argmin())
         if values[first] < best.value:
-            best.model, best.vector, best.value = strategy.model, admitted[first].vector, float(values[first])
+            best = replace(asked[first], value=float(values[first]))
         self._tell(best)
+        return best
 
     def _values(self, scored: Sequence[_Scored], scenes: int) -> np.ndarray:
         """Mean scores over the first scenes, lower is better, one each."""
         lists = [one.model.positions(one.vector, self._rays) for one in scored]
         began = self._budget.clock()
-        values = self._objective.values(lists, range(scenes), self._over)
+        values = self._objective.values(lists, range(scenes), lambda: self._share() >= 1.0)
         self._candidates += len(lists)
         self._evaluations += values.size
         spent = (self._budget.clock() - began) / values.size
@@ -300,30 +291,28 @@ class Search:
 
     def _share(self, ahead: int = 0) -> float:
         """The share of the budget that is used up with so many evaluations more, and those of the finalists."""
-        finalists = (len(self._finalists) + 2) * self._last
+        finalists = (len(self._finalists) + 1) * self._last
         # more than that, and they are compared on fewer scenes
         kept = min(finalists * self._per_evaluation, FINAL_SHARE * self._budget.seconds)
         finalists = min(finalists, FINAL_SHARE * self._budget.evaluations)
         elapsed = (self._budget.clock() - self._began + kept + ahead * self._per_evaluation) / self._budget.seconds
         return max(elapsed, (self._evaluations + finalists + ahead) / self._budget.evaluations)
 
-    def _over(self, ahead: int = 0) -> bool:
-        return self._share(ahead) >= 1.0
-
-    def _chosen(self, start: _Scored) -> SearchResult:
-        unique = {(id(one.model), one.vector.tobytes()): one for one in self._finalists}
-        lists = [one.model.positions(one.vector, self._rays) for one in unique.values()]
-        scenes = self._final_scenes(len(lists))
+    def _chosen(self, finalists: Sequence[_Scored]) -> SearchResult:
+        """The best of the finalists, of which the first is the start, on all scenes or as many as there is time for."""
+        left = self._budget.seconds - (self._budget.clock() - self._began)
+        in_time = left / max(len(finalists) * self._per_evaluation, TINY)
+        affordable = min(in_time, (self._budget.evaluations - self._evaluations) / len(finalists))
+        scenes = int(np.clip(affordable, min(FIRST_SCENES, self._last), self._last))
+        lists = [one.model.positions(one.vector, self._rays) for one in finalists]
         values = self._objective.values(lists, range(scenes)).mean(axis=1)
         self._evaluations += len(lists) * scenes
-        scores = dict(zip(unique, values.tolist(), strict=True))
-        best = min(scores, key=scores.__getitem__)
-        sign = self._objective.sign
+        best, sign = int(values.argmin()), self._objective.sign
         return SearchResult(
-            model=unique[best].model,
-            vector=unique[best].vector,
-            start_value=sign * scores[id(start.model), start.vector.tobytes()],
-            value=sign * scores[best],
+            model=finalists[best].model,
+            vector=finalists[best].vector,
+            start_value=sign * float(values[0]),
+            value=sign * float(values[best]),
             seconds=self._budget.clock() - self._began,
             cpu_seconds=time.process_time() - self._worked,
             candidates=self._candidates,
@@ -331,13 +320,6 @@ class Search:
             scenes=scenes,
             restarts=self._restarts,
         )
-
-    def _final_scenes(self, finalists: int) -> int:
-        """The number of scenes that finalists can be compared on: all, or as many as time and evaluations are left."""
-        left = self._budget.seconds - (self._budget.clock() - self._began)
-        in_time = left / max(finalists * self._per_evaluation, TINY)
-        affordable = min(in_time, (self._budget.evaluations - self._evaluations) / finalists)
-        return int(np.clip(affordable, self._stages[0], self._last))
 
     def _tell(self, best: _Scored) -> None:
         if self._show is not None:
@@ -376,12 +358,14 @@ class _Strategy:
         }
         self.model, self.evolution = model, cma.CMAEvolutionStrategy(mean, STEP, options)
 
-    def tell(self, vectors: Sequence[np.ndarray], admitted: Sequence[np.ndarray], values: np.ndarray) -> None:
-        """Scores of the admitted vectors; those beyond the constraints are ranked behind by how far they lie beyond.
+    def __len__(self) -> int:
+        return self.evolution.popsize
+
+    def tell(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> None:
+        """Scores of vectors; those beyond the constraints are ranked behind by how far they lie beyond.
 
         The distance is in units of the distribution, the penalty in those of the scores' own spread.
         """
         spread = float(np.subtract(*np.percentile(values, [75, 25])))
-        beyond = [float(np.square(one - other).mean()) for one, other in zip(vectors, admitted, strict=True)]
-        penalty = np.array(beyond) / self.evolution.sigma**2
+        penalty = np.array([self.model.excess(vector) for vector in vectors]) / self.evolution.sigma**2
         self.evolution.tell(vectors, (values + spread * penalty).tolist())

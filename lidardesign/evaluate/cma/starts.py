@@ -1,8 +1,8 @@
 """Where a direct search starts: what an engineer would try first, with as many sensors as the design has.
 
-All are built from where training returns are. Sensors at given origins tile the returns as they see them, in every
-arrangement of rows, with equal weights or weights by returns; another tiling covers the whole space. Scans are the
-even layouts that `bounding` and `uniform` take, with one gate, or with gates by the returns next to each ray.
+All are built from where training returns are, or, where there are none, from the whole space. Sensors at given origins
+tile the returns as they see them, in every arrangement of rows, with equal weights or weights by returns. Scans are the
+even layouts that `bounding` and `uniform` take, with one gate or a gate per ray.
 """
 
 from __future__ import annotations
@@ -14,19 +14,16 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidardesign.design.layouts.grid import low_discrepancy
-from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.sensor import Sensor, boresight_frame
 from lidardesign.evaluate.baselines.bounding import bounding
 from lidardesign.evaluate.baselines.candidates import LayoutSite, opened_gate, whole_range
 from lidardesign.evaluate.baselines.even import central, even_placement
 from lidardesign.evaluate.baselines.views import RAY_AXES, Observed, TrainingViews, dense_points, unrolled
-from lidardesign.evaluate.cma.model import with_gate
-from lidardesign.evaluate.cma.parameters import NARROWEST_RAD, SearchRules, admitted_origins
+from lidardesign.evaluate.cma.model import SearchRules
 from lidardesign.numerics import TINY, sphere_exp, sphere_log
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, angles
+from lidardesign.space import AZIMUTH, ELEVATION, angles, observed_point
 
 # Returns further apart than this from their middle are tiled in azimuth and elevation, others in a tangent plane.
 TANGENT_RAD = math.radians(70)
@@ -51,14 +48,14 @@ def starts(rules: SearchRules, views: TrainingViews, count: int) -> list[Start]:
         views: The training scenes.
         count: The number of sensors; of a scan, of rays.
     """
-    observed = views.hits(dense_points(rules.space))
     if rules.one_sensor_per_ray:
-        return scan_starts(rules, views, observed, count)
-    found = [*(_tilings(rules, observed, count) if len(observed.points) else ()), _even(rules, count)]
-    if rules.gates:
-        return found
-    whole_m = whole_range(rules.space).tolist()
-    return [tuple(with_gate(sensor, *whole_m) for sensor in start) for start in found]
+        return scan_starts(rules, views, count)
+    observed = views.observed(views.space)
+    if not len(observed.points):
+        points = dense_points(rules.space)
+        whole = np.column_stack([points[:, :RAY_AXES], np.full(len(points), whole_range(rules.space).mean())])
+        observed = Observed(whole, observed_point(whole))
+    return list(_tilings(rules, observed, count))
 
 
 def tiles(low: np.ndarray, high: np.ndarray, count: int, rows: int) -> list[Tile]:
@@ -101,14 +98,11 @@ def _origin_sets(rules: SearchRules, observed: Observed, count: int) -> list[np.
     """Origins (G, 3) each: the middle of what is admitted, and where that is a box, spread over it."""
     bounds = rules.bounds(count)
     sets = [(bounds.origin_low + bounds.origin_high) / 2]
-    if rules.axes.origin:
+    if rules.axes.origin and rules.origins is None:
         low, high = central(observed.points[:, :3])
-        sets += [_spread_origins(bounds, count), np.tile((low + high) / 2, (count, 1))]
-    return [admitted_origins(origins, bounds, rules.constraints) for origins in sets]
-
-
-def _spread_origins(bounds: Bounds, count: int) -> np.ndarray:
-    return bounds.origin_low + low_discrepancy(count, 3) * (bounds.origin_high - bounds.origin_low)
+        spread = bounds.origin_low + low_discrepancy(count, 3) * (bounds.origin_high - bounds.origin_low)
+        sets += [spread, np.tile((low + high) / 2, (count, 1))]
+    return [rules.standing(origins) for origins in sets]
 
 
 class _Seen(NamedTuple):
@@ -149,7 +143,9 @@ def _tile_sensor(rules: SearchRules, seen: _Seen, tile: Tile, index: int, weight
 
 
 def _gate(rules: SearchRules, range_m: np.ndarray) -> np.ndarray:
-    """The central 99 % of distances inside the range of the space, shape (2,) [m]."""
+    """The central 99 % of distances inside the range of the space, shape (2,) [m]; all of it where gates stay open."""
+    if not rules.gates:
+        return whole_range(rules.space)
     low, high = np.clip(central(range_m), *whole_range(rules.space))
     return opened_gate(float(low), float(high))
 
@@ -181,60 +177,24 @@ def _sensor(
     )
 
 
-def _even(rules: SearchRules, count: int) -> Start:
-    """The whole space in tiles whose cells are as square as can be, with the whole range."""
-    space, bounds = rules.space, rules.bounds(count)
-    low, high = (np.array(end)[[AZIMUTH, ELEVATION]] for end in (space.low, space.high))
-    width, height = (high - low) * [math.cos((low[1] + high[1]) / 2), 1.0]
-    rows = int(np.clip(round(math.sqrt(count * height / max(width, NARROWEST_RAD))), 1, count))
-    origins = admitted_origins(_spread_origins(bounds, count), bounds, rules.constraints)
-    sensors = []
-    for index, tile in enumerate(tiles(low, high, count, rows)):
-        azimuth, elevation = ((tile.low + tile.high) / 2).tolist()
-        field = (tile.high - tile.low) * [math.cos(elevation), 1.0]
-        gate = whole_range(space)
-        sensors.append(_sensor(rules, index, 1.0 / count, origins[index], (azimuth, elevation), field, gate))
-    return tuple(sensors)
+def scan_starts(rules: SearchRules, views: TrainingViews, count: int) -> list[Start]:
+    """Even rays as the simple rivals have them: those of `bounding`, with one gate or one per ray, and of `uniform`.
 
-
-def scan_starts(rules: SearchRules, views: TrainingViews, observed: Observed, count: int) -> list[Start]:
-    """Even rays as the simple rivals have them, with one gate, and with gates by the returns next to each ray.
-
-    They are those of `bounding`, the same at equal shares of the returns, and those of `uniform`.
+    Where one angle is free, also rays at equal shares of the returns.
     """
-    space = rules.space
-    laid_out = [layout.lay_out(count, LayoutSite(space)) for layout in bounding(views)]
-    layouts = [(points, gates[0]) for points, gates in laid_out]
+    space, points, site = rules.space, views.observed(views.space).points, LayoutSite(rules.space)
+    layouts = [layout.lay_out(count, site) for layout in bounding(views, gates_per_ray=rules.gates)]
     angular = [axis for axis in (AZIMUTH, ELEVATION) if axis in space.free]
-    if len(angular) == 1 and len(observed.points) and layouts:
-        points = layouts[0][0].copy()
-        points[:, angular[0]] = np.quantile(observed.points[:, angular[0]], (np.arange(count) + 0.5) / count)
-        layouts.append((points, layouts[0][1]))
-    low, high = np.array(space.low[:RAY_AXES]), np.array(space.high[:RAY_AXES])
-    layouts.append((even_placement(low, high, count), whole_range(space)))
-    found = []
-    for points, gate in layouts:
-        every = np.tile(gate if rules.gates else whole_range(space), (count, 1))
-        for gates in (every, nearby_gates(rules, observed, points, every))[: 1 + rules.gates]:
-            found.append(
-                tuple(
-                    _sensor(rules, i, 1.0 / count, point[:3], (point[AZIMUTH], point[ELEVATION]), np.zeros(2), gate_m)
-                    for i, (point, gate_m) in enumerate(zip(points, gates, strict=True))
-                )
-            )
-    return found
-
-
-def nearby_gates(rules: SearchRules, observed: Observed, points: np.ndarray, gates: np.ndarray) -> np.ndarray:
-    """Gates (N, 2) by the returns whose rays are nearest to each ray; where they are few, the one it had [m]."""
-    free = [axis for axis in range(RAY_AXES) if axis in rules.space.free]
-    if not (free and len(observed.points)):
-        return gates
-    scale = np.maximum(np.ptp(observed.points[:, free], axis=0), TINY)
-    nearest = cKDTree(points[:, free] / scale).query(observed.points[:, free] / scale)[1]
-    found = gates.copy()
-    for ray in range(len(points)):
-        range_m = observed.points[nearest == ray, RANGE]
-        if len(range_m) >= FEWEST_RETURNS:
-            found[ray] = _gate(rules, range_m)
-    return found
+    if len(angular) == 1 and layouts:
+        rays = layouts[0][0].copy()
+        rays[:, angular[0]] = np.quantile(points[:, angular[0]], (np.arange(count) + 0.5) / count)
+        layouts += [(rays, gates) for _, gates in layouts[: 1 + rules.gates]]
+    low, high, whole = np.array(space.low[:RAY_AXES]), np.array(space.high[:RAY_AXES]), whole_range(space)
+    layouts.append((even_placement(low, high, count), np.tile(whole, (count, 1))))
+    return [
+        tuple(
+            _sensor(rules, i, 1.0 / count, ray[:3], (ray[AZIMUTH], ray[ELEVATION]), np.zeros(2), gate)
+            for i, (ray, gate) in enumerate(zip(rays, gates if rules.gates else [whole] * count, strict=True))
+        )
+        for rays, gates in layouts
+    ]
