@@ -138,7 +138,7 @@ def quadruped():
     """The model of a real one, where its package is installed, which is never imported."""
     package = importlib.util.find_spec("dm_control")
     if package is None:
-        pytest.skip("dm_control is not installed: pip install --no-deps dm_control")
+        pytest.skip("dm_control is not installed: make consumers")
     return Path(package.submodule_search_locations[0]) / "suite" / "quadruped.xml"
 
 

@@ -52,6 +52,8 @@ def show(
             checks = check_design(design_document(specification), specification.constraints, space)
         for line in () if space is None else outside_notes(specification, space):
             output.remark(line)
+        if specification.mount is not None:
+            output.remark(f"places and directions are in the frame of the robot's body {specification.mount!r}")
         specification = placed(specification, condition) if condition else specification
         readout = readout_of(specification)
         document = {
