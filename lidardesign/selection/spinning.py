@@ -8,6 +8,7 @@ set of places is tried, and at each of its places as many rings are chosen as a 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,6 +18,7 @@ import numpy as np
 
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import inside_excluded, mounts_of, origin_box
 from lidardesign.design.files import MOST_TABLE_RAYS, design_document
 from lidardesign.design.fit import FitResult
@@ -38,7 +40,8 @@ from lidardesign.task import Information
 
 CHANNELS = 16  # of a sensor, where nobody says how many
 POINTS_PER_TURN = 1800  # of a channel: every fifth of a degree, as scanners do at ten turns per second
-EVEN_SHARE = 0.5  # of the candidate elevations that are even; the others lie where the density looks
+EVEN_SHARE = 0.25  # of the candidate elevations that are even; the others lie where even ones tell most
+FIRST_SHARE = 0.2  # of the scenes, that say where this is
 PLACES = np.array([(0.5, 0.5, 0.5), (0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 0)])  # in a box, no corners on one edge
 MOST_SETS, MOST_BOUNDED = 500, 20  # of places: that are tried, and that are bounded one by one
 
@@ -82,11 +85,15 @@ class RingCandidates:
         )
 
     def coverage(
-        self, rings: np.ndarray, scenes: Iterator[Scene], informs: Callable[[Scene, Sequence[Returns]], Information]
+        self,
+        rings: np.ndarray,
+        scenes: Iterator[Scene],
+        informs: Callable[[Scene, Sequence[Returns]], Information],
+        share: float = 1.0,
     ) -> tuple[Coverage, str]:
-        """What some rings tell about the next few scenes, and the unit of that."""
+        """What some rings tell about a share of the next few scenes, and the unit of that."""
         rays = self.rays(rings, np.arange(len(rings)))
-        few = itertools.islice(scenes, information.FEW_SCENES)
+        few = itertools.islice(scenes, round(share * information.FEW_SCENES))
         informed = [inform(scene, rays, [slice(0, len(rays))], informs) for scene in few]
         table = gather(informed, rays.gate_m[:, None], np.zeros((len(rays), 1)))
         grouped = table.grouped(np.arange(len(rays)).reshape(len(rings), self.points))
@@ -110,12 +117,11 @@ def choose_rings(
     """The design of a few spinning sensors with the best channels at the best places.
 
     Arguments:
-        samples: Of the density, near whose elevations half of the candidates lie.
+        samples: Of the density, whose design space says where rays may start and look.
         constraints: Where sensors may stand, and what else the design keeps.
         count: How many sensors.
         channels: Rings of each.
-        rays: Of all sensors per turn; None fires `POINTS_PER_TURN` for each channel, or what a file
-            holds.
+        rays: Of all sensors per turn; None fires `POINTS_PER_TURN` for each channel, or what a file holds.
         informs: What a task says of a scene's returns.
         scenes: Training scenes without end for a purpose, `choice` or `held back`.
         name: The design's name.
@@ -124,14 +130,15 @@ def choose_rings(
         ConfigError: Rays that rings cannot share, more channels than elevations, more sets of places than can be
             tried, or a density with conditions.
         DataError: No ring tells anything about the scenes.
+        InfeasibleError: Constraints that contradict each other.
     """
     started, space, rings = perf_counter(), samples.space, count * max(channels, 1)
+    check_feasible(constraints, space, sensors=count, rays=rays)
     points = min(POINTS_PER_TURN, MOST_TABLE_RAYS // rings) if rays is None else rays // rings
-    most = CANDIDATES_PER_RAY * channels
-    candidates = RingCandidates(
-        places_of(constraints, space), elevations_of(samples, most), points, (space.low[5], space.high[5])
-    )
-    elevations = len(candidates.elevation_rad)
+    low, high = space.low[4], space.high[4]
+    even = np.unique(np.linspace(low, high, CANDIDATES_PER_RAY * channels))
+    first = RingCandidates(places_of(constraints, space), even, points, (space.low[5], space.high[5]))
+    elevations = len(even)
     faults = {
         ("the density has conditions", "--layout spinning", "tasks whose sensors rest"): space.conditioned,
         (f"{channels} channels", "--channels", f"1 to {elevations}, as many as elevations to choose among"): not (
@@ -146,10 +153,14 @@ def choose_rings(
     for (fault, where, allowed), is_found in faults.items():
         if is_found:
             raise ConfigError(fault, where=where, allowed=allowed)
-    with phase("what returns tell"), information.choosing(rings / len(candidates)):
-        coverage, unit = candidates.coverage(np.arange(len(candidates)), scenes("choice"), informs)
-    if not len(coverage.item):
-        raise DataError(f"none of {len(candidates)} rings tells anything about the training scenes", where=name)
+    every = np.arange(len(first))
+    with phase("what returns tell"), information.choosing(rings / len(first)):
+        told, _ = first.coverage(every, scenes("choice"), informs, FIRST_SHARE)
+        if not len(told.item):
+            raise DataError(f"none of {len(first)} rings tells anything about the training scenes", where=name)
+        gains = told.gains(np.zeros(len(told.weight)))[:, 0].reshape(-1, elevations).sum(axis=0)
+        candidates = replace(first, elevation_rad=finer(even, gains))
+        coverage, unit = candidates.coverage(every, scenes("choice"), informs)
     with phase("choice"):
         choice, loss, bound = chosen_rings(coverage, candidates.place, count, channels)
     chosen = choice.rays
@@ -209,15 +220,15 @@ def places_of(constraints: Constraints, space: DesignSpace) -> np.ndarray:
     return np.unique(places[~inside_excluded(places, rules)], axis=0)
 
 
-def elevations_of(samples: Samples, count: int) -> np.ndarray:
-    """Candidate elevations, ascending (E,) [rad]: some even over the design space, others where the density looks."""
-    even = round(EVEN_SHARE * count)
-    elevation = samples.points[:, 4]
-    order = np.argsort(elevation, kind="stable")
-    reached = np.cumsum(samples.weights[order])
-    share = reached[-1] * (np.arange(count - even) + 0.5) / (count - even)
-    seen = elevation[order][np.searchsorted(reached, share)]
-    return np.unique(np.append(np.linspace(samples.space.low[4], samples.space.high[4], even), seen))
+def finer(elevation_rad: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """As many elevations (E,) [rad]: some even ones, and others the denser the more even ones gain (E,)."""
+    count = len(elevation_rad)
+    even = math.ceil(EVEN_SHARE * count)
+    reached = np.cumsum(gains) / gains.sum()
+    wanted = (np.arange(count - even) + 0.5) / (count - even)
+    return np.sort(
+        np.append(np.linspace(elevation_rad[0], elevation_rad[-1], even), np.interp(wanted, reached, elevation_rad))
+    )
 
 
 def chosen_rings(coverage: Coverage, place: np.ndarray, count: int, channels: int) -> tuple[Choice, float, float]:

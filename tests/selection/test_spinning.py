@@ -16,10 +16,9 @@ from lidardesign.design.files import design_document, load_design, save_design
 from lidardesign.design.layouts.rays import certificates_of, lay_out
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import FULL_TURN
-from lidardesign.samples import load_samples
 from lidardesign.selection import spinning
 from lidardesign.selection.coverage import LARGEST
-from lidardesign.selection.spinning import RingCandidates, chosen_rings, elevations_of, places_of
+from lidardesign.selection.spinning import RingCandidates, chosen_rings, finer, places_of
 from lidardesign.space import DesignSpace
 from lidardesign.workflow.runs import open_run
 
@@ -87,16 +86,13 @@ class TestCandidates:
         assert places() == [[0, 0, 1], [0, 1, 2], [1, 0.5, 1.5], [2, 0, 2], [2, 1, 1]]
         assert [0, 0, 1] not in places(exclude=[{"low_m": [-1, -1, 0], "high_m": [1, 0.4, 1.5]}])
 
-    def test_are_even_in_elevation_and_where_the_density_looks(self, run):
-        samples = load_samples(run)
-        elevation = elevations_of(samples, 40)
-        low, high = samples.space.low[4], samples.space.high[4]
-        assert (np.diff(elevation) > 0).all()
-        assert np.isin(np.linspace(low, high, 20), elevation).all()
-        seen = np.setdiff1d(elevation, np.linspace(low, high, 20))
-        weights = samples.weights
-        below = [weights[samples.points[:, 4] < angle].sum() / weights.sum() for angle in seen]
-        np.testing.assert_allclose(below, (np.arange(len(seen)) + 0.5) / len(seen), atol=weights.max() / weights.sum())
+    def test_are_some_of_them_even_and_the_others_where_rings_tell(self):
+        even = np.linspace(-0.6, 0.2, 81)
+        elevation = finer(even, np.where(np.abs(even + 0.1) < 0.05, 1.0, 0.0))
+        assert (len(elevation), elevation[0], elevation[-1]) == (81, -0.6, 0.2)
+        assert (np.diff(elevation) >= 0).all()
+        assert np.isin(np.linspace(-0.6, 0.2, 21), elevation).all()
+        assert (np.abs(elevation + 0.1) < 0.06).sum() >= 60
 
 
 class TestDesigns:
