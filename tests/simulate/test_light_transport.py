@@ -21,7 +21,7 @@ from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.shadowing import visible_echoes
 from lidardesign.simulate.light import Beams, Echoes, direct_echoes
@@ -133,7 +133,7 @@ def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitte
 
 
 @needs_simulator
-@each_row("shape", [Sphere(0.3), Box((0.2, 0.3, 0.25)), Capsule(0.2, 0.25), Cylinder(0.2, 0.25), Plane()], ids=repr)
+@each_row("shape", [Sphere(0.3), Box((0.2, 0.3, 0.25)), Capsule(0.2, 0.25), Plane()], ids=repr)
 @each_row("offset_m", [0.0, 1e5])
 def test_every_shape_is_exported_where_it_is(shape, offset_m):
     place = np.array([1.5 + offset_m, 0.2, 0.1])
@@ -143,6 +143,19 @@ def test_every_shape_is_exported_where_it_is(shape, offset_m):
     found = render_transient(scene, 0, rays, flood(rays.origin_m[:1]), PathBins(0.01, 1))
     assert (np.flatnonzero(found.steady > 0) == echoes.ray).mean() == 1
     np.testing.assert_allclose(found.steady[echoes.ray], echoes.gain, rtol=MOST_ENERGY)
+
+
+@needs_simulator
+@each_row("shape", [Cylinder(0.2, 0.25), Ellipsoid((0.2, 0.3, 0.25))], ids=repr)
+def test_shapes_that_the_renderer_takes_as_meshes_send_back_as_much_light(shape):
+    scene = Scene((Body(shape, poses=rigid(turned(2), (1.5, 0.2, 0.1))),))
+    rays = rays_from((0.0, 0.0, 0.0), spiral(500, 0.3), far_m=100.0)
+    echoes = single_bounces(scene, rays)
+    found = render_transient(scene, 0, rays, flood(rays.origin_m[:1]), PathBins(0.01, 1)).steady
+    assert ((found > 0) == np.isin(np.arange(500), echoes.ray)).mean() > 0.99
+    # flat sides are half a degree off where the shape is round
+    assert found.sum() == pytest.approx(echoes.gain.sum(), rel=MOST_ENERGY)
+    assert np.abs(found[echoes.ray] / echoes.gain - 1).mean() < 2 * MOST_ENERGY
 
 
 @needs_simulator

@@ -31,7 +31,7 @@ from lidardesign.simulate.light_transport.process import ask
 
 # Half sizes of a plane's nested squares, in reaches. What lies further sends back less than 1e-4 of its light.
 PLANE_REACHES = (2.0, 10.0, 100.0)
-ROUND_STEPS = 96  # round cylinders and ellipsoids, which the renderer takes as meshes: 5e-4 of their radius
+ROUND_STEPS = 360  # round cylinders and ellipsoids, which the renderer takes as meshes: flat sides half a degree off
 _SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 _BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
