@@ -24,8 +24,8 @@ from lidardesign.task import Metric, TaskConfig
 from lidardesign.workflow.config_reference import config_template, config_text, default_document, schema_of
 
 TASKS = [item.name for item in list_tasks() if item.error is None and item.distribution.startswith("lidardesign ")]
-# They need a folder, so that no configuration follows from the defaults alone.
-WITHOUT_DEFAULTS = ("meshes",)
+# They need a folder or a model, so that no configuration follows from the defaults alone.
+WITHOUT_DEFAULTS = {"meshes": "folder", "mujoco": "model"}
 
 
 def written(task, tmp_path, preset=None):
@@ -44,10 +44,9 @@ def uncommented(text):
 @each_row("name", TASKS)
 def test_a_file_to_begin_with_changes_nothing(name, tmp_path):
     task = load_task(name)
-    needed = ("folder=.",) if name in WITHOUT_DEFAULTS else ()
     path = written(task, tmp_path)
-    if needed:
-        with pytest.raises(ConfigError, match="folder"):
+    if name in WITHOUT_DEFAULTS:
+        with pytest.raises(ConfigError, match=WITHOUT_DEFAULTS[name]):
             resolve(task, config_file=path)
         return
     for preset in PRESETS:
