@@ -44,6 +44,15 @@ ALLOWED = "an MJCF or URDF model that MuJoCo can load"
 FileState = tuple[str, int, int]
 
 
+@dataclass(frozen=True)
+class RobotFile:
+    """The file of a model, the folder that holds all its files (None: its own), and the groups of geoms to be seen."""
+
+    path: Path
+    folder: Path | None = None
+    groups: tuple[int, ...] | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class ModelGeom:
     """One visible piece of a model: a geom, or all meshes without a name of one of its bodies.

@@ -12,6 +12,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate
 from lidardesign.geometry.rays import Rays
+from lidardesign.mujoco_model import RobotFile
 
 # A frame of a quarter of an hour, and one of a microsecond.
 SLOWEST_HZ, FASTEST_HZ = 0.001, 1e6
@@ -52,8 +53,7 @@ class Exporter:
         rays: Rays,
         path: Path,
         rate_hz: float | None = None,
-        robot: Path | None = None,
-        robot_folder: Path | None = None,
+        robot: RobotFile | None = None,
     ) -> list[str]:
         """Write the file, atomically; returns notes of what the format cannot hold.
 
@@ -63,7 +63,6 @@ class Exporter:
             path: The file or folder.
             rate_hz: Frames per second [Hz]; that of the read-out model by default.
             robot: A model that the sensors are put into; None: they are written alone.
-            robot_folder: Where all its files are; None: in its own folder.
 
         Raises:
             ConfigError: A frame rate or a robot for a format that holds none, or a rate that no sensor has.
@@ -73,7 +72,7 @@ class Exporter:
         self.check_rate(rate_hz)
         if robot is not None and not self.robotic:
             raise ConfigError(f"{self.name} holds no robot", where="--robot", allowed="with mjcf")
-        options: dict[str, Any] = {} if robot is None else {"robot": robot, "folder": robot_folder}
+        options: dict[str, Any] = {} if robot is None else {"robot": robot}
         if self.rated:
             options["rate_hz"] = Bandwidth().rate_hz if rate_hz is None else rate_hz
         notes = write(design, rays, Path(path), **options)

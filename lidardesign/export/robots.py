@@ -59,7 +59,7 @@ from lidardesign.export.common.poses import (
 )
 from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
-from lidardesign.mujoco_model import load_model, mujoco_warnings, seen_geoms
+from lidardesign.mujoco_model import RobotFile, load_model, mujoco_warnings, seen_geoms
 from lidardesign.numerics import SLACK, unit_vectors
 
 WORLD = "world"
@@ -69,9 +69,7 @@ UNSEEN = "lidardesign_unseen"
 USER_VALUES = 4  # of a rangefinder: gate start and end, sensor, time
 
 
-def write_mjcf(
-    design: DesignSpec, rays: Rays, path: Path, robot: Path | None = None, folder: Path | None = None
-) -> list[str]:
+def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | None = None) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold.
 
     Arguments:
@@ -79,7 +77,6 @@ def write_mjcf(
         rays: Its rays.
         path: The file.
         robot: A MuJoCo model, MJCF or URDF, of which the file is a copy with the sensors in it.
-        folder: Where all files of the robot are; None: in its own folder.
 
     Raises:
         DataError: The robot's model cannot be read, or has no such body.
@@ -88,7 +85,7 @@ def write_mjcf(
     place, sensors, notes = element("worldbody"), element("sensor"), design_losses(design, mounted)
     model, taken = element("mujoco", {"model": design.name}, [place, sensors]), [WORLD]
     if robot is not None:
-        model, place, sensors = _robot_with(design.mount, robot, folder, path)
+        model, place, sensors = _robot_with(design.mount, robot, path)
         taken += [body.get("name", "") for body in model.iter("body")]
         notes.append("geoms of the robot that are not shown are transparent, for MuJoCo's rays pass no others")
     bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
@@ -107,11 +104,11 @@ def write_mjcf(
     return [*notes, "a reading equal to the cutoff is a hit at or beyond the end of the gate; -1 is no hit"]
 
 
-def _robot_with(mount: str | None, robot: Path, folder: Path | None, path: Path) -> tuple[Element, Element, Element]:
+def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Element, Element, Element]:
     """A robot's model as MuJoCo writes it, for a file at a path, its body that sensors go into, and its sensors."""
     specifications: list[Any] = []
-    model, _ = load_model(robot, folder=folder, edit=specifications.append)
-    seen = set(seen_geoms(model)[0].tolist())
+    model, _ = load_model(robot.path, folder=robot.folder, edit=specifications.append)
+    seen = set(seen_geoms(model, robot.groups)[0].tolist())
     # the class of a geom may have a material, whose transparency counts more than the geom's own colour
     specifications[0].add_material(name=UNSEEN, rgba=(0.5, 0.5, 0.5, 0.0))
     for geom in specifications[0].geoms:
@@ -125,14 +122,14 @@ def _robot_with(mount: str | None, robot: Path, folder: Path | None, path: Path)
             root.append(element(tag))
     compiler, sensors, size = (next(root.iter(tag)) for tag in ("compiler", "sensor", "size"))
     for name in ("meshdir", "texturedir"):
-        place_of_files = robot.resolve().parent / compiler.get(name, "")
-        compiler.set(name, os.path.relpath(place_of_files, path.resolve().parent))
+        folder = robot.path.resolve().parent / compiler.get(name, "")
+        compiler.set(name, os.path.relpath(folder, path.resolve().parent))
     size.set("nuser_sensor", str(max(USER_VALUES, int(size.get("nuser_sensor", "0")))))
     bodies = {body.get("name", ""): body for body in root.iter("body")}
     place = next(root.iter("worldbody")) if mount is None else bodies.get(mount)
     if place is None:
         close = ", ".join(get_close_matches(str(mount), bodies, 3, 0.0))
-        raise DataError(f"has no body {mount!r}, which the design is mounted on", where=str(robot), allowed=close)
+        raise DataError(f"has no body {mount!r}, which the design is mounted on", where=str(robot.path), allowed=close)
     return root, place, sensors
 
 

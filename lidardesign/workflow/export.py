@@ -15,6 +15,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate, as_documents
 from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
+from lidardesign.mujoco_model import RobotFile
 from lidardesign.run.clock import phase
 from lidardesign.run.files import STDIO, is_input
 from lidardesign.workflow.run_folder import (
@@ -219,13 +220,13 @@ class ExportRequest:
             last_time(source.folder, "export"),
         )
 
-    def _robot(self) -> tuple[Path | None, Path | None]:
-        """The robot's model and the folder that holds all its files, as the run of the design names them."""
+    def _robot(self) -> RobotFile | None:
+        """The robot's model, and what the run of a mounted design says of it."""
         mounted = self.source.specification.mount is not None
         run = self.source.opened_run() if self.exporter.robotic and (mounted or self.robot) else None
         task = None if run is None else run.config.task
-        own = getattr(task, "model", None) if mounted else None
-        return self.robot or own, getattr(task, "folder", None)
+        path = self.robot or (getattr(task, "model", None) if mounted else None)
+        return path and RobotFile(path, getattr(task, "folder", None), getattr(task, "groups", None))
 
     def write(self, file: Path | None = None, notes: Notes = log_note) -> Exported:
         """Write the design and read it back.
@@ -238,7 +239,7 @@ class ExportRequest:
         open_rays = exporter.name in WITHOUT_RAYS
         design, rays = self.source.lay_out(self.rays, self.at, self.seed, may_stay_open=open_rays, notes=notes)
         with phase("writing"):
-            lost = tuple(exporter.write(design, rays, file, self.rate_hz, *self._robot()))
+            lost = tuple(exporter.write(design, rays, file, self.rate_hz, self._robot()))
         with phase("reading back"):
             rounding = exporter.rounding(design, rays, file)
         for note in lost:

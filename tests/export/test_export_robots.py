@@ -21,7 +21,7 @@ from lidardesign.export.common.names import identifier
 from lidardesign.export.common.poses import mounts
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.mujoco_model import bodies_from_mujoco, load_model
+from lidardesign.mujoco_model import RobotFile, bodies_from_mujoco, load_model
 from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
 from lidardesign.workflow.export import DesignSource, ExportRequest
 
@@ -158,7 +158,7 @@ def test_sensors_on_a_robot_measure_our_distances_wherever_it_is(tmp_path, robot
     (tmp_path / "exports").mkdir()
     path = tmp_path / "exports" / "with.xml"
     design = replace(DESIGN, mount=mount)
-    EXPORTERS["mjcf"].write(design, RAYS, path, robot=robot)
+    EXPORTERS["mjcf"].write(design, RAYS, path, robot=RobotFile(robot))
     assert max(one.error for one in EXPORTERS["mjcf"].rounding(design, RAYS, path).values()) < 1e-12
     alone, _ = load_model(robot)
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -193,9 +193,11 @@ def test_a_mounted_design_goes_into_the_model_of_its_run(tmp_path):
 
 def test_a_robot_without_the_body_that_carries_the_sensors_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"no body 'torsos'[\s\S]*torso"):
-        EXPORTERS["mjcf"].write(replace(DESIGN, mount="torsos"), RAYS, tmp_path / "a.xml", robot=own_robot(tmp_path))
+        EXPORTERS["mjcf"].write(
+            replace(DESIGN, mount="torsos"), RAYS, tmp_path / "a.xml", robot=RobotFile(own_robot(tmp_path))
+        )
     with pytest.raises(ConfigError, match="holds no robot"):
-        EXPORTERS["csv"].write(DESIGN, RAYS, tmp_path / "a.csv", robot=tmp_path / "robot.xml")
+        EXPORTERS["csv"].write(DESIGN, RAYS, tmp_path / "a.csv", robot=RobotFile(tmp_path / "robot.xml"))
     notes = EXPORTERS["mjcf"].write(replace(DESIGN, mount="torso"), RAYS, tmp_path / "a.xml")
     assert any("the robot's body 'torso'; --robot MODEL" in note for note in notes)
 
