@@ -11,7 +11,6 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -99,8 +98,8 @@ def choose_parts(
     most = (budget.rays or MOST_TABLE_RAYS) // count
     limits = _limits(placed, constraints, count, most, budget)
     bundle = PartBundle(placed, most, next(scenes("choice")).frames)
-    held_back, proposing = (itertools.islice(scenes(name), information.FEW_SCENES) for name in ("held back", "choice"))
-    coverage, unit = part_table(bundle, proposing, informs, count, seed)
+    training, held_back = (itertools.islice(scenes(one), information.FEW_SCENES) for one in ("choice", "held back"))
+    coverage, unit = part_table(bundle, training, informs, count, seed)
     with phase("choice"):
         chosen = choose_set(coverage, limits)
     if not chosen.members:
@@ -109,8 +108,9 @@ def choose_parts(
         notes(f"{len(chosen.members)} of {count} parts: no other tells more, or fits the bounds")
     judged, _ = part_table(bundle, held_back, informs, count, seed, chosen.members)
     loss = coverage.complete - chosen.value
+    design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays)
     certificate = {
-        "rays": 0,
+        "rays": design.rays,
         "value": float(loss),
         "bound": float(max(coverage.complete - chosen.bound, 0.0)),
         "gap": float((chosen.bound - chosen.value) / loss) if loss > 0 else 0.0,
@@ -121,7 +121,7 @@ def choose_parts(
         "proxy": PROXY,
         "unit": unit,
     }
-    design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays, certificate)
+    design = replace(design, provenance={CERTIFICATES: [certificate]})
     checks = check_design(design_document(design), constraints, space)
     return FitResult(
         design=design,
@@ -214,9 +214,7 @@ def _places(rules: SensorRules, samples: Samples, generator: np.random.Generator
     return np.concatenate([kept[0][: MOST_PLACES // 2], kept[1]])[:MOST_PLACES]
 
 
-def _design(
-    name: str, constraints: Constraints, placed: Sequence[PlacedPart], rays: int | None, certificate: dict[str, Any]
-) -> DesignSpec:
+def _design(name: str, constraints: Constraints, placed: Sequence[PlacedPart], rays: int | None) -> DesignSpec:
     """The design of chosen parts: explicit rays, of those of more than are asked for, or fit in a file, an even subset.
 
     Raises:
@@ -250,5 +248,4 @@ def _design(
         rays=total,
         ray_table=Rays.joined(fired).as_angles(),
         constraints=constraints.as_document(),
-        provenance={CERTIFICATES: [{**certificate, "rays": total}]},
     )
