@@ -24,6 +24,7 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Returns
 from lidardesign.geometry.surface import sample_body
 from lidardesign.scene import Sphere
+from lidardesign.selection.information import require_valid
 from lidardesign.space import aim
 from lidardesign.testing import check_task
 
@@ -367,6 +368,15 @@ def test_seen_counts_targets_and_frames_with_a_return(resting):
     assert TASK.score(scene, returns).value == pytest.approx(50.0)
     nothing = [Returns(one.rays, np.full(50, Outcome.MISS), one.range_m, np.full(50, -1), one.frame) for one in returns]
     assert TASK.score(scene, nothing).value == 0.0
+
+
+def test_a_surface_that_no_sensor_can_see_is_lost_and_tells_nothing(resting):
+    (scene, *_) = resting(metric="surface", mount_body="base", origin_m=(-0.2, 0.0, 0.0))
+    returns = answers(scene, rays_of_points(np.array([[-0.2, 0.0, 0.0, 0.0, 0.0, 1.0]]), (0.0, 10.0)))
+    assert TASK.score(scene, returns).failed
+    told = TASK.informs(scene, returns)
+    require_valid(told, 1, 3)
+    assert len(told.worth) == 0
 
 
 # Models that nobody here made: `make consumers` installs them

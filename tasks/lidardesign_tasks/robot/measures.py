@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from lidardesign.errors import DataError
 from lidardesign.geometry.rays import Outcome, Returns
 from lidardesign.scene import Scene
 from lidardesign.space import DesignSpace
@@ -122,8 +123,20 @@ def _bodies(scene: Scene) -> list[np.ndarray]:
 
 
 def _surface_score(scene: Scene, returns: Sequence[Returns]) -> Score:
-    return moving_score(scene.truth["metric"], scene, returns)
+    """As of any moving surface; the worst value where no sensor can see it in any frame, as behind the robot."""
+    try:
+        return moving_score(scene.truth["metric"], scene, returns)
+    except DataError:
+        return Score(scene.truth["metric"].worst, failed=True)
+
+
+def _surface_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
+    try:
+        return moving_informs(scene, returns)
+    except DataError:
+        none = np.zeros(0, dtype=np.int64)
+        return Information(none, none, np.zeros(0), np.zeros(1, dtype=np.int64), unit="m")
 
 
 _SCORES = {"position": _position_score, "surface": _surface_score, "seen": _seen_score}
-_INFORMS = {"position": _position_informs, "surface": moving_informs, "seen": _seen_informs}
+_INFORMS = {"position": _position_informs, "surface": _surface_informs, "seen": _seen_informs}
