@@ -223,7 +223,7 @@ def group_entries(
     opens = np.empty(count, dtype=np.uint8)
     told = np.zeros((len(entries.weight), gates))
     touched, is_touched = np.empty(len(told), dtype=np.int32), np.zeros(len(told), dtype=np.bool_)
-    place = 0
+    place, last = 0, float(len(entries.table) - 1)
     for group in range(len(first) - 1):
         if not fills:
             start[group] = place
@@ -237,7 +237,8 @@ def group_entries(
                 for gate in range(gates):
                     if entries.gates[entry] >> gate & 1:
                         old, more = told[about, gate], entries.worth[entry]
-                        told[about, gate] = old + more if len(entries.table) else max(old, more)
+                        # beyond the end of the table more counts no more, and bounds are the lower for it
+                        told[about, gate] = min(old + more, last) if last >= 0 else max(old, more)
         for about in touched[:many]:
             for gate in range(gates):
                 largest = told[about, gate]

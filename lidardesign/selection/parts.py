@@ -30,7 +30,7 @@ from lidardesign.task import Information, random_generator
 
 MOST_CAST = 60_000  # rays of a scene, over all places
 MOST_CASTS = 1_000_000  # of a scene, over all its frames
-MOST_PATTERN = 1000  # rays of a part's pattern that are told apart
+MOST_MEMBERS = 20_000_000  # rays of all parts' patterns that are told apart
 MOST_ITEMS = 60  # of a scene: the choice of a few parts needs few
 SIZED = 10  # one in so many parts says how large cells are, at first
 COARSE_CELL_RAD = math.radians(3.0)  # from which the size of cells is found
@@ -82,6 +82,7 @@ class PartBundle:
 
     def __init__(self, placed: Sequence[PlacedPart], most_rays: int, frames: int) -> None:
         self.placed, self.most_rays = placed, most_rays
+        self.most_pattern = min(most_rays, max(MOST_MEMBERS // len(placed), 1))
         self._patterns: dict[str, np.ndarray] = {}
         size_rad, most = COARSE_CELL_RAD, min(MOST_CAST, MOST_CASTS // frames)
         size_rad *= math.sqrt(len(np.unique(np.concatenate(self._keys(placed[::SIZED], size_rad)))) / most)
@@ -108,7 +109,7 @@ class PartBundle:
         part = placed.part
         if part.name not in self._patterns:
             rays = part.directions
-            self._patterns[part.name] = rays[even_subset(rays, min(len(rays), self.most_rays, MOST_PATTERN))]
+            self._patterns[part.name] = rays[even_subset(rays, min(len(rays), self.most_pattern))]
         return self._patterns[part.name] @ placed.pose.frame
 
     def _keys(self, placed: Sequence[PlacedPart], size_rad: float) -> list[np.ndarray]:
@@ -146,7 +147,7 @@ def part_table(
     gate_m = np.array([one.shape.gate_m for one in placed])
     # of dense patterns each ray stands for many
     fired = np.minimum([one.part.rays for one in placed], bundle.most_rays)
-    times = fired / np.minimum(fired, MOST_PATTERN)
+    times = fired / np.minimum(fired, bundle.most_pattern)
     share, told = min(count * bundle.usual_rays / len(rays), 1.0), []
     for number, scene in enumerate(scenes):
         with choosing(share):
@@ -160,7 +161,8 @@ def part_table(
         every = np.empty((len(placed), len(informed.weight)), dtype=np.float32)
         kernels.gather_parts(entries, informed.range_m[order], first, members, gate_m, every)
         if len(informed.sums):
-            every *= times[:, None]
+            # more counts no more, and bounds are the lower for it
+            every = np.minimum(every * times[:, None], len(informed.sums) - 1, dtype=np.float32)
         part, item = np.nonzero(every)
         worth, item, part = every[part, item], item.astype(np.int32), part.astype(np.int32)
         told.append(replace(informed, ray=part, item=item, worth=worth, range_m=np.zeros(len(part))))
