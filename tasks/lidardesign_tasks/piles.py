@@ -140,7 +140,7 @@ def settled_poses(meshes: tuple[Mesh, ...], background: Background, seed: int) -
         DataError: They come to rest in no attempt, or a mesh is flat.
     """
     hulls = [_hull(mesh) for mesh in meshes]
-    simulation = _Simulation([hull.corners for hull in hulls], background)
+    simulation = _simulation(meshes, background)
     low, high = background.bounds_m + np.array([[-1.0], [1.0]]) * background.overlap_m
     for attempt in range(ATTEMPTS):
         placed = simulation.dropped(np.random.default_rng([seed, attempt]))
@@ -183,6 +183,12 @@ def _hull(mesh: Mesh) -> _Hull:
     corners = used[np.sort(hull.vertices)]
     centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
     return _Hull(corners - centre, centre, float(hull.volume))
+
+
+@lru_cache(maxsize=64)
+def _simulation(meshes: tuple[Mesh, ...], background: Background) -> _Simulation:
+    """The simulation of some objects: to compile it takes as long as to drop them."""
+    return _Simulation([_hull(mesh).corners for mesh in meshes], background)
 
 
 class _Simulation:
