@@ -2,7 +2,8 @@
 
 Every sensor is off by a normal draw of its own in every scene, along each axis and about each. Draws belong to a scene
 and the number of a sensor, so all designs are mounted by the same hands. A sensor keeps its rays, their gates and its
-error at every position of what it is bolted to.
+error at every position of what it is bolted to. Where it stands in the end is known, as after a calibration: rays go
+elsewhere, and points are where they are measured.
 """
 
 from __future__ import annotations
