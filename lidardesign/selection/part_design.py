@@ -97,6 +97,14 @@ def choose_parts(
     budget = BandwidthBudget.of(constraints, rays)
     most = (budget.rays or MOST_TABLE_RAYS) // count
     limits = _limits(placed, constraints, count, most, budget)
+    if not limits.may_join((), len(placed)).any():
+        bounded = {"budget.bandwidth_mbps": budget.limit_mbps, "parts.power_w": wanted.power_w}
+        keys = [key for key, limit in bounded.items() if limit is not None]
+        raise InfeasibleError(
+            f"each of the parts needs more than {' or '.join(keys)} allows",
+            conflicts=keys,
+            hint="loosen one of the constraints named, or fire fewer rays",
+        )
     bundle = PartBundle(placed, most, next(scenes("choice")).frames)
     training, held_back = (itertools.islice(scenes(one), information.FEW_SCENES) for one in ("choice", "held back"))
     coverage, unit = part_table(bundle, training, informs, count, seed)

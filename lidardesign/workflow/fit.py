@@ -249,7 +249,7 @@ class FitRequest:
         sensors = "one sensor per ray" if LAYOUTS[choices["layout"]].one_sensor_per_ray else sensors
         place = "".join(f", {key} = {value:g}" for key, value in self.at.items())
         if self.constraints is not None and self.constraints.parts is not None:
-            return [f"choose {sensors} among parts, with their poses, on training scenes, seed {self.seed}"]
+            return [f"choose at most {sensors} among parts, with their poses, on training scenes, seed {self.seed}"]
         layout = choices["layout"] + ("" if self.channels is None else f" with {self.channels} channels")
         how = f"layout {layout}, {rays}, level {choices['level']:g}{place}, seed {self.seed}"
         steps = [f"fit {sensors}, {how}"]

@@ -120,6 +120,11 @@ def test_bounds_that_no_part_keeps_are_named(run):
         bought(run, field_of_view={"horizontal_deg": {"max": 1.0}})
 
 
+def test_a_bandwidth_that_no_part_keeps_is_named(run):
+    with pytest.raises(InfeasibleError, match=r"budget\.bandwidth_mbps"):
+        bought(run, budget={"bandwidth_mbps": 0.001})
+
+
 def test_fit_prints_parts_and_evaluate_takes_them(lidardesign, run):
     result = lidardesign("fit", run, "--parts", "vl53l5cx,tmf8828", "--sensors", 2, "--name", "b", "--json")
     assert result.code == 0, result.err

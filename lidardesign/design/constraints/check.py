@@ -406,7 +406,7 @@ def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list
     """Whether every sensor is the part that it says to be, one that was asked for, and no part comes too often."""
     if parts is None:
         return []
-    named = [] if parts["names"] == "catalog" else list(parts["names"])
+    named = [] if parts.get("names", "catalog") == "catalog" else list(parts["names"])
     checks, found = [], []
     for index, sensor in enumerate(document["sensors"]):
         name, own = f"{sensor.get('name', index)}.part", sensor.get("part")

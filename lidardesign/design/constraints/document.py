@@ -180,7 +180,7 @@ class Parts(_Keys):
         power_w: What all of them may consume [W]; parts of which no source says it are left out.
     """
 
-    names: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | Literal["catalog"]
+    names: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | Literal["catalog"] = "catalog"
     count: Count | None = None
     each: dict[str, MostOfPart] = {}
     power_w: Positive | None = None
