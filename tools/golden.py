@@ -70,8 +70,8 @@ FURTHER = {
     "face": """
         fit runs/face --sensors auto --name auto --json
         fit runs/face --layout scan --rays 40 --weight area_exponent=0.25 --name weighted --json
-        constrain runs/face --sensors 2 --set snap=catalog --name bought --json
-        constrain runs/face --sensors 2 --set 'snap.parts=[vl53l5cx, vl53l8cx]' --name ours
+        fit runs/face --sensors 2 --parts vl53l5cx,tmf8828 --name bought --json
+        constrain runs/face --set 'parts={names: [vl53l5cx, vl53l8cx], count: 2}' --name ours
         constrain runs/face --set gate.start_m.min=0.6 --set gate.end_m.max=0.5
         constrain runs/face --set gate.widht_m.max=0.1
         fit runs/face --like rig.sdf --name alike --json
