@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
-from lidardesign_tasks.robot.motion import DEPTH_M, Wanderer, joined, spans, window_frames
+from lidardesign_tasks.robot.motion import DEPTH_M, Wanderer, joined, spans, window_frames, windows
 from lidardesign_tasks.robot.recordings import Recording, columns, read_recordings
 from lidardesign_tasks.robot.targets import mean_depth_m
 from lidardesign_tasks.robot.task import MujocoTask
@@ -167,6 +167,21 @@ def test_several_recordings_are_split_by_file_and_one_in_its_middle():
     assert end == begin
     assert window_frames(whole, 20, 10.0) == 20
     assert window_frames(whole[:1], 40, 10.0) == 25
+
+
+def test_few_windows_of_many_recordings_are_of_others_with_every_seed(folder):
+    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    many = [Recording(f"{i}.csv", np.arange(50) / 10, np.tile([0, 0, *REST], (50, 1))) for i in range(60)]
+    shown = [{one.group for one in windows(model, many, "train", 10, 5, 10.0, seed)} for seed in range(6)]
+    assert all(len(names) == 10 for names in shown)
+    assert len(set.union(*shown)) > 15
+
+
+def test_recordings_go_a_little_beyond_limits_as_those_of_mujoco_do(folder):
+    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    beyond = np.radians(80) + 0.04 * np.radians(160)
+    (one,) = read_recordings(model, write_csv(folder / "walk.csv", table(np.full(5, beyond))))
+    assert one.qpos[0, 0] == pytest.approx(beyond)
 
 
 def test_windows_of_one_recording_stay_in_the_half_of_their_split(folder, configured):

@@ -102,9 +102,11 @@ def windows(
 ) -> list[Trajectory]:  # fmt: skip
     """So many windows of a split's recordings, in turn, that begin at random moments; see `spans`."""
     frames, shown = window_frames(recordings, frames, rate_hz), spans(recordings, split)
+    # few windows of many recordings are of others with every seed
+    order = random_generator(seed, "mujoco", split, "order").permutation(len(shown))
     length_s, found = (frames - 1) / rate_hz, []
     for index in range(count):
-        recording, first, last = shown[index % len(shown)]
+        recording, first, last = shown[order[index % len(shown)]]
         start = random_generator(seed, "mujoco", split, index).uniform(first, max(last - length_s, first))
         times = start + np.arange(frames) / rate_hz
         # of one recording, windows that may overlap are one group

@@ -23,8 +23,8 @@ PLACE, TURN = (".x", ".y", ".z"), (".qw", ".qx", ".qy", ".qz")
 ENDINGS = (".csv", ".npz")
 LARGEST_BYTES = 64_000_000
 MOST_SHOWN = 12
-# How far recorded joints may be beyond their limits [rad, m]: encoders and rounding go a little further.
-BEYOND_LIMIT = 0.01
+# How far recorded joints may be beyond their limits, as a share of what is between them: MuJoCo's own limits are soft.
+BEYOND_LIMIT = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ def _check_limits(model: mujoco.MjModel, qpos: np.ndarray, time_s: np.ndarray, p
         low, high = model.jnt_range[joint]
         beyond = np.maximum(low - qpos[:, place], qpos[:, place] - high)
         worst = int(np.argmax(beyond))
-        if beyond[worst] > BEYOND_LIMIT:
+        if beyond[worst] > BEYOND_LIMIT * (high - low):
             raise DataError(
                 f"the joint {names[place]!r} is at {qpos[worst, place]:.4g} at {time_s[worst]:g} s",
                 where=str(path),
