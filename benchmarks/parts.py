@@ -33,7 +33,7 @@ def chosen(options: Any, kinds: int) -> dict[str, Any]:
     from lidardesign.samples import load_samples
     from lidardesign.selection.information import checked_information
     from lidardesign.selection.part_design import proposed
-    from lidardesign.selection.parts import PartBundle, part_table
+    from lidardesign.selection.parts import PartBundle, part_table, parts_inform
     from lidardesign.selection.sets import SetLimits, choose_set
     from lidardesign.workflow.run_folder import RunFolder
     from lidardesign.workflow.select_rays import selection_scenes
@@ -45,7 +45,8 @@ def chosen(options: Any, kinds: int) -> dict[str, Any]:
     bundle = PartBundle(placed, 60_000 // options.count, next(selection_scenes(run, 0, "choice")).frames)
     marks.append(time.process_time())
     scenes = itertools.islice(selection_scenes(run, 0, "choice"), SCENES)
-    coverage, _ = part_table(bundle, scenes, partial(checked_information, run.task), options.count, 0)
+    informed = parts_inform(bundle, scenes, partial(checked_information, run.task), options.count, 0)
+    coverage = part_table(informed, len(placed))
     marks.append(time.process_time())
     found = choose_set(coverage, SetLimits(options.count))
     marks.append(time.process_time())

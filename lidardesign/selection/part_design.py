@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 
 import numpy as np
@@ -35,14 +36,16 @@ from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scene import Scene
 from lidardesign.selection import information
-from lidardesign.selection.parts import PartBundle, PlacedPart, part_table
-from lidardesign.selection.select import PROXY
-from lidardesign.selection.sets import SetLimits, choose_set
+from lidardesign.selection.coverage import Coverage, InformedScene
+from lidardesign.selection.parts import PartBundle, PlacedPart, part_table, parts_inform
+from lidardesign.selection.select import PROXY, SMALLEST_GAIN
+from lidardesign.selection.sets import ChosenSet, SetLimits, choose_set
 from lidardesign.space import angles, observed_point
 from lidardesign.task import Information, random_generator
 
 MOST_POSES = 500  # of each kind of part, over all places
 MOST_PLACES = 25  # in a box of origins
+MOST_TOLD = 1_000_000  # candidates times scenes
 
 
 def choose_parts(
@@ -106,15 +109,9 @@ def choose_parts(
             hint="loosen one of the constraints named, or fire fewer rays",
         )
     bundle = PartBundle(placed, most, next(scenes("choice")).frames)
-    training, held_back = (itertools.islice(scenes(one), information.FEW_SCENES) for one in ("choice", "held back"))
-    coverage, unit = part_table(bundle, training, informs, count, seed)
-    with phase("choice"):
-        chosen = choose_set(coverage, limits)
-    if not chosen.members:
-        raise DataError("none of the parts tells anything about the scenes", where="--parts")
+    chosen, coverage, held_back_loss, trained = _chosen_set(bundle, limits, informs, scenes, seed)
     if len(chosen.members) < count:
         notes(f"{len(chosen.members)} of {count} parts: no other tells more, or fits the bounds")
-    judged, _ = part_table(bundle, held_back, informs, count, seed, chosen.members)
     loss = coverage.complete - chosen.value
     design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays)
     certificate = {
@@ -122,12 +119,12 @@ def choose_parts(
         "value": float(loss),
         "bound": float(max(coverage.complete - chosen.bound, 0.0)),
         "gap": float((chosen.bound - chosen.value) / loss) if loss > 0 else 0.0,
-        "held_back_value": float(judged.loss_of(np.zeros(len(chosen.members), dtype=np.intp))),
+        "held_back_value": float(held_back_loss),
         "candidates": len(placed),
         "gates": 1,
-        "scenes": information.FEW_SCENES,
+        "scenes": len(trained),
         "proxy": PROXY,
-        "unit": unit,
+        "unit": trained[0].unit,
     }
     design = replace(design, provenance={CERTIFICATES: [certificate]})
     checks = check_design(design_document(design), constraints, space)
@@ -140,6 +137,37 @@ def choose_parts(
         constraints=checks,
         seconds=perf_counter() - started,
     )
+
+
+def _chosen_set(
+    bundle: PartBundle,
+    limits: SetLimits,
+    informs: Callable[[Scene, Sequence[Returns]], Information],
+    scenes: Callable[[str], Iterator[Scene]],
+    seed: int,
+) -> tuple[ChosenSet, Coverage, float, list[InformedScene]]:
+    """The best set, what all parts tell, its loss on scenes held back, and the scenes that it was chosen on.
+
+    Raises:
+        DataError: No part tells anything about the scenes.
+    """
+    inform = partial(parts_inform, bundle, informs=informs, count=limits.count, seed=seed)
+    held_back = list(itertools.islice(scenes("held back"), information.FEW_SCENES))
+    training, wanted, loss = scenes("choice"), information.FEW_SCENES, np.inf
+    informed: list[InformedScene] = []
+    while True:
+        informed += inform(itertools.islice(training, wanted - len(informed)), first_scene=len(informed))
+        coverage = part_table(informed, len(bundle.placed))
+        with phase("choice"):
+            chosen = choose_set(coverage, limits)
+        if not chosen.members:
+            raise DataError("none of the parts tells anything about the scenes", where="--parts")
+        judged = part_table(inform(held_back, among=chosen.members), len(chosen.members))
+        before, loss = loss, judged.loss_of(np.zeros(len(chosen.members), dtype=np.intp))
+        is_large = 2 * wanted > information.MOST_SCENES or 2 * wanted * len(bundle.placed) > MOST_TOLD
+        if is_large or loss > (1 - SMALLEST_GAIN) * before:
+            return chosen, coverage, loss, informed
+        wanted *= 2
 
 
 def _limits(

@@ -122,15 +122,17 @@ class PartBundle:
 
 
 @phase("what returns tell")
-def part_table(
+def parts_inform(
     bundle: PartBundle,
     scenes: Iterable[Scene],
     informs: Callable[[Scene, Sequence[Returns]], Information],
     count: int,
     seed: int,
+    *,
+    first_scene: int = 0,
     among: Sequence[int] | None = None,
-) -> tuple[Coverage, str]:
-    """What every part tells about scenes, and in which unit; parts are the candidates.
+) -> list[InformedScene]:
+    """What every part tells about scenes; parts are the candidates.
 
     Arguments:
         bundle: The parts and their rays.
@@ -138,6 +140,7 @@ def part_table(
         informs: What a task says of a scene's returns.
         count: How many parts a design has: what a return tells depends on how many there will be.
         seed: Root of the draws of items.
+        first_scene: The number of the first scene, for these draws.
         among: Some of the parts, where others are not asked for.
     """
     rows, rays = np.arange(len(bundle.placed)) if among is None else np.array(among), bundle.rays
@@ -149,7 +152,7 @@ def part_table(
     fired = np.minimum([one.part.rays for one in placed], bundle.most_rays)
     times = fired / np.minimum(fired, bundle.most_pattern)
     share, told = min(count * bundle.usual_rays / len(rays), 1.0), []
-    for number, scene in enumerate(scenes):
+    for number, scene in enumerate(scenes, first_scene):
         with choosing(share):
             informed = inform(scene, rays, [slice(0, len(rays))], informs)
         informed = _fewer_items(informed, random_generator(seed, "items of parts", number))
@@ -166,8 +169,12 @@ def part_table(
         part, item = np.nonzero(every)
         worth, item, part = every[part, item], item.astype(np.int32), part.astype(np.int32)
         told.append(replace(informed, ray=part, item=item, worth=worth, range_m=np.zeros(len(part))))
-    open_gates = np.tile([0.0, np.inf], (len(placed), 1, 1))
-    return gather(told, open_gates, np.zeros((len(placed), 1))), told[0].unit
+    return told
+
+
+def part_table(informed: Sequence[InformedScene], parts: int) -> Coverage:
+    """So many parts, each with one gate that is open, beside all items of scenes."""
+    return gather(informed, np.tile([0.0, np.inf], (parts, 1, 1)), np.zeros((parts, 1)))
 
 
 def _fewer_items(informed: InformedScene, generator: np.random.Generator) -> InformedScene:

@@ -16,7 +16,7 @@ from lidardesign.design.layouts.rays import certificates_of, lay_out
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.samples import load_samples
 from lidardesign.selection import information, part_design
-from lidardesign.selection.parts import COARSE_CELL_RAD, PartBundle, cells_of, part_table
+from lidardesign.selection.parts import COARSE_CELL_RAD, PartBundle, cells_of, part_table, parts_inform
 from lidardesign.selection.sets import SetLimits, choose_set
 from lidardesign.simulate.simulate import simulate_many
 from lidardesign.task import Information
@@ -38,6 +38,7 @@ def run(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     monkeypatch.setattr(information, "FEW_SCENES", 4)
+    monkeypatch.setattr(information, "MOST_SCENES", 4)
     monkeypatch.setattr(part_design, "MOST_POSES", 20)
 
 
@@ -160,7 +161,7 @@ def test_a_part_tells_what_its_own_rays_would(run):
     parts = [find_part(name) for name in THREE]
     placed = part_design.proposed(parts, part_design.Constraints(), load_samples(run), 0)
     scene = opened.task.scenes(opened.config.task, "train", 0)[0]
-    coverage, _ = part_table(PartBundle(placed, 64, 1), [scene], every_return, 2, 0)
+    coverage = part_table(parts_inform(PartBundle(placed, 64, 1), [scene], every_return, 2, 0), len(placed))
     for number in range(0, len(placed), 7):
         one = placed[number]
         rays = part_rays(one.part, one.pose)
