@@ -6,6 +6,7 @@ oncoming lane, on both sides are parked cars, pavements and walls.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -79,14 +80,20 @@ OWN = user_of("car", 0.0, 0.0)
 
 
 def build_scene(config: StreetConfig, name: str, generator: np.random.Generator) -> Scene:
-    """One moment; ground, walls and the own car block rays and are nothing worth observing."""
+    """One moment."""
     users: list[User] = []
     for band in BANDS_M:
         for _ in range(config.users):
             users.append(next(user for user in _drawn(band, generator) if all(map(user.is_apart, (*users, OWN)))))
+    return scene_of(users, name)
+
+
+def scene_of(users: Sequence[User], name: str = "street") -> Scene:
+    """These road users in the street; ground, walls and the own car block rays and are nothing worth observing."""
     ground = Body(Plane(), "ground", "occluder")
+    middle_m = WALL_HEIGHT_M / 2
     walls = [
-        Body(Box((STREET_M / 2, 0.1, WALL_HEIGHT_M / 2)), "wall", "occluder", rigid(translation_m=(0, y, 4.0)))
+        Body(Box((STREET_M / 2, 0.1, middle_m)), "wall", "occluder", rigid(translation_m=(0, y, middle_m)))
         for y in WALLS_M
     ]
     shown = [body for number, user in enumerate(users) for body in user.bodies(f"{user.kind} {number}", "both")]
@@ -97,7 +104,7 @@ def build_scene(config: StreetConfig, name: str, generator: np.random.Generator)
     return Scene((ground, *walls, *OWN.bodies("own car", "occluder"), *shown), name, truth=truth)
 
 
-def _drawn(band_m: tuple[float, float], generator: np.random.Generator):
+def _drawn(band_m: tuple[float, float], generator: np.random.Generator) -> Iterator[User]:
     """Road users in a band, one after the other, without end."""
     shares = [share for share, _ in PLACES.values()]
     while True:

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
 
-from lidardesign_street.scenes import BANDS_M, OWN, SIZES_M, User, user_of
+from lidardesign_street.scenes import BANDS_M, OWN, SIZES_M, User, scene_of, user_of
 from lidardesign_street.task import StreetTask
 from lidardesign_street.users import FEWEST_RETURNS, distances_m
 
@@ -18,12 +17,6 @@ def scenes():
     """Ten busy moments."""
     task = StreetTask()
     return task.scenes(task.Config(test=10, users=8), "test", 5)
-
-
-def scene_of(*users):
-    """A scene of these road users alone."""
-    truth = {name: np.stack([getattr(user, name) for user in users]) for name in ("centre_m", "half_m")}
-    return Scene(tuple(body for user in users for body in user.bodies(user.kind, "both")), truth=truth)
 
 
 def rays_at(points):
@@ -38,14 +31,14 @@ def rays_at(points):
 
 @pytest.mark.parametrize("kind", SIZES_M)
 def test_a_road_user_is_found_by_five_returns_and_missed_with_four(kind):
-    scene = scene_of(user_of(kind, 10.0, 0.0))
+    scene = scene_of([user_of(kind, 10.0, 0.0)])
     for count, missed in ((FEWEST_RETURNS, 0.0), (FEWEST_RETURNS - 1, 100.0)):
         rays = rays_at([[10.0, 0.0, height] for height in np.linspace(0.6, 1.2, count)])
         assert StreetTask().score(scene, simulate(scene, rays)).value == missed
 
 
 def test_what_returns_tell_is_what_they_leave_unfound():
-    scene = scene_of(user_of("car", 10.0, 0.0), user_of("pedestrian", 0.0, 8.0))
+    scene = scene_of([user_of("car", 10.0, 0.0), user_of("pedestrian", 0.0, 8.0)])
     found = StreetTask().informs(scene, simulate(scene, rays_at([[10.0, 0.0, 0.8], [0.0, 8.0, 1.0], [5.0, 5.0, 5.0]])))
     assert (found.ray.tolist(), found.item.tolist()) in (([0, 1], [0, 1]), ([1, 0], [1, 0]))
     assert found.sums.tolist() == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
