@@ -67,6 +67,13 @@ class FitResult:
     notes: tuple[str, ...] = field(default=())
     error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
 
+    @classmethod
+    def of_choice(cls, design: DesignSpec, constraints: Constraints, samples: Samples, seconds: float) -> FitResult:
+        """A design that was chosen on scenes instead of being fitted to samples."""
+        checks = check_design(design_document(design), constraints, samples.space)
+        satisfied = all(check.satisfied for check in checks)
+        return cls(design, None, None, samples.effective_sample_size, satisfied, checks, seconds)
+
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON keys; the path of the design is for the caller to fill."""
         return {

@@ -15,6 +15,7 @@ Without a budget lambda is the price that bandwidth was given, and lambda B is l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,7 @@ ROUNDS = 80
 PRICE_BISECTIONS = 12
 PATIENCE = 5  # rounds without a lower bound after which steps are halved
 PROGRESS = 0.02  # of what the bound exceeds the value by: a bound that is lower by less is not lower
+PROXY = "mean over items of what the returns of the chosen rays leave unknown, by informs of the task"
 MEMORY = 0.7  # how much of its last direction a step keeps
 
 
@@ -49,6 +51,41 @@ class Certificate:
         """How much smaller the loss could be at most, relative; the loss is what the objective lacks of `complete`."""
         loss = complete - self.value
         return (self.bound - self.value) / loss if loss > 0 else 0.0
+
+
+def certificate_document(
+    *,
+    rays: int,
+    value: float,
+    bound: float,
+    held_back_value: float,
+    candidates: int,
+    gates: int,
+    scenes: int,
+    unit: str,
+) -> dict[str, Any]:
+    """What a design file, JSON and reports say of a choice.
+
+    Arguments:
+        rays: How many fire.
+        value: What the choice loses on the scenes that it was made on, in the unit.
+        bound: What any other loses at least.
+        held_back_value: What it loses on scenes held back.
+        candidates, gates, scenes: How many there were.
+        unit: Of the losses.
+    """
+    return {
+        "rays": rays,
+        "value": float(value),
+        "bound": float(max(bound, 0.0)),  # nothing loses less than nothing
+        "gap": float((value - max(bound, 0.0)) / value) if value > 0 else 0.0,
+        "held_back_value": float(held_back_value),
+        "candidates": candidates,
+        "gates": gates,
+        "scenes": scenes,
+        "proxy": PROXY,
+        "unit": unit,
+    }
 
 
 def certify(

@@ -19,11 +19,10 @@ from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.catalog.library import named_parts, part_rays, part_sensor
 from lidardesign.design.catalog.part import Part
 from lidardesign.design.catalog.shapes import broken_keys, shapes_of
-from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints, SensorRules
 from lidardesign.design.constraints.feasibility import BandwidthBudget
 from lidardesign.design.constraints.origins import inside_excluded, mounts_of, origin_box
-from lidardesign.design.files import MOST_TABLE_RAYS, design_document
+from lidardesign.design.files import MOST_TABLE_RAYS
 from lidardesign.design.fit import FitResult
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.mixture.bounds import bounds_of, clip_azimuth
@@ -36,9 +35,10 @@ from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scene import Scene
 from lidardesign.selection import information
+from lidardesign.selection.certificate import certificate_document
 from lidardesign.selection.coverage import Coverage, InformedScene
 from lidardesign.selection.parts import PartBundle, PlacedPart, part_table, parts_inform
-from lidardesign.selection.select import PROXY, SMALLEST_GAIN
+from lidardesign.selection.select import SMALLEST_GAIN
 from lidardesign.selection.sets import ChosenSet, SetLimits, choose_set
 from lidardesign.space import angles, observed_point
 from lidardesign.task import Information, random_generator
@@ -112,31 +112,19 @@ def choose_parts(
     chosen, coverage, held_back_loss, trained = _chosen_set(bundle, limits, informs, scenes, seed)
     if len(chosen.members) < count:
         notes(f"{len(chosen.members)} of {count} parts: no other tells more, or fits the bounds")
-    loss = coverage.complete - chosen.value
     design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays)
-    certificate = {
-        "rays": design.rays,
-        "value": float(loss),
-        "bound": float(max(coverage.complete - chosen.bound, 0.0)),
-        "gap": float((chosen.bound - chosen.value) / loss) if loss > 0 else 0.0,
-        "held_back_value": float(held_back_loss),
-        "candidates": len(placed),
-        "gates": 1,
-        "scenes": len(trained),
-        "proxy": PROXY,
-        "unit": trained[0].unit,
-    }
-    design = replace(design, provenance={CERTIFICATES: [certificate]})
-    checks = check_design(design_document(design), constraints, space)
-    return FitResult(
-        design=design,
-        log_likelihood=None,
-        admissible_mass=None,
-        ess=samples.effective_sample_size,
-        satisfied=all(check.satisfied for check in checks),
-        constraints=checks,
-        seconds=perf_counter() - started,
+    certificate = certificate_document(
+        rays=design.rays or 0,
+        value=coverage.complete - chosen.value,
+        bound=coverage.complete - chosen.bound,
+        held_back_value=held_back_loss,
+        candidates=len(placed),
+        gates=1,
+        scenes=len(trained),
+        unit=trained[0].unit,
     )
+    design = replace(design, provenance={CERTIFICATES: [certificate]})
+    return FitResult.of_choice(design, constraints, samples, perf_counter() - started)
 
 
 def _chosen_set(

@@ -21,13 +21,12 @@ from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.selection import information
 from lidardesign.selection.candidates import inform
-from lidardesign.selection.certificate import certify
+from lidardesign.selection.certificate import certificate_document, certify
 from lidardesign.selection.choice import Choice, RayCounts, choose, choose_within
 from lidardesign.selection.coverage import Coverage, InformedScene, gather
 from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
 
-PROXY = "mean over items of what the returns of the chosen rays leave unknown, by informs of the task"
 LOSS_PER_BANDWIDTH = 0.2  # where bandwidth has no limit: ten percent more of it must bring two percent less loss
 SMALLEST_GAIN = 0.01  # of the held-back loss: what twice the scenes must gain
 MOST_ENTRIES = 10_000_000  # of the table, some 200 MB: scenes of few items may be more
@@ -233,22 +232,21 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
         if problem.is_trial:
             continue
         value, bound = problem.certified(coverage, choices)
-        selected[-1].certificate.update(
+        document = certificate_document(
             rays=count,
-            value=float(value),
-            bound=float(bound),
-            gap=float((value - bound) / value) if value > 0 else 0.0,
-            held_back_value=float(judged.loss_of(gate)),
+            value=value,
+            bound=bound,
+            held_back_value=judged.loss_of(gate),
             candidates=len(rays),
             gates=gates_m.shape[1],
             scenes=len(informed),
-            proxy=PROXY,
             unit=informed[0].unit,
         )
         if count == middle:
-            selected[-1].certificate["curve"] = price_curve(coverage, problem.counts(count), len(problem.visits))
+            document["curve"] = price_curve(coverage, problem.counts(count), len(problem.visits))
             if problem.further is not None:
-                selected[-1].certificate["gap_doubled"] = _gap_doubled(problem, problem.further, count, shared)
+                document["gap_doubled"] = _gap_doubled(problem, problem.further, count, shared)
+        selected[-1] = Selected(tables, document)
     return selected
 
 

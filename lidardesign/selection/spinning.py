@@ -16,11 +16,10 @@ from time import perf_counter
 
 import numpy as np
 
-from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import inside_excluded, mounts_of, origin_box
-from lidardesign.design.files import MOST_TABLE_RAYS, design_document
+from lidardesign.design.files import MOST_TABLE_RAYS
 from lidardesign.design.fit import FitResult
 from lidardesign.design.sensor import CERTIFICATES, DEFAULT_LEVEL, DesignSpec, Sensor, interval_factor
 from lidardesign.errors import ConfigError, DataError
@@ -31,10 +30,9 @@ from lidardesign.samples import Samples
 from lidardesign.scene import Scene
 from lidardesign.selection import information
 from lidardesign.selection.candidates import CANDIDATES_PER_RAY, inform
-from lidardesign.selection.certificate import certify
+from lidardesign.selection.certificate import certificate_document, certify
 from lidardesign.selection.choice import Choice, RayCounts, choose
 from lidardesign.selection.coverage import Coverage, gather
-from lidardesign.selection.select import PROXY
 from lidardesign.space import DesignSpace
 from lidardesign.task import Information
 
@@ -96,11 +94,7 @@ class RingCandidates:
         few = itertools.islice(scenes, round(share * information.FEW_SCENES))
         informed = [inform(scene, rays, [slice(0, len(rays))], informs) for scene in few]
         table = gather(informed, rays.gate_m[:, None], np.zeros((len(rays), 1)))
-        grouped = table.grouped(np.arange(len(rays)).reshape(len(rings), self.points))
-        if len(table.table):
-            # what exceeds the table counts nothing, and would only loosen bounds
-            grouped = replace(grouped, worth=np.minimum(grouped.worth, np.float32(len(table.table) - 1)))
-        return grouped, informed[0].unit
+        return table.grouped(np.arange(len(rays)).reshape(len(rings), self.points)), informed[0].unit
 
 
 def choose_rings(
@@ -168,18 +162,16 @@ def choose_rings(
         judged, _ = candidates.coverage(chosen, scenes("held back"), informs)
     places, sensor = np.unique(candidates.place[chosen], return_inverse=True)
     table = candidates.rays(chosen, sensor)
-    certificate = {
-        "rays": len(table),
-        "value": loss,
-        "bound": bound,
-        "gap": (loss - bound) / loss if loss > 0 else 0.0,
-        "held_back_value": judged.loss_of(np.zeros(len(chosen), dtype=np.intp)),
-        "candidates": len(candidates),
-        "gates": 1,
-        "scenes": information.FEW_SCENES,
-        "proxy": PROXY,
-        "unit": unit,
-    }
+    certificate = certificate_document(
+        rays=len(table),
+        value=loss,
+        bound=bound,
+        held_back_value=judged.loss_of(np.zeros(len(chosen), dtype=np.intp)),
+        candidates=len(candidates),
+        gates=1,
+        scenes=information.FEW_SCENES,
+        unit=unit,
+    )
     reached = np.abs(candidates.elevation_rad[chosen % elevations])
     design = DesignSpec(
         name=name,
@@ -198,16 +190,7 @@ def choose_rings(
         constraints=constraints.as_document(),
         provenance={"channels": channels, CERTIFICATES: [certificate]},
     )
-    checks = check_design(design_document(design), constraints, space)
-    return FitResult(
-        design=design,
-        log_likelihood=None,
-        admissible_mass=None,
-        ess=samples.effective_sample_size,
-        satisfied=all(check.satisfied for check in checks),
-        constraints=checks,
-        seconds=perf_counter() - started,
-    )
+    return FitResult.of_choice(design, constraints, samples, perf_counter() - started)
 
 
 def places_of(constraints: Constraints, space: DesignSpace) -> np.ndarray:
