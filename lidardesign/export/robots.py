@@ -2,7 +2,7 @@
 
 MuJoCo: a body per sensor, a site per ray whose +z looks along it, and a rangefinder on each.
 
-`sensordata` has the rays in their own order: the distance [m], -1 where nothing is hit, and the gate's end where what
+`sensordata` has the rays in their own order: the distance [m], negative where nothing is hit, the gate's end where what
 is hit lies beyond (`cutoff`). The start of the gate, the sensor's number and the firing time stand in the rangefinder's
 user data, which MuJoCo keeps (`model.sensor_user`) and does not use. The file is a model of its own and may be
 included in another one, or a copy of a robot's with the sensors on one of its bodies. Rangefinders see neither geoms of
@@ -101,7 +101,7 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | No
             f"MuJoCo has no gate start: {len(late)} of {len(rays)} rays also see what is nearer than theirs, of "
             f"{late.min():.3g} to {late.max():.3g} m; it stands in the rangefinders' user data"
         )
-    return [*notes, "a reading equal to the cutoff is a hit at or beyond the end of the gate; -1 is no hit"]
+    return [*notes, "a reading equal to the cutoff is a hit at or beyond the end of the gate; a negative one is no hit"]
 
 
 def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Element, Element, Element]:

@@ -12,8 +12,8 @@ import pytest
 import trimesh
 from lidardesign_tasks.robot.motion import DEPTH_M, Wanderer, joined, spans, window_frames, windows
 from lidardesign_tasks.robot.recordings import Recording, columns, read_recordings
-from lidardesign_tasks.robot.targets import mean_depth_m
-from lidardesign_tasks.robot.task import MujocoTask
+from lidardesign_tasks.robot.targets import mean_depth_m, refuse_sensors_inside
+from lidardesign_tasks.robot.task import MujocoTask, model_of
 from support.rays import rays_of_points
 from support.robots import written
 from support.tables import each_row
@@ -304,6 +304,15 @@ def test_a_configuration_that_cannot_be_used_says_what_to_do(configured, case):
         TASK.scenes(configured(**keys), "train", 0)
     assert said in str(error.value)
     assert "task." in str(error.value.where)
+
+
+def test_what_passes_through_a_sensor_is_no_error_and_what_stays_there_is(configured):
+    model = model_of(configured())
+    through = model.poses(np.array([[lift, 0, *REST] for lift in (0, -1, -1)]))
+    at_the_hand = np.array([[0.65, 0.0, 0.9]])
+    refuse_sensors_inside(model, through, at_the_hand)
+    with pytest.raises(ConfigError, match="inside 'hand'"):
+        refuse_sensors_inside(model, through[:1], at_the_hand)
 
 
 def test_one_name_needs_no_list(folder):
