@@ -21,7 +21,7 @@ from lidardesign.scene import Scene
 from lidardesign.task import Information, Task
 
 # On so many scenes rays are chosen at first, and at most; as many as at first are held back.
-FEW_SCENES, MOST_SCENES = 50, 800
+FEW_SCENES, MOST_SCENES = 50, 400
 # Of the candidates' returns so many are chosen, or about so many: lengths follow from it, and they are no thresholds.
 CHOSEN_SHARE = 0.2
 # A return tells about what is nearer than so many mean spacings of the chosen ones: sqrt(5), so that on a surface it is

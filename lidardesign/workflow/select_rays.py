@@ -88,7 +88,8 @@ def select_rays(
         scenes=lambda purpose: itertools.chain(
             first[purpose], itertools.islice(selection_scenes(run, seed, purpose), len(first[purpose]), None)
         ),
-        most_scenes=information.MOST_SCENES,
+        # each of a few values of a condition sees little of a scene
+        most_scenes=information.MOST_SCENES * (1 + bool(samples.space.conditioned)),
         bandwidth=bandwidth_limit(constraints, len(rays))[0],
         limit_mbps=np.inf if limit is None else limit,
         one_gate=spec.gates != "ray",

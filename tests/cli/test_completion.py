@@ -32,7 +32,7 @@ from lidardesign.export.registry import EXPORTERS
 from lidardesign.simulate.detector.detector import EFFECTS
 
 # What nobody can know beforehand; a metavar that is neither here nor completed is a mistake.
-FREE = {"N", "SECONDS", "SHARE", "VALUE", "MM", "DEG", "HZ", "P", "X,Y,Z", "PERCENT", "KLUX", "MB", "S"}
+FREE = {"N", "SECONDS", "SHARE", "VALUE", "MM", "DEG", "HZ", "P", "X,Y,Z", "PERCENT", "KLUX", "MB", "S", "LENGTH,ANGLE"}
 NEW_NAMES = {("tasks new", "NAME"), ("fit", "NAME"), ("constrain", "NAME")}
 
 
