@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 # of click's own copy inside typer, or of click where an older typer stands on it
 _COMPLETION = importlib.import_module(f"{typer.Context.__mro__[1].__module__.rpartition('.')[0]}.shell_completion")
 FILE, FOLDER, PATH = "files", "folders", "paths"
-FILE_METAVARS = frozenset(("FILE", "FILE.html", "FILE.yaml", "MESH", "CAPTURE", "PATH", "NAME|FILE"))
+FILE_METAVARS = frozenset(("FILE", "MODEL", "FILE.html", "FILE.yaml", "MESH", "CAPTURE", "PATH", "NAME|FILE"))
 FOLDER_METAVARS = frozenset(("DIR", "FOLDER"))
 DESIGN_METAVARS = frozenset(("DESIGN", "OTHER", "RUN|DESIGN", "RIG"))
 # Words between strokes that are written as they are meant; the others name what is to be filled in.
