@@ -101,7 +101,10 @@ def ellipsoid_distance(axes, points, halvings=1200):
     high = np.linalg.norm(axes * place, axis=1)
     for _ in range(halvings):
         middle = (low + high) / 2
-        low, high = np.where(beyond(middle), middle, low), np.where(beyond(middle), high, middle)
+        if ((middle == low) | (middle == high) | (high - low < 1e-20 * square.min())).all():
+            break
+        is_beyond = beyond(middle)
+        low, high = np.where(is_beyond, middle, low), np.where(is_beyond, high, middle)
     nearest = square * place / ((low + high)[:, None] / 2 + square)
     inside = ((points / axes) ** 2).sum(axis=1) < 1
     return np.where(inside, -1.0, 1.0) * np.linalg.norm(nearest - np.abs(points), axis=1)
