@@ -24,7 +24,7 @@ OPTION = "--mount-error"
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 RADIANS = {"mrad": 1e-3, "deg": math.pi / 180, "rad": 1.0}
 PART = re.compile(r"\s*([0-9.eE+-]+)\s*([a-z]+)\s*")
-MOST_RAD = math.pi
+MOST = {"place_m": 10.0, "angle_rad": math.pi / 2}
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,12 @@ class MountError:
                 value = float(number) * scales.get(unit, math.nan)
             except ValueError:
                 value = math.nan
-            if kind in found or not 0 <= value < (math.inf if kind == "place_m" else MOST_RAD):
+            if kind in found or not 0 <= value <= MOST[kind]:
                 raise ConfigError(
                     f"{part.strip()!r} in {text!r}",
                     where=OPTION,
-                    allowed=f"a length in {', '.join(METRES)} and an angle in {', '.join(RADIANS)}, once each",
+                    allowed=f"a length in {', '.join(METRES)} from 0 to 10 m, an angle in {', '.join(RADIANS)} "
+                    "from 0 to 90 degrees, once each",
                     hint=f"{OPTION} 5mm,0.5deg",
                 )
             found[kind] = value

@@ -110,7 +110,8 @@ def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Elemen
     model, _ = load_model(robot.path, folder=robot.folder, edit=specifications.append)
     seen = set(seen_geoms(model, robot.groups)[0].tolist())
     # the class of a geom may have a material, whose transparency counts more than the geom's own colour
-    specifications[0].add_material(name=UNSEEN, rgba=(0.5, 0.5, 0.5, 0.0))
+    if all(material.name != UNSEEN for material in specifications[0].materials):
+        specifications[0].add_material(name=UNSEEN, rgba=(0.5, 0.5, 0.5, 0.0))
     for geom in specifications[0].geoms:
         if geom.id not in seen:
             geom.material = UNSEEN

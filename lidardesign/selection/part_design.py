@@ -96,6 +96,12 @@ def choose_parts(
         notes(f"no source says what {', '.join(power)} consume: left out, as parts.power_w is bounded")
     unknown = {*power, *(nearest if wanted.names == "catalog" else ())}
     every = [part for part in every if part.name not in unknown]
+    if not every:
+        raise InfeasibleError(
+            "no source says what any of the parts consumes",
+            conflicts=["parts.power_w"],
+            hint="leave parts.power_w out, or name parts whose power is known",
+        )
     placed = proposed(every, constraints, samples, seed)
     budget = BandwidthBudget.of(constraints, rays)
     most = (budget.rays or MOST_TABLE_RAYS) // count
@@ -149,7 +155,11 @@ def _chosen_set(
         with phase("choice"):
             chosen = choose_set(coverage, limits)
         if not chosen.members:
-            raise DataError("none of the parts tells anything about the scenes", where="--parts")
+            raise DataError(
+                "none of the parts tells anything about the scenes",
+                where="--parts",
+                hint="parts whose ranges reach the targets, or looser bounds of boresight and origin",
+            )
         judged = part_table(inform(held_back, among=chosen.members), len(chosen.members))
         before, loss = loss, judged.loss_of(np.zeros(len(chosen.members), dtype=np.intp))
         is_large = 2 * wanted > information.MOST_SCENES or 2 * wanted * len(bundle.placed) > MOST_TOLD

@@ -133,10 +133,11 @@ def choose_rings(
     even = np.unique(np.linspace(low, high, CANDIDATES_PER_RAY * channels))
     first = RingCandidates(places_of(constraints, space), even, points, (space.low[5], space.high[5]))
     elevations = len(even)
+    most = min(elevations, MOST_TABLE_RAYS // count)
     faults = {
         ("the density has conditions", "--layout spinning", "tasks whose sensors rest"): space.conditioned,
-        (f"{channels} channels", "--channels", f"1 to {elevations}, as many as elevations to choose among"): not (
-            1 <= channels <= elevations
+        (f"{channels} channels", "--channels", f"1 to {most}, of as many elevations and rays as there are"): not (
+            1 <= channels <= most
         ),
         (
             f"{rays} rays of {count} sensors with {channels} channels",

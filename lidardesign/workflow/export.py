@@ -226,6 +226,8 @@ class ExportRequest:
         run = self.source.opened_run() if self.exporter.robotic and (mounted or self.robot) else None
         task = None if run is None else run.config.task
         path = self.robot or (getattr(task, "model", None) if mounted else None)
+        if path is not None and path.exists() and self.target.exists() and path.samefile(self.target):
+            raise ConfigError(f"{self.target} is the robot's model", where="--out", allowed="another file")
         return path and RobotFile(path, getattr(task, "folder", None), getattr(task, "groups", None))
 
     def write(self, file: Path | None = None, notes: Notes = log_note) -> Exported:

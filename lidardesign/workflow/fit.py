@@ -180,6 +180,8 @@ class FitRequest:
             channels = base.provenance.get("channels")
         elif layout != "spinning" and channels is not None:
             raise ConfigError(f"{channels} channels in the layout {layout}", where="--channels", allowed="spinning")
+        if layout == "spinning" and options.gates == "ray":
+            raise ConfigError("a gate per ray in the layout spinning", where="--gates", allowed="sensor")
         usual_level = CHOSEN_LEVEL if LAYOUTS[layout].chosen_on_scenes else defaults.level
         level = options.level if options.level is not None else base.level if base else usual_level
         if not LEVELS[0] <= level <= LEVELS[1]:
@@ -294,6 +296,7 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
         "parts beside --at or --weight": options.at or options.weights,
         "parts beside each, which bounds single sensors": asked.each,
         f"parts in the layout {options.layout}": options.layout,
+        "parts beside --gates: their gates are what they are": options.gates,
         f"the task {run.task.name} does not say what returns tell": not informs_rays(run.task),
     }
     for fault, is_found in lacking.items():

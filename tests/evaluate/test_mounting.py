@@ -50,7 +50,10 @@ def test_errors_are_read_in_their_units(text, place_m, angle_rad):
     assert MountError.parse(text) == MountError(pytest.approx(place_m), pytest.approx(angle_rad))
 
 
-@each_row("text", ["", "5", "5 miles", "mm", "1e,2mm", "-1mm", "nan mm", "5mm,6mm", "1deg,2rad", "5mm 1deg", "200deg"])
+@each_row(
+    "text",
+    ["", "5", "5 miles", "mm", "1e,2mm", "-1mm", "nan mm", "5mm,6mm", "1deg,2rad", "5mm 1deg", "200deg", "1e99m"],
+)
 def test_what_is_no_error_is_refused_with_what_is(text):
     with pytest.raises(ConfigError, match="--mount-error") as caught:
         MountError.parse(text)

@@ -189,6 +189,12 @@ def test_a_mounted_design_goes_into_the_model_of_its_run(tmp_path):
     model, data = simulated(exported.path)
     assert model.body(model.body("front_left").parentid[0]).name == "torso"
     assert len(data.sensordata) == len(RAYS) + 1
+    again = ExportRequest(source, EXPORTERS["mjcf"], tmp_path / "both.xml", robot=exported.path).write()
+    model, data = simulated(again.path)
+    assert len(data.sensordata) == 2 * len(RAYS) + 1
+    with pytest.raises(ConfigError, match=r"robot\.xml is the robot's model"):
+        ExportRequest(source, EXPORTERS["mjcf"], tmp_path / "robot.xml").write()
+    assert (tmp_path / "robot.xml").read_text() == ROBOT
 
 
 def test_a_robot_without_the_body_that_carries_the_sensors_is_refused(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -104,6 +105,8 @@ class TestDesignsOfParts:
         ({"parts": ["vl53l8xc"], "sensors": 1}, "no part 'vl53l8xc'"),
         ({"parts": ["vl53l8cx"]}, "how many parts"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "grid"}, "parts in the layout grid"),
+        ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "ray"}, "beside --gates"),
+        ({"parts": [str(Path(__file__).parent)], "sensors": 1}, "holds no file"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "constraints": {"each": [{"gate": {"width_m": {"max": 1}}}]}}, "each"),
         (
             {"sensors": 1, "constraints": {"parts": {"names": ["vl53l8cx"], "each": {"vl53l5cx": {"max": 1}}}}},

@@ -133,6 +133,8 @@ class TestDesigns:
             (("--layout", "spinning", "--channels", 4, "--rays", 30), "30 rays of 1 sensors with 4 channels"),
             (("--layout", "spinning", "--sensors", "best"), "'best' sensors that spin"),
             (("--layout", "grid", "--channels", 4), "4 channels in the layout grid"),
+            (("--layout", "spinning", "--gates", "ray"), "a gate per ray in the layout spinning"),
+            (("--layout", "spinning", "--channels", 100_000), "100000 channels"),
         ],
     )
     def test_are_refused_where_options_contradict_each_other(self, lidardesign, run, options, says):

@@ -292,6 +292,9 @@ WRONG = {
     "a target that is not there": ({"targets": ("hnad*",)}, "did you mean 'hand'"),
     "a known part that is not there": ({"known": ("trnk",)}, "did you mean 'trunk'"),
     "a mount that is not there": ({"mount_body": "bse"}, "did you mean 'base'"),
+    "a mount that is the world": ({"mount_body": "world"}, "no body is called 'world'"),
+    "a target that carries the sensors": ({"mount_body": "hand", "targets": ("hand",)}, "is a target"),
+    "targets alone as known": ({"known": ("hand",), "targets": ("hand",)}, "all that is known is a target"),
     "sensors inside geometry": ({"origin_m": (0, 0, 0.5)}, "inside 'base'"),
     "sensors inside the mount": ({"mount_body": "base", "origin_m": (0, 0, 0)}, "inside 'base'"),
 }

@@ -148,6 +148,9 @@ def named_parts(names: Sequence[str] | str) -> list[Part]:
         library = load_library()
         return [library.part(name) for name in library.names]
     inside = [sorted(Path(text).glob(f"*{SUFFIX}")) if Path(text).is_dir() else [text] for text in names]
+    for text, found in zip(names, inside, strict=True):
+        if not found:
+            raise ConfigError(f"holds no file *{SUFFIX}", where=str(text), hint="docs/catalog.md shows a part file")
     return [find_part(name) for name in dict.fromkeys(itertools.chain.from_iterable(inside))]
 
 

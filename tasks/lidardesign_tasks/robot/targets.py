@@ -131,15 +131,22 @@ def _read(path: Path, folder: Path | None, states: tuple[FileState, ...], target
     pieces = tuple(without_notes(piece) for piece, left_out in zip(pieces, gone, strict=True) if not left_out)
     wanted = _named(pieces, targets, "targets")
     names = [model.body(body).name for body in range(model.nbody)]
-    if mount is not None and mount not in names:
+    if mount is not None and mount not in names[1:]:
         raise ConfigError(f"no body is called {mount!r}", where="task.mount_body", allowed=listed(names[1:]),
                           hint=suggest(mount, names))  # fmt: skip
     found = [
         _target(pieces, np.flatnonzero(wanted & np.array([piece.body == body for piece in pieces])))
         for body in dict.fromkeys(piece.body for piece, is_target in zip(pieces, wanted, strict=True) if is_target)
     ]
-    told_apart = _named(pieces, known, "known") & ~wanted
     number = None if mount is None else names.index(mount)
+    if any(target.body == number for target in found):
+        raise ConfigError(f"{mount!r}, which sensors are on, is a target", where="task.targets",
+                          hint="targets on other bodies, or another mount_body")  # fmt: skip
+    told_apart = _named(pieces, known, "known")
+    if known and not (told_apart & ~wanted).any() and not wanted.all():
+        raise ConfigError("all that is known is a target", where="task.known",
+                          allowed="names of other bodies or geoms, [*] for all of them, [] for none")  # fmt: skip
+    told_apart &= ~wanted
     return Model(model, pieces, tuple(found), told_apart, number, (*said, *notes))
 
 
