@@ -74,7 +74,7 @@ class ModelGeom:
     pose: np.ndarray
 
     def at(self, poses: np.ndarray, role: Role = "both") -> Body:
-        """The piece where `body_poses` (F, nbody, 4, 4) says; at rest where its body never moves."""
+        """The piece as a body, at rest where it never moves; `poses` (F, nbody, 4, 4) are those of `body_poses`."""
         own = poses[:, self.body] @ self.pose
         return Body(self.shape, self.name, role, own[0] if (own == own[0]).all() else own)
 

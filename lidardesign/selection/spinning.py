@@ -130,24 +130,10 @@ def choose_rings(
     check_feasible(constraints, space, sensors=count, rays=rays)
     points = min(POINTS_PER_TURN, MOST_TABLE_RAYS // rings) if rays is None else rays // rings
     low, high = space.low[4], space.high[4]
-    even = np.unique(np.linspace(low, high, CANDIDATES_PER_RAY * channels))
+    even = np.unique(np.linspace(low, high, CANDIDATES_PER_RAY * max(channels, 1)))
     first = RingCandidates(places_of(constraints, space), even, points, (space.low[5], space.high[5]))
     elevations = len(even)
-    most = min(elevations, MOST_TABLE_RAYS // count)
-    faults = {
-        ("the density has conditions", "--layout spinning", "tasks whose sensors rest"): space.conditioned,
-        (f"{channels} channels", "--channels", f"1 to {most}, of as many elevations and rays as there are"): not (
-            1 <= channels <= most
-        ),
-        (
-            f"{rays} rays of {count} sensors with {channels} channels",
-            "--rays",
-            f"a multiple of {rings}, at most {MOST_TABLE_RAYS}: as many for each channel",
-        ): points * rings != (rays or points * rings) or not 0 < points * rings <= MOST_TABLE_RAYS,
-    }
-    for (fault, where, allowed), is_found in faults.items():
-        if is_found:
-            raise ConfigError(fault, where=where, allowed=allowed)
+    _refuse_wrong(space, rays, count, channels, elevations, points)
     every = np.arange(len(first))
     with phase("what returns tell"), information.choosing(rings / len(first)):
         told, _ = first.coverage(every, scenes("choice"), informs, FIRST_SHARE)
@@ -178,8 +164,7 @@ def choose_rings(
         name=name,
         sensors=tuple(
             replace(
-                _spinning(candidates, candidates.places_m[place], reached[sensor == number].max()),
-                name=f"s{number}",
+                _spinning(candidates, f"s{number}", candidates.places_m[place], reached[sensor == number].max()),
                 weight=1 / count,
                 rays=points * channels,
             )
@@ -192,6 +177,28 @@ def choose_rings(
         provenance={"channels": channels, CERTIFICATES: [certificate]},
     )
     return FitResult.of_choice(design, constraints, samples, perf_counter() - started)
+
+
+def _refuse_wrong(
+    space: DesignSpace, rays: int | None, count: int, channels: int, elevations: int, points: int
+) -> None:
+    """Raises ConfigError where so many rings cannot be chosen, or cannot share the rays."""
+    rings = count * max(channels, 1)
+    most = min(elevations, MOST_TABLE_RAYS // count)
+    faults = {
+        ("the density has conditions", "--layout spinning", "tasks whose sensors rest"): space.conditioned,
+        (f"{channels} channels", "--channels", f"1 to {most}, of as many elevations and rays as there are"): not (
+            1 <= channels <= most
+        ),
+        (
+            f"{rays} rays of {count} sensors with {channels} channels",
+            "--rays",
+            f"a multiple of {rings}, at most {MOST_TABLE_RAYS}: as many for each channel",
+        ): points * rings != (rays or points * rings) or not 0 < points * rings <= MOST_TABLE_RAYS,
+    }
+    for (fault, where, allowed), is_found in faults.items():
+        if is_found:
+            raise ConfigError(fault, where=where, allowed=allowed)
 
 
 def places_of(constraints: Constraints, space: DesignSpace) -> np.ndarray:
@@ -222,7 +229,7 @@ def chosen_rings(coverage: Coverage, place: np.ndarray, count: int, channels: in
         coverage: What the rings tell.
         place: The place of each, (N,).
         count: How many sensors.
-        channels: RingCandidates of each.
+        channels: Rings of each.
 
     Raises:
         ConfigError: Fewer places than sensors, or too many sets of places.
@@ -250,11 +257,11 @@ def chosen_rings(coverage: Coverage, place: np.ndarray, count: int, channels: in
     return best, loss, float(np.clip(coverage.complete - gain, 0.0, loss))
 
 
-def _spinning(rings: RingCandidates, place_m: np.ndarray, highest_rad: float) -> Sensor:
+def _spinning(rings: RingCandidates, name: str, place_m: np.ndarray, highest_rad: float) -> Sensor:
     """A sensor that stands upright and looks along +x; its field is a full turn, as a part's (see `part_sensor`)."""
     half, (near, far) = interval_factor(DEFAULT_LEVEL), rings.range_m
     return Sensor(
-        name="",
+        name=name,
         weight=1.0,
         origin_m=place_m,
         origin_covariance_m2=np.zeros((3, 3)),

@@ -208,13 +208,14 @@ class ExportRequest:
         content = "its sensors" if count is None else f"its {count} rays"
         place = "".join(f" at {key} = {value:g}" for key, value in self.at.items())
         run = [] if source.folder is None else [source.folder / CONFIGURATION, source.folder / MANIFEST]
+        robot = self._robot()
         return RequestPlan(
             "export",
             [
                 f"write {content}{place} as {exporter.name}: {exporter.summary}",
                 "read the file back, and say what its numbers lose",
             ],
-            [design.name if source.path is None else source.path, *run],
+            [design.name if source.path is None else source.path, *run, *([robot.path] if robot else [])],
             [f"{self.target}/" if exporter.folder else self.target],
             {"format": exporter.name, "rays": count, "at": dict(self.at)},
             last_time(source.folder, "export"),

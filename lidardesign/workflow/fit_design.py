@@ -248,8 +248,8 @@ def _fitted(fitter: Fitter, request: FitRequest, *, is_trial: bool = False) -> F
     """
     samples, run = fitter.samples, request.run
     layout, rays = request.choices["layout"], request.choices["rays"]
-    wants_parts = request.constraints is not None and request.constraints.parts is not None
-    if not wants_parts and not LAYOUTS[layout].chosen_on_scenes:
+    constraints = request.constraints or Constraints()
+    if constraints.parts is None and not LAYOUTS[layout].chosen_on_scenes:
         return fitter.fit(request)
     from lidardesign.workflow.select_rays import near, select_rays, selection_scenes
 
@@ -261,12 +261,12 @@ def _fitted(fitter: Fitter, request: FitRequest, *, is_trial: bool = False) -> F
             hint="another --layout, or give the task a method informs(scene, returns)",
         )
     informs, scenes = partial(checked_information, run.task), partial(selection_scenes, run, request.seed)
-    if wants_parts and request.constraints is not None:
+    if constraints.parts is not None:
         from lidardesign.selection.part_design import choose_parts
 
         return choose_parts(
             samples,
-            request.constraints,
+            constraints,
             count=request.choices["sensors"],
             rays=rays,
             informs=informs,
@@ -280,7 +280,7 @@ def _fitted(fitter: Fitter, request: FitRequest, *, is_trial: bool = False) -> F
 
         return choose_rings(
             samples,
-            request.constraints or Constraints(),
+            constraints,
             count=request.choices["sensors"] or 1,
             channels=CHANNELS if request.channels is None else request.channels,
             rays=rays,

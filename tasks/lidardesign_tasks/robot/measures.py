@@ -17,7 +17,7 @@ from lidardesign.geometry.rays import Outcome, Returns
 from lidardesign.scene import Scene
 from lidardesign.space import DesignSpace
 from lidardesign.task import Information, Metric, Score
-from lidardesign_tasks.moving_surface import moving_informs, moving_score, with_moving_truth
+from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
 from lidardesign_tasks.robot.targets import Model
 from lidardesign_tasks.robot.tracking import FEWEST_FRAMES, filled_path, path_information, tracked_places
 from lidardesign_tasks.surface import MILLIMETRES
@@ -122,20 +122,25 @@ def _bodies(scene: Scene) -> list[np.ndarray]:
     return [np.flatnonzero(own == target) for target in range(len(scene.truth["places_m"]))]
 
 
-def _surface_score(scene: Scene, returns: Sequence[Returns]) -> Score:
-    """As of any moving surface; the worst value where no sensor can see it in any frame, as behind the robot."""
+def _is_hidden(scene: Scene) -> bool:
+    """Whether no sensor can see a target in any frame, as behind the robot."""
     try:
-        return moving_score(scene.truth["metric"], scene, returns)
-    except DataError:
-        return Score(scene.truth["metric"].worst, failed=True)
+        return scene.truth[SURFACES] is None
+    except DataError:  # so the truth says it
+        return True
+
+
+def _surface_score(scene: Scene, returns: Sequence[Returns]) -> Score:
+    """As of any moving surface; the worst value where it is hidden."""
+    metric = scene.truth["metric"]
+    return Score(metric.worst, failed=True) if _is_hidden(scene) else moving_score(metric, scene, returns)
 
 
 def _surface_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
-    try:
+    if not _is_hidden(scene):
         return moving_informs(scene, returns)
-    except DataError:
-        none = np.zeros(0, dtype=np.int64)
-        return Information(none, none, np.zeros(0), np.zeros(1, dtype=np.int64), unit="m")
+    none = np.zeros(0, dtype=np.int64)
+    return Information(none, none, np.zeros(0), np.zeros(1, dtype=np.int64), unit="m")
 
 
 _SCORES = {"position": _position_score, "surface": _surface_score, "seen": _seen_score}
