@@ -20,6 +20,7 @@ import numpy as np
 
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.numerics import ROUNDING
+from lidardesign.run.inputs import MESH, check_bytes, read_file
 from lidardesign.scene import LARGEST_WEIGHT, Mesh, Sign
 from lidardesign.space import FARTHEST_M
 
@@ -197,7 +198,6 @@ def _alone(values: np.ndarray) -> np.ndarray:
 
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-LARGEST_FILE_BYTES = 2 * 1024**3
 # a triangle whose double area is a smaller share of its longest edge squared has a normal of rounding noise
 FLATTEST_TRIANGLE = ROUNDING
 
@@ -378,12 +378,7 @@ def _read(path: Path, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, 
     where = str(path)
     if path.suffix.lower() not in SUFFIXES:
         raise DataError(f"has the suffix {path.suffix!r}", where=where, allowed=", ".join(SUFFIXES))
-    try:
-        data = path.read_bytes() if path.stat().st_size <= LARGEST_FILE_BYTES else None
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror or error})", where=where, hint="check the path") from error
-    if data is None:
-        raise DataError("is larger than 2 GiB", where=where, hint="simplify the mesh")
+    data = read_file(path, MESH, hint="check the path")
     if not data.strip():
         raise DataError("is an empty file", where=where)
     try:
@@ -435,13 +430,17 @@ class _SameFolder:
 
     def __init__(self, path: Path) -> None:
         self._folder = path.resolve().parent
+        self._bytes = 0
 
     def get(self, name: str) -> bytes:
         """The content of a file of the same folder."""
         path = (self._folder / name).resolve()
         if path.parent != self._folder:
             raise DataError(f"refers to {name!r}, which is outside its folder", where=str(self._folder))
-        return path.read_bytes()
+        content = read_file(path, MESH)
+        self._bytes += len(content)
+        check_bytes(self._bytes, MESH, str(path))
+        return content
 
     __getitem__ = get
 

@@ -20,13 +20,13 @@ import numpy as np
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.surface import grid_faces
 from lidardesign.meshio import check_mesh
+from lidardesign.run.inputs import ROBOT_FILES, check_bytes, check_file
+from lidardesign.run.xml import read_xml
 from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Role, Shape, Sphere, rigid
 
 if TYPE_CHECKING:
     import mujoco
 
-LARGEST_XML_BYTES = 16_000_000
-LARGEST_ASSETS_BYTES = 2_000_000_000
 DIRECTORIES = ("meshdir", "texturedir", "assetdir")
 MAX_INCLUDES = 100
 MESH_ENDINGS = (".obj", ".stl", ".msh")  # what MuJoCo reads
@@ -342,7 +342,7 @@ def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], 
     for document in documents:  # grows while included files are found
         if len(documents) > MAX_INCLUDES:
             raise DataError(f"includes more than {MAX_INCLUDES} files", where=str(path))
-        root = _parse(document)
+        root = read_xml(document, ALLOWED)
         if document == documents[0] and root.tag not in ("mujoco", "robot"):
             allowed = "<mujoco>, an MJCF model, or <robot>, a URDF model"
             raise DataError(f"its root element is <{root.tag}>", where=str(path), allowed=allowed)
@@ -357,9 +357,8 @@ def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], 
             else:
                 assets += [name for name in names if name]
     found = {inside(directory, name) for directory in directories for name in ["", *assets]}
-    states = tuple(_state(file) for file in [*documents, *sorted(found)] if file.is_file())
-    if sum(size for _, _, size in states) > LARGEST_ASSETS_BYTES:
-        raise DataError("its files are too large", where=str(path), allowed=f"{LARGEST_ASSETS_BYTES} bytes in all")
+    states = tuple(_state(file) for file in [*documents, *sorted(found)] if file.exists() and not file.is_dir())
+    check_bytes(sum(size for _, _, size in states), ROBOT_FILES, str(path))
     return states, roots[0]
 
 
@@ -382,19 +381,7 @@ def _settle_urdf(root: ElementTree.Element, own: Path, folder: Path) -> None:
             mesh.set("filename", os.path.relpath(found, own))
 
 
-def _parse(path: Path) -> ElementTree.Element:
-    try:
-        if path.exists() and not path.is_file():
-            raise DataError("is no regular file", where=str(path), allowed=ALLOWED)
-        if path.stat().st_size > LARGEST_XML_BYTES:
-            raise DataError(f"has {path.stat().st_size} bytes", where=str(path), allowed=f"{LARGEST_XML_BYTES}")
-        return ElementTree.fromstring(path.read_bytes())
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror})", where=str(path), allowed=ALLOWED) from error
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise DataError(f"is no XML ({error})", where=str(path), allowed=ALLOWED) from error
-
-
 def _state(path: Path) -> FileState:
+    check_file(path, ROBOT_FILES)
     state = path.stat()
     return str(path), state.st_mtime_ns, state.st_size

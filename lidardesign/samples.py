@@ -14,6 +14,7 @@ from lidardesign.errors import DataError
 from lidardesign.numerics import normalised_weights, systematic_draw
 from lidardesign.run.arrays import guarded, read_npz
 from lidardesign.run.clock import phase
+from lidardesign.run.inputs import parse_json
 from lidardesign.run.manifest import verify, write_recorded
 from lidardesign.space import DesignSpace
 
@@ -116,7 +117,7 @@ def load_samples(run: Path) -> Samples:
                 allowed=f"float64 of shape {shape}",
                 hint=DAMAGED_HINT,
             )
-    space = guarded(lambda: DesignSpace.from_dict(json.loads(arrays["space"].tobytes())), path, DAMAGED_HINT)
+    space = guarded(lambda: DesignSpace.from_dict(parse_json(arrays["space"].tobytes())), path, DAMAGED_HINT)
     try:
         return Samples(points, log_prob, log_target, space)
     except DataError as error:

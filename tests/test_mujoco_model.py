@@ -234,7 +234,7 @@ def test_a_file_that_is_no_model_is_refused_with_its_name(tmp_path, case):
         path.write_text(text)
     with pytest.raises(DataError, match=message) as refused:
         load_model(path)
-    assert refused.value.where == str(path)
+    assert refused.value.where.startswith(str(path))
 
 
 def test_files_may_lie_in_a_wider_folder_that_is_named(tmp_path):

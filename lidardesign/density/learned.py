@@ -33,6 +33,7 @@ from lidardesign.density.training.training import PROGRESS, SIGMA_START_RATIO
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.numerics import TINY
+from lidardesign.run.inputs import RECORD, read_file
 from lidardesign.run.manifest import verify
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
@@ -131,7 +132,7 @@ def seconds_at(run: Path, steps: list[int]) -> dict[int, float]:
     """
     verify(run, PROGRESS)
     try:
-        rows = [json.loads(line) for line in (run / PROGRESS).read_text(encoding="utf-8").splitlines()]
+        rows = [json.loads(line) for line in read_file(run / PROGRESS, RECORD).decode().splitlines()]
         done = np.array([0.0, *(float(row["step"]) for row in rows)])
         taken = np.array([0.0, *(float(row["seconds"]) for row in rows)])
         if not (np.isfinite(done).all() and np.isfinite(taken).all() and (np.diff(done) > 0).all()):

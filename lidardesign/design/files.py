@@ -33,11 +33,12 @@ from lidardesign.design.sensor import (
     Track,
     interval_factor,
 )
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
+from lidardesign.run.inputs import DESIGN, RAY_TABLE, read_head
 from lidardesign.run.validation import LocateKey, Node
 from lidardesign.run.yaml import Document, dump_yaml, load_yaml
 from lidardesign.space import DIMENSIONS
@@ -45,8 +46,6 @@ from lidardesign.space import DIMENSIONS
 SCHEMA_VERSION = 1
 SCHEMA_FILE = Path(__file__).with_name("design.schema.json")
 LAYOUTS = get_args(LayoutName)
-# A file of a hundred thousand explicit rays; the YAML reader's own limit is for settings.
-MAX_BYTES = 64_000_000
 # Eight numbers a ray stay below the number of values that the YAML reader accepts in one file.
 MOST_TABLE_RAYS = 60_000
 # How far a written interval may be from the one that the spread gives: digits that a person may have rounded.
@@ -213,20 +212,13 @@ def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
     """
     path = Path(path)
     hint = "give a design file, as RUN/designs/NAME.yaml"
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        # a pipe gives its content once, and would be waited for the second time
-        raise DataError("is no regular file", where=str(path), hint=f"{hint}, or - for standard input")
-    try:
-        with path.open("rb") as file:
-            head = file.read(4096)
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror or error}", where=str(path), hint=hint) from None
+    head = read_head(path, RAY_TABLE, hint=f"{hint}, or - for standard input")
     rig = read_rig(path, head)
     if rig is not None:
         return rig_design(rig, path, reach_m)
     if begins_as_sensor_csv(head):
         return read_sensor_csv(path)
-    document = load_yaml(path, max_bytes=MAX_BYTES)
+    document = load_yaml(path, DESIGN)
     return replace(design_from_document(document.value, str(path), locate=document.locate), name=path.stem)
 
 

@@ -14,7 +14,6 @@ random.
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +37,9 @@ from lidardesign.export.common.poses import rays_rounding
 from lidardesign.export.ray_lists import ray_list_losses
 from lidardesign.geometry.rays import Rays, fire_times
 from lidardesign.numerics import ROUNDING, SLACK, TINY
+from lidardesign.run.arrays import csv_rows
 from lidardesign.run.files import write_atomic
+from lidardesign.run.inputs import RAY_TABLE, read_head
 
 NEIGHBOURS = 6
 LONGEST_MOVED = 3
@@ -199,7 +200,6 @@ LONGEST_SHOWN = 200
 BOM = b"\xef\xbb\xbf"
 # Angles at the limit come out of sines and cosines a few units in the last place off.
 ROUNDING_DEG = SLACK
-MOST_ROWS = 1_000_000
 # Whole numbers up to here are exact as float64; light takes 104 days for so many picoseconds.
 MOST_WHOLE = 2**53
 
@@ -313,9 +313,8 @@ def is_galvo_file(path: Path) -> bool:
     """Whether a file begins as `write_galvo` begins one."""
     header = ",".join(COLUMNS).encode()
     try:
-        with Path(path).open("rb") as file:
-            return file.read(len(BOM) + len(header)).removeprefix(BOM).startswith(header)
-    except OSError:
+        return read_head(path, RAY_TABLE).removeprefix(BOM).startswith(header)
+    except DataError:
         return False
 
 
@@ -358,18 +357,12 @@ def _summary(positions: list[Position]) -> list[str]:
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
     where = str(path)
-    try:
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row, _ in zip(csv.reader(file), range(MOST_ROWS + 1), strict=False)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"cannot be read as a table ({error})", where=where) from error
-    if not rows or tuple(rows[0]) != COLUMNS:
+    (_, header), *rows = csv_rows(path, RAY_TABLE) or [(1, [])]
+    if tuple(header) != COLUMNS:
         raise DataError("is no ray list of the galvo format", where=where, allowed=",".join(COLUMNS))
-    if len(rows) > MOST_ROWS:
-        raise DataError(f"holds more than {MOST_ROWS} rays", where=where)
-    values = np.empty((len(rows) - 1, len(COLUMNS)))
-    for number, row in enumerate(rows[1:], start=2):
-        values[number - 2] = _numbers(row, f"{where}, line {number}")
+    values = np.empty((len(rows), len(COLUMNS)))
+    for index, (line, row) in enumerate(rows):
+        values[index] = _numbers(row, f"{where}:{line}")
     return {
         name: column.astype(np.int64) if name in WHOLE else column
         for name, column in zip(COLUMNS, values.T, strict=True)

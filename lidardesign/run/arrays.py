@@ -12,34 +12,39 @@ import io
 import math
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 
 from lidardesign.errors import DataError, LidardesignError
+from lidardesign.run.inputs import ARRAYS, MOST_COLUMNS, MOST_ROWS, Kind, check_bytes, check_file, read_file
 
 NUMERIC_KINDS = "buif"
-LARGEST_BYTES = 1 << 30
 LARGEST_HEADER_BYTES = 10_000
+# What an archive says at its end, and of how large a list of arrays.
+END_MARK, END_MARK_64 = b"PK\5\6", b"PK\6\7"
+END_BYTES, LARGEST_LIST_BYTES = 1 << 16, 1_000_000
 Result = TypeVar("Result")
 
 
 def read_npz(
-    path: Path, *, kinds: str = NUMERIC_KINDS, hint: str = "write it with numpy.savez"
+    path: Path, kind: Kind = ARRAYS, *, kinds: str = NUMERIC_KINDS, hint: str = "write it with numpy.savez"
 ) -> dict[str, np.ndarray]:
     """All arrays of a file by name.
 
     Arguments:
         path: The file.
+        kind: How large it may be.
         kinds: Letters of the numpy kinds that it may hold.
         hint: What to do with a damaged file.
 
     Raises:
         DataError: The file cannot be read, is damaged or too large, or holds something else.
     """
-    return guarded(lambda: _read(path, kinds, hint), path, hint)
+    check_file(path, kind)
+    return guarded(lambda: _read(path, kind, kinds, hint), path, hint)
 
 
 def guarded(read: Callable[[], Result], path: Path, hint: str) -> Result:
@@ -60,33 +65,31 @@ def guarded(read: Callable[[], Result], path: Path, hint: str) -> Result:
         ) from error
 
 
-def _read(path: Path, kinds: str, hint: str) -> dict[str, np.ndarray]:
+def _read(path: Path, kind: Kind, kinds: str, hint: str) -> dict[str, np.ndarray]:
     where = str(path)
     with path.open("rb") as file:
-        if not zipfile.is_zipfile(file):
-            raise DataError("is no .npz file, or one cut short", where=where, hint=hint)
+        _check_list(file, where, hint)
         with zipfile.ZipFile(file) as archive:
             members = archive.infolist()
-            check_size((member.file_size for member in members), where)
+            check_bytes(sum(member.file_size for member in members), kind, where, unpacked=True)
             return {
                 member.filename.removesuffix(".npy"): _array(archive, member, kinds, where, hint) for member in members
             }
 
 
-def check_size(sizes: Iterable[int], where: str, what: str = "all data") -> None:
-    """Refuse more bytes than any file of this program needs.
+def _check_list(file: BinaryIO, where: str, hint: str) -> None:
+    """Refuse what is no archive, and one whose list of arrays would take long to read and much memory.
 
     Raises:
-        DataError: They are more than 1 GiB together.
+        DataError: So it is.
     """
-    size = sum(sizes)
-    if size > LARGEST_BYTES:
-        raise DataError(
-            f"{what} takes {size / 2**30:.1f} GiB",
-            where=where,
-            allowed=f"at most {LARGEST_BYTES / 2**30:g} GiB",
-            hint="keep fewer bins, fewer pixels or a smaller type, as uint16",
-        )
+    if not zipfile.is_zipfile(file):
+        raise DataError("is no .npz file, or one cut short", where=where, hint=hint)
+    file.seek(-min(file.seek(0, io.SEEK_END), END_BYTES), io.SEEK_END)
+    end = file.read()
+    size = int.from_bytes(end[end.rfind(END_MARK) + 12 :][:4], "little")
+    if size > LARGEST_LIST_BYTES or END_MARK_64 in end:
+        raise DataError("lists too many arrays", where=where, allowed="some thousand arrays", hint=hint)
 
 
 def check_kind(dtype: np.dtype, name: str, where: str, kinds: str = NUMERIC_KINDS) -> None:
@@ -116,28 +119,31 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, kinds: str, where:
         data = member.file_size - file.tell()
         if math.prod(shape) * dtype.itemsize != data:
             raise DataError(f"{name!r} of shape {shape} has {data} bytes of data", where=where, hint=hint)
-    # the size that the archive states is no more than a promise either: reading stops where the data does
-    return np.load(io.BytesIO(archive.read(member)), allow_pickle=False, max_header_size=LARGEST_HEADER_BYTES)
+    # the size that the archive states is no more than a promise either: memory is used where there is data
+    with archive.open(member) as file:
+        return np.lib.format.read_array(file, allow_pickle=False, max_header_size=LARGEST_HEADER_BYTES)
 
 
-def csv_rows(path: Path, largest_bytes: int) -> list[tuple[int, list[str]]]:
+def csv_rows(path: Path, kind: Kind) -> list[tuple[int, list[str]]]:
     """The line and the cells of every row that is not blank, the header first.
 
     Raises:
-        DataError: The file cannot be read, is larger than that, is no UTF-8 text, or no CSV.
+        DataError: The file cannot be read, has more bytes, rows or columns than it may, is no UTF-8 text, or no CSV.
     """
+    # `splitlines` would also part names at the line ends of other scripts
+    text = io.TextIOWrapper(io.BytesIO(read_file(path, kind)), encoding="utf-8-sig", newline="")
+    reader = csv.reader(text, strict=True)
+    rows: list[tuple[int, list[str]]] = []
     try:
-        size = path.stat().st_size
-        if size > largest_bytes:
-            raise DataError(f"has {size} bytes", where=str(path), allowed=f"at most {largest_bytes}")
-        text = path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
+        for cells in reader:
+            if len(cells) > MOST_COLUMNS or len(rows) == MOST_ROWS:
+                found = f"has {len(cells)} columns" if len(cells) > MOST_COLUMNS else f"has more than {MOST_ROWS} rows"
+                allowed = f"at most {MOST_COLUMNS} columns and {MOST_ROWS} rows, the header included"
+                raise DataError(found, where=f"{path}:{reader.line_num}", allowed=allowed)
+            if any(cell.strip() for cell in cells):
+                rows.append((reader.line_num, cells))
     except UnicodeDecodeError:
         raise DataError("is not UTF-8 text", where=str(path)) from None
-    # `splitlines` would also part names at the line ends of other scripts
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        return [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     except csv.Error as error:
         raise DataError(f"is no CSV: {error}", where=f"{path}:{reader.line_num}") from None
+    return rows

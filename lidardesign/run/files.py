@@ -24,6 +24,7 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.run.inputs import DESIGN, RECORD, STATE, check_file, parse_json, read_file
 
 HOST_DIGITS = 8
 
@@ -164,6 +165,7 @@ def sha256_file(path: Path) -> str:
         DataError: The file cannot be read.
     """
     digest = hashlib.sha256()
+    check_file(path, STATE)
     try:
         with Path(path).open("rb") as file:
             while chunk := file.read(CHUNK_BYTES):
@@ -175,8 +177,6 @@ def sha256_file(path: Path) -> str:
 
 # What stands for standard input where a file is read, and for standard output where one is written.
 STDIO = "-"
-# What a design may have that is read from standard input.
-MOST_INPUT_BYTES = 64_000_000
 HINT = "give one of them as a file; a file that is called - is given by its whole path"
 
 
@@ -256,7 +256,7 @@ def readable(path: Path, kind: str = "a design") -> Iterator[Path]:
     if not is_input(path):
         yield path
         return
-    content = read_input(kind, MOST_INPUT_BYTES)
+    content = read_input(kind, DESIGN.most_bytes)
     with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
         copy = Path(folder) / "stdin"
         copy.write_bytes(content)
@@ -314,11 +314,11 @@ def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
 
 def writer(run: Path) -> str | None:
     """Who is writing a run at this moment; None where nobody is, or only a dead process's lock file is left."""
-    try:
-        holder = json.loads((Path(run) / FILE_NAME).read_bytes())
-        pid, host = int(holder["pid"]), str(holder["host"])
-    except FileNotFoundError:
+    if not os.path.lexists(Path(run) / FILE_NAME):
         return None
-    except (OSError, ValueError, TypeError, KeyError):
+    try:
+        holder = parse_json(read_file(Path(run) / FILE_NAME, RECORD))
+        pid, host = int(holder["pid"]), str(holder["host"])
+    except (DataError, ValueError, TypeError, KeyError):
         return "another process"
     return None if host == socket.gethostname() and is_gone(pid) else f"process {pid} on {host}"

@@ -14,6 +14,7 @@ from typing import Any
 from lidardesign import __version__
 from lidardesign.errors import DataError
 from lidardesign.run.files import sha256_file, write_atomic, writer
+from lidardesign.run.inputs import RECORD, parse_json, read_file
 
 FILE_NAME = "manifest.json"
 SCHEMA_VERSION = 1
@@ -62,11 +63,11 @@ def read_manifest(run: Path) -> dict[str, Any]:
     path = run / FILE_NAME
     if not run.exists():
         raise DataError("no such run", where=str(run), hint=LEARN_HINT)
-    if not path.is_file():
+    if not path.exists():
         raise DataError(f"is no run folder: it has no {FILE_NAME}", where=str(run), hint=LEARN_HINT)
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        manifest = parse_json(read_file(path, RECORD))
+    except ValueError as error:
         raise DataError(f"the manifest cannot be read: {error}", where=str(path), hint="learn the run again") from None
     if not isinstance(manifest, dict) or not isinstance(manifest.get("files"), dict):
         raise DataError("the manifest lists no files", where=str(path), hint="learn the run again")

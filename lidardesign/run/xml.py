@@ -11,8 +11,8 @@ from pathlib import Path
 from xml.parsers import expat
 
 from lidardesign.errors import DataError
+from lidardesign.run.inputs import XML, Kind, read_file
 
-LARGEST_BYTES = 16_000_000
 DEEPEST = 200
 MOST_ELEMENTS = 500_000
 LONGEST_QUOTE = 80
@@ -36,23 +36,13 @@ class Element(ElementTree.Element):
     line: int = 0
 
 
-def read_xml(
-    path: Path, allowed: str, *, largest_bytes: int = LARGEST_BYTES, most_elements: int = MOST_ELEMENTS
-) -> Element:
+def read_xml(path: Path, allowed: str, *, kind: Kind = XML, most_elements: int = MOST_ELEMENTS) -> Element:
     """The root element of a file.
 
     Raises:
         DataError: The file cannot be read, is too large, is no XML, has a document type, or is nested too deep.
     """
-    try:
-        if path.exists() and not path.is_file():
-            raise DataError("is no regular file", where=str(path), allowed=allowed)
-        with path.open("rb") as file:
-            content = file.read(largest_bytes + 1)
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror or error}", where=str(path), allowed=allowed) from None
-    if len(content) > largest_bytes:
-        raise DataError("the file is too large", where=str(path), allowed=f"at most {largest_bytes} bytes")
+    content = read_file(path, kind, allowed=allowed)
     builder = _Builder(path, most_elements)
     try:
         return builder.build(content)

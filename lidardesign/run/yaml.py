@@ -20,8 +20,8 @@ import yaml
 
 from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.run.files import is_input, read_input
+from lidardesign.run.inputs import YAML, Kind, read_file
 
-MAX_BYTES = 1_000_000
 MAX_DEPTH = 32
 MAX_NODES = 500_000
 MAX_DIGITS = 100
@@ -85,23 +85,14 @@ class Document:
         return self.value
 
 
-def load_yaml(path: Path, *, max_bytes: int = MAX_BYTES) -> Document:
+def load_yaml(path: Path, kind: Kind = YAML) -> Document:
     """Read a YAML file; in a command `-` is standard input.
 
     Raises:
         ConfigError: The file cannot be read, is too large, is not UTF-8, or is not in the accepted subset.
     """
     path = Path(path)
-    if is_input(path):
-        content = read_input("a YAML file", max_bytes)
-    else:
-        try:
-            with path.open("rb") as file:
-                content = file.read(max_bytes + 1)
-        except OSError as error:
-            raise ConfigError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
-        if len(content) > max_bytes:
-            raise ConfigError("the file is too large", where=str(path), allowed=f"at most {max_bytes} bytes")
+    content = read_input("a YAML file", kind.most_bytes) if is_input(path) else read_file(path, kind)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -14,11 +14,11 @@ from typing import Any, Literal
 import numpy as np
 
 from lidardesign.errors import DataError
+from lidardesign.run.inputs import HEAD_MODEL, check_bytes, check_file
 
 Unit = Literal["auto", "mm", "cm", "m"]
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 LAYOUT = "the HDF5 layout of the Basel Face Model"
-LARGEST_DATASET_BYTES = 2 * 1024**3
 # Squares of what is beyond would overflow; no head is as large in any unit.
 LARGEST_VALUE = 1e12
 CELL_NAMES = ("representer/cells", "representer/reference-mesh/triangle-list")
@@ -63,8 +63,7 @@ def load_model(path: str | Path, *, unit: Unit = "auto", modes: int | None = Non
     import h5py
 
     path = Path(path)
-    if not path.is_file():
-        raise DataError("no such file", where=str(path), hint=f"give a morphable model in {LAYOUT}")
+    check_file(path, HEAD_MODEL, hint=f"give a morphable model in {LAYOUT}")
     try:
         with h5py.File(path, "r") as file:
             return _read(_File(file, str(path)), unit, modes)
@@ -80,6 +79,7 @@ class _File:
     def __init__(self, file: Any, where: str) -> None:
         self.file, self.where = file, where
         self.prefix = "shape/" if "shape" in file else ""
+        self.unpacked = 0
 
     def fail(self, name: str, found: str, allowed: str | None = None) -> DataError:
         return DataError(found, where=f"{self.where}: dataset {self.prefix}{name}", allowed=allowed)
@@ -96,15 +96,15 @@ class _File:
             raise self.fail(present[0], "is not an array of numbers")
         if dataset.file != self.file or dataset.external or dataset.is_virtual:
             raise self.fail(present[0], "is stored in another file", "all data in one file")
-        if dataset.nbytes > LARGEST_DATASET_BYTES:
-            raise self.fail(present[0], f"has {dataset.nbytes / 1e9:.1f} GB", "at most 2 GiB")
+        self.unpacked += dataset.size * np.dtype(np.float64).itemsize
+        check_bytes(self.unpacked, HEAD_MODEL, f"{self.where}: dataset {self.prefix}{present[0]}", unpacked=True)
         try:
             values = np.asarray(dataset[()])
         except OSError as error:
             raise self.fail(present[0], f"is damaged ({str(error).splitlines()[0]})") from error
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise self.fail(present[0], f"{int((~np.isfinite(values)).sum())} values are NaN or infinite")
-        largest = float(np.abs(values.astype(np.float64)).max(initial=0.0))
+        largest = max(float(values.max(initial=0)), -float(values.min(initial=0)))
         if largest > LARGEST_VALUE:
             raise self.fail(present[0], f"reaches {largest:.3g}", f"at most {LARGEST_VALUE:g}")
         return values
@@ -129,9 +129,7 @@ def _read(file: _File, unit: Unit, modes: int | None) -> MorphableModel:
     scale = METRES[_unit(file, mean.reshape(-1, 3), unit, notes)]
     scaled = _per_deviation(file, basis[:, :kept].astype(np.float64), np.sqrt(variance[:kept]), notes)
     shapes = np.ascontiguousarray(scaled.T).reshape(kept, -1, 3)
-    return MorphableModel(
-        scale * mean.reshape(-1, 3), scale * shapes, _faces(file, mean.size // 3), tuple(notes)
-    )
+    return MorphableModel(scale * mean.reshape(-1, 3), scale * shapes, _faces(file, mean.size // 3), tuple(notes))
 
 
 def _per_deviation(file: _File, basis: np.ndarray, deviation: np.ndarray, notes: list[str]) -> np.ndarray:

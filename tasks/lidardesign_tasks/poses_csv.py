@@ -19,6 +19,7 @@ import numpy as np
 from lidardesign.errors import DataError
 from lidardesign.geometry.frames import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.run.arrays import csv_rows
+from lidardesign.run.inputs import TABLE
 from lidardesign.scene import rigid
 from lidardesign.space import FARTHEST_M
 from lidardesign_tasks.pose import rotation_matrix
@@ -29,7 +30,6 @@ DEGREES, RADIANS = ("roll_deg", "pitch_deg", "yaw_deg"), ("roll_rad", "pitch_rad
 ROTATIONS = (QUATERNION, DEGREES, RADIANS)
 TIME, BODY = "time_s", "body"
 COLUMNS = (TIME, BODY, *PLACE, *QUATERNION, *DEGREES, *RADIANS)
-LARGEST_BYTES = 64_000_000
 MOST_ROWS = 200_000
 LATEST_S = 1e9
 LARGEST_NUMBER = FARTHEST_M
@@ -150,7 +150,7 @@ class _Row:
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
     """The line and the cells of every row that is not blank, the header first."""
-    rows = csv_rows(path, LARGEST_BYTES)
+    rows = csv_rows(path, TABLE)
     if not rows or len(rows) > MOST_ROWS + 1:
         raise DataError(f"{max(len(rows) - 1, 0)} rows", where=str(path), allowed=f"a header and 1 to {MOST_ROWS} rows")
     width = len(rows[0][1])

@@ -62,7 +62,7 @@ CASES = [
             "Ideal": "did you mean 'ideal'",
             LONG: "there is no detector",
             "garbage": "is not UTF-8 text",
-            "run": "Is a directory",
+            "run": "it is a folder",
             "empty.yaml": "says nothing about a detector",
             "comment.yaml": "says nothing about a detector",
             "null.yaml": "says nothing about a detector",

@@ -5,6 +5,7 @@ import io
 import pickle
 import struct
 import zipfile
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -17,7 +18,7 @@ from lidardesign.errors import DataError
 from lidardesign.evaluate.captures import arrays as matlab
 from lidardesign.evaluate.captures.arrays import read_arrays
 from lidardesign.evaluate.captures.capture import load_capture
-from lidardesign.run import arrays as npz
+from lidardesign.run.inputs import CAPTURE
 
 
 def save_npz(path, arrays):
@@ -326,30 +327,31 @@ def test_flipped_bytes_end_in_a_clear_error_or_in_a_checked_capture(tmp_path, ki
 @pytest.mark.parametrize("suffix", [".npz", ".mat"])
 def test_garbage_a_folder_and_nothing_are_refused(tmp_path, suffix):
     path = tmp_path / f"s{suffix}"
-    with pytest.raises(DataError, match="no such file"):
+    with pytest.raises(DataError, match="No such file"):
         load_capture(path)
     path.write_bytes(bytes(range(256)) * 16)
     with pytest.raises(DataError):
         load_capture(path)
     folder = tmp_path / f"folder{suffix}"
     folder.mkdir()
-    with pytest.raises(DataError, match="no such file"):
+    with pytest.raises(DataError, match="it is a folder"):
         load_capture(folder)
     with pytest.raises(DataError, match=r"suffix '.csv'.*\n.*\.npz, \.mat"):
         load_capture(tmp_path / "s.csv")
 
 
 def test_files_above_the_stated_size_are_refused_before_they_are_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(npz, "LARGEST_BYTES", 100_000)
+    small = replace(CAPTURE, most_bytes=100_000, unpacked_bytes=100_000)
+    monkeypatch.setattr("lidardesign.evaluate.captures.arrays.CAPTURE", small)
     zeros = {**make_capture(3), "counts": np.zeros((3, 3, 100_000), np.uint8)}
     for kind, save in FORMATS.items():
         path = path_of(tmp_path, kind)
         save(path, zeros)
         assert path.stat().st_size < 100_000, "packed, it is small"
-        with pytest.raises(DataError, match="GiB"):
+        with pytest.raises(DataError, match="unpacked take"):
             load_capture(path)
     (tmp_path / "big.npz").write_bytes(bytes(100_001))
-    with pytest.raises(DataError, match="the file takes"):
+    with pytest.raises(DataError, match="the file is too large"):
         load_capture(tmp_path / "big.npz")
 
 

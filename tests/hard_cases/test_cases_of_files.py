@@ -21,8 +21,9 @@ from lidardesign.density.training.training import CHECKPOINT
 from lidardesign.design.files import load_design
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.registry import load_task
+from lidardesign.run.inputs import YAML
 from lidardesign.run.manifest import record, start_manifest
-from lidardesign.run.yaml import MAX_BYTES, MAX_DEPTH, parse_yaml
+from lidardesign.run.yaml import MAX_DEPTH, parse_yaml
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.workflow.fit import load_constraints
 
@@ -102,7 +103,7 @@ class TestYaml:
         assert [path.name for path in tmp_path.iterdir()] == ["input.yaml"]
 
     def test_more_than_a_megabyte_is_refused_before_it_is_parsed(self, tmp_path):
-        (tmp_path / "input.yaml").write_bytes(b"a: '" + b"x" * MAX_BYTES + b"'")
+        (tmp_path / "input.yaml").write_bytes(b"a: '" + b"x" * YAML.most_bytes + b"'")
         for reader in ("configuration", "constraints", "detector"):
             with pytest.raises(ConfigError, match="too large"):
                 readers(tmp_path)[reader]()

@@ -122,7 +122,7 @@ def test_files_that_cannot_be_text_are_refused(tmp_path):
     path.write_bytes(b"a: '" + b"x" * 1_000_000 + b"'")
     with pytest.raises(ConfigError, match="too large"):
         load_yaml(path)
-    with pytest.raises(ConfigError, match="Is a directory"):
+    with pytest.raises(ConfigError, match="it is a folder"):
         load_yaml(tmp_path)
 
 

@@ -105,7 +105,7 @@ REFUSED = {
         "<!DOCTYPE m [<!ENTITY a 'aaaaaaaaaa'>"
         + "".join(f"<!ENTITY {chr(98 + i)} '{f'&{chr(97 + i)};' * 10}'>" for i in range(9))
         + "]><mujoco model='&j;'/>",
-        "is no XML",
+        "has a document type",
     ),
     "another format": ("<sdf name='x'/>", "<sdf>"),
     "an unknown element": ("<mujoco><worldbody><bogus/></worldbody></mujoco>", "unrecognized element"),

@@ -134,7 +134,7 @@ def test_a_file_that_is_not_hdf5_or_cut_is_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(DataError, match=r"model\.h5: is not a readable HDF5 file"):
             load_model(path)
-    with pytest.raises(DataError, match="no such file"):
+    with pytest.raises(DataError, match="No such file"):
         load_model(tmp_path / "nowhere.h5")
 
 

@@ -26,6 +26,7 @@ from lidardesign.config import LearningSettings
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.errors import DataError
 from lidardesign.run.files import remove_stray_temporaries
+from lidardesign.run.inputs import STATE, check_file, parse_json
 from lidardesign.run.manifest import forget, read_manifest, verify, write_recorded
 
 FORMAT = "lidardesign-1"
@@ -50,6 +51,7 @@ def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, 
 
     verify(run, name)
     path = run / name
+    check_file(path, STATE)
     try:
         with safe_open(path, framework="np") as file:
             metadata = file.metadata() or {}
@@ -65,8 +67,8 @@ def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, 
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             raise DataError(f"{key} holds values that are not finite", where=str(path), hint="learn the run again")
     try:
-        state = json.loads(metadata[FORMAT])
-    except (ValueError, RecursionError) as error:
+        state = parse_json(metadata[FORMAT])
+    except ValueError as error:
         raise DataError(f"its state cannot be read: {error}", where=str(path), hint="learn the run again") from None
     if not isinstance(state, dict):
         raise DataError("holds no state", where=str(path), hint="learn the run again")

@@ -43,6 +43,7 @@ from lidardesign.errors import DataError, DivergenceError, NumericalError
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.clock import phase
 from lidardesign.run.files import append_line, write_atomic
+from lidardesign.run.inputs import RECORD, read_file
 from lidardesign.run.manifest import record
 
 # How much of the means of gradients and of their squares a step keeps.
@@ -342,7 +343,7 @@ class Trainer(LearnedFlow):
         clear_snapshots(self.run, beyond=self.step)
         path = self.run / PROGRESS
         if path.exists():
-            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+            lines = read_file(path, RECORD).decode(errors="replace").splitlines()
             write_atomic(path, "".join(line + "\n" for line in lines if _step_of(line) <= self.step))
 
 

@@ -21,12 +21,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.design.rigs.rig import LARGEST_TABLE_BYTES, Rig, RigSensor, number_of
+from lidardesign.design.rigs.rig import Rig, RigSensor, number_of
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.arrays import NUMERIC_KINDS, csv_rows, read_npz
 from lidardesign.run.files import write_atomic
+from lidardesign.run.inputs import RAY_TABLE
 from lidardesign.space import FULL_TURN, MOST_TURNS, angles, direction
 
 ORIGIN = ("origin_x_m", "origin_y_m", "origin_z_m")
@@ -157,7 +158,7 @@ def read_ray_csv(path: Path) -> Rig:
     Raises:
         DataError: The file cannot be read, or a cell cannot be used; with file, line and column.
     """
-    rows = csv_rows(path, LARGEST_TABLE_BYTES)
+    rows = csv_rows(path, RAY_TABLE)
     if not rows:
         raise DataError("is empty", where=str(path), allowed="a header and one ray per line")
     (header_line, header), *body = rows
@@ -280,7 +281,7 @@ def read_sensor_csv(path: Path) -> DesignSpec:
 
 def _rows(path: Path) -> tuple[list[tuple[dict[str, float], str]], list[str]]:
     """Numbers by column name and the position of each row, with notes."""
-    lines = csv_rows(path, LARGEST_TABLE_BYTES)
+    lines = csv_rows(path, RAY_TABLE)
     if not lines:
         raise DataError("is empty", where=str(path), allowed=f"rows of {len(SENSOR_COLUMNS)} columns")
     first = [cell.strip() for cell in lines[0][1]]

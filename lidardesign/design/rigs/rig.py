@@ -34,8 +34,6 @@ CENTRING_ROUNDS = 8
 SHORTEST_MEAN = 1e-3
 # More sensors than any rig has; each takes a row in every table.
 MOST_SENSORS = 10_000
-# A million rays of twelve columns with all their digits.
-LARGEST_TABLE_BYTES = 256_000_000
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.run import arrays as npz
-from lidardesign.run.arrays import check_kind, check_size, guarded, read_npz
+from lidardesign.run.arrays import check_kind, guarded, read_npz
+from lidardesign.run.inputs import CAPTURE, check_bytes, check_file
 
 # Numpy's types by MATLAB's classes.
 NUMBERS = {"double": "f8", "single": "f4", "logical": "?"} | {
@@ -34,6 +34,7 @@ NUMBERS = {"double": "f8", "single": "f4", "logical": "?"} | {
 PATIENCE_SECONDS = 120.0
 # Memory of the process, in times of the largest size: packed data, the same unpacked, the array, and the libraries.
 MEMORY_SHARE = 4
+MOST_ARRAYS = 1000
 
 
 def read_matlab(path: Path) -> dict[str, np.ndarray]:
@@ -46,7 +47,7 @@ def read_matlab(path: Path) -> dict[str, np.ndarray]:
     program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "arrays.npz"
-        command = [sys.executable, "-c", program, str(path), str(target), str(npz.LARGEST_BYTES)]
+        command = [sys.executable, "-c", program, str(path), str(target), str(CAPTURE.unpacked_bytes)]
         try:
             done = subprocess.run(command, capture_output=True, check=True, timeout=PATIENCE_SECONDS)
             found = json.loads(done.stdout)
@@ -55,8 +56,8 @@ def read_matlab(path: Path) -> dict[str, np.ndarray]:
             raise DataError("is no MATLAB file, or a damaged one", where=str(path), hint=hint) from error
         if "refused" in found:
             raise refused(*found["refused"], str(path))
-        npz.check_size([found["bytes"]], str(path))
-        stored = npz.read_npz(target)
+        check_bytes(found["bytes"], CAPTURE, str(path), unpacked=True)
+        stored = read_npz(target, CAPTURE)
         return {name: stored[f"array_{number}"] for number, name in enumerate(found["names"])}
 
 
@@ -107,17 +108,10 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     path, where = Path(path), str(path)
     if path.suffix.lower() not in SUFFIXES:
         raise DataError(f"has the suffix {path.suffix!r}", where=where, allowed=", ".join(SUFFIXES))
-    try:
-        size = path.stat().st_size if path.is_file() else None
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror or error})", where=where) from error
-    if size is None:
-        raise DataError("no such file", where=where, hint="check the path")
-    check_size([size], where, "the file")
-    if not size:
+    if not check_file(path, CAPTURE, hint="check the path"):
         raise DataError("is an empty file", where=where)
     if path.suffix.lower() == ".npz":
-        return read_npz(path)
+        return read_npz(path, CAPTURE)
     # 7.3 is HDF5, what is older has a format of its own
     import h5py
 
@@ -129,6 +123,8 @@ def _read_hdf5(path: Path) -> dict[str, np.ndarray]:
     import h5py
 
     with h5py.File(path, "r") as file:
+        if len(file) > MOST_ARRAYS:
+            raise DataError(f"holds {len(file)} variables", where=str(path), allowed=f"at most {MOST_ARRAYS}")
         links = {name: file.get(name, getlink=True) for name in file if not name.startswith("#")}
         outside = [name for name, link in links.items() if not isinstance(link, h5py.HardLink)]
         if outside:
@@ -136,7 +132,7 @@ def _read_hdf5(path: Path) -> dict[str, np.ndarray]:
         datasets = {name: file[name] for name in links}
         for name, dataset in datasets.items():
             _check_dataset(name, dataset, str(path))
-        check_size((dataset.nbytes for dataset in datasets.values()), str(path))
+        check_bytes(sum(dataset.nbytes for dataset in datasets.values()), CAPTURE, str(path), unpacked=True)
         return {name: np.asarray(dataset[()]).T for name, dataset in datasets.items()}
 
 

@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element
 from lidardesign.errors import DataError
 from lidardesign.run import xml
 from lidardesign.run.files import write_atomic
+from lidardesign.run.inputs import Kind
 
 # Of what a name becomes; topics and prim paths are built of several.
 LONGEST_NAME = 64
@@ -102,7 +103,7 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
 
 
 # A million rays of some 300 bytes.
-MOST_BYTES = 1_000_000_000
+EXPORT = Kind("exported XML", 1_000_000_000)
 
 
 def element(
@@ -160,7 +161,7 @@ def read_xml(path: Path, tag: str) -> Element:
     Raises:
         DataError: It cannot be read, is no such document, or declares a document type.
     """
-    root = xml.read_xml(path, f"a <{tag}> document", largest_bytes=MOST_BYTES, most_elements=MOST_BYTES)
+    root = xml.read_xml(path, f"a <{tag}> document", kind=EXPORT, most_elements=EXPORT.most_bytes)
     if root.tag != tag:
         raise DataError(f"is no <{tag}> document but a <{root.tag[:40]}>", where=str(path))
     return root

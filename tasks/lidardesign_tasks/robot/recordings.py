@@ -13,6 +13,7 @@ import numpy as np
 from lidardesign.errors import DataError
 from lidardesign.mujoco_model import import_mujoco
 from lidardesign.run.arrays import csv_rows, read_npz
+from lidardesign.run.inputs import TABLE
 from lidardesign.run.validation import suggest
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 TIME, ALL = "time_s", "qpos"
 PLACE, TURN = (".x", ".y", ".z"), (".qw", ".qx", ".qy", ".qz")
 ENDINGS = (".csv", ".npz")
-LARGEST_BYTES = 64_000_000
 MOST_SHOWN = 12
 # How far recorded joints may be beyond their limits, as a share of what is between them: MuJoCo's own limits are soft.
 BEYOND_LIMIT = 0.05
@@ -153,7 +153,7 @@ def _read(path: Path, changed_ns: int, size: int) -> Mapping[str, np.ndarray]:
     """The columns of one file by name; space and both splits need it."""
     if path.suffix == ".npz":
         return read_npz(path)
-    (_, header), *rows = csv_rows(path, LARGEST_BYTES) or [(1, [])]
+    (_, header), *rows = csv_rows(path, TABLE) or [(1, [])]
     names = [name.strip() for name in header]
     if len(set(names)) < len(names):
         raise DataError("a column is given twice", where=str(path))

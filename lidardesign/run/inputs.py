@@ -1,0 +1,134 @@
+"""What input files may be: one table of their sizes, and one way to open them.
+
+Only regular files are opened: a pipe, a device or a socket could be waited for or read for ever. Sizes are looked at
+before memory is taken.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lidardesign.errors import ConfigError, DataError
+
+HEAD_BYTES = 4096
+STDIN_HINT = "give a file; commands take - for standard input where they read a design or YAML"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of input file.
+
+    Arguments:
+        name: What people call it.
+        most_bytes: How large the file may be.
+        unpacked_bytes: How large what is packed in it may be; None: nothing is packed.
+        error: What is raised where such a file cannot be used.
+    """
+
+    name: str
+    most_bytes: int
+    unpacked_bytes: int | None = None
+    error: type[ConfigError | DataError] = DataError
+
+
+YAML = Kind("configurations, constraints, detectors, parts: YAML", 1_000_000, error=ConfigError)
+DESIGN = Kind("designs: YAML", 64_000_000, error=ConfigError)
+XML = Kind("robots, rigs: MJCF, URDF, SDF", 16_000_000)
+ROBOT_FILES = Kind("all files of a robot together", 512_000_000)
+TABLE = Kind("poses, joint positions: CSV", 64_000_000)
+RAY_TABLE = Kind("rays, sensors: CSV", 128_000_000)
+ARRAYS = Kind("rays, joint positions, samples: NPZ", 256_000_000, 256_000_000)
+CAPTURE = Kind("captures: NPZ, MAT", 1 << 30, 1 << 30)
+MESH = Kind("meshes: GLB, glTF and its buffers, OBJ, OFF, PLY, STL", 512_000_000)
+HEAD_MODEL = Kind("head models: HDF5", 1 << 30, 512_000_000)
+STATE = Kind("checkpoints: safetensors", 1 << 30)
+RECORD = Kind("manifests, progress: JSON", 64_000_000)
+KINDS = (YAML, DESIGN, XML, ROBOT_FILES, TABLE, RAY_TABLE, ARRAYS, CAPTURE, MESH, HEAD_MODEL, STATE, RECORD)
+# Of rows of any table, the header included, and of its columns.
+MOST_ROWS, MOST_COLUMNS = 1_000_001, 2_000
+
+
+def size_text(size: float) -> str:
+    """A number of bytes for people, as 64 MB."""
+    unit = next((unit for unit in ((1e9, "GB"), (1e6, "MB")) if size >= unit[0]), (1, "bytes"))
+    return f"{size / unit[0]:.4g} {unit[1]}"
+
+
+def check_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint: str | None = None) -> int:
+    """The size of a file [bytes], once it is known to be one that can be read without waiting.
+
+    Raises:
+        DataError, ConfigError: By the kind: it is missing, no regular file, or too large.
+    """
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise kind.error(f"cannot be read: {reason}", where=str(path), allowed=allowed, hint=hint) from None
+    if stat.S_ISDIR(status.st_mode):
+        raise kind.error("cannot be read: it is a folder", where=str(path), allowed=allowed or "a file", hint=hint)
+    if not stat.S_ISREG(status.st_mode):
+        raise kind.error("is no regular file", where=str(path), allowed=allowed, hint=hint or STDIN_HINT)
+    check_bytes(status.st_size, kind, str(path))
+    return status.st_size
+
+
+def check_bytes(size: int, kind: Kind, where: str, *, unpacked: bool = False) -> None:
+    """Refuse more bytes than a kind of file may have.
+
+    Raises:
+        DataError, ConfigError: By the kind.
+    """
+    most = (kind.unpacked_bytes or 0) if unpacked else kind.most_bytes
+    if size > most:
+        what = "its data unpacked take" if unpacked else "the file is too large:"
+        raise kind.error(f"{what} {size_text(size)}", where=where, allowed=f"at most {size_text(most)} ({kind.name})")
+
+
+def read_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint: str | None = None) -> bytes:
+    """All bytes of a file.
+
+    Raises:
+        DataError, ConfigError: As of `check_file`, or it cannot be read.
+    """
+    check_file(path, kind, allowed=allowed, hint=hint)
+    try:
+        with open(path, "rb") as file:
+            content = file.read(kind.most_bytes + 1)
+    except OSError as error:
+        raise kind.error(
+            f"cannot be read: {error.strerror or error}", where=str(path), allowed=allowed, hint=hint
+        ) from None
+    check_bytes(len(content), kind, str(path))
+    return content
+
+
+def read_head(path: Path | str, kind: Kind, *, hint: str | None = None) -> bytes:
+    """The first bytes of a file, which tell what is in it.
+
+    Raises:
+        DataError, ConfigError: As of `read_file`.
+    """
+    check_file(path, kind, hint=hint)
+    try:
+        with open(path, "rb") as file:
+            return file.read(HEAD_BYTES)
+    except OSError as error:
+        raise kind.error(f"cannot be read: {error.strerror or error}", where=str(path), hint=hint) from None
+
+
+def parse_json(content: bytes | str) -> Any:
+    """A JSON document.
+
+    Raises:
+        ValueError: It is none, is no UTF-8, or is nested so deep that it cannot be read.
+    """
+    try:
+        return json.loads(content)
+    except RecursionError:
+        raise ValueError("nested too deep") from None
