@@ -4,7 +4,9 @@ CARLA: a sensor.lidar.ray_cast per sensor, with its blueprint's attributes and i
 
 `attributes` are the text that `blueprint.set_attribute` takes; `transform` is in CARLA's left-handed frame: x forward,
 y to the right, z up, in metres and degrees. With the world's fixed time step of `fixed_delta_seconds`, every frame has
-all rays once: azimuths are swept from minus half of `horizontal_fov` on, so the mount is turned by half a step.
+all rays once: azimuths are swept from minus half of `horizontal_fov` on, so the mount is turned by half a step. The
+next frame begins where a product of single-precision numbers ends: where it falls short of the field of view by its
+rounding, the first column looks to the other edge. Frequency and field are written so that it does not.
 
 ASAM OSI: a SensorViewConfiguration with one LidarSensorViewConfiguration per sensor, as protobuf writes it in JSON.
 
@@ -52,25 +54,25 @@ from lidardesign.space import angles, direction
 MIRROR = np.diag([1.0, -1.0, 1.0])
 # A sweep of one column is as narrow as its field of view is written.
 NARROWEST_DEG = 0.001
+# Unreal's frames last from half a millisecond to 0.4 s; it makes others so.
+SLOWEST_HZ, FASTEST_HZ = 2.5, 2000.0
+# How many single-precision numbers from the field of view on, and around the frequency, are tried.
+TRIED_FIELDS, TRIED_RATES = 400, (0, 1, -1, 2, -2, 3, -3)
 
 
 def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold.
 
     Raises:
-        ConfigError: A frame rate at which CARLA's whole number of points per second is not the rays of a frame.
+        ConfigError: A frame rate that Unreal's frames do not have; at those, CARLA's whole numbers of points per second
+            are the rays of a frame.
     """
+    if not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
+        raise ConfigError(
+            f"{rate_hz:g}", where="--rate-hz", allowed=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz, the frames of CARLA"
+        )
     design, rays = by_channel(design, rays)
     mounted = mounts(design, rays)
-    for mount in mounted:
-        grid = grid_of(mount)
-        if round(round(len(grid) * rate_hz) / rate_hz / grid.rows) != grid.columns:
-            raise ConfigError(
-                f"{rate_hz:g} frames of {len(grid)} rays per second are no whole number of points per second, as CARLA "
-                f"counts them ({mount.name})",
-                where="--rate-hz",
-                allowed="a rate at which they are, as one of 1 or more",
-            )
     document = {
         "design": design.name,
         "fixed_delta_seconds": 1 / rate_hz,
@@ -107,13 +109,13 @@ def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
     grid = grid_of(mount)
     # from one azimuth to the next; 0 for one column
     step_rad = (grid.azimuth_rad[1] - grid.azimuth_rad[0]) / max(grid.columns - 1, 1)
-    field_deg = max(math.degrees(step_rad) * grid.columns, NARROWEST_DEG)
+    turn_hz, field_deg = _sweep(max(math.degrees(step_rad) * grid.columns, NARROWEST_DEG), rate_hz)
     low_deg, high_deg = (math.degrees(value) for value in grid.elevation_rad)
     attributes = {
         "channels": str(grid.rows),
         "range": repr(mount.gate_m[1]),
         "points_per_second": str(round(len(grid) * rate_hz)),
-        "rotation_frequency": repr(float(rate_hz)),
+        "rotation_frequency": repr(turn_hz),
         "upper_fov": repr(high_deg),
         "lower_fov": repr(low_deg),
         "horizontal_fov": repr(field_deg),
@@ -121,7 +123,8 @@ def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
         "dropoff_general_rate": "0.0",
         "dropoff_zero_intensity": "0.0",
         "noise_stddev": "0.0",
-        "sensor_tick": repr(1 / rate_hz),
+        # at every frame: an interval of the same length leaves frames out by its rounding
+        "sensor_tick": "0.0",
         "role_name": mount.name,
     }
     location = dict(zip("xyz", (MIRROR @ mount.origin_m).tolist(), strict=True))
@@ -132,6 +135,16 @@ def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
         "attributes": attributes,
         "transform": {"location": location, "rotation": _rotation(mount, grid, field_deg)},
     }
+
+
+def _sweep(field_deg: float, rate_hz: float) -> tuple[float, float]:
+    """The rotation frequency [Hz] and the field of view [deg] of which CARLA sweeps just the whole in a frame."""
+    field, rate, step_s = (np.float32(value) for value in (field_deg, rate_hz, 1 / rate_hz))
+    fields = (field.view(np.int32) + np.arange(TRIED_FIELDS, dtype=np.int32)).view(np.float32)
+    rates = (rate.view(np.int32) + np.array(TRIED_RATES, dtype=np.int32)).view(np.float32)
+    whole = rates[:, None] * fields * step_s == fields
+    nearest = np.argwhere(whole)[0] if whole.any() else (0, 0)
+    return float(rates[nearest[0]]), float(fields[nearest[1]])
 
 
 def _rotation(mount: Mount, grid: EvenGrid, field_deg: float) -> dict[str, float]:

@@ -3,12 +3,16 @@
 Each twin was written from the published source of its program, as of 2026-11-22, and reads nothing but the files.
 """
 
+import json
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
+import pytest
+from support.rigs import even, farthest_nearest, sensor
 from support.tables import each_row
 
 from lidardesign.design.sensor import DesignSpec, Sensor
+from lidardesign.errors import ConfigError
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.geometry.rays import Rays
 
@@ -105,3 +109,83 @@ def test_helios_would_send_no_power_through_a_gate_from_0(tmp_path, version):
     scanner, [channel], _ = helios_scanner(tmp_path / "out", np.array([[0.0, 25]]))
     found = helios_range_m(scanner, channel, 1.0, version, 1.0, start_m=0.0)
     assert (found is None) == (version[0] != "Gaussian")
+
+
+# CARLA --------------------------------------------------------------------------------------------------------------
+
+# Sensor/RayCastSemanticLidar.cpp, RayCastLidar.cpp and Sensor.cpp; Unreal's AWorldSettings::FixupDeltaSeconds
+SINGLE = np.float32
+
+
+def carla_frames(sensor, step_s, count):
+    """Pitch and yaw [deg] of all rays of so many frames, (N, 2) each, in single precision as CARLA reckons."""
+    text = sensor["attributes"]
+    field, low, high, rate = (
+        SINGLE(text[name]) for name in ("horizontal_fov", "lower_fov", "upper_fov", "rotation_frequency")
+    )
+    channels, delta = int(text["channels"]), SINGLE(np.clip(step_s, 0.0005, 0.4))
+    points = int(SINGLE(int(text["points_per_second"])) * delta / SINGLE(channels) + SINGLE(0.5))
+    between = (high - low) / SINGLE(channels - 1) if channels > 1 else SINGLE(0)
+    pitch = high - np.arange(channels, dtype=SINGLE) * between
+    tick, current, frames = rate * field * delta, SINGLE(0), []
+    for _ in range(count):
+        start = np.degrees(current)
+        yaw = np.fmod(start + tick / SINGLE(points) * np.arange(points, dtype=SINGLE), field) - field / SINGLE(2)
+        frames.append(np.stack([np.repeat(pitch, points), np.tile(yaw, channels)], axis=1))
+        current = np.radians(np.fmod(start + tick, field))
+    return frames
+
+
+def unreal_rays(rotation, pitch_yaw_deg):
+    """Unit vectors in our right-handed world of rays in an actor's frame, by the axes of FRotationMatrix."""
+    (sp, cp), (sy, cy), (sr, cr) = (
+        (np.sin(angle), np.cos(angle)) for angle in np.radians([rotation[name] for name in ("pitch", "yaw", "roll")])
+    )
+    axes = np.array(
+        [
+            [cp * cy, cp * sy, sp],
+            [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, -sr * cp],
+            [-(cr * sp * cy + sr * sy), cy * sr - cr * sp * sy, cr * cp],
+        ]
+    )
+    pitch, yaw = np.radians(pitch_yaw_deg.astype(np.float64)).T
+    local = np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], axis=1)
+    return local @ axes * [1, -1, 1]
+
+
+CARLA_GRIDS = {
+    "one ray": ((1, 1), (0.0, 0.0), (0.0, 0.0)),
+    "one column": ((1, 4), (0.1, 0.1), (-0.2, 0.3)),
+    "one row": ((5, 1), (-0.3, 0.2), (0.1, 0.1)),
+    "even": ((7, 6), (-0.31, 0.32), (-0.2, 0.3)),
+    "all round": ((36, 3), (-np.pi, np.pi - np.pi / 18), (-0.25, 0.3)),
+}
+
+
+@each_row(
+    ("rate_hz", "case"),
+    [(rate, case) for rate in (2.5, 3.7, 10, 29.97, 30, 60, 144, 333, 2000) for case in CARLA_GRIDS],
+)
+def test_every_frame_of_carla_has_the_grids_rays_once(tmp_path, rate_hz, case):
+    (columns, rows), azimuth, elevation = CARLA_GRIDS[case]
+    local = even(columns, rows, azimuth, elevation)
+    count = len(local)
+    looking = sensor("one", (0, 0, 0), 2.5, -0.4, 0.3)
+    rays = Rays(
+        np.zeros((count, 3)), local @ looking.frame, np.tile([0.0, 9.0], (count, 1)), np.zeros(count), np.zeros(count)
+    )
+    EXPORTERS["carla"].write(DesignSpec("one", (looking,)), rays, tmp_path / "out.json", rate_hz)
+    whole = json.loads((tmp_path / "out.json").read_text())
+    [written] = whole["sensors"]
+    frames = carla_frames(written, whole["fixed_delta_seconds"], 100)
+    fired = unreal_rays(written["transform"]["rotation"], frames[0])
+    assert len(fired) == count
+    assert farthest_nearest(rays.direction, fired) < 3e-5
+    assert all((frame == frames[0]).all() for frame in frames)
+    assert written["attributes"]["sensor_tick"] == "0.0"
+
+
+@each_row("rate_hz", [0.001, 1.0, 2.49, 2001, 1e5])
+def test_carla_refuses_frames_that_unreal_does_not_have(tmp_path, rate_hz):
+    with pytest.raises(ConfigError, match=r"--rate-hz[\s\S]*2\.5 to 2000 Hz"):
+        EXPORTERS["carla"].write(ONE, rays_with_gates(np.array([[0.0, 9.0]])), tmp_path / "out.json", rate_hz)

@@ -390,17 +390,6 @@ def test_no_sensor_has_such_a_frame_rate(tmp_path, rate_hz):
     assert not list(tmp_path.iterdir())
 
 
-def test_carla_fires_whole_numbers_of_points_per_second(tmp_path):
-    with pytest.raises(ConfigError, match="whole number of points per second"):
-        EXPORTERS["carla"].write(DESIGN, RAYS, tmp_path / "out", 0.3)
-    found = []
-    for rate_hz in (1.3, 10.0):
-        EXPORTERS["carla"].write(DESIGN, RAYS, tmp_path / "out", rate_hz)
-        found.append(EXPORTERS["carla"].rounding(DESIGN, RAYS, tmp_path / "out"))
-    assert found[0]["rays"] == found[1]["rays"]
-    assert found[0]["direction_rad"].error == pytest.approx(found[1]["direction_rad"].error)
-
-
 @each_row("name", ["mjcf", "sdf", "urdf", "xacro"])
 def test_names_cannot_leave_their_attribute(exported, name):
     path, notes = exported[name]
