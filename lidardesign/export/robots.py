@@ -11,7 +11,8 @@ their own body, of which those of sensors have none, nor ones that are fully tra
 Gazebo and ROS: a gpu_lidar per sensor, in SDF 1.9, in a URDF, or in a xacro macro.
 
 A gpu_lidar fires an even grid of azimuth and elevation, the first and the last ray on the bounds, and has one range for
-all of them. In SDF they are in one link of a static model.
+all of them. In SDF they are in one link of a static model. Gazebo draws the six faces of a cube around the sensor and
+takes each range from the pixel in which the ray lies, that is, along the ray of its middle.
 
 For ROS there is a link per sensor with Gazebo's gpu_lidar on it. Links follow REP 103: x forward, y to the left, z up,
 in metres and radians. In the URDF they are fixed to a base link, which is fixed to `world` and has a nominal mass:
@@ -22,6 +23,7 @@ are relative to the parent.
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -51,6 +53,7 @@ from lidardesign.export.common.names import (
 from lidardesign.export.common.poses import (
     Mount,
     ReadMount,
+    angles_between,
     design_losses,
     mounts,
     mounts_rounding,
@@ -205,6 +208,10 @@ def _floats(one: Element, name: str) -> np.ndarray:
 
 
 LINK = "lidar"
+# Sides of a face's picture, in pixels, and the least angle that is divided by to find them.
+FEWEST_PIXELS, MOST_PIXELS, LEAST_ANGLE_RAD = 128, 1024, 1e-4
+# Scans are pictures too, and GPUs have no wider ones.
+MOST_SAMPLES = 16_384
 # Gazebo renders depth images, whose near plane must be in front of the camera.
 NEAREST_M = 0.001
 
@@ -242,8 +249,29 @@ def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list
             f"gates of {len(near)} of {len(mounted)} sensors start below {NEAREST_M:g} m, where Gazebo's depth camera "
             f"cannot: they start at {NEAREST_M:g} m"
         )
+    grids = [grid_of(one) for one in mounted]
+    wide = sum(max(grid.columns, grid.rows) > MOST_SAMPLES for grid in grids)
+    if wide:
+        notes.append(
+            f"{wide} of {len(mounted)} sensors have more than {MOST_SAMPLES} columns or rows: Gazebo fails on them"
+        )
+    beside = max((float(pixel_offsets_rad(grid).max()) for grid in grids), default=0.0)
+    notes.append(f"Gazebo measures along the pixels of a picture: up to {math.degrees(beside):.2g} deg beside the rays")
     names = [design.name, *(one.sensor.name for one in mounted)]
     return [*notes, *renamed_note(names, [identifier(design.name), *(one.name for one in mounted)])]
+
+
+def pixel_offsets_rad(grid: EvenGrid) -> np.ndarray:
+    """How far the middles of Gazebo's pixels are from the rays of a grid that lie in them, shape (rows * columns,)."""
+    axes = [(grid.azimuth_rad, grid.columns), *([(grid.elevation_rad, grid.rows)] if grid.rows > 1 else [])]
+    wanted = max(int(math.pi / 2 / max(high - low, LEAST_ANGLE_RAD) * count) for (low, high), count in axes)
+    pixels = min(max(2 ** math.ceil(math.log2(max(wanted, 1))), FEWEST_PIXELS), MOST_PIXELS)
+    looking = grid.directions()
+    reach = np.abs(looking).max(axis=1, keepdims=True)
+    on_face = looking / reach
+    pixel = np.clip(np.floor((on_face + 1) / 2 * pixels), 0, pixels - 1)
+    middle = np.where(np.abs(looking) == reach, on_face, (2 * pixel + 1) / pixels - 1)
+    return angles_between(unit_vectors(middle), looking)
 
 
 def sensor_element(mount: Mount, rate_hz: float, *, posed: bool, name: str | None = None) -> Element:

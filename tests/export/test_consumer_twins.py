@@ -189,3 +189,84 @@ def test_every_frame_of_carla_has_the_grids_rays_once(tmp_path, rate_hz, case):
 def test_carla_refuses_frames_that_unreal_does_not_have(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match=r"--rate-hz[\s\S]*2\.5 to 2000 Hz"):
         EXPORTERS["carla"].write(ONE, rays_with_gates(np.array([[0.0, 9.0]])), tmp_path / "out.json", rate_hz)
+
+
+# Gazebo -------------------------------------------------------------------------------------------------------------
+
+# gz-rendering: ogre2/src/Ogre2GpuRays.cpp and its two fragment programs
+
+
+def gazebo_pixels(scan):
+    """Unit vectors in a sensor's frame of the pixels that Gazebo reads, row by row, and how many pixels a face has."""
+    low, high, count = (
+        [float(scan.findtext(f"{axis}/{name}")) for axis in ("horizontal", "vertical")]
+        for name in ("min_angle", "max_angle", "samples")
+    )
+    columns, rows = map(int, count)
+    wide = max(high[0] - low[0], 1e-4)
+    tall = max(high[1] - low[1], 1e-4)
+    most = max(int(np.pi / 2 / wide * columns), int(np.pi / 2 / tall * rows) if rows > 1 else 0)
+    side = 1
+    while side < most:
+        side *= 2
+    side = min(max(side, 128), 1024)
+    read = []
+    for row in range(rows):
+        for column in range(columns):
+            across = low[0] + column * (wide / (columns - 1) if columns > 1 else 0)
+            up = low[1] + row * (tall / (rows - 1) if rows > 1 else 0)
+            # a cube map looks along z, y up, x to the right
+            x, y, z = -np.sin(across) * np.cos(up), np.sin(up), np.cos(across) * np.cos(up)
+            if abs(z) >= abs(x) and abs(z) >= abs(y):
+                u, v, scale = (-x if z < 0 else x), -y, abs(z)
+                corner = lambda a, b, z=z: (-a if z < 0 else a, -b, np.sign(z))  # noqa: E731
+            elif abs(y) >= abs(x):
+                u, v, scale = x, (-z if y < 0 else z), abs(y)
+                corner = lambda a, b, y=y: (a, np.sign(y), -b if y < 0 else b)  # noqa: E731
+            else:
+                u, v, scale = (z if x < 0 else -z), -y, abs(x)
+                corner = lambda a, b, x=x: (np.sign(x), -b, a if x < 0 else -a)  # noqa: E731
+            texel = [min(int((0.5 * one / scale + 0.5) * side), side - 1) for one in (u, v)]
+            x, y, z = corner(*(2 * (one + 0.5) / side - 1 for one in texel))
+            read.append(np.array([z, -x, y]) / np.linalg.norm([x, y, z]))
+    return np.array(read), side
+
+
+GAZEBO_GRIDS = {
+    "one ray": ((1, 1), (0.0, 0.0), (0.0, 0.0), 1024),
+    "few": ((6, 6), (-0.17, 0.17), (-0.17, 0.17), 128),
+    "many": ((120, 40), (-0.4, 0.4), (-0.3, 0.35), 256),
+    "row": ((300, 1), (-0.2, 0.2), (0.1, 0.1), 1024),
+    "all round": ((36, 3), (-np.pi, np.pi - np.pi / 18), (-1.5, 1.5), 128),
+}
+
+
+@each_row("case", GAZEBO_GRIDS)
+def test_notes_say_how_far_gazebos_pixels_are_from_the_rays(tmp_path, case):
+    (columns, rows), azimuth, elevation, side = GAZEBO_GRIDS[case]
+    local = even(columns, rows, azimuth, elevation)
+    rays = Rays(
+        np.zeros((len(local), 3)),
+        local,
+        np.tile([0.0, 9.0], (len(local), 1)),
+        np.zeros(len(local)),
+        np.zeros(len(local)),
+    )
+    notes = EXPORTERS["sdf"].write(ONE, rays, tmp_path / "out.sdf")
+    [sensor] = ElementTree.parse(tmp_path / "out.sdf").iter("sensor")
+    read, found_side = gazebo_pixels(sensor.find("lidar/scan"))
+    assert found_side == side
+    beside = np.degrees(2 * np.arcsin(np.linalg.norm(read - local, axis=1) / 2)).max()
+    [told] = [note for note in notes if "pixels of a picture" in note]
+    assert abs(float(told.split(" deg")[0].split()[-1]) - beside) <= 0.05 * beside
+    # half a diagonal of the pixel in the middle of a face
+    assert 0.4 < beside / np.degrees(np.sqrt(2) / side) <= 1.01
+    assert float(sensor.findtext("lidar/range/min")) > 0
+
+
+def test_a_grid_that_no_gpu_draws_is_told(tmp_path):
+    local = even(16_385, 1, (-1.0, 1.0), (0.0, 0.0))
+    count = len(local)
+    rays = Rays(np.zeros((count, 3)), local, np.tile([0.0, 9.0], (count, 1)), np.zeros(count), np.zeros(count))
+    notes = EXPORTERS["sdf"].write(ONE, rays, tmp_path / "out.sdf")
+    assert any(note.startswith("1 of 1 sensors have more than 16384 columns or rows") for note in notes)
