@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from lidardesign.errors import ConfigError
+from lidardesign.errors import UNSET_HINT, ConfigError
 from lidardesign.registry import load_task, plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import verify, write_recorded
@@ -132,6 +132,8 @@ def parse_override(text: str, option: str = "--set") -> Override:
     if not equals or not all(parts):
         raise ConfigError("is not of the form KEY=VALUE", where=where, allowed="a dotted key, as density.sigma_m=0.005")
     value = value.strip()
+    if not value:
+        raise ConfigError(f"{key.strip()} has no value", where=where, allowed="a value", hint=UNSET_HINT)
     if value.startswith(("[", "{", '"', "'")):
         return Override(tuple(parts), parse_yaml(value, where=where).value, where)
     try:
@@ -294,7 +296,7 @@ def resolve(
     Raises:
         ConfigError: At file:line:column or at the `--set` option.
     """
-    document = load_yaml(config_file) if config_file else Document({}, "defaults")
+    document = load_yaml(config_file, empty_sections=True) if config_file else Document({}, "defaults")
     header = _header(task, document, preset, seed)
     layers = _Layers({section: {} for section in SECTIONS})
     layers.merge("learning", PRESET_LEARNING[header["preset"]], f"preset {header['preset']}")

@@ -7,11 +7,14 @@ Exit codes (design contract): 0 ok, 1 threshold missed, 2 usage or config, 3 bad
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral, Real
 from typing import TypeVar
 
 # What files and options say may be quoted; nobody reads more of it than this.
 LONGEST_PART = 1500
 Text = TypeVar("Text", str, None)
+# What to do where an option or a key has nothing behind it.
+UNSET_HINT = "a shell variable that is not set leaves nothing: give a value, or leave it out"
 
 
 class LidardesignError(Exception):
@@ -118,6 +121,18 @@ class ThresholdError(LidardesignError):
     """A threshold that the user set was missed (exit 1)."""
 
     exit_code, kind = 1, "threshold"
+
+
+def check_number(value: float, where: str, low: float, high: float, *, whole: bool = False) -> None:
+    """Refuse a number outside of its limits, both of which are allowed, and what is no number.
+
+    Raises:
+        ConfigError: It is outside.
+    """
+    kinds = Integral if whole else Real
+    if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
+        allowed = f"{'a whole number' if whole else 'a number'} from {low:.9g} to {high:.9g}"
+        raise ConfigError(f"{value!r}", where=where, allowed=allowed)
 
 
 def check_choice(value: str, where: str, allowed: Sequence[str]) -> str:

@@ -152,6 +152,8 @@ BAD_FILES = {
     "preset": ("preset: quick\n", "1:9", "draft, standard, fine"),
     "seed": ("seed: -1\n", "1:7", "whole number"),
     "rule of the task": ("task:\n  low: 2\n", "", "low is above high"),
+    "nothing behind a key": ("density:\n  sigma_m:\n  margin_m: 1\n", "2:11", "density.sigma_m has no value"),
+    "nothing in a list": ("space:\n  x_m:\n  - 0\n  -\n", "4:4", "space.x_m.1 has no value"),
     "duplicate": ("density:\n  sigma_m: 1\n  sigma_m: 2\n", "3:3", "given before"),
     "list": ("- a\n", "1:1", "keys and values"),
 }
@@ -171,7 +173,10 @@ def test_errors_in_a_file_point_at_line_and_column(write, case):
 BAD_OVERRIDES = {
     "density.sigma_m=-1": "greater than or equal to 0.000000001",
     "density.sigma=1": "did you mean 'sigma_m'",
-    "density.sigma_m=": "valid number",
+    "density.sigma_m=": "sigma_m has no value",
+    "density.margin_m=": "margin_m has no value",
+    "label= ": "label has no value",
+    "space=": "space has no value",
     "density=3": "unknown key 'task.density'",
     "count=0": "greater than or equal to 1",
     "count=1.5": "valid integer",

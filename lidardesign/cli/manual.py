@@ -13,6 +13,8 @@ from typing import Any
 
 from typer.core import TyperCommand
 
+from lidardesign.errors import UNSET_HINT, ConfigError
+
 WIDEST = 100
 DOCS = "docs/"
 
@@ -41,7 +43,32 @@ FROM_A_RUN = {4: "constraints that no design satisfies", 5: "a numerical failure
 
 
 class ManualCommand(TyperCommand):
-    """A command whose help ends with its manual."""
+    """A command whose help ends with its manual, and that takes no values which nobody writes on purpose."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the command line; a value that is empty, or `1_0` where a number is asked for, is a mistake.
+
+        Raises:
+            ConfigError: At the option or argument.
+        """
+        rest = list(args)
+        given = {} if ctx.resilient_parsing else self.make_parser(ctx).parse_args(args=rest)[0]
+        texts = [(parameter, text) for parameter in self.get_params(ctx) for text in _texts(given.get(parameter.name))]
+        for parameter, text in texts:
+            if not text.strip():
+                raise ConfigError("is empty", where=_name(parameter), allowed="a value", hint=UNSET_HINT)
+        left = super().parse_args(ctx, args)
+        from lidardesign.run.yaml import plain_number
+
+        for parameter, text in texts:
+            value = ctx.params.get(parameter.name)
+            values = value if isinstance(value, list | tuple) else [value]
+            if all(isinstance(each, int | float) and not isinstance(each, bool) for each in values):
+                try:
+                    plain_number(text)
+                except ValueError:
+                    raise ConfigError(repr(text), where=_name(parameter), allowed="a finite number") from None
+        return left
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the help of the options, then the manual."""
@@ -49,6 +76,16 @@ class ManualCommand(TyperCommand):
         manual = MANUALS.get(" ".join(ctx.command_path.split()[1:]))
         if manual is not None:
             print(manual_text(manual, min(WIDEST, shutil.get_terminal_size().columns)))
+
+
+def _texts(given: Any) -> list[str]:
+    """What a command line gives for a parameter: nothing, one text, or several."""
+    return [text for text in (given if isinstance(given, list | tuple) else [given]) if isinstance(text, str)]
+
+
+def _name(parameter: Any) -> str:
+    """A parameter as the command line calls it."""
+    return parameter.opts[0] if parameter.param_type_name == "option" else parameter.metavar or parameter.name
 
 
 def manual_text(manual: Manual, width: int) -> str:

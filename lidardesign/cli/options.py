@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -10,10 +11,19 @@ import typer
 
 from lidardesign.errors import ConfigError
 
+MOST_SEED = 2**63 - 1
+
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, errors too.")]
 Seed = Annotated[
     int | None,
-    typer.Option("--seed", metavar="N", min=0, help="Root of every random stream.", show_default="the run's, or 0"),
+    typer.Option(
+        "--seed",
+        metavar="N",
+        min=0,
+        max=MOST_SEED,
+        help="Root of every random stream.",
+        show_default="the run's, or 0",
+    ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no notes.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
@@ -169,11 +179,13 @@ def parse_at(texts: list[str] | None) -> dict[str, float]:
     Raises:
         ConfigError: One is not NAME=VALUE with a finite number, or a name is given twice.
     """
+    from lidardesign.run.yaml import plain_number
+
     values: dict[str, float] = {}
     for text in texts or []:
         name, equals, value = (part.strip() for part in text.partition("="))
         try:
-            number = float(value)
+            number = plain_number(value)
         except ValueError:
             number = math.nan
         if not (name and equals and math.isfinite(number)):
@@ -185,16 +197,8 @@ def parse_at(texts: list[str] | None) -> dict[str, float]:
 
 
 def sensor_count(text: str | None) -> int | str | None:
-    """The value of `--sensors`: a number from 1, `best`, `auto`, or None.
-
-    Raises:
-        ConfigError: It is none of these.
-    """
-    if text in (None, "best", "auto"):
-        return text
-    if not text.isdecimal() or int(text) < 1:
-        raise ConfigError(f"{text!r}", where="--sensors", allowed="a whole number from 1, best or auto")
-    return int(text)
+    """The value of `--sensors`: a number, or a word that is left to whoever takes it."""
+    return int(text) if text is not None and re.fullmatch("[0-9]{1,9}", text) else text
 
 
 def part_names(text: str | None) -> list[str] | str | None:

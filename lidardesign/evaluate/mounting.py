@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.geometry.rays import Rays
+from lidardesign.run.yaml import plain_number
 from lidardesign.task import random_generator
 
 OPTION = "--mount-error"
@@ -47,7 +48,7 @@ class MountError:
             number, unit = match.groups() if match else ("", "")
             kind, scales = ("place_m", METRES) if unit in METRES else ("angle_rad", RADIANS)
             try:
-                value = float(number) * scales.get(unit, math.nan)
+                value = plain_number(number) * scales.get(unit, math.nan)
             except ValueError:
                 value = math.nan
             if kind in found or not 0 <= value <= MOST[kind]:

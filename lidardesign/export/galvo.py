@@ -40,6 +40,7 @@ from lidardesign.numerics import ROUNDING, SLACK, TINY
 from lidardesign.run.arrays import csv_rows
 from lidardesign.run.files import write_atomic
 from lidardesign.run.inputs import RAY_TABLE, read_head
+from lidardesign.run.yaml import plain_number
 
 NEIGHBOURS = 6
 LONGEST_MOVED = 3
@@ -376,7 +377,7 @@ def _short(text: str) -> str:
 def _numbers(row: list[str], where: str) -> list[float]:
     """The values of a row: finite, and whole and not negative where they count or time something."""
     try:
-        found = [float(cell) for cell in row]
+        found = [plain_number(cell) for cell in row]
     except ValueError as error:
         raise DataError(_short(str(error)), where=where, allowed="numbers") from error
     if len(found) != len(COLUMNS) or not all(map(math.isfinite, found)):

@@ -12,6 +12,7 @@ from xml.parsers import expat
 
 from lidardesign.errors import DataError
 from lidardesign.run.inputs import XML, Kind, read_file
+from lidardesign.run.yaml import plain_number
 
 DEEPEST = 200
 MOST_ELEMENTS = 500_000
@@ -119,7 +120,7 @@ def numbers_of(text: str | None, count: int, where: str, name: str) -> list[floa
         DataError: They are more or fewer, or none.
     """
     try:
-        values = [float(part) for part in (text or "").split()]
+        values = [plain_number(part) for part in (text or "").split()]
     except ValueError:
         values = []
     if len(values) != count or not all(math.isfinite(value) for value in values):

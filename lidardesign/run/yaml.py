@@ -85,8 +85,14 @@ class Document:
         return self.value
 
 
-def load_yaml(path: Path, kind: Kind = YAML) -> Document:
+def load_yaml(path: Path, kind: Kind = YAML, *, empty_sections: bool = False) -> Document:
     """Read a YAML file; in a command `-` is standard input.
+
+    Arguments:
+        path: The file.
+        kind: What it is, which says how large it may be.
+        empty_sections: Whether a key of the first level may have nothing behind it, as a section all of whose keys
+            are comments.
 
     Raises:
         ConfigError: The file cannot be read, is too large, is not UTF-8, or is not in the accepted subset.
@@ -98,12 +104,12 @@ def load_yaml(path: Path, kind: Kind = YAML) -> Document:
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise ConfigError("is not UTF-8 text", where=f"{path}:{line}:1", hint="save it as UTF-8") from None
-    return parse_yaml(text, where=str(path))
+    return parse_yaml(text, where=str(path), empty_sections=empty_sections)
 
 
-def parse_yaml(text: str, *, where: str) -> Document:
+def parse_yaml(text: str, *, where: str, empty_sections: bool = False) -> Document:
     """Parse YAML text; `where` names it in messages."""
-    builder = _Builder(where)
+    builder = _Builder(where, empty_sections)
     try:
         for event in yaml.parse(text, Loader=_Loader):
             builder.take(event)
@@ -142,6 +148,20 @@ def resolve_scalar(text: str) -> Any:
     return text
 
 
+def plain_number(text: str) -> float:
+    """The number that a text is in options and tables: decimal digits, as in files.
+
+    Python also reads `1_0`, digits of other scripts, `nan` and `inf`, which nobody writes on purpose.
+
+    Raises:
+        ValueError: It is none, or not finite.
+    """
+    number = float(text) if _FLOAT.fullmatch(text.strip()) else math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{text!r} is no finite number")
+    return number
+
+
 @dataclass
 class _Frame:
     """A collection that is being read."""
@@ -164,8 +184,8 @@ class _Anchor:
 class _Builder:
     """Turns parser events into values: one pass, no recursion, so that depth cannot exhaust the stack."""
 
-    def __init__(self, where: str) -> None:
-        self.where = where
+    def __init__(self, where: str, empty_sections: bool) -> None:
+        self.where, self.empty_sections = where, empty_sections
         self.root: Any = None
         self.keys: dict[KeyPath, Position] = {}
         self.values: dict[KeyPath, Position] = {}
@@ -227,7 +247,10 @@ class _Builder:
             name = ".".join(map(str, self._next_path()))
             raise self._error(event, f"{name}: {error}" if name else str(error)) from None
         self._count(event, 1)
-        self._put(value, event)
+        path = self._put(value, event)
+        if plain and not event.value and len(path) > self.empty_sections:
+            name = ".".join(map(str, path))
+            raise self._error(event, f"{name} has no value", "a value, or null for none", "leave the key out")
         if event.anchor:
             self._anchors[event.anchor] = _Anchor(value, 1, 0)
 

@@ -241,12 +241,12 @@ def schema_of(kind: str, task: Task | None = None) -> dict[str, Any]:
     if kind == "config":
         return _config_schema(task)
     if kind == "constraints":
-        # The schema of `constrain --constraints FILE`, whose keys may all be left empty
+        # The schema of `constrain --constraints FILE`, whose keys may all be left out, and not left empty
         schema = Constraints.model_json_schema()
         for part in (schema, *schema.get("$defs", {}).values()):
-            for name, value in part.get("properties", {}).items():
-                if name not in part.get("required", ()):
-                    part["properties"][name] = {"anyOf": [value, NULL]}
+            for value in part.get("properties", {}).values():
+                if "anyOf" in value:
+                    value["anyOf"] = [one for one in value["anyOf"] if one != NULL]
         return {
             "$schema": DIALECT,
             "$id": "urn:lidardesign:constraints:1",

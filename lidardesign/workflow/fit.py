@@ -8,16 +8,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from lidardesign.config import apply_override, parse_override
+from lidardesign.config import MAX_SEED, apply_override, parse_override, with_task_settings
 from lidardesign.design.catalog.library import named_parts
-from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.document import MOST_FITTED, Constraints
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import is_mounted, snap_to_space
 from lidardesign.design.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
 from lidardesign.design.layouts.layout import Layout
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, layout_of
-from lidardesign.design.sensor import FITTED_LAYOUTS, LEVELS, DesignSpec, Gates
-from lidardesign.errors import ConfigError, check_choice
+from lidardesign.design.sensor import FITTED_LAYOUTS, LEVELS, MOST_RAYS, DesignSpec, Gates
+from lidardesign.errors import ConfigError, check_choice, check_number
 from lidardesign.run.manifest import verify
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
 from lidardesign.selection.information import informs_rays
@@ -91,6 +91,15 @@ class FitOptions:
             check_choice(self.layout, "--layout", FITTED_LAYOUTS)
         if self.gates is not None:
             check_choice(self.gates, "--gates", get_args(Gates))
+        if self.sensors not in (None, BEST, "auto", *range(1, MOST_FITTED + 1)):
+            allowed = f"a whole number from 1 to {MOST_FITTED}, best or auto"
+            raise ConfigError(repr(self.sensors), where="--sensors", allowed=allowed)
+        limits = {"rays": (1, MOST_RAYS), "channels": (1, MOST_FITTED), "seed": (0, MAX_SEED)}
+        for name, (low, high) in limits.items():
+            if getattr(self, name) is not None:
+                check_number(getattr(self, name), f"--{name}", low, high, whole=True)
+        if self.level is not None:
+            check_number(self.level, "--level", *LEVELS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +193,9 @@ class FitRequest:
             raise ConfigError("a gate per ray in the layout spinning", where="--gates", allowed="sensor")
         usual_level = CHOSEN_LEVEL if LAYOUTS[layout].chosen_on_scenes else defaults.level
         level = options.level if options.level is not None else base.level if base else usual_level
-        if not LEVELS[0] <= level <= LEVELS[1]:
-            raise ConfigError(f"{level:g}", where="--level", allowed=f"{LEVELS[0]:g} to {LEVELS[1]:g}")
+        weighting = _weighting(settings_texts(options.weights), base)
+        if weighting.settings:
+            with_task_settings(run.task, run.config, weighting.settings, option=weighting.origin)
         most_rays = None if LAYOUTS[layout].leaves_rays_open(options.gates) else max(defaults.rays)
         return cls(
             run,
@@ -200,7 +210,7 @@ class FitRequest:
                 "gates": options.gates or _own_gates(base, layout),
                 "level": level,
             },
-            _weighting(settings_texts(options.weights), base),
+            weighting,
             channels,
             names,
             "fit" if asked is None else "constrain",

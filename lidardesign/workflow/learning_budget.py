@@ -82,7 +82,7 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
     if STEPS_KEY in keys:
         raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
     if path is not None:
-        document, key = load_yaml(path), tuple(STEPS_KEY.split("."))
+        document, key = load_yaml(path, empty_sections=True), tuple(STEPS_KEY.split("."))
         if key in dict(leaves(document.value)):
             where = f"{TIME_BUDGET}, {document.locate(key)}"
             raise ConfigError(f"the time decides {STEPS_KEY}", where=where, hint=f"leave out {STEPS_KEY} there")

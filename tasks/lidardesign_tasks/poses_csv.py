@@ -20,6 +20,7 @@ from lidardesign.errors import DataError
 from lidardesign.geometry.frames import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.run.arrays import csv_rows
 from lidardesign.run.inputs import TABLE
+from lidardesign.run.yaml import plain_number
 from lidardesign.scene import rigid
 from lidardesign.space import FARTHEST_M
 from lidardesign_tasks.pose import rotation_matrix
@@ -127,7 +128,7 @@ class _Row:
     def number(self, name: str, largest: float) -> float:
         cell = self.cells[self.names.index(name)]
         try:
-            value = float(cell)
+            value = plain_number(cell)
         except ValueError:
             value = math.nan
         if not abs(value) <= largest:

@@ -134,7 +134,7 @@ MISTAKES = [
     ("fit run --at x_m=here", 2, "NAME=VALUE"),
     ("fit run --at x_m=nan", 2, "finite"),
     ("fit run --at x_m=inf", 2, "finite"),
-    ("fit run --at x_m=1_0", 2, "0 to 1"),
+    ("fit run --at x_m=1_0", 2, "finite number"),
     ("fit run --at x_m=0.1 --at x_m=0.2", 2, "twice"),
     ("fit run --at x_m=1.01", 2, "0 to 1"),
     ("fit run --at y_m=0", 2, "x_m"),

@@ -78,7 +78,7 @@ def test_what_is_chosen_is_set_and_all_else_is_not(lidardesign, tmp_path):
     result = lidardesign("config", "init", "flatland", *chosen)
     path = tmp_path / "flat.yaml"
     path.write_text(result.out)
-    assert parse_yaml(result.out, where="text").value == {
+    assert parse_yaml(result.out, where="text", empty_sections=True).value == {
         "schema_version": 1,
         "task_name": "flatland",
         "seed": 7,
@@ -117,7 +117,7 @@ def test_no_word_of_a_task_leaves_its_comment(summary, description, unit):
         defaults=SimpleNamespace(density={}, learning={}),
     )
     text = config_text(task, default_document(task, "draft"), "draft")
-    assert parse_yaml(text, where="text").value == {
+    assert parse_yaml(text, where="text", empty_sections=True).value == {
         "schema_version": 1, "task_name": "odd", "task": None, "space": None, "density": None, "learning": None
     }  # fmt: skip
 
@@ -143,7 +143,7 @@ def test_schemas_are_schemas_and_are_printed_as_such(lidardesign, kind):
 @each_row("name", TASKS)
 def test_a_configuration_that_is_resolved_is_valid(name, tmp_path):
     task = load_task(name)
-    document = parse_yaml(uncommented(written(task, tmp_path).read_text()), where="text").value
+    document = parse_yaml(uncommented(written(task, tmp_path).read_text()), where="text", empty_sections=True).value
     document["space"] = None if name in WITHOUT_DEFAULTS else document["space"]
     assert accepts(schema_of("config", task), document)
     assert accepts(schema_of("config"), document)

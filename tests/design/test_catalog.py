@@ -619,7 +619,7 @@ def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
         (("--out", "o.yaml", "--at-origin", "1,2"), "three numbers"),
         (("--out", "o.yaml", "--at-origin", "1,2,nan"), "three numbers"),
         (("--out", "o.yaml", "--elevation-deg", "91"), "-90 to 90"),
-        (("--out", "o.yaml", "--azimuth-deg", "nan"), "-360 to 360"),
+        (("--out", "o.yaml", "--azimuth-deg", "361"), "-360 to 360"),
         (("--out", "o.yaml", "--arrange", "beside"), "is for several parts"),
         (("--out", "o.yaml", "--arrange", "stacked", "--parts", "2"), "interleaved"),
         (("--out", "o.yaml", "--parts", "2", "--rays", "129"), "129 rays of 2 x vl53l8cx"),

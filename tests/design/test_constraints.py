@@ -176,9 +176,28 @@ def test_a_document_holds_what_was_given_and_no_more():
     assert Constraints().as_document() == {}
 
 
-def test_empty_sections_say_nothing():
-    assert Constraints.from_mapping({"gate": None, "sensors": {"count": None}}).as_document() in ({}, {"sensors": {}})
-    assert Constraints.from_mapping(None).as_document() == {}
+@each_row(
+    ("values", "name"),
+    [
+        ({"gate": None}, "gate"),
+        ({"gate": {"width_m": {"max": None}}}, "gate.width_m.max"),
+        ({"sensors": {"count": None}}, "sensors.count"),
+        ({"parts": None}, "parts"),
+        ({"parts": {"each": None}}, "parts.each"),
+        ({"parts": {"each": {"vl53l8cx": None}}}, "parts.each.vl53l8cx"),
+        ({"each": [None]}, "each.0"),
+        ({"each": [{"origin": {"fixed_m": [0, None, 0]}}]}, "each.0.origin.fixed_m.1"),
+        ({"origin": {"exclude": None}}, "origin.exclude"),
+        ({"budget": {"rays": None}}, "budget.rays"),
+    ],
+)
+def test_a_key_without_a_value_drops_no_constraint(values, name):
+    with pytest.raises(ConfigError, match=f"{name} has no value"):
+        Constraints.from_mapping(values)
+
+
+def test_no_constraints_say_nothing():
+    assert Constraints.from_mapping(None).as_document() == Constraints.from_mapping({}).as_document() == {}
 
 
 def test_exact_bounds_are_exact_without_any_tolerance():

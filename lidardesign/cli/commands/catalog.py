@@ -200,6 +200,7 @@ def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> Des
 
     from lidardesign.design.catalog.library import Pose, interleaved, part_design, parts_for, side_by_side
     from lidardesign.design.sensor import MOST_RAYS
+    from lidardesign.run.yaml import plain_number
     from lidardesign.space import FARTHEST_M
 
     count, number = given["--rays"], given["--parts"]
@@ -214,7 +215,7 @@ def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> Des
             raise ConfigError(f"found {value:g}", where=option, allowed=f"-{most} to {most} degrees")
     text = given["--at-origin"]
     try:
-        origin = np.array([float(item) for item in (text or "0,0,0").split(",")])
+        origin = np.array([plain_number(item) for item in (text or "0,0,0").split(",")])
     except ValueError:
         origin = np.zeros(0)
     if origin.shape != (3,) or not (np.abs(origin) <= FARTHEST_M).all():

@@ -191,6 +191,7 @@ def evaluate(
             "--scenes-seed",
             metavar="N",
             min=0,
+            max=options.MOST_SEED,
             help="Root of the held-out scenes.",
             show_default="--seed, or the (first) run's",
         ),

@@ -32,8 +32,9 @@ from pydantic import (
 )
 
 from lidardesign.design.sensor import MOST_RAYS
-from lidardesign.errors import ConfigError
+from lidardesign.errors import UNSET_HINT, ConfigError
 from lidardesign.run.validation import check_model
+from lidardesign.run.yaml import leaves
 
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Distance = Annotated[float, Field(ge=0)]
@@ -266,8 +267,12 @@ class Constraints(SensorConstraints):
         def named(path: tuple[str | int, ...], *, key: bool = False) -> str:
             return where
 
-        # YAML writes an empty section as null; it says nothing
-        return check_model(cls, _without_empty(dict(values or {})), locate or named)
+        values, locate = dict(values or {}), locate or named
+        for path, value in leaves(values):
+            if value is None:
+                name = ".".join(map(str, path))
+                raise ConfigError(f"{name} has no value", where=locate(path), allowed="a value", hint=UNSET_HINT)
+        return check_model(cls, values, locate)
 
     @cached_property
     def rules(self) -> tuple[SensorRules, ...]:
@@ -301,8 +306,3 @@ def _key_paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
         yield prefix + key
         if isinstance(value, Mapping):
             yield from _key_paths(value, f"{prefix}{key}.")
-
-
-def _without_empty(values: dict[str, Any]) -> dict[str, Any]:
-    given = {key: value for key, value in values.items() if value is not None}
-    return {key: _without_empty(value) if isinstance(value, dict) else value for key, value in given.items()}

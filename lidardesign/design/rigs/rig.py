@@ -26,6 +26,7 @@ from lidardesign.design.sensor import (
 from lidardesign.errors import DataError
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.validation import is_name
+from lidardesign.run.yaml import plain_number
 from lidardesign.space import FARTHEST_M, FULL_TURN, angles, direction
 
 # Rounds in which a boresight moves to the middle of its field: away from the poles it rests after two or three.
@@ -171,7 +172,7 @@ def _check_numbers(one: RigSensor, path: Path) -> None:
 def number_of(text: str) -> float | None:
     """The number that a cell holds; None where it is none."""
     try:
-        return float(text)
+        return plain_number(text)
     except ValueError:
         return None
 

@@ -50,6 +50,7 @@ from lidardesign.evaluate.baselines.views import TrainingViews, dense_points
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import effective_count, systematic_draw
 from lidardesign.run.clock import phase
+from lidardesign.run.yaml import plain_number
 from lidardesign.samples import Samples
 from lidardesign.space import AZIMUTH, DIMENSIONS, FARTHEST_M, RANGE, DesignSpace, aim, observed_point
 from lidardesign.task import random_generator
@@ -285,7 +286,7 @@ def split_argument(argument: str) -> tuple[Part, Pose | None]:
     if not at:
         return part, None
     try:
-        numbers = [float(one) for one in text.split(",")]
+        numbers = [plain_number(one) for one in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in (5, 6) or not np.isfinite(numbers).all() or abs(numbers[4]) > 90:

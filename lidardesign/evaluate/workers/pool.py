@@ -149,7 +149,7 @@ def _undisturbed() -> Iterator[None]:
         sys.modules["__main__"] = script
 
 
-ADDRESS = re.compile(r"tcp://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):(\d{1,5})")
+ADDRESS = re.compile(r"tcp://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
 MOST_PROCESSES = 1024
 ALLOWED = f"a whole number from 1 to {MOST_PROCESSES}, or tcp://HOST:PORT of a dask scheduler"
 # How often somebody looks whether there is still a worker, while none answers.
@@ -237,7 +237,7 @@ def check_workers(text: str) -> int | str:
     address = ADDRESS.fullmatch(text.strip())
     if address and 0 < int(address.group(2)) <= 65_535:
         return text.strip()
-    if re.fullmatch(r"\d{1,9}", text.strip()) and 1 <= int(text) <= MOST_PROCESSES:
+    if re.fullmatch("[0-9]{1,9}", text.strip()) and 1 <= int(text) <= MOST_PROCESSES:
         return int(text)
     raise ConfigError(f"{text!r}", where="--workers", allowed=ALLOWED)
 

@@ -15,6 +15,7 @@ from lidardesign.mujoco_model import import_mujoco
 from lidardesign.run.arrays import csv_rows, read_npz
 from lidardesign.run.inputs import TABLE
 from lidardesign.run.validation import suggest
+from lidardesign.run.yaml import plain_number
 
 if TYPE_CHECKING:
     import mujoco
@@ -166,7 +167,7 @@ def _read(path: Path, changed_ns: int, size: int) -> Mapping[str, np.ndarray]:
 
 def _number(path: Path, name: str, line: int, cell: str) -> float:
     try:
-        return float(cell)
+        return plain_number(cell)
     except ValueError:
         raise DataError(f"{name} is {cell.strip()[:60]!r}", where=f"{path}:{line}", allowed="a number") from None
 
