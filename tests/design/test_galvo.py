@@ -239,9 +239,9 @@ BROKEN = {
     "an empty file": (lambda text: "", "no ray list"),
     "a unit of another kind": (lambda text: text.replace("x_deg", "x_rad"), "no ray list"),
     "a ray twice": (lambda text: text + text.splitlines()[1] + "\n", "there twice"),
-    "a row cut short": (lambda text: text[:-9], "line 61"),
-    "no number": (lambda text: text.replace(",0.4,", ",wide,", 1), "line 2.*wide"),
-    "NaN": (lambda text: text.replace(",0.4,", ",nan,", 1), "line 2"),
+    "a row cut short": (lambda text: text[:-9], ":61: "),
+    "no number": (lambda text: text.replace(",0.4,", ",wide,", 1), ":2: .*wide"),
+    "NaN": (lambda text: text.replace(",0.4,", ",nan,", 1), ":2: "),
     "a negative gate": (
         lambda text: text[: text.rindex("\n", 0, -1)] + "\n59,0,0,0,0,0,0,0,0,-5,1,0,59\n",
         "gate_start",
