@@ -203,8 +203,10 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
         DataError: The design has no rays, or the file cannot be written.
     """
     require_rays(design, rays, "a lidar's configuration")
-    # uint32 there: every frame rate that exports take has fewer microseconds in a frame
+    # uint32 there: every frame rate that exports take has fewer microseconds in a frame; the last are not rounded into
+    # the next frame
     times_us = np.rint(fire_times_s(rays, rate_hz) * MICROSECONDS_PER_S)
+    times_us = np.minimum(times_us, math.ceil(MICROSECONDS_PER_S / rate_hz) - 1)
     cycle_ns = round(NANOSECONDS_PER_S / rate_hz)
     mounted = mounts(design, rays)
     found = places(mounted, rays)

@@ -10,6 +10,10 @@ and `mounts.json`: names, places [m] and quaternions (w, x, y, z), as its comman
 USD, in its text form: attributes have the names and types of OmniSensorGenericLidarCoreAPI. `reportRateBaseHz` became
 `patternFiringRateHz` in version 6: both are written. Each prim is posed by translate and orient ops below one Xform,
 in metres, z up.
+
+NVIDIA's documentation wants a sensor's near range above its range offset and its least distance between echos, which
+are 0, so gates start at a millimetre or more. What a range resolution of 0 does is not documented: 0.1 mm is
+written.
 """
 
 from __future__ import annotations
@@ -37,6 +41,9 @@ from lidardesign.space import direction
 NANOSECONDS_PER_SECOND = 1_000_000_000
 # Isaac counts nanoseconds of a frame as signed 32-bit numbers, and frames per second as whole numbers.
 SLOWEST_HZ = 1
+LEAST_START_M, RESOLUTION_M = 0.001, 0.0001
+# Returns of less than a tenth are lost beyond this range, or beyond the last gate.
+LEAST_REFLECTANCE, LEAST_REFLECTANCE_RANGE_M = 0.1, 270.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +66,7 @@ class Emitters:
 
 def emitters_of(mount: Mount, rays: Rays, rate_hz: int) -> Emitters:
     """The emitters of a mounted sensor."""
-    ranges, range_id = np.unique(rays.gate_m[mount.ray], axis=0, return_inverse=True)
+    ranges, range_id = np.unique(np.maximum(rays.gate_m[mount.ray], LEAST_START_M), axis=0, return_inverse=True)
     return Emitters(
         np.degrees(mount.azimuth_rad).astype(np.float32),
         np.degrees(mount.elevation_rad).astype(np.float32),
@@ -87,6 +94,12 @@ def isaac_losses(design: DesignSpec, mounted: Sequence[Mount], rate_hz: float) -
     notes = [*design_losses(design, mounted), *origin_losses(mounted)]
     if whole_rate_hz(rate_hz) != rate_hz:
         notes.append(f"frame rates are whole numbers there: {rate_hz:g} Hz is {whole_rate_hz(rate_hz)} Hz")
+    near = sum(one.gate_m[0] < LEAST_START_M for one in mounted)
+    if near:
+        notes.append(
+            f"gates of {near} of {len(mounted)} sensors start below {LEAST_START_M:g} m: they start there, for Isaac's "
+            "near ranges are above 0"
+        )
     notes.append("angles and lengths are kept in single precision, firing times in whole nanoseconds")
     return [*notes, *renamed_note([one.sensor.name for one in mounted], [one.name for one in mounted])]
 
@@ -157,11 +170,9 @@ OPTICS = {
     "effectiveApertureSize": 0.0145,
     "focusDistM": 0.16,
     "avgPowerW": 0.002,
-    "minReflectance": 0.1,
     "wavelengthNm": 1550.0,
     "pulseTimeNs": 6,
 }
-LEAST_REFLECTANCE_RANGE_M = 270.0
 
 
 def write_isaac_json(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
@@ -209,7 +220,7 @@ def file_name(mount: Mount) -> str:
 
 def _profile(mount: Mount, rays: Rays, rate_hz: int) -> dict[str, Any]:
     held, count = emitters_of(mount, rays, rate_hz), len(mount.ray)
-    near, far = mount.gate_m
+    near, far = np.maximum(mount.gate_m, LEAST_START_M).tolist()
     state = {
         "azimuthDeg": [float(str(value)) for value in held.azimuth_deg],
         "elevationDeg": [float(str(value)) for value in held.elevation_deg],
@@ -228,9 +239,10 @@ def _profile(mount: Mount, rays: Rays, rate_hz: int) -> dict[str, Any]:
         "farRangeM": far,
         # returns nearer than this are lost
         "minDistBetweenEchos": 0.0,
-        "rangeResolutionM": 0.0,
+        "rangeResolutionM": RESOLUTION_M,
         "rangeAccuracyM": 0.0,
         **OPTICS,
+        "minReflectance": LEAST_REFLECTANCE,
         "minReflectanceRange": max(LEAST_REFLECTANCE_RANGE_M, far),
         "maxReturns": 1,
         "scanRateBaseHz": float(rate_hz),
@@ -340,7 +352,7 @@ def _prim(mount: Mount, rays: Rays, rate_hz: int) -> list[str]:
 
 def _attributes(mount: Mount, held: Emitters, rate_hz: int) -> list[tuple[str, str, str]]:
     """Type, name and value of what holds for all emitters of a sensor, then of the arrays of their state."""
-    count, (near, far) = len(mount.ray), mount.gate_m
+    count, (near, far) = len(mount.ray), np.maximum(mount.gate_m, LEAST_START_M).tolist()
     core = [
         ("token", "scanType", '"SOLID_STATE"'),
         ("token", "rayType", '"IDEALIZED"'),
@@ -361,6 +373,9 @@ def _attributes(mount: Mount, held: Emitters, rate_hz: int) -> list[tuple[str, s
         # a design says nothing of errors: there are none
         *(("float", f"{axis}Error{what}", "0") for axis in ("azimuth", "elevation") for what in ("Mean", "Std")),
         ("float", "rangeAccuracyM", "0"),
+        ("float", "rangeResolutionM", _single(RESOLUTION_M)),
+        ("float", "minReflectance", _single(LEAST_REFLECTANCE)),
+        ("float", "minReflectionRangeM", _single(max(LEAST_REFLECTANCE_RANGE_M, far))),
     ]
     state = [
         ("float[]", "azimuthDeg", _singles(held.azimuth_deg)),
@@ -374,6 +389,7 @@ def _attributes(mount: Mount, held: Emitters, rate_hz: int) -> list[tuple[str, s
     return [
         ("string", "omni:sensor:marketName", quoted(mount.sensor.name)),
         ("float", "omni:sensor:tickRate", str(rate_hz)),
+        ("double2", "omni:sensor:frameRate", f"({rate_hz}, 1)"),
         *((kind, CORE + name, value) for kind, name, value in core),
         *((kind, STATE + name, value) for kind, name, value in state),
     ]

@@ -195,6 +195,8 @@ SCENE_SUFFIX = ".xml"
 SAMPLES = 64
 # From the light to a surface and back to the sensor.
 DEPTH = 2
+# Dr.Jit counts the numbers of an array with 32 bits.
+MOST_NUMBERS = 2**32 - 1
 
 
 def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
@@ -212,6 +214,11 @@ def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         f"the light is one flash for all rays: only light straight there and back (max_depth {DEPTH}) is the ray's own",
         f"gates end on whole bins of {MM_PER_M * Bandwidth().bin_m:.1f} mm; times within the frame are not held",
     ]
+    largest = max(len(one.ray) * _bins(rays, one) for one in found)
+    if largest > MOST_NUMBERS:
+        notes.append(
+            f"a film of {largest:.2g} numbers is more than Mitsuba holds: shorten its gates, or fire fewer rays"
+        )
     # a film has one gate
     wider = np.concatenate([np.abs(rays.gate_m[one.ray] - _gate_m(rays, one)).max(axis=1) for one in found])
     if wider.any():
@@ -228,6 +235,11 @@ def _gate_m(rays: Rays, place: Place) -> tuple[float, float]:
     """The narrowest gate that holds those of all rays of a place: start and end."""
     gate = rays.gate_m[place.ray]
     return float(gate[:, 0].min()), float(gate[:, 1].max())
+
+
+def _bins(rays: Rays, place: Place) -> int:
+    start, end = _gate_m(rays, place)
+    return int(Bandwidth().bins(end - start))
 
 
 def _scene(place: Place, rays: Rays) -> Element:
@@ -253,15 +265,14 @@ def _scene(place: Place, rays: Rays) -> Element:
 
 def _add_film(batch: Element, place: Place, rays: Rays) -> None:
     """One pixel per ray, and the gate that they share as optical path lengths."""
-    readout = Bandwidth()
-    start, end = _gate_m(rays, place)
+    start, _ = _gate_m(rays, place)
     film = child(batch, "film", type="transient_hdr_film")
     for name, value in (
-        ("width", len(place.ray)), ("height", 1), ("temporal_bins", int(readout.bins(end - start))),
+        ("width", len(place.ray)), ("height", 1), ("temporal_bins", _bins(rays, place)),
     ):  # fmt: skip
         child(film, "integer", name=name, value=value)
     child(film, "float", name="start_opl", value=2 * start)
-    child(film, "float", name="bin_width_opl", value=2 * readout.bin_m)
+    child(film, "float", name="bin_width_opl", value=2 * Bandwidth().bin_m)
     child(film, "rfilter", type="box")
 
 

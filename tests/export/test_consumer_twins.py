@@ -270,3 +270,40 @@ def test_a_grid_that_no_gpu_draws_is_told(tmp_path):
     rays = Rays(np.zeros((count, 3)), local, np.tile([0.0, 9.0], (count, 1)), np.zeros(count), np.zeros(count))
     notes = EXPORTERS["sdf"].write(ONE, rays, tmp_path / "out.sdf")
     assert any(note.startswith("1 of 1 sensors have more than 16384 columns or rows") for note in notes)
+
+
+# Robotec GPU Lidar --------------------------------------------------------------------------------------------------
+
+# RGLGazeboPlugin: Lidar.cc, LidarPatternLoader.cc; RobotecGPULidar: src/graph/SetRangeRaysNode.cpp
+
+
+@each_row("rate_hz", [0.001, 29.97, 1e6])
+def test_rgl_takes_patterns_ranges_and_rates_at_their_ends(tmp_path, rate_hz):
+    gates_m = np.array([[0, 0], [0, 1e-9], [0.3, 0.3 + 1e-12], [1e-30, 1e9]])
+    EXPORTERS["rgl"].write(ONE, rays_with_gates(gates_m), tmp_path / "out", rate_hz)
+    plugin = ElementTree.parse(tmp_path / "out" / "model.sdf").find("model/link/sensor/plugin")
+    assert {"update_rate", "range", "topic", "frame", "pattern_preset_path"} <= {one.tag for one in plugin}
+    whole = np.array([[SINGLE(plugin.findtext(f"range/{name}")) for name in ("min", "max")]])
+    own = np.fromfile(tmp_path / "out" / "one.range2f", SINGLE).reshape(-1, 2)
+    assert len(own) == len(gates_m)
+    for ranges in (whole, own):
+        assert np.isfinite(ranges).all()
+        assert (ranges[:, 0] >= 0).all()
+        assert (ranges[:, 0] <= ranges[:, 1]).all()
+    size = (tmp_path / "out" / "one.mat3x4f").stat().st_size
+    assert size > 0
+    assert size % 48 == 0
+    # the plugin counts whole microseconds between frames
+    assert int(1e6 / SINGLE(plugin.findtext("update_rate"))) >= 1
+
+
+# Mitsuba ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_film_that_mitsuba_cannot_hold_is_told(tmp_path):
+    def told(end_m):
+        notes = EXPORTERS["mitsuba"].write(ONE, rays_with_gates(np.array([[0.0, end_m]] * 4)), tmp_path / "out")
+        return any("more than Mitsuba holds" in note for note in notes)
+
+    assert not told(1e7)
+    assert told(2e7)

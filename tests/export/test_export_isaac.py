@@ -63,7 +63,8 @@ CORE_TYPES = {
          "maxReturns", "numLines", "rangeCount"), "uint"),
     **dict.fromkeys(
         ("nearRangeM", "farRangeM", "minDistBetweenEchosM", "azimuthErrorMean", "azimuthErrorStd",
-         "elevationErrorMean", "elevationErrorStd", "rangeAccuracyM"), "float"),
+         "elevationErrorMean", "elevationErrorStd", "rangeAccuracyM", "rangeResolutionM", "minReflectance",
+         "minReflectionRangeM"), "float"),
     **dict.fromkeys(("rangesMinM", "rangesMaxM"), "float[]"),
     "numRaysPerLine": "uint[]",
     **dict.fromkeys(("emitterState:s001:azimuthDeg", "emitterState:s001:elevationDeg"), "float[]"),
@@ -114,7 +115,7 @@ def turn_of(w, x, y, z):
 def check_emitters(state, ranges, rays, turn):
     """That emitters are a sensor's rays, one by one."""
     np.testing.assert_allclose(world(state, turn), rays.direction, atol=2e-7)
-    np.testing.assert_allclose(np.array(ranges)[list(state["rangeId"])], rays.gate_m, atol=3e-7)
+    np.testing.assert_allclose(np.array(ranges)[list(state["rangeId"])], np.maximum(rays.gate_m, 0.001), atol=3e-7)
     times = np.array(state["fireTimeNs"], dtype=np.int64)
     assert (np.abs(times - rays.time_s * 1e9) <= 1).all()
     assert times.max() < 100_000_000
@@ -132,7 +133,9 @@ def test_profiles_have_the_fields_and_types_of_nvidias(profiles):
         assert len(body["numRaysPerLine"]) == body["numLines"] == 1
         assert sorted(state["channelId"]) == list(range(count))
         assert len(body["ranges"]) == body["rangeCount"] == max(state["rangeId"]) + 1
-        assert body["minDistBetweenEchos"] <= body["nearRangeM"]
+        # both by NVIDIA's documentation of profiles
+        assert 0 == body["minDistBetweenEchos"] < body["nearRangeM"]
+        assert body["rangeResolutionM"] > 0
 
 
 def test_profiles_hold_every_ray_with_its_gate(profiles):
@@ -142,7 +145,7 @@ def test_profiles_hold_every_ray_with_its_gate(profiles):
         ranges = [(one["min"], one["max"]) for one in body["ranges"]]
         check_emitters(body["emitterStates"][0], ranges, mine, turn_of(*mount["orientation_wxyz"]))
         np.testing.assert_allclose(mount["translation_m"], mine.origin_m.mean(axis=0), atol=1e-12)
-        assert body["nearRangeM"] == mine.gate_m[:, 0].min()
+        assert body["nearRangeM"] == max(mine.gate_m[:, 0].min(), 0.001)
         assert body["farRangeM"] == mine.gate_m[:, 1].max()
 
 
@@ -167,7 +170,10 @@ def test_usd_has_an_omnilidar_per_sensor_with_the_schemas_types(stage):
         assert sum(core["numRaysPerLine"].Get()) == core["numberOfEmitters"].Get() == count
         assert sorted(core["emitterState:s001:channelId"].Get()) == list(range(1, count + 1))
         assert len(core["rangesMinM"].Get()) == len(core["rangesMaxM"].Get()) == core["rangeCount"].Get()
-        assert core["minDistBetweenEchosM"].Get() <= core["nearRangeM"].Get()
+        assert 0 == core["minDistBetweenEchosM"].Get() < core["nearRangeM"].Get()
+        assert core["rangeResolutionM"].Get() > 0
+        assert core["minReflectionRangeM"].Get() >= core["farRangeM"].Get()
+        assert list(prim.GetAttribute("omni:sensor:frameRate").Get()) == [10, 1]
 
 
 def test_usd_places_every_ray_with_its_gate(stage):

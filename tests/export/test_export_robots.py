@@ -355,7 +355,8 @@ def test_what_a_format_holds_comes_back(exported, name):
         assert any("gates of their own" in note for note in notes)
     else:
         assert found["direction_rad"].error < 1e-6
-        assert found["gate_m"].error < 1e-6
+        # Isaac's start a millimetre late too
+        assert found["gate_m"].error == pytest.approx(0.001 * name.startswith("isaac"), abs=1e-6)
         assert found["time_s"].error < 1.01e-9
         assert not any("gates of their own" in note for note in notes)
 

@@ -346,6 +346,18 @@ def test_osi_times_follow_the_frame_rate(tmp_path):
     assert EXPORTERS["osi"].rounding(DESIGN, rays, path)["time_s"].error <= 0.5e-6 + EXACT
 
 
+@each_row("rate_hz", [0.001, 10.0, 30.0, 1e6])
+def test_osi_fires_nothing_in_the_next_frame(tmp_path, rate_hz):
+    rays = CASES["mounted"]
+    late = Rays(rays.origin_m, rays.direction, rays.gate_m, rays.sensor, np.linspace(0, 0.1, len(rays), endpoint=False))
+    late.time_s[-1] = np.nextafter(0.1, 0)
+    EXPORTERS["osi"].write(DESIGN, late, tmp_path / "out.json", rate_hz=rate_hz)
+    whole = json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))
+    times_us = [time for lidar in whole["lidarSensorViewConfiguration"] for time in lidar["timings"]]
+    assert 0 <= min(times_us) <= max(times_us) < min(1e6 / rate_hz, 2**32)
+    assert max(times_us) >= 1e6 / rate_hz - 1
+
+
 @each_row("rate_hz", [1e-5, 1e10])
 def test_osi_refuses_frames_whose_times_it_cannot_count(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match="rate-hz"):
