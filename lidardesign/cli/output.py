@@ -1,20 +1,16 @@
-"""What commands print and how they end: one JSON document or text for people, messages, exit codes.
-
-Files that a command will write: `-` for standard output, pages, and folders that are not there yet.
-"""
+"""What commands print and how they end: one JSON document or text for people, messages, exit codes."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import io
 import json
 import math
 import os
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -112,17 +108,39 @@ class Output:
         Arguments:
             document: The JSON form; `timings` and `peak_memory_bytes` are added.
             show: Prints the result for people.
-            show_costs: Whether people are shown the times: not by commands that only look something up.
+            show_costs: Whether people are shown the times, and the result is kept where it cannot be shown: not by
+                commands that only look something up.
+
+        Raises:
+            OSError: Standard output is full, or was closed.
         """
-        timings = self.clock.timings()
-        if self.json:
-            self.answered = True
-            print_json({**document, "timings": timings, "peak_memory_bytes": peak_memory_bytes()}, self.stream)
-            return
-        rich = self.rich()
-        show(rich)
-        if show_costs and not self.quiet:
-            show_times(timings, peak_memory_bytes(), rich)
+        document = {**document, "timings": self.clock.timings(), "peak_memory_bytes": peak_memory_bytes()}
+        try:
+            if self.json:
+                self.answered = True
+                print_json(document, self.stream)
+            else:
+                rich = self.rich()
+                show(rich)
+                if show_costs and not self.quiet:
+                    show_times(document["timings"], document["peak_memory_bytes"], rich)
+                self.stream.flush()
+        except (OSError, SystemExit) as error:
+            if show_costs:  # it was worked for
+                self.keep(f"{json_text(document)}\n", ".json")
+            # rich ends the process by itself where nobody reads
+            raise error if isinstance(error, OSError) else BrokenPipeError from None
+
+    def keep(self, content: str, suffix: str) -> None:
+        """Keep what cannot be put where it belongs in a temporary file, and say where; without room, print it."""
+        try:
+            descriptor, place = tempfile.mkstemp(prefix="lidardesign-", suffix=suffix)
+            with open(descriptor, "w", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(content)
+        except OSError:
+            print_message(content)
+        else:
+            print_message(f"what could not be written is kept in {place}")
 
     @contextlib.contextmanager
     def progress(self, label: str, *columns: str) -> Iterator[Progress | None]:
@@ -149,8 +167,12 @@ def print_message(text: str) -> None:
 
 def print_json(document: dict[str, Any], output: TextIO | None = None) -> None:
     """Print the one JSON document of a command, on stdout."""
-    text = json.dumps({"schema_version": SCHEMA_VERSION, **plain_json(document)}, allow_nan=False, indent=2)
-    print(text, file=output or sys.stdout, flush=True)
+    print(json_text(document), file=output or sys.stdout, flush=True)
+
+
+def json_text(document: dict[str, Any]) -> str:
+    """The one JSON document of a command."""
+    return json.dumps({"schema_version": SCHEMA_VERSION, **plain_json(document)}, allow_nan=False, indent=2)
 
 
 @contextlib.contextmanager
@@ -314,106 +336,3 @@ def show_plan(plan: RequestPlan, output: Output) -> None:
     lines.append("nothing was done: leave out --dry-run to do it")
 
     output.result(document, lambda rich: rich.print("\n".join(lines), soft_wrap=True), show_costs=False)
-
-
-def claim_stdout(output: Output, *, dry_run: bool = False, **files: Path | None) -> None:
-    """Give standard output to the file that is `-`, if one is; people then read all else on stderr, or nowhere with
-    --quiet.
-
-    Arguments:
-        output: The command's.
-        dry_run: Whether the files are only spoken of, so that standard output stays with the result.
-        files: What would be written, by the option that says so, with _ for -.
-
-    Raises:
-        ConfigError: Several want standard output, or --json has it.
-    """
-    asking = ["--" + name.replace("_", "-") for name, path in files.items() if path is not None and str(path) == STDIO]
-    if not asking:
-        return
-    if output.json:
-        asking.append("--json")
-    if len(asking) > 1:
-        problem = f"{' and '.join(asking)} both write to standard output"
-        raise ConfigError(problem, where=asking[0], hint=f"give {asking[0]} a file")
-    if not dry_run:
-        output.stream = io.StringIO() if output.quiet else sys.stderr
-
-
-def is_output(path: Path | None) -> bool:
-    """Whether what is written there goes to standard output."""
-    return str(path) == STDIO
-
-
-@contextlib.contextmanager
-def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
-    """The file to write for a path: for `-` one that is copied to standard output when it is whole.
-
-    Raises:
-        ConfigError: What was written is no text, and standard output is a terminal.
-    """
-    if not is_output(path):
-        yield path
-        return
-    with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
-        staged = Path(folder) / f"stdout{suffix}"
-        yield staged
-        content = staged.read_bytes()
-    put_on_stdout(content)
-
-
-def put_on_stdout(content: bytes) -> None:
-    """Write bytes to standard output.
-
-    Raises:
-        ConfigError: They are no text, and it is a terminal.
-    """
-    if sys.stdout.isatty() and b"\0" in content:
-        raise ConfigError("is no text; a terminal cannot show it", where=STDIO, hint="send it to a file: > FILE")
-    sys.stdout.flush()
-    stream = getattr(sys.stdout, "buffer", None)
-    if stream is None:
-        sys.stdout.write(content.decode(errors="backslashreplace"))
-    else:
-        stream.write(content)
-        stream.flush()
-
-
-PAGE_SUFFIXES = (".html", ".htm")
-
-
-def claim_outputs(
-    output: Output,
-    *,
-    dry_run: bool = False,
-    csv: Path | None = None,
-    report: Path | None = None,
-    plots: Path | None = None,
-) -> None:
-    """Claim what a command will write: standard output for `-`, a page for the report, folders that are not there.
-
-    Raises:
-        ConfigError: As of `claim_stdout`, or a report whose name says that it is something else than a page.
-    """
-    claim_stdout(output, dry_run=dry_run, csv=csv, report=report)
-    # pipes and devices have any name
-    is_page = report is not None and (report.is_file() or not report.exists())
-    if is_page and report.suffix.lower() not in ("", *PAGE_SUFFIXES):
-        raise ConfigError(
-            f"{report.name} is no name of an HTML page",
-            where="--report",
-            allowed=", ".join(PAGE_SUFFIXES),
-            hint=f"--report {report.with_suffix('.html')}; a browser prints it as PDF",
-        )
-    note_new_folders([path for path in (csv, report, plots) if path is not None], output)
-
-
-def note_new_folders(paths: Iterable[Path], output: Output) -> None:
-    """Say which folders are made for files, so that a misspelt one is seen; each once, by its topmost new part."""
-    new: dict[Path, Path] = {}
-    for path in paths:
-        missing = [parent for parent in path.parents if not parent.exists()]
-        if missing and not is_output(path):
-            new.setdefault(missing[-1], path)
-    for folder, path in new.items():
-        output.note(f"note: there is no folder {folder} yet; it is made for {path}")

@@ -70,7 +70,8 @@ def write_atomic(path: Path, content: bytes | str) -> None:
     Raises:
         DataError: The disk is full, the folder is read-only, or anything else the system reports.
     """
-    path = Path(path)
+    # what a link leads to is written; of /dev/stdout, too, nothing but the link would be replaced
+    path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
     # names of files may be no UTF-8; they are shown escaped then
     payload = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     try:

@@ -22,6 +22,7 @@ from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.files import STDIO, is_input, is_there, readable
 from lidardesign.run.manifest import changed_since_recorded, read_manifest
+from lidardesign.run.outputs import check_writable
 from lidardesign.scene import Scene
 from lidardesign.space import RANGE
 from lidardesign.task import Metric, Split, Task, metric_of, scenes_of
@@ -270,17 +271,9 @@ class RequestPlan:
         Raises:
             DataError: A file stands where a folder would be, a folder where a file would, or writing is forbidden.
         """
-        for path in (path for path in map(str, self.writes) if path != STDIO):
-            target, is_folder = Path(path), path.endswith("/")
-            if target.is_dir() and not is_folder:
-                raise DataError("is a folder", where=path, hint="give the name of a file")
-            if target.is_file() and is_folder:
-                raise DataError("is a file", where=str(target), hint="give a new folder, or one that is there")
-            there = next(parent for parent in (target, *target.absolute().parents) if parent.exists())
-            if there != target and not there.is_dir():
-                raise DataError(f"cannot be made: {there} is a file", where=path, hint="give another place")
-            if not os.access(there, os.W_OK):
-                raise DataError(f"cannot be written: {there} is read-only", where=path, hint="give another place")
+        for path in map(str, self.writes):
+            if path != STDIO:
+                check_writable(Path(path), is_folder=path.endswith("/"))
 
 
 def _is_file(path: Path | str) -> bool:

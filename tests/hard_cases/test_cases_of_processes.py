@@ -161,7 +161,7 @@ class TestKillsFullDisksAndTwoWriters:
         run.chmod(0o755)
         assert ended.returncode == 3, ended.stderr
         assert json.loads(ended.stdout)["error"]["message"] in (
-            "cannot be locked: Permission denied", "cannot be locked: Read-only file system",
+            "cannot be written: Permission denied", "cannot be written: Read-only file system",
         )  # fmt: skip
         assert files_under(run) == before
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, claim_outputs, command, keep_times, written_file
+from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output_files import claim_outputs, written_file
 from lidardesign.cli.tables.grids import RichConsole, number, print_table
 from lidardesign.errors import ConfigError, DataError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.files import is_input, is_there
+from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.captures.score import CaptureEvaluation
@@ -83,6 +86,7 @@ def capture(
     """Score designs by a captured scan: with their gates, without, and beside even rays."""
     with command(json=json, quiet=quiet, debug=debug) as output:
         claim_outputs(output, csv=csv)
+        check_outputs({"--csv": csv}, [file, *designs, *([] if reference is None else [reference])])
         if not 0 < false_alarm < 1:
             raise ConfigError(f"{false_alarm}", where="--false-alarm", allowed="above 0 and below 1")
         if within_deg is not None and not (0 < within_deg <= 180):
@@ -107,13 +111,20 @@ def capture(
             evaluation = evaluate_capture(captured, named, settings)
         for note in evaluation.notes:
             output.remark(note)
-        if csv is not None:
-            with phase("writing"), written_file(csv) as table:
-                write_csv(evaluation, table)
-        for folder in dict.fromkeys(folder for _, folder in scanned if folder is not None):
-            keep_times(folder, "capture", output)
-        document = {"capture": str(file), **evaluation.as_dict(), "files": [] if csv is None else [str(csv)]}
-        output.result(document, lambda rich: _show(document, evaluation, rich))
+        written: list[Path] = []
+
+        def show_result() -> None:
+            document = {"capture": str(file), **evaluation.as_dict(), "files": [str(path) for path in written]}
+            output.result(document, lambda rich: _show(document, evaluation, rich))
+
+        with ExitStack() as rest:  # the scores are shown whatever becomes of the file
+            rest.callback(show_result)
+            for folder in dict.fromkeys(folder for _, folder in scanned if folder is not None):
+                rest.callback(keep_times, folder, "capture", output)
+            if csv is not None:
+                with phase("writing"), written_file(csv) as table:
+                    write_csv(evaluation, table)
+                written.append(csv)
 
 
 def _rays_and_run(

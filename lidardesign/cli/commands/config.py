@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, is_output, note_new_folders, put_on_stdout
+from lidardesign.cli.output import Output, command
+from lidardesign.cli.output_files import is_output, note_new_folders, put_on_stdout
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
 

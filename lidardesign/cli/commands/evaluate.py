@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import sys
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import (
-    FIRST_LINE,
-    Output,
-    claim_outputs,
-    command,
-    is_output,
-    keep_times,
-    show_plan,
-    written_file,
-)
+from lidardesign.cli.output import FIRST_LINE, Output, command, keep_times, show_plan
+from lidardesign.cli.output_files import claim_outputs, is_output, written_file
 from lidardesign.cli.tables.grids import RichConsole, number
 from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
 from lidardesign.errors import ConfigError, ThresholdError
 from lidardesign.run.clock import phase
+from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
     from lidardesign.evaluate.cma.candidate import Show
     from lidardesign.evaluate.cma.search import Progress
+    from lidardesign.evaluate.figures.scene_figure import FigureData
     from lidardesign.evaluate.results import Evaluation
     from lidardesign.workflow.evaluate import ScoreRequest, Scores
     from lidardesign.workflow.seeds import SeedsRequest
@@ -231,24 +228,32 @@ def evaluate(
             if runs
             else ScoreRequest.resolve(targets, chosen, notes=output.remark)
         )
-        files = (report, plots, csv)
+        files = {"--report": report, "--plots": plots, "--csv": csv}
+        plan = request.plan(files)
+        check_outputs(files, plan.reads, ("--plots",))
         if dry_run:
-            return show_plan(request.plan({"--report": report, "--plots": plots, "--csv": csv}), output)
+            return show_plan(plan, output)
         scores = _score(request, output)
-        # accuracy takes minutes: what was scored by then is written already
-        written = _write_files(scores, *(None if accuracy and is_output(path) else path for path in files))
-        if accuracy:
-            scores = _with_accuracy(scores, output)
-            written = _write_files(scores, *files)
-        document = {**scores.as_dict(), "files": [str(path) for path in written]}
-        keep_times(request.run.folder, "evaluate", output)
+        written: dict[Path, None] = {}
 
-        def show(rich: RichConsole) -> None:
-            if scores.evaluation.accuracy is not None:
-                show_accuracy(scores.evaluation.accuracy, rich)
-            show_evaluation({**document, "notes": []} if output.quiet else document, written, rich)
+        def show_result() -> None:
+            document = {**scores.as_dict(), "files": [str(path) for path in written]}
 
-        output.result(document, show)
+            def show(rich: RichConsole) -> None:
+                if scores.evaluation.accuracy is not None:
+                    show_accuracy(scores.evaluation.accuracy, rich)
+                show_evaluation({**document, "notes": []} if output.quiet else document, list(written), rich)
+
+            output.result(document, show)
+
+        with ExitStack() as rest:  # the scores are shown whatever becomes of the files and of what is measured further
+            rest.callback(show_result)
+            rest.callback(keep_times, request.run.folder, "evaluate", output)
+            # accuracy takes minutes: what was scored by then is written already
+            _write_files(scores, written, *(None if accuracy and is_output(path) else path for path in files.values()))
+            if accuracy:
+                scores = _with_accuracy(scores, output)
+                _write_files(scores, written, *files.values())
         if fail_above is not None:
             _check_threshold(scores.evaluation, fail_above)
         _check_audit(scores.evaluation)
@@ -293,20 +298,26 @@ def _with_accuracy(scores: Scores, output: Output) -> Scores:
 
 
 @phase("writing")
-def _write_files(scores: Scores, report: Path | None, plots: Path | None, csv: Path | None) -> list[Path]:
-    written: list[Path] = []
-    if csv is not None:
-        with written_file(csv) as file:
-            scores.to_csv(file)
-        written.append(csv)
-    pictured = scores.figure_data() if report or plots else None
-    if plots is not None:
-        written += scores.plots(plots, pictured)
-    if report is not None:
-        with written_file(report) as file:
-            scores.report(file, ("lidardesign", *sys.argv[1:]), pictured)
-        written.append(report)
-    return written
+def _write_files(
+    scores: Scores, written: dict[Path, None], report: Path | None, plots: Path | None, csv: Path | None
+) -> None:
+    """Write what was asked for, each whatever becomes of the others; what is there then is added to `written`."""
+    pictured = functools.cache(scores.figure_data)
+    with ExitStack() as rest:
+        if report is not None:
+            rest.callback(_write_report, scores, written, report, pictured)
+        if plots is not None:
+            rest.callback(lambda: written.update(dict.fromkeys(scores.plots(plots, pictured()))))
+        if csv is not None:
+            with written_file(csv) as file:
+                scores.to_csv(file)
+            written[csv] = None
+
+
+def _write_report(scores: Scores, written: dict[Path, None], path: Path, pictured: Callable[[], FigureData]) -> None:
+    with written_file(path) as file:
+        scores.report(file, ("lidardesign", *sys.argv[1:]), pictured())
+    written[path] = None
 
 
 def _check_threshold(evaluation: Evaluation, limit: float) -> None:

@@ -8,10 +8,12 @@ from typing import Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, claim_stdout, command, keep_times, note_new_folders, show_plan, written_file
+from lidardesign.cli.output import Output, command, keep_times, show_plan
+from lidardesign.cli.output_files import claim_stdout, note_new_folders, written_file
 from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
+from lidardesign.run.outputs import check_outputs
 
 
 def export(
@@ -80,8 +82,10 @@ def export(
         target = export_target(design, out, exporter)
         request = ExportRequest(source, exporter, target, rays, place, rate_hz, seed or 0, robot)
         note_new_folders([target], output)
+        plan = request.plan()
+        check_outputs({"--out": target}, plan.reads, ("--out",) if exporter.folder else ())
         if dry_run:
-            return show_plan(request.plan(), output)
+            return show_plan(plan, output)
         with written_file(target, exporter.suffix) as file:
             exported = request.write(file, output.remark)
         if source.folder is not None:

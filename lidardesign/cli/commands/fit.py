@@ -11,7 +11,9 @@ from lidardesign.cli import options
 from lidardesign.cli.output import Output, command, keep_times, show_plan
 from lidardesign.cli.tables.designs import show_fit
 from lidardesign.cli.tables.grids import RichConsole
+from lidardesign.errors import LidardesignError
 from lidardesign.run.clock import WAIT_S, phase
+from lidardesign.run.outputs import check_writable
 
 if TYPE_CHECKING:
     from lidardesign.workflow.fit import FitRequest
@@ -64,10 +66,16 @@ def fit(
 
 def run_fit(request: FitRequest, output: Output) -> None:
     """Fit the design of a request, save it, and give the result."""
+    from lidardesign.design.files import design_text
     from lidardesign.workflow.designs import Design
 
+    check_writable(request.run.design_path(request.name))
     design = Design.fitted(request, notes=output.remark)
-    design.save()
+    try:
+        design.save()
+    except LidardesignError:
+        output.keep(design_text(design.specification, Path(design.name)), ".yaml")
+        raise
     document = design.as_dict()
     keep_times(request.run.folder, request.command, output, wait_s=WAIT_S)
 
