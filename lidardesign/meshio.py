@@ -7,7 +7,6 @@ number per vertex, or the brightness of vertex colours.
 from __future__ import annotations
 
 import io
-import json
 import logging
 import warnings
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from lidardesign.errors import DataError, LidardesignError
+from lidardesign.geometry.mesh_formats import check_gltf, check_ply, check_triangles, read_obj, read_off, read_stl
 from lidardesign.numerics import ROUNDING
 from lidardesign.run.inputs import MESH, check_bytes, read_file
 from lidardesign.scene import LARGEST_WEIGHT, Mesh, Sign
@@ -198,6 +198,7 @@ def _alone(values: np.ndarray) -> np.ndarray:
 
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+READERS = {".obj": read_obj, ".off": read_off, ".stl": read_stl}
 # a triangle whose double area is a smaller share of its longest edge squared has a normal of rounding noise
 FLATTEST_TRIANGLE = ROUNDING
 
@@ -405,24 +406,58 @@ def _reason(error: Exception) -> str:
 
 def _geometry(path: Path, data: bytes, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """All triangles of a file as one mesh, each part at its place in the file's scene; weights where asked for."""
+    vertices, faces, weights, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0)], 0
+    for part, transform in _parts(path, data):
+        own = np.asarray(part.faces, dtype=np.int64)
+        wrong = ((own < 0) | (own >= len(part.vertices))).any(axis=1)
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            raise DataError(
+                f"triangle {first} of {len(own)} names the vertices {', '.join(map(str, own[first]))}",
+                where=str(path),
+                allowed=f"0 to {len(part.vertices) - 1}",
+            )
+        vertices.append(part.vertices @ transform[:3, :3].T + transform[:3, 3])
+        faces.append(own + count)
+        count += len(part.vertices)
+        if painted is not None:
+            weights.append(painted_weights(part, painted, str(path)))
+    check_triangles(sum(map(len, faces)), str(path))
+    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(weights) if painted else None
+
+
+def _parts(path: Path, data: bytes) -> Iterator[tuple[trimesh.Trimesh, np.ndarray]]:
+    """The meshes of a file and where each stands, a transform of shape (4, 4)."""
     import trimesh
 
-    suffix = path.suffix.lower()[1:]
-    if suffix == "gltf":
-        json.loads(data)  # on garbage trimesh would silently read a file called model.gltf from the same folder
-    options = {"skip_materials": True} if suffix in ("glb", "gltf", "obj") else {}
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix, resolver=_SameFolder(path), process=False, **options)
-    vertices, faces, weights, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0)], 0
+    suffix = path.suffix.lower()
+    if suffix in READERS:
+        vertices, faces, colours = READERS[suffix](data, str(path))
+        yield trimesh.Trimesh(vertices, faces, process=False, vertex_colors=colours), np.eye(4)
+        return
+    if suffix == ".ply":
+        check_ply(data, str(path))
+        options = {"skip_materials": True, "fix_texture": False}
+    else:
+        check_gltf(data, str(path))
+        options = {"skip_materials": True}
+    resolver = _SameFolder(path)
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=resolver, process=False, **options)
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         part = scene.geometry[name]
         if isinstance(part, trimesh.Trimesh):
-            vertices.append(part.vertices @ transform[:3, :3].T + transform[:3, 3])
-            faces.append(np.asarray(part.faces, dtype=np.int64) + count)
-            count += len(part.vertices)
-            if painted is not None:
-                weights.append(painted_weights(part, painted, str(path)))
-    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(weights) if painted else None
+            _check_polygons(part, str(path))
+            yield part, transform
+
+
+def _check_polygons(part: trimesh.Trimesh, where: str) -> None:
+    """Refuse a binary PLY whose faces have other numbers of corners than its first: their indices would be misread."""
+    faces = part.metadata.get("_ply_raw", {}).get("face", {}).get("data")
+    for name in getattr(getattr(faces, "dtype", None), "names", None) or ():
+        sizes = faces[name]["f0"] if faces[name].dtype.names else np.zeros(0)
+        if sizes.size and (sizes != sizes[0]).any():
+            raise DataError("has faces of several sizes", where=where, allowed="one size", hint="export triangles")
 
 
 class _SameFolder:
@@ -454,6 +489,8 @@ def _quiet_trimesh() -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            # what is no number ends the reading of numbers: the rest would be left out in silence
+            warnings.filterwarnings("error", "string or file could not be read")
             yield
     finally:
         log.setLevel(level)
