@@ -18,7 +18,7 @@ from lidardesign.registry import load_task, plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import verify, write_recorded
 from lidardesign.run.validation import anchor_paths, check_model, suggest
-from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml, parse_yaml, resolve_scalar
+from lidardesign.run.yaml import MAX_DEPTH, Document, KeyPath, dump_yaml, leaves, load_yaml, parse_yaml, resolve_scalar
 from lidardesign.space import DIMENSIONS, FARTHEST_M, DesignSpace
 from lidardesign.task import Task, TaskConfig
 
@@ -131,6 +131,8 @@ def parse_override(text: str, option: str = "--set") -> Override:
     parts = key.strip().split(".")
     if not equals or not all(parts):
         raise ConfigError("is not of the form KEY=VALUE", where=where, allowed="a dotted key, as density.sigma_m=0.005")
+    if len(parts) > MAX_DEPTH:
+        raise ConfigError(f"the key has {len(parts)} parts", where=where, allowed=f"at most {MAX_DEPTH}")
     value = value.strip()
     if not value:
         raise ConfigError(f"{key.strip()} has no value", where=where, allowed="a value", hint=UNSET_HINT)

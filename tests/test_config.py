@@ -273,3 +273,9 @@ def test_what_was_learned_stays_when_a_run_is_judged(override, message):
     with pytest.raises(ConfigError, match=message) as caught:
         with_task_settings(TASK, resolve(TASK), [override])
     assert override in str(caught.value.where)
+
+
+@each_row("text", [".".join("a" * count) + "=1" for count in (33, 500, 5000)])
+def test_a_key_of_many_parts_is_refused(text):
+    with pytest.raises(ConfigError, match=r"(?s)has \d+ parts.*at most 32"):
+        parse_override(text)

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from lidardesign.cli.output import Output
-from lidardesign.errors import ConfigError
-from lidardesign.run.files import STDIO
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.run.files import STDIO, write_atomic
 from lidardesign.run.outputs import check_outputs
 
 
@@ -46,19 +46,25 @@ def is_output(path: Path | None) -> bool:
 
 @contextlib.contextmanager
 def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
-    """The file to write for a path: for `-` one that is copied to standard output when it is whole.
+    """The file to write for a path: for `-`, a pipe or a device one that is copied there when it is whole.
 
     Raises:
         ConfigError: What was written is no text, and standard output is a terminal.
+        DataError: It is a folder, or cannot be written.
     """
-    if not is_output(path):
+    if not is_output(path) and (path.is_file() or path.is_dir() or not path.exists()):
         yield path
         return
     with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
         staged = Path(folder) / f"stdout{suffix}"
         yield staged
+        if staged.is_dir():
+            raise DataError("is no folder, and this is a folder of files", where=str(path), hint="give a folder's name")
         content = staged.read_bytes()
-    put_on_stdout(content)
+    if is_output(path):
+        put_on_stdout(content)
+    else:
+        write_atomic(path, content)
 
 
 def put_on_stdout(content: bytes) -> None:

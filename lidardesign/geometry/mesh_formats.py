@@ -7,9 +7,9 @@ negative number for one from the end.
 
 from __future__ import annotations
 
+import copy
 import re
 import warnings
-from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,11 +39,24 @@ class TextMesh(NamedTuple):
     colours: np.ndarray | None = None
 
 
-class Rows(NamedTuple):
-    """Rows of numbers in a text, with their lines."""
+class Rows:
+    """Rows of a text that are alike: what the last group of a pattern finds; or some of them, changed."""
 
-    texts: list[bytes]
-    lines: list[int]
+    def __init__(self, data: bytes, pattern: bytes) -> None:
+        self._data, self._pattern, self._first = data, re.compile(b"(?mi)" + pattern), 0
+        self.texts: list[bytes] = self._pattern.findall(data)
+
+    def part(self, first: int, texts: list[bytes]) -> Rows:
+        """Other texts of the rows from one on."""
+        part = copy.copy(self)
+        part._first, part.texts = self._first + first, texts
+        return part
+
+    def lines(self) -> np.ndarray:
+        """The line of each row, from 1; found when it is asked for, as messages do."""
+        ends = np.flatnonzero(np.frombuffer(self._data, dtype=np.uint8) == ord("\n"))
+        starts = [match.start(1) for match in self._pattern.finditer(self._data)]
+        return 1 + np.searchsorted(ends, starts)[self._first : self._first + len(self.texts)]
 
 
 def read_obj(data: bytes, where: str) -> TextMesh:
@@ -52,44 +65,41 @@ def read_obj(data: bytes, where: str) -> TextMesh:
     Raises:
         DataError: A number is none or a face names what is not there; with its line.
     """
-    kinds: dict[bytes, Rows] = {name: Rows([], []) for name in (b"v", b"vt", b"vn", b"f")}
-    # vertices, texture places and normals before each face: negative indices count back from there
-    before: list[tuple[int, int, int]] = []
-    for line, text in _lines(data, where):
-        word, _, rest = text.replace(b"\t", b" ").partition(b" ")
-        rows = kinds.get(word)
-        if rows is None:
-            continue
-        if word == b"f":
-            before.append(tuple(len(kinds[name].texts) for name in (b"v", b"vt", b"vn")))  # type: ignore[arg-type]
-        rows.texts.append(rest)
-        rows.lines.append(line)
-    columns = _column_counts(kinds[b"v"], 3, where)
+    data = _plain(data, where)
+    # a line that ends in \ goes on in the next; the lines after it keep their numbers
+    data = re.sub(rb"(?:[^\n]*\\[ ]*\n)+[^\n]*", _joined, data) if b"\\" in data else data
+    points, places, normals, faces = (
+        Rows(data, rb"^[ \t]*%b[ \t]+([^\n#]*)" % name) for name in (b"v", b"vt", b"vn", b"f")
+    )
+    columns = _column_counts(points, 3, where)
     least = int(columns.min()) if len(columns) else 3
-    points = _numbers(kinds[b"v"], least if (columns == least).all() else None, where)
-    faces = kinds[b"f"]
+    numbers = _numbers(points, least if (columns == least).all() else None, where)
     corners = _column_counts(faces, 3, where)
-    before_face = np.array(before, dtype=np.int64).reshape(-1, 3)
     references = _references(faces, where)
-    if len(references) != corners.sum():  # a blank beside a slash
-        raise DataError("has a face with a broken corner", where=where, allowed="as 1, 1/2, 1//3 or 1/2/3")
-    face = np.repeat(np.arange(len(corners)), corners)
-    for column, (what, name) in enumerate((("vertex", b"v"), ("texture place", b"vt"), ("normal", b"vn"))):
-        index, count = references[:, column], len(kinds[name].texts)
-        index = np.where(index > 0, index - 1, np.where(index < 0, before_face[face, column] + index, -1))
-        wrong = ((index < 0) | (index >= count)) & ((column == 0) | (references[:, column] != ABSENT))
+    vertices = np.zeros(len(references), dtype=np.int64)
+    for column, (what, rows) in enumerate((("vertex", points), ("texture place", places), ("normal", normals))):
+        named = references[:, column]
+        index = _resolved(named, rows, faces, corners) if (named < 0).any() else named - 1
+        wrong = ((index < 0) | (index >= len(rows.texts))) & ((column == 0) | (named != ABSENT))
         if wrong.any():
             first = int(np.argmax(wrong))
-            back = int(before_face[face[first], column])
-            raise DataError(
-                f"a face names {what} {references[first, column]}",
-                where=f"{where}:{faces.lines[face[first]]}",
-                allowed=f"1 to {count}" + (f", or -1 to -{back} back from here" if back else ""),
-            )
-        if not column:
-            vertices = index
-    colours = points[:, 3:6] if points.shape[1] >= 6 else None
-    return TextMesh(points[:, :3], fans(vertices, corners), colours)
+            line = faces.lines()[int(np.searchsorted(np.cumsum(corners), first, side="right"))]
+            allowed = f"1 to {len(rows.texts)}, or as far back from here as there are some before it"
+            raise DataError(f"a face names {what} {named[first]}", where=f"{where}:{line}", allowed=allowed)
+        vertices = index if column == 0 else vertices
+    colours = numbers[:, 3:6] if numbers.shape[1] >= 6 else None
+    return TextMesh(numbers[:, :3], fans(vertices, corners), colours)
+
+
+def _resolved(named: np.ndarray, rows: Rows, faces: Rows, corners: np.ndarray) -> np.ndarray:
+    """Indices from 0 of what faces name: negative numbers count back from the line of the face; -1 where it is 0."""
+    before = np.repeat(np.searchsorted(rows.lines(), faces.lines()), corners)
+    return np.where(named > 0, named - 1, np.where(named < 0, np.maximum(named, -1 - before) + before, -1))
+
+
+def _joined(found: re.Match[bytes]) -> bytes:
+    parts = re.split(rb"\\[ ]*\n", found[0])
+    return b" ".join(parts) + b"\n" * (len(parts) - 1)
 
 
 def read_off(data: bytes, where: str) -> TextMesh:
@@ -98,40 +108,49 @@ def read_off(data: bytes, where: str) -> TextMesh:
     Raises:
         DataError: It promises more than it has, a number is none, or a face names what is not there; with its line.
     """
-    lines = [(line, text) for line, text in _lines(data, where) if text]
-    word, _, rest = (lines[0][1] if lines else b"").partition(b" ")
-    if not re.fullmatch(rb"C?N?OFF", word.upper()) or rest.strip().upper() == b"BINARY":
+    data = _plain(data, where)
+    rows = Rows(data, rb"^[ \t]*([^\s#][^\n#]*)")
+    word, _, rest = (rows.texts[0] if rows.texts else b"").partition(b" ")
+    if not re.fullmatch(rb"C?N?OFF", word.strip().upper()) or rest.strip().upper() == b"BINARY":
         raise DataError("is no OFF file in text", where=where, allowed="a first line OFF, COFF, NOFF or CNOFF")
-    header, *rows = [(lines[0][0], rest.strip()), *lines[1:]] if rest.strip() else lines[1:] or lines
-    counts = header[1].split()
+    begin = 0 if rest.strip() else 1
+    counts = (rest if rest.strip() else b" ".join(rows.texts[1:2])).split()
     if len(counts) < 2 or not all(count.isdigit() and len(count) < 19 for count in counts[:2]):
-        raise DataError("has no counts of vertices and faces", where=f"{where}:{header[0]}", hint=AGAIN_HINT)
+        line = rows.lines()[min(begin, len(rows.texts) - 1)]
+        raise DataError("has no counts of vertices and faces", where=f"{where}:{line}", hint=AGAIN_HINT)
     count, face_count = int(counts[0]), int(counts[1])
-    if len(rows) < count + face_count:
+    texts = rows.texts[begin + 1 :]
+    if len(texts) < count + face_count:
         raise DataError(
-            f"promises {count} vertices and {face_count} faces, and has {len(rows)} lines of them",
-            where=f"{where}:{header[0]}",
+            f"promises {count} vertices and {face_count} faces, and has {len(texts)} lines of them",
+            where=f"{where}:{rows.lines()[begin]}",
             hint="it may be cut short",
         )
-    points = Rows([b" ".join(text.split()[:3]) for _, text in rows[:count]], [line for line, _ in rows[:count]])
+    points = rows.part(begin + 1, [b" ".join(text.split()[:3]) for text in texts[:count]])
     _column_counts(points, 3, where)
-    polygons = Rows([], [])
-    for line, text in rows[count : count + face_count]:
-        size, *indices = text.split()
-        corners = int(size) if size.isdigit() and len(size) < 9 else 0
-        if not 3 <= corners <= len(indices):
-            shown = text[:40].decode(errors="replace")
-            raise DataError(f"the face is {shown!r}", where=f"{where}:{line}", allowed="3 or more, and so many indices")
-        polygons.texts.append(b" ".join(indices[:corners]))
-        polygons.lines.append(line)
-    sizes = _column_counts(polygons, 3, where)
-    vertices = _whole_numbers(polygons, where)
+    faces = rows.part(begin + 1 + count, texts[count : count + face_count])
+    found = [_polygon(text) for text in faces.texts]
+    if None in found:
+        first = found.index(None)
+        shown, place = faces.texts[first][:40].decode(errors="replace"), f"{where}:{faces.lines()[first]}"
+        raise DataError(f"the face is {shown!r}", where=place, allowed="3 or more, and so many whole numbers")
+    corners = np.array([len(polygon) for polygon in found], dtype=np.int64)  # type: ignore[arg-type]
+    vertices = np.array([index for polygon in found for index in polygon], dtype=np.int64)  # type: ignore[union-attr]
     wrong = (vertices < 0) | (vertices >= count)
     if wrong.any():
         first = int(np.argmax(wrong))
-        line = polygons.lines[int(np.repeat(np.arange(len(sizes)), sizes)[first])]
+        line = faces.lines()[int(np.searchsorted(np.cumsum(corners), first, side="right"))]
         raise DataError(f"a face names vertex {vertices[first]}", where=f"{where}:{line}", allowed=f"0 to {count - 1}")
-    return TextMesh(_numbers(points, 3, where), fans(vertices, sizes))
+    return TextMesh(_numbers(points, 3, where), fans(vertices, corners))
+
+
+def _polygon(text: bytes) -> tuple[int, ...] | None:
+    """The corners of a face that says first how many they are; None where it has fewer, or one is no number."""
+    size, *indices = text.split()
+    corners = int(size) if size.isdigit() and len(size) < 9 else 0
+    if not 3 <= corners <= len(indices) or not all(WHOLE_NUMBER.fullmatch(index) for index in indices[:corners]):
+        return None
+    return tuple(map(int, indices[:corners]))
 
 
 STL_HEADER, STL_FACET = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -156,19 +175,19 @@ def read_stl(data: bytes, where: str) -> TextMesh:
             where=where,
             hint="it may be cut short, or no STL file",
         )
-    corners, ends, ended = Rows([], []), 0, False
-    for line, text in _lines(data, where, comment=None):
-        word = text[:9].lower()
-        if word.startswith(b"vertex"):
-            corners.texts.append(text[6:])
-            corners.lines.append(line)
-        elif word.startswith((b"endfacet", b"end facet")):
-            ends += 1
-            if len(corners.texts) != 3 * ends:
-                found = len(corners.texts) - 3 * (ends - 1)
-                raise DataError(f"a facet has {found} corners", where=f"{where}:{line}", allowed="3")
-        ended = ended or word.startswith((b"endsolid", b"end solid"))
-    if not ended or len(corners.texts) != 3 * ends:
+    data = _plain(data, where)
+    corners, words = (
+        Rows(data, rb"^[ \t]*vertex[ \t]+([^\n]*)"),
+        Rows(data, rb"^[ \t]*(vertex|end ?facet|end ?solid)\b"),
+    )
+    # the last letters of the words: three of `vertex`, then one of `endfacet`, and so on until `endsolid`
+    letters = b"".join(word[-1:].lower() for word in words.texts)
+    fitting = re.match(rb"(?:xxxt|d)*", letters)
+    assert fitting is not None, "nothing fits as well"
+    if fitting.end() < len(letters.rstrip(b"x")):
+        line = words.lines()[fitting.end()]
+        raise DataError("a facet has not 3 corners", where=f"{where}:{line}", allowed="3 in each")
+    if not letters.endswith(b"d"):
         raise DataError("ends early: the last solid is not closed", where=where, hint="it may be cut short")
     _column_counts(corners, 3, where, most=3)
     return TextMesh(_numbers(corners, 3, where), np.arange(len(corners.texts)).reshape(-1, 3))
@@ -182,21 +201,12 @@ def fans(vertices: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return vertices[np.stack([start, start + step + 1, start + step + 2], axis=1)]
 
 
-def _lines(data: bytes, where: str, comment: bytes | None = b"#") -> Iterator[tuple[int, bytes]]:
-    """Number and text of every line, without blanks around it and comments; one that ends in \\ goes on in the next."""
+def _plain(data: bytes, where: str) -> bytes:
+    """A text whose lines end in a line feed alone, without the mark of UTF-8; refuses more than a few million lines."""
     data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if data.count(b"\n") > MOST_ROWS:
-        raise DataError(
-            "has too many lines", where=where, allowed=f"{MOST_ROWS}", hint="export it as binary PLY or GLB"
-        )
-    parts: list[bytes] = []
-    for line, whole in enumerate(data.split(b"\n"), 1):
-        text = whole.partition(comment)[0] if comment else whole
-        parts.append(text.rstrip().removesuffix(b"\\"))
-        if not text.rstrip().endswith(b"\\"):
-            yield line - len(parts) + 1, b" ".join(parts).strip() if len(parts) > 1 else parts[0].strip()
-            parts = []
-    yield line, b" ".join(parts).strip()
+        raise DataError("has too many lines", where=where, allowed=f"{MOST_ROWS}", hint=BINARY_HINT)
+    return data
 
 
 def _column_counts(rows: Rows, least: int, where: str, most: int | None = None) -> np.ndarray:
@@ -206,7 +216,7 @@ def _column_counts(rows: Rows, least: int, where: str, most: int | None = None) 
     if wrong.any():
         first = int(np.argmax(wrong))
         allowed = f"{least}" if most else f"{least} or more"
-        raise DataError(f"has {counts[first]} values", where=f"{where}:{rows.lines[first]}", allowed=allowed)
+        raise DataError(f"has {counts[first]} values", where=f"{where}:{rows.lines()[first]}", allowed=allowed)
     return counts
 
 
@@ -215,7 +225,7 @@ def _numbers(rows: Rows, columns: int | None, where: str) -> np.ndarray:
     texts = rows.texts if columns else [b" ".join(text.split()[:3]) for text in rows.texts]
     found = _parsed(b" ".join(texts), np.float64)
     if found is None or not np.isfinite(found).all():
-        for text, line in zip(texts, rows.lines, strict=True):
+        for text, line in zip(texts, rows.lines(), strict=True):
             one = _parsed(text, np.float64)
             if one is None or not np.isfinite(one).all():
                 shown = text[:60].decode(errors="replace").strip()
@@ -234,53 +244,49 @@ def _parsed(text: bytes, kind: type) -> np.ndarray | None:
             return None
 
 
-def _whole_numbers(rows: Rows, where: str) -> np.ndarray:
-    found = _parsed(b" ".join(rows.texts), np.int64)
-    if found is None:
-        for text, line in zip(rows.texts, rows.lines, strict=True):
-            if _parsed(text, np.int64) is None:
-                shown = text[:60].decode(errors="replace").strip()
-                raise DataError(f"the face is {shown!r}", where=f"{where}:{line}", allowed="whole numbers")
-    assert found is not None, "every row is numbers, so all are"
-    return found
-
-
 # No index: of texture places and normals that a face does not name.
 ABSENT = np.iinfo(np.int64).min
-WHOLE = rb"[-+]?\d+"
-CORNERS = {
-    (0,): WHOLE,
-    (0, 1): rb"%b/%b/?" % (WHOLE, WHOLE),
-    (0, 2): rb"%b//%b" % (WHOLE, WHOLE),
-    (0, 1, 2): rb"%b/%b/%b" % (WHOLE, WHOLE, WHOLE),
-}
+WHOLE_NUMBER = re.compile(rb"[-+]?\d{1,18}")
+# Faces whose corners are taken apart at once; bounds memory.
+ROWS_AT_ONCE = 100_000
 
 
 def _references(faces: Rows, where: str) -> np.ndarray:
     """The indices of vertex, texture place and normal of every corner as they stand there, shape (N, 3)."""
-    whole = b" ".join(faces.texts)
-    for used, pattern in CORNERS.items():
-        if not re.sub(rb"(?<!\S)%b(?!\S)" % pattern, b"", whole).strip():
-            found = _parsed(whole.replace(b"/", b" "), np.int64)
-            if found is not None:
-                return _spread(found.reshape(-1, len(used)), used)
-    rows = []
-    for text, line in zip(faces.texts, faces.lines, strict=True):
-        for corner in text.split():
-            fitting = (used for used, pattern in CORNERS.items() if re.fullmatch(pattern, corner))
-            used, found = next(fitting, None), _parsed(corner.replace(b"/", b" "), np.int64)
-            if used is None or found is None:
-                shown = corner[:40].decode(errors="replace")
-                allowed = "whole numbers, as 1, 1/2, 1//3 or 1/2/3"
-                raise DataError(f"a corner of the face is {shown!r}", where=f"{where}:{line}", allowed=allowed)
-            rows.append(_spread(found.reshape(1, -1), used))
-    return np.concatenate(rows) if rows else np.zeros((0, 3), dtype=np.int64)
+    found = [np.zeros((0, 3), dtype=np.int64)]
+    for begin in range(0, len(faces.texts), ROWS_AT_ONCE):
+        texts = faces.texts[begin : begin + ROWS_AT_ONCE]
+        part = _indices(b" ".join(texts))
+        if part is None:
+            row = next(row for row, text in enumerate(texts) if _indices(text) is None)
+            wrong = next(corner for corner in texts[row].split() if _indices(corner) is None)
+            place, shown = f"{where}:{faces.lines()[begin + row]}", repr(wrong[:40].decode(errors="replace"))
+            allowed = "whole numbers, as 1, 1/2, 1//3 or 1/2/3"
+            raise DataError(f"a corner of the face is {shown}", where=place, allowed=allowed)
+        found.append(part)
+    return np.concatenate(found)
 
 
-def _spread(found: np.ndarray, used: Sequence[int]) -> np.ndarray:
-    spread = np.full((len(found), 3), ABSENT)
-    spread[:, list(used)] = found
-    return spread
+def _indices(text: bytes) -> np.ndarray | None:
+    """Three indices of each corner, (N, 3); None where something is no corner."""
+    letters = np.frombuffer(b" " + text + b" ", dtype=np.uint8)
+    digit, slash = (letters >= ord("0")) & (letters <= ord("9")), letters == ord("/")
+    blank, sign = (letters == ord(" ")) | (letters == ord("\t")), (letters == ord("+")) | (letters == ord("-"))
+    loose_sign = sign[1:-1] & ~(digit[2:] & (blank | slash)[:-2])
+    if loose_sign.any() or not (digit | slash | blank | sign).all():
+        return None
+    begins = np.flatnonzero(~blank[1:] & blank[:-1]) + 1
+    numbers = np.flatnonzero(digit[1:] & ~digit[:-1]) + 1
+    corner, passed = np.searchsorted(begins, numbers, side="right") - 1, np.cumsum(slash, dtype=np.int32)
+    column = passed[numbers] - passed[begins][corner]
+    most = np.append(passed[begins[1:] - 1], passed[-1]) - passed[begins]
+    found = _parsed(text.replace(b"/", b" "), np.int64)
+    named_first = np.bincount(corner[column == 0], minlength=len(begins)) == 1
+    if slash[begins].any() or (most > 2).any() or not named_first.all() or found is None or len(found) != len(numbers):
+        return None
+    indices = np.full((len(begins), 3), ABSENT)
+    indices[corner, column] = found
+    return indices
 
 
 PLY_BYTES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}

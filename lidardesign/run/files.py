@@ -79,7 +79,7 @@ def write_atomic(path: Path, content: bytes | str) -> None:
         if path.is_dir():
             raise DataError("is a folder", where=str(path), hint="give the name of a file")
         if path.exists() and not path.is_file():
-            path.write_bytes(payload)
+            _write_straight(path, payload)
         else:
             temporary = temporary_beside(path)
             _remove_abandoned(temporary)
@@ -102,6 +102,14 @@ def write_atomic(path: Path, content: bytes | str) -> None:
                     os.close(descriptor)
     except OSError as error:
         raise _unwritten(path, error) from error
+
+
+def _write_straight(path: Path, payload: bytes) -> None:
+    """Write to a pipe or a device; one that nobody reads is an error, not waited for."""
+    descriptor = os.open(path, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
+    os.set_blocking(descriptor, True)
+    with open(descriptor, "wb") as file:
+        file.write(payload)
 
 
 def append_line(path: Path, line: str) -> None:
@@ -290,6 +298,8 @@ def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     path = Path(run) / FILE_NAME
+    if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
+        raise DataError("is no regular file, as a lock is", where=str(path), hint="remove it")
     lock = FileLock(path)
     try:
         lock.acquire(timeout=wait_s)

@@ -27,7 +27,7 @@ from lidardesign.meshio import SUFFIXES, load_mesh
 from lidardesign.mujoco_model import model_files
 from lidardesign.run import inputs
 from lidardesign.run.arrays import read_npz
-from lidardesign.run.files import sha256_file
+from lidardesign.run.files import FILE_NAME, run_lock, sha256_file, write_atomic
 from lidardesign.run.manifest import read_manifest
 from lidardesign.run.xml import read_xml
 from lidardesign.run.yaml import load_yaml
@@ -139,3 +139,30 @@ def test_the_documentation_lists_the_limits():
     for kind in inputs.KINDS:
         unpacked = "" if kind.unpacked_bytes is None else inputs.size_text(kind.unpacked_bytes)
         assert f"| {kind.name} | {inputs.size_text(kind.most_bytes)} | {unpacked} |" in text
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@each_row("make", [make_pipe, make_socket, make_folder, make_device])
+def test_a_lock_that_is_no_file_is_refused_and_nothing_behind_it_is_touched(tmp_path, make):
+    make(tmp_path / FILE_NAME)
+    with an_alarm(), pytest.raises(DataError, match="no regular file"), run_lock(tmp_path):
+        pytest.fail("the lock is no lock")
+    assert os.path.lexists(tmp_path / FILE_NAME)
+
+
+@each_row("there", [True, False])
+def test_a_lock_that_is_a_link_neither_empties_nor_makes_what_it_names(tmp_path, there):
+    target = tmp_path / "precious"
+    if there:
+        target.write_text("precious")
+    (tmp_path / FILE_NAME).symlink_to(target)
+    with pytest.raises(DataError, match="no regular file"), run_lock(tmp_path):
+        pytest.fail("the lock is no lock")
+    assert (target.read_text() == "precious") if there else not target.exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_that_nobody_reads_is_not_written_to(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with an_alarm(), pytest.raises(DataError, match="cannot be written"):
+        write_atomic(tmp_path / "pipe", b"x")
