@@ -32,7 +32,11 @@ RAYS, BEAMS, FRUSTA = "rays.ply", "beams.ply", "frusta.ply"
 PLACE = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 COLOUR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 NORMAL = [("nx", "<f8"), ("ny", "<f8"), ("nz", "<f8")]
-RAY = [("gate_start", "<f8"), ("gate_end", "<f8"), ("time", "<f8"), ("sensor", "<i4")]
+# CloudCompare reads properties of these names as scalar fields without being asked, and leaves their beginning out.
+RAY = [
+    (f"scalar_{name}", kind)
+    for name, kind in (("gate_start", "<f8"), ("gate_end", "<f8"), ("time", "<f8"), ("sensor", "<i4"))
+]
 FACE = [("corners", "u1"), ("vertex_indices", "<i4", (4,))]
 EDGE = [("vertex1", "<i4"), ("vertex2", "<i4")]
 TYPES = {"f8": "double", "u1": "uchar", "i4": "int"}
@@ -152,9 +156,9 @@ def read_ply(path: Path) -> Rays:
         raise DataError(f"cannot be read as rays: {error}", where=str(where), hint="export it again") from error
     origin, looking, gate = (
         np.stack([table[name] for name in names], axis=1)
-        for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("gate_start", "gate_end"))
+        for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("scalar_gate_start", "scalar_gate_end"))
     )
-    return Rays(origin, looking, gate, table["sensor"], table["time"])
+    return Rays(origin, looking, gate, table["scalar_sensor"], table["scalar_time"])
 
 
 def ply_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:

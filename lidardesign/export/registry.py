@@ -160,7 +160,7 @@ EXPORTERS: dict[str, Exporter] = {
             "lidardesign.export.robots",
             ("write_sdf", "sdf_rounding"),
             reader="Gazebo",
-            checked="parsed by libsdformat without a warning, all values compared",
+            checked="parsed by libsdformat without a warning, all values compared; its pixels in a twin",
             rated=True,
         ),
         Exporter(
@@ -221,7 +221,7 @@ EXPORTERS: dict[str, Exporter] = {
             "lidardesign.export.ray_tracers",
             ("write_helios", "helios_rounding"),
             reader="HELIOS++",
-            checked="valid by schemas of its fields; a twin of HELIOS++ fires the rays",
+            checked="valid by schemas of its fields; a twin of HELIOS++ fires the rays and finds their echoes",
             folder=True,
             rated=True,
         ),
@@ -263,7 +263,7 @@ EXPORTERS: dict[str, Exporter] = {
             "lidardesign.export.meshes",
             ("write_ply", "ply_rounding"),
             reader="CloudCompare, Blender, MeshLab",
-            checked="loaded by trimesh, and read back",
+            checked="loaded by trimesh, and read back; names as CloudCompare and Blender know them",
             folder=True,
         ),
         Exporter(

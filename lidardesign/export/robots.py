@@ -255,8 +255,9 @@ def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list
         notes.append(
             f"{wide} of {len(mounted)} sensors have more than {MOST_SAMPLES} columns or rows: Gazebo fails on them"
         )
-    beside = max((float(pixel_offsets_rad(grid).max()) for grid in grids), default=0.0)
-    notes.append(f"Gazebo measures along the pixels of a picture: up to {math.degrees(beside):.2g} deg beside the rays")
+    if grids:
+        beside = math.degrees(max(float(pixel_offsets_rad(grid).max()) for grid in grids))
+        notes.append(f"Gazebo measures along the pixels of a picture: up to {beside:.2g} deg beside the rays")
     names = [design.name, *(one.sensor.name for one in mounted)]
     return [*notes, *renamed_note(names, [identifier(design.name), *(one.name for one in mounted)])]
 

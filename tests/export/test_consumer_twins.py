@@ -30,12 +30,12 @@ def rays_with_gates(gates_m):
 # src/scanner/ScanningDevice.cpp, detector/FullWaveformPulseRunnable.cpp, maths/model/*EnergyModel.cpp, WaveMaths.cpp;
 # what a scanner file leaves out is of assetloading/XmlAssetsLoader.cpp
 C_M_NS = 0.299792458
-POWER_W, APERTURE_M, EFFICIENCY, VISIBILITY_KM, WAVELENGTH_M = 4.0, 0.15, 0.99, 23.0, 1064e-9
+APERTURE_M, EFFICIENCY, VISIBILITY_KM, WAVELENGTH_M = 0.15, 0.99, 23.0, 1064e-9
 # how a version spreads the power over the beam, and the least intensity [nW] that is an echo
 HELIOS = [(beam, least) for beam in ("focused", "focused, radii in rad", "Gaussian") for least in (1e-3, 1e-4)]
 
 
-def helios_intensity(beam, divergence_rad, start_m, range_m, brightness):
+def helios_intensity(beam, power_w, divergence_rad, start_m, range_m, brightness):
     """The received power [nW] of a surface of so much reflectance times cosine."""
     if beam == "Gaussian":
         share = 1 - np.exp(-2.0)
@@ -47,7 +47,7 @@ def helios_intensity(beam, divergence_rad, start_m, range_m, brightness):
         radius_m = divergence_rad / 2 * (range_m if beam == "focused" else 1.0)
         share = -np.expm1(-2 * (radius_m / width_m) ** 2)
     air = np.exp(-2 * range_m * 3.91 / VISIBILITY_KM * (WAVELENGTH_M * 1e9 / 0.55) ** -1.3)
-    return 1e9 * POWER_W * share * APERTURE_M**2 * EFFICIENCY * air * np.pi / 4 * brightness / range_m**2
+    return 1e9 * power_w * share * APERTURE_M**2 * EFFICIENCY * air * np.pi / 4 * brightness / range_m**2
 
 
 def helios_range_m(scanner, channel, range_m, version, brightness, start_m=None):
@@ -58,7 +58,8 @@ def helios_range_m(scanner, channel, range_m, version, brightness, start_m=None)
     start = float(channel.get("rangeMin_m")) if start_m is None else start_m
     if range_m < start or range_m > float(channel.get("rangeMax_m")):
         return None
-    intensity = helios_intensity(beam, float(scanner.get("beamDivergence_rad")), start, range_m, brightness)
+    power_w, divergence_rad = float(scanner.get("averagePower_w")), float(scanner.get("beamDivergence_rad"))
+    intensity = helios_intensity(beam, power_w, divergence_rad, start, range_m, brightness)
     time = 7 / pulse * bin_ns * np.arange(int(pulse / bin_ns))
     wave = time**2 * np.exp(-time)
     peak = int(wave.argmax())
@@ -88,7 +89,7 @@ def helios_scanner(folder, gates_m):
 
 @each_row("version", HELIOS)
 def test_helios_returns_what_lies_inside_a_gate_wherever_that_starts(tmp_path, version):
-    gates_m = np.array([[0, 0.0005], [0, 25], [1e-6, 25], [0.001, 25], [0.02, 3], [0.4, 0.5], [5, 25], [24.9, 25]])
+    gates_m = np.array([[0, 0.0005], [0, 100], [1e-6, 25], [0.001, 100], [0.02, 3], [0.4, 0.5], [5, 100], [24.9, 25]])
     scanner, channels, notes = helios_scanner(tmp_path / "out", gates_m)
     [lost] = [note for note in notes if "behind a gate's start" in note]
     lost_m = float(lost.split(" mm")[0].split()[-1]) / 1000 + 1e-4
@@ -307,3 +308,61 @@ def test_a_film_that_mitsuba_cannot_hold_is_told(tmp_path):
 
     assert not told(1e7)
     assert told(2e7)
+
+
+# CloudCompare and Blender -------------------------------------------------------------------------------------------
+
+# libs/qCC_io/src/PlyFilter.cpp; source/blender/io/ply/importer/ply_import_data.cc
+
+
+def properties(path):
+    """Names of each element's properties, by the header."""
+    found = {}
+    for line in path.read_bytes().partition(b"end_header")[0].decode("ascii").splitlines():
+        words = line.split()
+        if words[0] == "element":
+            found[words[1]] = []
+        elif words[0] == "property":
+            found[list(found)[-1]].append(words[-1])
+    return found
+
+
+def cloudcompare(element, names):
+    """What CloudCompare takes each property for, before it asks."""
+    found = {}
+    for name in map(str.upper, names):
+        guesses = (
+            *((axis, axis in name) for axis in ("NX", "NY", "NZ")),
+            *((colour, colour in name) for colour in ("RED", "GREEN", "BLUE")),
+            ("scalar", any(word in name for word in ("INTENSITY", "GRAY", "GREY"))),
+            ("scalar", "VERT" in element.upper() and "SCAL" in name),
+            *((axis, "VERT" in element.upper() and name.endswith(axis)) for axis in "XYZ"),
+        )
+        taken = set(found.values()) - {"scalar"}
+        found[name] = next((what for what, fits in guesses if fits and what not in taken), None)
+    return found
+
+
+@pytest.fixture(scope="module")
+def points(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ply")
+    EXPORTERS["ply"].write(ONE, rays_with_gates(np.array([[0.0, 9.0]])), folder)
+    return folder
+
+
+def test_cloudcompare_knows_every_property_of_the_points(points):
+    names = properties(points / "rays.ply")["vertex"]
+    known = cloudcompare("vertex", names)
+    assert [known[name.upper()] for name in names] == [
+        *("X", "Y", "Z", "NX", "NY", "NZ", "RED", "GREEN", "BLUE"), *("scalar",) * 4
+    ]  # fmt: skip
+    assert set(cloudcompare("edge", properties(points / "beams.ply")["edge"]).values()) == {None}
+
+
+def test_blender_finds_points_edges_and_faces_by_their_names(points):
+    for file in ("rays.ply", "beams.ply", "frusta.ply"):
+        elements = properties(points / file)
+        assert {"x", "y", "z", "red", "green", "blue"} <= set(elements["vertex"])
+    assert {"nx", "ny", "nz"} <= set(properties(points / "rays.ply")["vertex"])
+    assert properties(points / "beams.ply")["edge"] == ["vertex1", "vertex2"]
+    assert properties(points / "frusta.ply")["face"] == ["vertex_indices"]

@@ -535,7 +535,7 @@ def test_ply_points_are_the_rays_and_edges_their_gates(written):
     np.testing.assert_array_equal(places(points), rays.origin_m)
     np.testing.assert_array_equal(places(points, ("nx", "ny", "nz")), rays.direction)
     for name, column in (("gate_start", rays.gate_m[:, 0]), ("gate_end", rays.gate_m[:, 1]), ("sensor", rays.sensor)):
-        np.testing.assert_array_equal(points[name], column)
+        np.testing.assert_array_equal(points[f"scalar_{name}"], column)
     beams = read_ply(path / "beams.ply")
     ends = places(beams["vertex"])[np.stack([beams["edge"]["vertex1"], beams["edge"]["vertex2"]], axis=1)]
     np.testing.assert_allclose(
