@@ -13,8 +13,9 @@ import torch
 from lidardesign.config import LearningSettings, RunConfig
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates, on_device, stays_on
-from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.target.prepare import prepare_target, training_scenes
 from lidardesign.density.target.proposals import independent_points
+from lidardesign.density.target.scale import scale_notes
 from lidardesign.density.target.target import Target
 from lidardesign.density.target.visibility import common_receiver
 from lidardesign.density.training.checkpoint import clear_snapshots, save_flow
@@ -30,7 +31,7 @@ from lidardesign.run.manifest import note, record
 from lidardesign.samples import save_samples
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH, observed_point
-from lidardesign.task import Task, notes_of, random_generator, scenes_of
+from lidardesign.task import Task, notes_of, random_generator
 
 FLOW = "flow.safetensors"
 ON_PROCESSOR = (
@@ -79,12 +80,13 @@ class TrainingData:
     pool: Pool
 
 
-def prepare_training_data(task: Task, config: RunConfig) -> TrainingData:
+def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str], None] | None = None) -> TrainingData:
     """The training data of a task; it does not depend on the steps, the flow or its optimiser.
 
     Arguments:
         task: The plugin.
         config: The resolved configuration.
+        remark: Called with what is wrong with lengths as soon as there are scenes; the notes have it too.
 
     Raises:
         ConfigError, DataError: Unusable settings or scenes.
@@ -98,7 +100,11 @@ def prepare_training_data(task: Task, config: RunConfig) -> TrainingData:
         )
     with plugin_guard(config.task_name):
         task_notes = notes_of(task, config.task, config.space)
-    target, notes = prepare_target(training_scenes(task, config), config)
+    scenes = training_scenes(task, config)
+    of_lengths = scale_notes(scenes, config)
+    for line in of_lengths if remark else ():
+        remark(line)
+    target, notes = prepare_target(scenes, config)
     with phase("proposals"):
         # independent of those that coverage is measured on
         generator = random_generator(config.seed, "balancing")
@@ -113,22 +119,7 @@ def prepare_training_data(task: Task, config: RunConfig) -> TrainingData:
         # points on the space's faces may leave it by rounding
         unit = config.space.to_unit(points).clip(-1.0, 1.0)
         pool = Pool.of(unit, target.log_density(points), log_density)
-    return TrainingData(target, (*task_notes, *notes), pool)
-
-
-@phase("scenes")
-def training_scenes(task: Task, config: RunConfig) -> list[Scene]:
-    """The scenes that a density is learned from.
-
-    Raises:
-        DataError: There are none.
-        PluginError: The task's own code failed.
-    """
-    with plugin_guard(config.task_name):
-        scenes = list(scenes_of(task, config.task, "train", config.seed, config.space))
-    if not scenes:
-        raise DataError(f"the task {config.task_name!r} gave no training scenes", where="task")
-    return scenes
+    return TrainingData(target, (*task_notes, *of_lengths, *notes), pool)
 
 
 def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
@@ -156,6 +147,7 @@ def learn(
     progress: Callable[[LearnProgress], None] | None = None,
     data: TrainingData | None = None,
     replan: Callable[[Trainer], LearningSettings] | None = None,
+    remark: Callable[[str], None] | None = None,
 ) -> LearnResult:
     """Learn the density of a task into a run folder.
 
@@ -168,6 +160,7 @@ def learn(
         progress: Called about every tenth step.
         data: What `prepare_training_data` made of the same task and configuration, to be learned on again.
         replan: Asked for the settings anew when balancing begins; see `Trainer`.
+        remark: See `prepare_training_data`.
 
     Raises:
         ConfigError, DataError: Unusable settings or scenes.
@@ -175,7 +168,7 @@ def learn(
     """
     place = choose_device(device)
     with running() as clock:
-        data = prepare_training_data(task, config) if data is None else data
+        data = prepare_training_data(task, config, remark) if data is None else data
         trainer = make_trainer(data, config, run, place)
         trainer.replan = replan
         if resume:

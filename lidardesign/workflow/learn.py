@@ -149,6 +149,17 @@ class LearnRequest:
         with plugin_guard(self.task.name):
             return notes_of(self.task, self.settings.task, self.settings.space)
 
+    def scale_notes(self) -> list[str]:
+        """What is wrong with the lengths of the training scenes, which are made for it, of the space and of sigma.
+
+        Raises:
+            DataError: There are no training scenes.
+        """
+        from lidardesign.density.target.prepare import training_scenes
+        from lidardesign.density.target.scale import scale_notes
+
+        return scale_notes(training_scenes(self.task, self.settings), self.settings)
+
     def plan(self) -> RequestPlan:
         """What learning would do."""
         settings, learning, goal = self.settings, self.settings.learning, self.goal
@@ -178,18 +189,19 @@ class LearnRequest:
             None if self.begun else _time_of_twin(self.folder, {name: document[name] for name in TIME_SECTIONS}),
         )
 
-    def run(self, progress: Callable[[LearnProgress], None] | None = None) -> LearnResult:
+    def run(self, progress: Callable[[LearnProgress], None] | None = None, remark: Notes | None = None) -> LearnResult:
         """Learn into the folder; what failed before anything was learned is taken away again.
 
         Arguments:
             progress: Called about every tenth step.
+            remark: Called with what is wrong with lengths, before anything is learned.
 
         Raises:
             ConfigError, DataError: Unusable settings or scenes, or a folder that cannot be written.
             DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
         """
         folder = self.folder
-        learner = Learner(self.task, folder, self.device, progress, outermost_clock() or Clock())
+        learner = Learner(self.task, folder, self.device, progress, outermost_clock() or Clock(), remark)
         with _new_folder(folder), run_lock(folder):
             if not self.begun:
                 check_can_start(folder)  # another process may have been faster

@@ -119,6 +119,7 @@ class Learner:
         device: auto, cpu or cuda.
         progress: Called about every tenth step.
         clock: By which a time budget is measured.
+        remark: Called with what is wrong with lengths, before anything is learned.
     """
 
     task: Task
@@ -126,6 +127,7 @@ class Learner:
     device: str
     progress: Callable[[LearnProgress], None] | None
     clock: Clock
+    remark: Callable[[str], None] | None = None
 
     def learn(self, config: RunConfig, goal: Goal, *, resume: bool) -> LearnResult:
         """Learn a configuration, or to a goal, or go on with it."""
@@ -137,7 +139,7 @@ class Learner:
             return self._to_tolerance(config, goal, resume, train)
         if goal.time_budget_s is not None and not resume:
             return self._within(config, goal.time_budget_s, train)
-        result = train(config, resume=resume)
+        result = train(config, resume=resume, remark=self.remark)
         return result if goal.is_none else replace(result, goal=read_manifest(self.run)[GOAL])
 
     def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool, train: Train) -> LearnResult:
@@ -147,7 +149,7 @@ class Learner:
         begun, note = goal_of(self.run), ""
         if begun is None:
             config, begun, note = self._begun(config, goal)
-        data = prepare_training_data(self.task, config)
+        data = prepare_training_data(self.task, config, self.remark)
 
         def once(staged: RunConfig, going_on: bool) -> LearnResult:
             return train(staged, resume=going_on, data=data)
@@ -159,7 +161,7 @@ class Learner:
 
     def _begun(self, config: RunConfig, goal: Goal) -> tuple[RunConfig, ToleranceGoal, str]:
         """The configuration with fields for the tolerance, and what they leave of it to learning."""
-        from lidardesign.density.learn import training_scenes
+        from lidardesign.density.target.prepare import training_scenes
         from lidardesign.density.training.schedule import ToleranceGoal
         from lidardesign.evaluate.accuracy.fields import fields_within
 
@@ -181,7 +183,7 @@ class Learner:
 
         place, startup = choose_device(self.device), self._startup_s()
         keeper = Timekeeper(time_budget_s, lambda: self.clock.seconds + startup, config, self.run)
-        data = prepare_training_data(self.task, config)
+        data = prepare_training_data(self.task, config, self.remark)
         with phase("planning"):
             planned = keeper.plan(data, place)
         result = train(planned, data=data, replan=keeper.replan)

@@ -92,17 +92,24 @@ def learn(
             command=("lidardesign", *sys.argv[1:]),
         )
         request = LearnRequest.resolve(task, chosen, output.remark)
-        task_notes = request.task_notes()
-        for note in task_notes:
+        said: list[str] = []
+
+        def remark(note: str) -> None:
+            said.append(note)
             output.remark(note)
+
+        for note in request.task_notes():
+            remark(note)
         if dry_run:
+            for note in request.scale_notes():
+                remark(note)
             return show_plan(request.plan(), output)
         output.when_interrupted = request.resume_hint
         with output.progress("learning", "loss", "ess", "left") as bar:
-            result = request.run(_progress(bar, output))
+            result = request.run(_progress(bar, output), remark)
         keep_times(request.folder, "learn", output, wait_s=WAIT_S)
         result = replace(result, notes=(*result.notes, *learning_advice(result)))
-        further = [] if output.quiet else [note for note in result.notes if note not in task_notes]
+        further = [] if output.quiet else [note for note in result.notes if note not in said]
         output.result(result_document(result), lambda rich: _show(result, further, rich))
         check_met(result, request.goal)
 

@@ -21,15 +21,15 @@ from lidardesign.density.target.proposals import occluded_share, propose
 from lidardesign.density.target.quadrature import Quadrature
 from lidardesign.density.target.target import Target, build_target
 from lidardesign.density.target.visibility import Optics, RayBatch, Raycast
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.space import RANGE, observed_point
-from lidardesign.task import random_generator
+from lidardesign.task import Task, random_generator, scenes_of
 
 PROBES = 4096
 OCCLUDED_SHARE_TO_CARE = 1e-3
-HIDDEN_SHARE_TO_WARN = 0.99
 MAXIMUM_POINTS = 1024
 # The share of probed rays that quadrature may see through although ray casting finds them opaque.
 MISSED_SHARE_TO_CARE = 0.005
@@ -43,6 +43,21 @@ FLAT_NATS = 0.5
 FLATNESS_PROBES = 256
 # Scenes that large with a sigma that fine are more likely in another unit.
 DOUBTFUL_ACROSS_M = 20.0
+
+
+@phase("scenes")
+def training_scenes(task: Task, config: RunConfig) -> list[Scene]:
+    """The scenes that a density is learned from.
+
+    Raises:
+        DataError: There are none.
+        PluginError: The task's own code failed.
+    """
+    with plugin_guard(config.task_name):
+        scenes = list(scenes_of(task, config.task, "train", config.seed, config.space))
+    if not scenes:
+        raise DataError(f"the task {config.task_name!r} gave no training scenes", where="task")
+    return scenes
 
 
 @phase("fields")
@@ -96,10 +111,7 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
     share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
     if share < OCCLUDED_SHARE_TO_CARE:
         return "off", f"visibility off: of {len(proposals.points)} probed rays {share:.2%} had anything in the way"
-    reason = f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
-    if share > HIDDEN_SHARE_TO_WARN:
-        reason += "; hardly anything is ever visible: check the occluders' places and the bodies' roles"
-    return "raycast", reason
+    return "raycast", f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
 
 
 def refine_quadrature(target: Target, probes: np.ndarray) -> tuple[Target, list[str]]:
