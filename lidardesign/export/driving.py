@@ -56,8 +56,8 @@ MIRROR = np.diag([1.0, -1.0, 1.0])
 NARROWEST_DEG = 0.001
 # Unreal's frames last from half a millisecond to 0.4 s; it makes others so.
 SLOWEST_HZ, FASTEST_HZ = 2.5, 2000.0
-# How many single-precision numbers from the field of view on, and around the frequency, are tried.
-TRIED_FIELDS, TRIED_RATES = 400, (0, 1, -1, 2, -2, 3, -3)
+# How many single-precision numbers around the field of view and the frequency are tried, the nearest first.
+TRIED_FIELDS, TRIED_RATES = (sorted(range(-most, most + 1), key=abs) for most in (4000, 3))
 
 
 def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
@@ -140,11 +140,11 @@ def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
 def _sweep(field_deg: float, rate_hz: float) -> tuple[float, float]:
     """The rotation frequency [Hz] and the field of view [deg] of which CARLA sweeps just the whole in a frame."""
     field, rate, step_s = (np.float32(value) for value in (field_deg, rate_hz, 1 / rate_hz))
-    fields = (field.view(np.int32) + np.arange(TRIED_FIELDS, dtype=np.int32)).view(np.float32)
+    fields = (field.view(np.int32) + np.array(TRIED_FIELDS, dtype=np.int32)).view(np.float32)
     rates = (rate.view(np.int32) + np.array(TRIED_RATES, dtype=np.int32)).view(np.float32)
-    whole = rates[:, None] * fields * step_s == fields
+    whole = rates * fields[:, None] * step_s == fields[:, None]
     nearest = np.argwhere(whole)[0] if whole.any() else (0, 0)
-    return float(rates[nearest[0]]), float(fields[nearest[1]])
+    return float(rates[nearest[1]]), float(fields[nearest[0]])
 
 
 def _rotation(mount: Mount, grid: EvenGrid, field_deg: float) -> dict[str, float]:

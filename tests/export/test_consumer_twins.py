@@ -186,6 +186,31 @@ def test_every_frame_of_carla_has_the_grids_rays_once(tmp_path, rate_hz, case):
     assert written["attributes"]["sensor_tick"] == "0.0"
 
 
+# few numbers near these do
+HARD_TO_SWEEP = """
+1024.3652784223673 0.015327117154160736
+128.03374440245298 25.87963506289764
+512.4703039523956 121.9597825772253
+128.01017118282869 1.5650519973915888
+4.00009405912849 91.6654571465388
+"""
+
+
+@each_row(("rate_hz", "field_deg"), [map(float, row.split()) for row in HARD_TO_SWEEP.strip().splitlines()])
+def test_carla_sweeps_just_the_whole_field_in_a_frame(tmp_path, rate_hz, field_deg):
+    field = np.radians(field_deg)
+    local = even(4, 1, (-field / 2, field / 4), (0.0, 0.0))
+    rays = Rays(np.zeros((4, 3)), local, np.tile([0.0, 9.0], (4, 1)), np.zeros(4), np.zeros(4))
+    EXPORTERS["carla"].write(ONE, rays, tmp_path / "out.json", rate_hz)
+    whole = json.loads((tmp_path / "out.json").read_text())
+    text = whole["sensors"][0]["attributes"]
+    step_s = SINGLE(whole["fixed_delta_seconds"])
+    assert SINGLE(text["rotation_frequency"]) * SINGLE(text["horizontal_fov"]) * step_s == SINGLE(
+        text["horizontal_fov"]
+    )
+    assert float(text["horizontal_fov"]) == pytest.approx(field_deg, rel=5e-4)
+
+
 @each_row("rate_hz", [0.001, 1.0, 2.49, 2001, 1e5])
 def test_carla_refuses_frames_that_unreal_does_not_have(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match=r"--rate-hz[\s\S]*2\.5 to 2000 Hz"):
