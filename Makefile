@@ -7,6 +7,7 @@
 # make mutation  changes the core's code in a thousand small ways and counts what its tests notice; to docs/soak
 # make soak   all long runs, a night on two cores: random whole runs, many seeds, kills, then fuzz and mutation; each
 #             also alone, as make soak-runs, soak-seeds and soak-kills; dated results go to docs/soak
+# make soak-promise  makes 2,000 random plans of effects and looks whether they keep what they promise, ten minutes
 # make clean  takes all of it away again
 PYTHON ?= python3
 VENV := .venv
@@ -16,7 +17,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: demo test consumers system-programs test-arithmetic coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills clean
+.PHONY: demo test consumers system-programs test-arithmetic coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills soak-promise clean
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): once, a minute or more"
@@ -96,6 +97,10 @@ soak-seeds: $(BIN)/.ready
 # Learning, fitting and evaluating are killed at random moments: what is left can be read, and going on repeats the bytes
 soak-kills: $(BIN)/.ready
 	PYTHONPATH=tests $(BIN)/python -m faults.kills --out docs/soak/kills-$$(date -u +%F).md
+
+# 2,000 random plans: nothing that is skipped changes more than is tolerated
+soak-promise: $(BIN)/.ready
+	PYTHONPATH=tests $(BIN)/python -m soak.promise --count 2000
 
 clean:
 	rm -rf $(VENV) build dist runs *.egg-info

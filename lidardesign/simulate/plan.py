@@ -2,7 +2,9 @@
 
 Each effect's `bound` (`simulate.effects`) says what it could change at most. The smallest are skipped as long as all
 that is skipped stays within a tolerance together: errors of range add up in the worst case, and so do shares of
-returns. Where nothing calls for an effect that is seen without casting a ray.
+returns. That is promised of what a detector reports, rounded and from the photons that chance brings, ray by ray with
+the same random numbers (`effects.steps`; tests/soak/promise.py tries it). Where nothing calls for an effect that is
+seen without casting a ray.
 
 What simulating an effect takes is predicted per ray and frame, as measured on one core (2.5 GHz) with a face of 20,000
 triangles, some hundred photons per ray and a gate of 1 m, each effect added to photon noise alone. Elsewhere the
@@ -25,7 +27,15 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.run.validation import suggest
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import EFFECTS, IDEAL, Detector, Physics, check_effects, check_windows
+from lidardesign.simulate.detector.detector import (
+    COUNTED,
+    EFFECTS,
+    IDEAL,
+    Detector,
+    Physics,
+    check_effects,
+    check_windows,
+)
 from lidardesign.simulate.effects import (
     ambient,
     atmosphere,
@@ -41,6 +51,7 @@ from lidardesign.simulate.effects import (
 )
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
+from lidardesign.simulate.effects.steps import with_steps
 from lidardesign.simulate.light_transport import process
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import Metric
@@ -87,6 +98,8 @@ CHOICES = ("auto", "all", "none")
 WORDS = (*CHOICES, "audit")
 # Scenes that move are looked at in so many frames, evenly spread: bounds are means over time.
 MOST_FRAMES = 16
+# Where these are on, a ray may have several echoes.
+SEVERAL_ECHOES = frozenset({"footprint", "specular", "multipath"})
 # What these change depends on first hits alone, behind mirrors and glass too.
 OF_FIRST_HITS = ("specular", "multipath", "shadowing")
 
@@ -96,7 +109,7 @@ class Tolerance:
     """What all skipped effects together may change.
 
     Arguments:
-        range_m: Of ranges, rms over returns [m].
+        range_m: Of ranges as they are reported, rms over returns [m].
         lost: Of returns, the share that is lost, invented or taken from somewhere else.
 
     Raises:
@@ -232,6 +245,9 @@ class Planner:
     def _decided(self, found: dict[str, Bound], seconds: dict[str, float]) -> EffectPlan:
         if self.choice == "auto":
             wanted = _called_for(found, self.tolerated)
+            if self.detector.photons is not None and wanted & SEVERAL_ECHOES and not wanted & COUNTED:
+                # echoes that are counted mix in another way than those that are not
+                wanted.add(max(COUNTED, key=lambda name: (found[name].relative(self.tolerated), name)))
         elif self.choice == "all":
             wanted = available_effects(self.detector)
         else:
@@ -318,6 +334,12 @@ def _bounds(
 def _frame_bounds(counts: Counts, present: Sequence[str]) -> dict[str, EffectBound]:
     """What each effect could change: anything, where mirrors and glass lead light to what no first hit shows."""
     bounds = {name: EFFECT_MODULES[name].bound(counts.first_hits, counts) for name in present}
+    # of ranges, where an echo takes a longer or shorter way to a receiver that stands elsewhere
+    stretched = 1 / counts.first_hits.path_per_range**2
+    bounds = {
+        name: replace(bound, squared_m2=bound.squared_m2 * stretched)
+        for name, bound in with_steps(counts, bounds).items()
+    }
     led = bounds["specular"].lost if "specular" in bounds else np.zeros(0)
     if not led.any():
         return bounds

@@ -12,6 +12,8 @@ import math
 import numpy as np
 from numba import njit, vectorize
 
+from lidardesign.simulate.detector.detector import MOST_COUNTS
+
 # 2^64 over the golden ratio, which makes the hash of 0 differ from 0, and the finaliser's multipliers
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 FIRST = np.uint64(0xBF58476D1CE4E5B9)
@@ -87,8 +89,6 @@ TAIL_START, TAIL_END = 1.6, 5.0
 # Below this mean a Poisson quantile is found by summing probabilities; above it by the expansion of Cornish and
 # Fisher (1938) to its third term, which is then off by less than one count.
 SUMMED_MEAN = 32.0
-# More counts than this are as good as any number of them, and still exact in float64.
-MOST_COUNTS = 2.0**40
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -80,7 +80,7 @@ def test_one_time_per_return_strays_by_the_whole_jitter():
 
 def test_the_matched_filter_averages_photons():
     never_blind = replace(SINGLE.photons, dead_s=0.0)
-    detector = replace(SINGLE, divergence_rad=0.0, footprint_rays=1, photons=never_blind)
+    detector = replace(SINGLE, divergence_rad=0.0, footprint_rays=1, photons=never_blind, bin_s=None)
     signal = float(counts(facing_wall(), detector, NARROW).signal[0])
     found = bound("photon_noise", facing_wall(), detector, NARROW).range_m
     assert found == pytest.approx(metres(detector.timing_sigma_s) / math.sqrt(signal), rel=1e-3)
@@ -200,13 +200,14 @@ def test_bounds_grow_with_jitter_bins_and_dead_time():
     growing("pile_up", [(sunny, detector) for detector in dead])
 
 
-def test_a_slanted_plane_spreads_a_beam_by_the_tangent_of_incidence():
-    tilt, width = math.radians(60), 0.01
+@each_row("tilt_deg", [0, 30, 60, 80, 88])
+def test_a_slanted_plane_spreads_a_beam_as_far_as_its_rim(tilt_deg):
+    tilt, width = math.radians(tilt_deg), 0.01
     turned = np.array([[math.cos(tilt), -math.sin(tilt), 0], [math.sin(tilt), math.cos(tilt), 0], [0, 0, 1.0]])
     wall = Body(Box((1e-6, 50, 50)), poses=rigid(turned, (2, 0, 0)))
     detector = replace(TIMED, divergence_rad=width, footprint_rays=7)
     found = bound("footprint", Scene((wall,)), detector, NARROW)
-    assert found.range_m == pytest.approx(2 * width / 2 * math.tan(tilt), rel=1e-3)
+    assert found.range_m == pytest.approx(2 * (math.cos(tilt) / math.cos(tilt + width / 2) - 1), rel=0.05)
     assert found.lost == 0
 
 

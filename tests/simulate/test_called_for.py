@@ -134,7 +134,7 @@ def test_a_wide_beam_at_a_depth_edge_calls_for_its_footprint():
     rays = rays_of(origins, np.tile([0.0, 1.0, 0.0], (64, 1)), (0.0, 1.2))
     wide = Detector("wide", bin_s=2e-11, divergence_rad=0.1, footprint_rays=16)
     assert_called_for("footprint", "beams of 100 mrad", FLATLAND, scenes, rays, wide)
-    for decisions in plans(scenes, rays, replace(wide, divergence_rad=1e-6)):
+    for decisions in plans(scenes, rays, replace(wide, divergence_rad=1e-8)):
         assert not decisions["footprint"].on
 
 

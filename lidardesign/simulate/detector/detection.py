@@ -12,6 +12,7 @@ from lidardesign.simulate.detector.dead_time import find_corrected
 from lidardesign.simulate.detector.detector import (
     COUNTED,
     FWHM_PER_SIGMA,
+    MOST_COUNTS,
     Bins,
     Physics,
     bins_of,
@@ -34,7 +35,7 @@ from lidardesign.simulate.effects.photon_noise import draw_numbers, draw_places
 from lidardesign.simulate.effects.pile_up import survive_dead_time
 from lidardesign.simulate.effects.quantisation import round_to_bins
 from lidardesign.simulate.light import Background, Echoes
-from lidardesign.simulate.streams import MOST_COUNTS, normal_quantiles
+from lidardesign.simulate.streams import normal_quantiles
 
 # Rays that more photons than this are expected of are counted bin by bin, others photon by photon
 PHOTONS_ONE_BY_ONE = 512.0
@@ -98,8 +99,10 @@ def _from_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physi
     known = _known_level(light, physics)
     matched = detector.estimator == "matched"
     judged = (counts, bins.offset, bins.end_shares, bins.width_m, sigma_m, half, known, detector.false_alarm, matched)
-    if detector.correction == "coates" and "pile_up" in physics.effects and detector.photons.dead_s > 0:
-        times_m = metres(detector.photons.dead_s), metres(1 / detector.photons.repetition_hz)
+    if detector.correction == "coates" and detector.photons.dead_s > 0:
+        # it judges in the same way, and finds nothing to correct, where it is never blind
+        dead_s = detector.photons.dead_s if "pile_up" in physics.effects else 0.0
+        times_m = metres(dead_s), metres(1 / detector.photons.repetition_hz)
         place = find_corrected(*judged, max(light.pulses, 1.0), *(time_m / bins.width_m for time_m in times_m))
     else:
         place = find_returns(*judged)
@@ -114,10 +117,10 @@ def _known_level(light: ArrivingLight, physics: Physics) -> np.ndarray:
     """
     detector, width_m = physics.detector, light.bins.width_m
     arriving = light.per_metre * width_m
-    if "pile_up" not in physics.effects:
-        return light.pulses * arriving
     if detector.correction == "coates" and detector.photons.dead_s > 0:
         return light.pulses * -np.expm1(-arriving)
+    if "pile_up" not in physics.effects:
+        return light.pulses * arriving
     return light.pulses * arriving / (1 + light.per_metre * metres(detector.photons.dead_s))
 
 

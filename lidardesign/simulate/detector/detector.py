@@ -26,6 +26,8 @@ from lidardesign.scene import SPEED_OF_LIGHT_M_S, Scene
 from lidardesign.simulate.light import Echoes
 
 PLANCK_J_S = 6.62607015e-34
+# More counts than this are as good as any number of them, and still exact in float64.
+MOST_COUNTS = 2.0**40
 # Full width at half maximum over standard deviation of a Gaussian.
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 

@@ -1,7 +1,7 @@
 """Light of the surroundings and dark counts.
 
-A surface under the spectral irradiance E of the ambient light has the radiance reflectance * E / pi, in all
-directions. A pixel sees it through the aperture A, the filter's width W and its solid angle Omega:
+A surface under the spectral irradiance E of the ambient light has the radiance reflectance * E / pi, in all directions.
+A pixel sees it through the aperture A, the filter's width W and its solid angle Omega:
 
     rate = E reflectance / pi * W * A * Omega * efficiency / (photon energy) + dark counts      [1/s]
 
@@ -12,7 +12,8 @@ bin, B bins and s counts in the echo's bin, another bin wins with at most (B - 1
 union over bins of Chernoff's bound. A threshold that lets background pass with the probability `false_alarm` hides
 echoes below it, and a ray that has no return invents one as often as that. Counts under the echo make its range stray:
 in much background, b per metre, n photons of a Gaussian are placed with the variance (sigma^2 / n) (4 sqrt(pi) sigma b
-/ n) (Cramer and Rao's bound), which is added to that without; the highest bin strays (1 + b / s)^(1/4) times as far.
+/ n) (Cramer and Rao's bound), which is added to that without; the highest bin strays (1 + b / s)^(1/4) times as far. By
+the level of background the matched filter's place between bins moves too, half a step at most (`FirstHits.step_m`).
 
 No false peak can be where no count arrives: it is at most 1 - exp(-B b). Where a detector is blind after a count, light
 before an echo leaves less of it (see `Blindness`), and is uneven, so that more of it is taken for returns.
@@ -35,7 +36,6 @@ from lidardesign.simulate.effects.expected_counts import (
     Counts,
     count_text,
     missed_behind,
-    share_in_bins,
     unevenness,
     variance_of_missing,
 )
@@ -97,7 +97,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     alarms = np.minimum(first_hits.detector.false_alarm + unevenness(counts, blind), any_count)
     lost = np.minimum(np.where(first_hits.returned, wrong + hidden, alarms + unmade), 1.0)
     squared = np.minimum(_strayed(counts, signal, sigma_m), first_hits.width_m) ** 2
-    squared += variance_of_missing(counts, in_the_dark.left, signal, sigma_m)
+    squared += variance_of_missing(counts, in_the_dark.left, signal, sigma_m) + any_count * counts.level_m2
     return EffectBound(squared, lost, _reason(first_hits, per_bin * counts.bins))
 
 
@@ -107,7 +107,7 @@ def _strayed(counts: Counts, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndar
     if counts.first_hits.detector.estimator == "matched":
         per_metre = per_bin / counts.bin_m
         return error * np.sqrt(4 * math.sqrt(math.pi) * sigma_m * safe_divide(per_metre, np.maximum(signal, 1.0)))
-    echo = np.maximum(signal, 1.0) * share_in_bins(1, counts.bin_m, sigma_m)
+    echo = np.maximum(signal, 1.0) * counts.share_in_bins(1, sigma_m)
     return error * np.sqrt(np.sqrt(1 + safe_divide(per_bin, echo)) - 1)
 
 

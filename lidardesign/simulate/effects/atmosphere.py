@@ -177,6 +177,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     wrong = np.minimum(counts.mistaken(left, counts.per_bin + fullest, own, sigma_m), any_count)
     changed = np.maximum(changed_share(clear, counts.in_air), changed_share(without.left, left))
     squared = counts.error_m(left, sigma_m) ** 2 * np.minimum(2 * np.sqrt(changed) + any_count, 1.0)
+    squared += np.minimum(changed + any_count, 1.0) * counts.level_m2
     lost = np.where(first_hits.returned, fewer + wrong, any_count)
     medium = first_hits.scene.medium
     return EffectBound(

@@ -24,9 +24,9 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.geometry.frames import range_of_path
-from lidardesign.numerics import COARSE_SLACK, EPSILON, TINY, safe_divide
+from lidardesign.numerics import COARSE_SLACK, EPSILON, SQUARABLE, TINY, safe_divide
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
-from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector, bin_width_m, metres
+from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, MOST_COUNTS, Detector, bin_width_m, metres
 from lidardesign.simulate.effects.first_hits import FirstHits
 from lidardesign.simulate.light import spectral_irradiance
 
@@ -67,7 +67,7 @@ def haze_per_pulse(first_hits: FirstHits, emitted: np.ndarray, bin_m: float) -> 
     if first_hits.scene.receiver is not None:
         whole, fullest = _haze_beside_rays(first_hits, end, bin_m)
         return light * whole, light * fullest
-    focus = 1 / np.maximum(first_hits.hits.range_m, TINY)
+    focus = 1 / np.maximum(first_hits.hits.range_m, SQUARABLE)
     sharp = 1 / (focus + math.sqrt(photons.field_of_view_sr / photons.aperture_m2))
     sharp = np.clip(sharp, start, end)
     before = safe_divide(sharp - start, (1 - start * focus) * (1 - sharp * focus))
@@ -149,17 +149,26 @@ class Counts:
     @cached_property
     def _of_first_hit(self) -> np.ndarray:
         photons = self.first_hits.detector.photons
-        return self._by_sharing("emitted") * photons.aperture_m2 * photons.efficiency * self.first_hits.gain
+        per_gain = self._by_sharing("emitted") * photons.aperture_m2 * photons.efficiency
+        # limited before the product: a surface that touches the receiver has the largest gain there is
+        return np.minimum(self.first_hits.gain, MOST_COUNTS / (per_gain * self.pulses)) * per_gain
 
-    def leaked(self, sigma_m: np.ndarray) -> np.ndarray:
+    def leaked(self, sigma_m: np.ndarray, nearer_m: np.ndarray | float = 0.0) -> np.ndarray:
         """Counts that the pulse of a hit outside the gate spills into it in a frame, in clear air, shape (N,).
 
-        The part of a Gaussian inside the window, at most its part beyond the nearer end.
+        The part of a Gaussian inside the window, at most its part beyond the nearer end, where that is so much nearer.
         """
         from scipy.special import ndtr
 
-        share = ndtr(-self.first_hits.gate_edge_m / np.maximum(sigma_m, TINY))
+        share = ndtr((nearer_m - self.first_hits.gate_edge_m) / np.maximum(sigma_m, SQUARABLE))
         return np.where(self.first_hits.returned, 0.0, self._of_first_hit * self.pulses * share)
+
+    def spilled(self, moved_m: np.ndarray) -> np.ndarray:
+        """Probability that a pulse spills into a gate because its hit has moved so far (N,) [m], shape (N,)."""
+        if self.first_hits.detector.photons is None:
+            return np.zeros(len(self.first_hits))
+        sigma_m = self.first_hits.sigma_m()
+        return -np.expm1(np.minimum(self.leaked(sigma_m) - self.leaked(sigma_m, moved_m), 0.0))
 
     @cached_property
     def signal(self) -> np.ndarray:
@@ -203,8 +212,8 @@ class Counts:
 
     @cached_property
     def per_bin(self) -> np.ndarray:
-        """Ambient and dark counts per bin in a frame, shape (N,)."""
-        return self.background_per_metre * self.bin_m * self.pulses
+        """Ambient and dark counts per bin in a frame, or in the part of it that is listened to, shape (N,)."""
+        return self.background_per_metre * np.minimum(self.bin_m, self.first_hits.width_m) * self.pulses
 
     @cached_property
     def pulse_bins(self) -> int:
@@ -223,6 +232,14 @@ class Counts:
         pairs, place = np.unique(level + 1j * bins, return_inverse=True)
         return needed_counts(pairs.real, pairs.imag, self.first_hits.detector.false_alarm)[place]
 
+    def share_in_bins(self, count: int, sigma_m: np.ndarray) -> np.ndarray:
+        """Share of an echo's photons in an odd number of bins, and no more than its gate does not cut off, (N,)."""
+        from scipy.special import ndtr
+
+        away = (self.first_hits.window_m - self.first_hits.path_m[:, None]).T / np.maximum(sigma_m, SQUARABLE)
+        inside = np.where(self.first_hits.returned, ndtr(away[1]) - ndtr(away[0]), 1.0)
+        return np.minimum(share_in_bins(count, self.bin_m, sigma_m), inside)
+
     def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_m: np.ndarray) -> np.ndarray:
         """Probability that the echo's bins hold fewer counts than it takes to be reported, shape (N,).
 
@@ -234,7 +251,7 @@ class Counts:
         from scipy.special import pdtr
 
         per_bin = np.broadcast_to(per_bin, signal.shape)
-        expected = signal * share_in_bins(self.pulse_bins, self.bin_m, sigma_m) + per_bin * self.pulse_bins
+        expected = signal * self.share_in_bins(self.pulse_bins, sigma_m) + per_bin * self.pulse_bins
         return pdtr(self.needed(per_bin) - 1, expected)
 
     def more_missed(self, before: Echo, after: Echo) -> np.ndarray:
@@ -254,9 +271,30 @@ class Counts:
         wide as a pulse, no worse than by their sums.
         """
         wide = self.pulse_bins if self.first_hits.detector.estimator == "matched" else 1
-        expected = signal * share_in_bins(wide, self.bin_m, sigma_m) + wide * per_bin
+        expected = signal * self.share_in_bins(wide, sigma_m) + wide * per_bin
         lead = np.maximum(np.sqrt(expected) - np.sqrt(wide * other), 0.0)
         return np.minimum((self.bins - 1) * np.exp(-(lead**2)), 1.0)
+
+    def missed_on_edges(self, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
+        """How much more often an echo is missed on the edge of a bin than in its middle, shape (N,)."""
+        from scipy.special import erf
+
+        middle = erf(self.pulse_bins * self.bin_m / (2 * math.sqrt(2) * np.maximum(sigma_m, SQUARABLE)))
+        share = safe_divide(middle, self.share_in_bins(self.pulse_bins, sigma_m), 1.0)
+        return self.more_missed(Echo(signal * share, sigma_m), Echo(signal, sigma_m))
+
+    def by_chance(self, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:
+        """Probability that a return is of background: taken for the echo, or where there is none, shape (N,)."""
+        any_count = -np.expm1(-self.per_bin * self.bins)
+        wrong = self.mistaken(blind.left, self.per_bin, self.per_bin * blind.under, sigma_m)
+        alarms = self.first_hits.detector.false_alarm + unevenness(self, blind)
+        return np.minimum(np.where(self.first_hits.returned, wrong, alarms), any_count)
+
+    @cached_property
+    def level_m2(self) -> np.ndarray:
+        """How far another level of background moves what the matched filter finds between bins, squared, (N,) [m^2]."""
+        matched = self.first_hits.detector.estimator == "matched" and self.first_hits.detector.bin_m is not None
+        return (self.first_hits.step_m / 2) ** 2 * matched
 
     def error_m(self, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
         """How far the range from so many photons strays, rms, shape (N,) [m]."""
@@ -276,7 +314,7 @@ def share_in_bins(count: int, bin_m: float, sigma_m: np.ndarray) -> np.ndarray:
     """Share of an echo's photons in an odd number of bins, in the worst case: it lies on an edge of the middle one."""
     from scipy.special import erf
 
-    spread_m = math.sqrt(2) * np.maximum(sigma_m, TINY)
+    spread_m = math.sqrt(2) * np.maximum(sigma_m, SQUARABLE)
     return 0.5 * (erf((count - 1) / 2 * bin_m / spread_m) + erf((count + 1) / 2 * bin_m / spread_m))
 
 
@@ -342,7 +380,8 @@ class Blindness:
     def of(cls, counts: Counts, *, ambient: bool = True, haze: bool = True) -> Blindness:
         """With ambient light and dark counts, and with what the air sends back, or as if there were none."""
         first_hits, photons = counts.first_hits, counts.first_hits.detector.photons
-        echo = safe_divide(counts.in_air, counts.pulses)
+        # what spills into a gate from outside it is an echo there
+        echo = safe_divide(counts.in_air + counts.leaked(first_hits.sigma_m()), counts.pulses)
         from_air = counts.haze_per_pulse[0] * haze
         per_metre = counts.background_per_metre * ambient
         whole = per_metre * first_hits.width_m + from_air + echo
@@ -364,7 +403,7 @@ def missed_behind(counts: Counts, blind: Blindness, sigma_m: np.ndarray) -> np.n
     from scipy.special import pdtr
 
     width = counts.pulse_bins
-    expected = blind.left * share_in_bins(width, counts.bin_m, sigma_m) + width * counts.per_bin * blind.under
+    expected = blind.left * counts.share_in_bins(width, sigma_m) + width * counts.per_bin * blind.under
     return pdtr(counts.needed(counts.per_bin * blind.level) - 1, expected)
 
 

@@ -13,7 +13,7 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Hits, Outcome, Rays, gate_outcomes
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector, metres, resolution_m
+from lidardesign.simulate.detector.detector import Detector, bins_start, metres, resolution_m
 from lidardesign.simulate.light import Beams, direct_echoes
 
 # A surface that is grazed more flatly than this counts as met at it: ranges then change by up to 50 times a step aside.
@@ -22,6 +22,8 @@ FLATTEST_COSINE = 0.02
 NEIGHBOURS = 4
 # The matched filter takes photons up to so many standard deviations from its pulse's centre into account.
 PULSE_REACH = 4.0
+# Of a pulse r bins wide, the matched filter leaves the share exp(-3.2 r) + 0.044 / r^2 of a step between bins, at most
+FILTER_SOFTENS, FILTER_LEAVES = 3.2, 0.044
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +31,7 @@ class EffectBound:
     """What an effect could change, ray by ray.
 
     Arguments:
-        squared_m2: Mean squared error of the range of a return, (N,) [m^2].
+        squared_m2: Mean squared error of half the path of a return, (N,) [m^2].
         lost: Probability that a return is lost, or invented, or taken from somewhere else, (N,).
         reason: Why, in one line.
     """
@@ -130,6 +132,24 @@ class FirstHits:
         return path_of_range(self.rays, self.scene.receiver, self.range_m)
 
     @cached_property
+    def path_per_range(self) -> np.ndarray:
+        """How much half a path grows by a longer range, at least `FLATTEST_COSINE`: 1 without a receiver, (N,)."""
+        if self.scene.receiver is None:
+            return np.ones(len(self))
+        back = (
+            self.rays.origin_m - np.asarray(self.scene.receiver.origin_m) + self.range_m[:, None] * self.rays.direction
+        )
+        along = np.einsum("nk,nk->n", back, self.rays.direction)
+        return np.maximum((1 + safe_divide(along, np.linalg.norm(back, axis=1), 1.0)) / 2, FLATTEST_COSINE)
+
+    def half_path_m(self, range_m: np.ndarray, aside_m: np.ndarray) -> np.ndarray:
+        """How much half a path changes at most where a hit lies further by (N,) and aside by (N,) [m], shape (N,)."""
+        if self.scene.receiver is None:
+            return range_m
+        together = (self.rays.origin_m == np.asarray(self.scene.receiver.origin_m)).all(axis=1)
+        return np.where(together, range_m, (range_m + np.hypot(range_m, aside_m)) / 2)
+
+    @cached_property
     def before_m(self) -> np.ndarray:
         """How much of its window lies before a ray's return; the whole window without one, shape (N,) [m]."""
         return np.where(self.returned, np.clip(self.path_m - self.window_m[:, 0], 0.0, self.width_m), self.width_m)
@@ -168,6 +188,25 @@ class FirstHits:
         """
         averages = self.detector.photons is not None and self.detector.estimator == "matched"
         return max(resolution_m(self.detector), averages * PULSE_REACH * metres(self.detector.timing_sigma_s))
+
+    @cached_property
+    def rounding_m(self) -> np.ndarray:
+        """How far each first hit lies from the middle of its bin, at most half a bin, shape (N,) [m]."""
+        phase_m = np.mod(self.path_m - bins_start(self.window_m, self.detector), self.detector.bin_m)
+        return np.abs(phase_m - self.detector.bin_m / 2)
+
+    @cached_property
+    def step_m(self) -> np.ndarray:
+        """How far a range jumps at most where an echo goes from one of the detector's bins to the next, (N,) [m].
+
+        By a bin, but the matched filter finds its place between bins: what is left there of rounding was computed for
+        a Gaussian of the standard deviation r bins in all its places, levels of background and widths of the filter.
+        """
+        bin_m = self.detector.bin_m or 0.0
+        if bin_m == 0 or self.detector.photons is None or self.detector.estimator == "peak":
+            return np.full(len(self), bin_m)
+        spread = self.sigma_m(jitter=False) / bin_m
+        return np.minimum(np.exp(-FILTER_SOFTENS * spread) + FILTER_LEAVES / np.maximum(spread, 1.0) ** 2, 1.0) * bin_m
 
 
 # A step in range counts as an edge where it exceeds the slope of both surfaces this many times over.

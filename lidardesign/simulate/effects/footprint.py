@@ -4,12 +4,13 @@ What a detector makes of several echoes of one ray is its own matter (`simulate.
 mixed return, of distant ones it reports one.
 
 What it could change (`bound`), as slanted surfaces spread an echo and beams on a depth edge meet two surfaces: a beam
-of half angle h is R h wide at the range R; on a surface met at the angle theta its ranges spread by
-+-R h tan(theta), so a return is off by at most that, and may leave or enter a gate that ends within it. An edge within
-R h of the ray's end mixes both surfaces: the return may be of either and counts as lost, or between them, as far apart
-as the detector does not tell them apart; see `edge_probability` (an estimate). What lies between rays is met by a beam
-but by none of them: one place on the rim of each beam is looked at too. Photons from all over the spread are as
-good as noise for the time of one: the spread is counted in full, not its rms of a half.
+of half angle h is R h wide at the range R; on a plane met at the angle theta its rim lies up to R cos(theta) /
+cos(theta + h) away, so a return is off by at most what that exceeds R by, and may leave or enter a gate that ends
+within it, or spill into it. A receiver elsewhere is further from the rim, too. An edge within R h of the ray's end
+mixes both surfaces: the return may be of either and counts as lost, or between them, as far apart as the detector does
+not tell them apart; see `edge_probability` (an estimate). What lies between rays is met by a beam but by none of them:
+one place on the rim of each beam is looked at too. Photons from all over the spread are as good as noise for the time
+of one: the spread is counted in full, not its rms of a half.
 """
 
 from __future__ import annotations
@@ -96,10 +97,14 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of beams with a width."""
     radius_m, wide_rad = first_hits.beam_m, first_hits.detector.divergence_rad
-    spread_m = radius_m * first_hits.tangent
+    # of a plane, at its far end: R (cos theta / cos(theta + h) - 1)
+    steepness = math.cos(wide_rad / 2) - first_hits.tangent * math.sin(wide_rad / 2)
+    spread_m = first_hits.range_m * (1 / np.maximum(steepness, FLATTEST_COSINE) - 1)
+    spread_m = first_hits.half_path_m(spread_m, radius_m)
     edge = edge_probability(first_hits, radius_m)
     squared = np.minimum(spread_m, first_hits.width_m) ** 2 + edge * first_hits.resolution_m**2
     lost = np.maximum(edge, (first_hits.gate_edge_m <= spread_m) | stray_rims(first_hits))
+    lost = np.maximum(lost, counts.spilled(spread_m))
     wide_m = float(np.median(2 * radius_m[first_hits.returned])) if first_hits.returned.any() else 0.0
     return EffectBound(
         squared, lost, f"beams of {1000 * wide_rad:.3g} mrad are {1000 * wide_m:.3g} mm wide where they return"

@@ -1,11 +1,13 @@
 """The timing of a photon strays: by diode and converter, as a normal error that every photon has anew.
 
 What it could change (`bound`): without photons each return has one normal error, (c / 2) sigma_j rms. With n photons
-the matched filter averages them: (c / 2) sigma_j / sqrt(n). The highest bin does not average; with timing errors it
-strays as `estimate_error_m` says of pulse and timing together, and without them it strayed by itself, so that the two
-differ by at most sqrt(e(sigma_p, sigma_j)^2 + e(sigma_p)^2). A wider echo is also lower: returns are lost where it now
-falls below what is reported, and surfaces outside a gate spill more photons into it. Of several photons in a pulse a
-detector that is blind after a count times the first, which is the earlier the more they stray.
+the matched filter averages them: (c / 2) sigma_j / sqrt(n), where bins are as fine; each photon also goes to another
+bin by itself, which adds a bin times (c / 2) sigma_j to the variance of one, and a wider pulse is found elsewhere
+between bins. The highest bin does not average; with timing errors it strays as `estimate_error_m` says of pulse and
+timing together, and without them it strayed by itself, so that the two differ by at most sqrt(e(sigma_p, sigma_j)^2 +
+e(sigma_p)^2). A wider echo is also lower: returns are lost where it now falls below what is reported, or below
+background as photons leave their bins, and surfaces outside a gate spill more photons into it. Of several photons in a
+pulse a detector that is blind after a count times the first, which is the earlier the more they stray.
 
 The pulse is taken as Gaussian and n as its expectation: an estimate where n is small.
 """
@@ -50,11 +52,17 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     blind = Blindness.of(counts)
     signal, pulse_m, both_m = blind.left, first_hits.sigma_m(jitter=False), first_hits.sigma_m()
     if detector.estimator == "matched":
-        squared = estimate_error_m(detector, signal, metres(sigma_s)) ** 2
+        # between bins a wider pulse is found elsewhere, too
+        moved_m = np.minimum(2 * (both_m - pulse_m), first_hits.step_m)
+        # and every photon that strays may go to another bin by itself
+        strayed_m2 = metres(sigma_s) * (metres(sigma_s) + (detector.bin_m or 0.0))
+        squared = estimate_error_m(detector, signal, np.sqrt(strayed_m2)) ** 2 + moved_m**2
     else:
         squared = counts.error_m(signal, both_m) ** 2 + counts.error_m(signal, pulse_m) ** 2
     squared = squared + ((both_m - pulse_m) * blind.early) ** 2
     lost = counts.more_missed(Echo(signal, pulse_m), Echo(signal, both_m))
+    # photons that change bins make background win, or not any more
+    lost = lost + np.minimum(signal * metres(sigma_s) / counts.bin_m, 1.0) * counts.by_chance(blind, both_m)
     spilled = -np.expm1(-np.maximum(counts.leaked(both_m) - counts.leaked(pulse_m), 0.0))
     return EffectBound(
         squared,

@@ -233,6 +233,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     squared = np.minimum(moved_m, first_hits.width_m) ** 2 + edge * first_hits.resolution_m**2
     entered = entered_rays(first_hits)
     lost = np.maximum(edge, ((first_hits.gate_edge_m <= moved_m) & (moved_m > 0)) | entered)
+    lost = np.maximum(lost, counts.spilled(moved_m))
     reason = f"surfaces move by up to {1000 * step_m.max(initial=0.0):.3g} mm within a frame"
     if entered.any():
         reason += f", and into {100 * entered.mean():.3g} % of rays"

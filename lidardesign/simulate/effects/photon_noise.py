@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidardesign.geometry.rays import Rays
-from lidardesign.numerics import TINY
+from lidardesign.numerics import SQUARABLE
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.effects.expected_counts import Blindness, Counts, missed_behind
@@ -66,5 +66,5 @@ def _cut_m(first_hits: FirstHits, sigma_m: np.ndarray) -> np.ndarray:
     """How far the mean of a pulse moves where the gate's end cuts it off, shape (N,) [m]."""
     from scipy.special import ndtr
 
-    away = np.where(first_hits.returned, first_hits.gate_edge_m, np.inf) / np.maximum(sigma_m, TINY)
+    away = np.where(first_hits.returned, first_hits.gate_edge_m, np.inf) / np.maximum(sigma_m, SQUARABLE)
     return sigma_m * np.exp(-(away**2) / 2) / (math.sqrt(2 * math.pi) * ndtr(away))

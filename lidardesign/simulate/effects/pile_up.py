@@ -69,6 +69,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     # How much more often what is left of an echo is missed or mistaken
     per_bin, haze = counts.per_bin, [counts.pulses * part for part in counts.haze_per_pulse]
     gone = counts.in_air - blind.left + counts.pulse_bins * per_bin * (1 - blind.under)
+    squared += np.clip(gone, 0.0, 1.0) * counts.level_m2
     in_light = missed_behind(counts, blind, sigma_m) - counts.missed(counts.in_air, per_bin, sigma_m)
     in_the_dark = counts.missed(blind.left, 0.0, sigma_m) - counts.missed(counts.in_air, 0.0, sigma_m)
     missed = np.maximum(np.maximum(in_light, in_the_dark), 0.0)
@@ -86,6 +87,6 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
 
 def _invented(counts: Counts, blind: Blindness) -> np.ndarray:
     """How much more or less often background is taken for a return; not at all where none of it is gone, (N,)."""
-    haze = counts.pulses * counts.haze_per_pulse[0]
-    gone = (counts.per_bin * counts.bins + haze) * (1 - blind.level)
-    return np.minimum(unevenness(counts, blind) - np.expm1(-haze), np.minimum(gone, 1.0))
+    stray = counts.pulses * counts.haze_per_pulse[0] + counts.leaked(counts.first_hits.sigma_m())
+    gone = (counts.per_bin * counts.bins + stray) * (1 - blind.level)
+    return np.minimum(unevenness(counts, blind) - np.expm1(-stray), np.minimum(gone, 1.0))

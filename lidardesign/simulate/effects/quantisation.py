@@ -1,20 +1,21 @@
 """Times are rounded to bins, which start with the gate or with the pulse: an error spread evenly over a bin.
 
-What it could change (`bound`): its rms is bin / sqrt(12), as ranges lie anywhere in a bin: an estimate where all of
-them lie at one place of their bin, which may be half a bin off.
+What it could change (`bound`): its rms is bin / sqrt(12), as ranges lie anywhere in a bin, or what rounding does to the
+ranges of first hits where that is more: where all of them lie at one place of their bin it may be half a bin. The
+highest bin of other bins is another one, and background makes other peaks in them, or none.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from lidardesign.geometry.rays import Rays
+from lidardesign.numerics import safe_divide
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Detector, bins_start
-from lidardesign.simulate.effects.expected_counts import Counts
+from lidardesign.simulate.effects.expected_counts import Blindness, Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 
 
@@ -33,10 +34,14 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """bin^2 / 12 for every ray."""
-    bin_m = first_hits.detector.bin_m
-    return EffectBound(
-        np.full(len(first_hits), (bin_m / math.sqrt(12)) ** 2),
-        np.zeros(len(first_hits)),
-        f"bins are {1000 * bin_m:.3g} mm wide",
-    )
+    """bin^2 / 12 for every ray, or what rounding does to the first hits of its list."""
+    bin_m, row = first_hits.detector.bin_m, first_hits.row
+    rounded_m2 = np.bincount(row, first_hits.rounding_m**2 * first_hits.returned)
+    squared = np.maximum(bin_m**2 / 12, safe_divide(rounded_m2, np.bincount(row, first_hits.returned)))[row]
+    lost = np.zeros(len(first_hits))
+    if first_hits.detector.photons is not None:
+        sigma_m, blind = first_hits.sigma_m(), Blindness.of(counts)
+        if first_hits.detector.estimator == "peak":
+            squared = squared + 2 * counts.error_m(blind.left, sigma_m) ** 2
+        lost = np.minimum(2 * counts.by_chance(blind, sigma_m) + counts.missed_on_edges(blind.left, sigma_m), 1.0)
+    return EffectBound(squared, lost, f"bins are {1000 * bin_m:.3g} mm wide")
