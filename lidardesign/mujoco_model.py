@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -20,15 +20,23 @@ import numpy as np
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.surface import grid_faces
 from lidardesign.meshio import check_mesh
-from lidardesign.run.inputs import ROBOT_FILES, check_bytes, check_file
+from lidardesign.run.inputs import ROBOT_FILES, check_bytes, check_file, read_head
 from lidardesign.run.xml import read_xml
 from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Role, Shape, Sphere, rigid
+from lidardesign.space import FARTHEST_M
 
 if TYPE_CHECKING:
     import mujoco
 
 DIRECTORIES = ("meshdir", "texturedir", "assetdir")
-MAX_INCLUDES = 100
+MAX_INCLUDES = MAX_DIRECTORIES = 100
+# What MuJoCo would make of a few words: elements, copies of them, pixels, places of terrain, room for keyframes.
+# Its time grows with the square of the elements, and faster with copies.
+MOST_ELEMENTS, MOST_COPIES = 20_000, 2000
+MOST_PIXELS, MOST_PLACES = 1 << 27, 1 << 21
+MOST_NUMBERS = 10_000
+REPEATING = ("replicate", "composite", "flexcomp")
+PNG_BEGINNING = b"\x89PNG\r\n\x1a\n"
 MESH_ENDINGS = (".obj", ".stl", ".msh")  # what MuJoCo reads
 # What MuJoCo's viewer shows unless told otherwise; Menagerie keeps what is seen in group 2, what collides in group 3.
 SHOWN_GROUPS = (0, 1, 2)
@@ -138,13 +146,35 @@ def load_model(
             if edit is not None:
                 edit(spec)
             model = spec.compile()
-        except (ValueError, mujoco.FatalError) as error:
+        except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
             reason = " ".join(str(error).split())
             raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from error
+    _check_places(model, path)
     if root.find("mujoco/compiler[@discardvisual='true']") is not None:
         collected.append("visual shapes are discarded, those that collide are seen")
     lines = dict.fromkeys(" ".join(str(line).split()) for line in (*collected, *(one.message for one in caught)))
     return model, tuple(f"{path.name}: MuJoCo warns: {line}" for line in lines)
+
+
+def _check_places(model: mujoco.MjModel, path: Path) -> None:
+    """Refuse poses and sizes that are no numbers, or farther than anything is measured.
+
+    Raises:
+        DataError: So is one, with the body or geom.
+    """
+    kinds = {"body": ("body_pos", "body_quat"), "geom": ("geom_pos", "geom_quat", "geom_size"), "jnt": ("jnt_pos",)}
+    for kind, names in kinds.items():
+        for name in names:
+            rows = getattr(model, name)
+            wrong = ~(np.abs(rows) <= FARTHEST_M).all(axis=1)
+            if wrong.any():
+                number = int(np.argmax(wrong))
+                called = (model.joint if kind == "jnt" else getattr(model, kind))(number).name
+                found = f"{name} of {called or f'{kind} {number}'!r} is {' '.join(map(str, rows[number].tolist()))}"
+                raise DataError(found, where=str(path), allowed=f"numbers up to {FARTHEST_M:g}")
+    places = int((model.hfield_nrow * model.hfield_ncol).sum())
+    if places > MOST_PLACES:
+        raise DataError(f"has {places} places of height fields", where=str(path), allowed=f"at most {MOST_PLACES}")
 
 
 def bodies_from_mujoco(
@@ -342,7 +372,7 @@ def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], 
     for document in documents:  # grows while included files are found
         if len(documents) > MAX_INCLUDES:
             raise DataError(f"includes more than {MAX_INCLUDES} files", where=str(path))
-        root = read_xml(document, ALLOWED)
+        root = read_xml(document, ALLOWED, most_elements=MOST_ELEMENTS)
         if document == documents[0] and root.tag not in ("mujoco", "robot"):
             allowed = "<mujoco>, an MJCF model, or <robot>, a URDF model"
             raise DataError(f"its root element is <{root.tag}>", where=str(path), allowed=allowed)
@@ -356,10 +386,60 @@ def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], 
                 documents += [found for name in names if (found := inside("", name)) not in documents]
             else:
                 assets += [name for name in names if name]
+    if len(directories) > MAX_DIRECTORIES:
+        raise DataError(f"names {len(directories)} folders", where=str(path), allowed=f"at most {MAX_DIRECTORIES}")
     found = {inside(directory, name) for directory in directories for name in ["", *assets]}
     states = tuple(_state(file) for file in [*documents, *sorted(found)] if file.exists() and not file.is_dir())
     check_bytes(sum(size for _, _, size in states), ROBOT_FILES, str(path))
+    _check_growth(roots, {Path(name) for name, _, _ in states}, path)
     return states, roots[0]
+
+
+def _check_growth(roots: Sequence[ElementTree.Element], files: Collection[Path], path: Path) -> None:
+    """Refuse a model that is small as text, and beyond measure once MuJoCo has read it.
+
+    Raises:
+        DataError: So it is, with what grows.
+    """
+    pixels = {file.name: _pixels(file) for file in files if file.suffix.lower() == ".png"}
+    elements = [element for root in roots for element in root.iter()]
+    copies = sum(map(_expanded, roots)) - len(elements)
+    grown = {"elements": len(elements), "copies": copies, "pixels of textures": 0, "places of height fields": 0}
+    for element in elements:
+        drawn = sum(pixels.get(Path(name).name, 0) for key, name in element.attrib.items() if key.startswith("file"))
+        if element.tag == "texture":
+            width, height = _whole(element, "width"), _whole(element, "height")
+            grown["pixels of textures"] += drawn + (width * height if element.get("type") == "2d" else 6 * width**2)
+        elif element.tag == "hfield":
+            grown["places of height fields"] += drawn + _whole(element, "nrow") * _whole(element, "ncol")
+        elif element.tag == "size":
+            for name in element.attrib:
+                count = _whole(element, name)
+                if (name == "nkey" or name.startswith("nuser_")) and count > MOST_NUMBERS:
+                    raise DataError(f"{name} is {count}", where=str(path), allowed=f"at most {MOST_NUMBERS}")
+    for (what, count), most in zip(grown.items(), (MOST_ELEMENTS, MOST_COPIES, MOST_PIXELS, MOST_PLACES), strict=True):
+        if count > most:
+            raise DataError(f"has {count:.4g} {what}", where=str(path), allowed=f"at most {most} in all")
+
+
+def _expanded(element: ElementTree.Element) -> int:
+    """How many elements one becomes: itself and those inside, as often as it repeats them."""
+    times = 1
+    for count in element.get("count", "1").split() if element.tag in REPEATING else ():
+        times *= max(int(count), 1) if count.isdecimal() and len(count) < 12 else 1
+    return times * (1 + sum(map(_expanded, element)))
+
+
+def _whole(element: ElementTree.Element, name: str) -> int:
+    text = element.get(name, "0").strip()
+    return int(text) if text.isdecimal() and len(text) < 12 else 0
+
+
+def _pixels(path: Path) -> int:
+    """How many pixels a PNG file says that it has; 0 where it is none."""
+    head = read_head(path, ROBOT_FILES)
+    width, height = (int.from_bytes(head[begin : begin + 4], "big") for begin in (16, 20))
+    return width * height if head.startswith(PNG_BEGINNING) else 0
 
 
 def _settle_urdf(root: ElementTree.Element, own: Path, folder: Path) -> None:

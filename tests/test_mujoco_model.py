@@ -13,7 +13,7 @@ from lidardesign.density.fields.distance import build_field
 from lidardesign.errors import DataError
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.surface import sample_body
-from lidardesign.mujoco_model import bodies_from_mujoco, load_model, visible_geoms
+from lidardesign.mujoco_model import PNG_BEGINNING, bodies_from_mujoco, load_model, visible_geoms
 from lidardesign.scene import Cylinder, Mesh, Plane, Scene, Sphere
 from lidardesign.space import DesignSpace
 
@@ -219,6 +219,51 @@ BAD = {
         '<mujoco><worldbody><body><joint type="saddle"/><geom size="1"/></body></worldbody></mujoco>',
         "MuJoCo cannot read it",
     ),
+    "copies without end": (
+        '<mujoco><worldbody><replicate count="1000"><replicate count="1000"><geom size="1"/></replicate></replicate>'
+        "</worldbody></mujoco>",
+        "has 2.001e.06 copies",
+    ),
+    "a grid without end": (
+        '<mujoco><worldbody><body name="b"><flexcomp name="f" count="900 900 9"/></body></worldbody></mujoco>',
+        "has 7.29e.06 copies",
+    ),
+    "elements without end": (
+        "<mujoco><worldbody>" + '<geom size="1"/>' * 30_000 + "</worldbody></mujoco>",
+        "too many elements.*20000 elements",
+    ),
+    "a texture without end": (
+        '<mujoco><asset><texture type="2d" name="t" builtin="flat" width="60000" height="60000"/></asset></mujoco>',
+        "has 3.6e.09 pixels of textures",
+    ),
+    "a sky without end": (
+        '<mujoco><asset><texture type="skybox" builtin="flat" width="30000" height="1"/></asset></mujoco>',
+        "has 5.4e.09 pixels of textures",
+    ),
+    "a picture without end": (
+        '<mujoco><asset><texture type="2d" name="t" file="huge.png"/></asset></mujoco>',
+        "has 9e.08 pixels of textures",
+    ),
+    "terrain without end": (
+        '<mujoco><asset><hfield name="h" nrow="50000" ncol="50000" size="1 1 1 1"/></asset></mujoco>',
+        "has 2.5e.09 places of height fields",
+    ),
+    "a picture of terrain without end": (
+        '<mujoco><asset><hfield name="h" file="huge.png" size="1 1 1 1"/></asset></mujoco>',
+        "has 9e.08 places of height fields",
+    ),
+    "keyframes without end": ('<mujoco><size nkey="1000000000"/></mujoco>', "nkey is 1000000000"),
+    "numbers without end": ('<mujoco><size nuser_geom="100000000"/></mujoco>', "nuser_geom is 100000000"),
+    "levels without end": ("<mujoco>" + "<worldbody>" * 5000, "nested too deep"),
+    "a place that is no number": (
+        '<mujoco><worldbody><geom name="g" pos="nan 0 0" size="1"/></worldbody></mujoco>',
+        "geom_pos of 'g' is nan 0.0 0.0",
+    ),
+    "a place far away": (
+        '<mujoco><worldbody><body name="b" pos="1e200 0 0"><geom size="1"/></body></worldbody></mujoco>',
+        "body_pos of 'b' is 1e.200 0.0 0.0",
+    ),
+    "a document type": ("<!DOCTYPE m [<!ENTITY a 'a'>]><mujoco model='&a;'/>", "has a document type"),
     "a URDF without its mesh": (
         URDF.replace("m.obj", "b.stl"),
         "MuJoCo cannot read it.*b.stl",
@@ -232,7 +277,8 @@ def test_a_file_that_is_no_model_is_refused_with_its_name(tmp_path, case):
     path = tmp_path / "robot.xml"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(DataError, match=message) as refused:
+    (tmp_path / "huge.png").write_bytes(PNG_BEGINNING + b"\0\0\0\rIHDR" + 2 * (30_000).to_bytes(4, "big"))
+    with pytest.raises(DataError, match=f"(?s){message}") as refused:
         load_model(path)
     assert refused.value.where.startswith(str(path))
 

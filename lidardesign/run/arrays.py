@@ -135,8 +135,8 @@ def csv_rows(path: Path, kind: Kind) -> list[tuple[int, list[str]]]:
     reader = csv.reader(text, strict=True)
     rows: list[tuple[int, list[str]]] = []
     try:
-        for cells in reader:
-            if len(cells) > MOST_COLUMNS or len(rows) == MOST_ROWS:
+        for number, cells in enumerate(reader):  # rows of nothing count too: they take as long to read
+            if len(cells) > MOST_COLUMNS or number == MOST_ROWS:
                 found = f"has {len(cells)} columns" if len(cells) > MOST_COLUMNS else f"has more than {MOST_ROWS} rows"
                 allowed = f"at most {MOST_COLUMNS} columns and {MOST_ROWS} rows, the header included"
                 raise DataError(found, where=f"{path}:{reader.line_num}", allowed=allowed)

@@ -95,7 +95,7 @@ class _Builder:
             raise DataError(
                 "is nested too deep or has too many elements",
                 where=f"{self._path}:{self._parser.CurrentLineNumber}",
-                allowed=f"{DEEPEST} levels",
+                allowed=f"{DEEPEST} levels, {self._most} elements",
             )
         element = Element(tag, attributes)
         element.line = self._parser.CurrentLineNumber

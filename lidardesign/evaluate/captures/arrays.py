@@ -73,7 +73,7 @@ def main() -> None:
     with contextlib.suppress(ImportError, ValueError, OSError):
         import resource
 
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_SHARE * max(most, 1 << 30), resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_SHARE * max(most, 1 << 29), resource.RLIM_INFINITY))
     print(json.dumps(_convert(source, target, most)))
 
 
