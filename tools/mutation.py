@@ -1,7 +1,8 @@
 """How many small changes of the core's code its tests notice: `python tools/mutation.py` (see `make mutation`).
 
 Every mutant (`mutants.py`) of a module meets the module's own fast test files in a forked process (`mutant_tests.py`);
-nothing on disk is changed. What survives is listed with the reason that `mutation_reasons.yaml` gives.
+nothing on disk is changed. Interrupted and started again it goes on behind those that are tested. What survives is
+listed with the reason that `mutation_reasons.yaml` gives.
 """
 
 from __future__ import annotations
@@ -9,11 +10,9 @@ from __future__ import annotations
 import argparse
 import datetime
 import hashlib
-import json
 import os
 import subprocess
 import sys
-import time
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -25,7 +24,6 @@ from mutant_tests import Children, try_mutants
 from mutants import Mutant, mutants_of
 
 ROOT = Path(__file__).resolve().parent.parent
-RECORDS = ROOT / "build" / "mutation"
 # The files that test each module. A change outside of functions meets the first one alone, whole.
 TESTS = {
     "lidardesign/numerics.py": ("test_numerics.py",),
@@ -55,27 +53,29 @@ class Outcome:
 
 
 class Record:
-    """The outcomes of a module's mutants, one a line of a file in `build`."""
+    """The outcomes of a module's mutants, one a line of a file in `build/long`.
 
-    def __init__(self, module: str) -> None:
+    Arguments:
+        module: The module.
+        retry: Whether those count that another commit's tests killed in the same source.
+    """
+
+    def __init__(self, module: str, retry: bool) -> None:
+        from support.pieces import Pieces
+
         self.module = module
-        self.path = RECORDS / (module.replace("/", ".") + ".jsonl")
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        name = f"mutation.{module.replace('/', '.')}"
+        self.pieces = Pieces(name, still=lambda outcome: retry and outcome["outcome"] != "survived")
 
     def read(self) -> list[Outcome]:
         """All outcomes, by line of the module."""
-        lines = self.path.read_text().splitlines() if self.path.exists() else []
-        return sorted((Outcome(**json.loads(line)) for line in lines), key=lambda one: (one.line, one.operator))
-
-    def begin(self, kept: list[Outcome]) -> None:
-        """Start it anew with outcomes that are known."""
-        self.path.write_text("".join(json.dumps(asdict(one)) + "\n" for one in kept))
+        found = (Outcome(**outcome) for outcome in self.pieces.done.values())
+        return sorted(found, key=lambda one: (one.line, one.operator))
 
     def tell(self, mutant: Mutant, outcome: str) -> None:
         """Write down what became of a mutant."""
         one = Outcome(key_of(mutant), mutant.operator, mutant.line, mutant.before, mutant.after, outcome)
-        with self.path.open("a") as file:
-            file.write(json.dumps(asdict(one)) + "\n")
+        self.pieces.keep(one.key, asdict(one))
         if outcome == "survived":
             print(f"{self.module}:{one.line} {one.operator}\n  - {one.before}\n  + {one.after}", flush=True)
 
@@ -86,17 +86,13 @@ def key_of(mutant: Mutant) -> str:
 
 
 def run_module(module: str, jobs: int, retry: bool, sample: int | None) -> int:
-    """Test the mutants of a module in this process, which imports for it; returns pytest's exit code.
-
-    With `retry` those that were killed before are not tested again.
-    """
+    """Test mutants of a module that were not yet, in this process, which imports for it; pytest's exit code."""
     path, name = ROOT / module, module.removesuffix(".py").replace("/", ".")
     files = [str(ROOT / "tests" / name) for name in TESTS[module]]
-    found, record = mutants_of(path.read_text()), Record(module)
+    found, record = mutants_of(path.read_text()), Record(module, retry)
     found = found if sample is None else found[:: max(1, len(found) // sample)]
-    keys = {key_of(mutant) for mutant in found}
-    record.begin([one for one in record.read() if retry and one.outcome != "survived" and one.key in keys])
-    known = {one.key for one in record.read()}
+    record.pieces.only({key_of(mutant) for mutant in found})
+    known = record.pieces.done
     waiting = [mutant for mutant in found if key_of(mutant) not in known]
     ours = OURS | {"tests", *(folder.name for folder in (ROOT / "tests").iterdir() if folder.is_dir())}
     return try_mutants(path, name, files, waiting, Children(jobs, record.tell), ours)
@@ -147,14 +143,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("modules", nargs="*", default=list(TESTS), help="modules, as lidardesign/numerics.py; all")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at once; one for each core")
-    parser.add_argument("--retry", action="store_true", help="run only what survived the last time, or is new")
+    parser.add_argument("--retry", action="store_true", help="what another commit killed in the same source counts")
     parser.add_argument("--sample", type=int, help="about so many mutants of each module, evenly spread")
     parser.add_argument("--out", type=Path, help="write the page there")
     options = parser.parse_args()
     os.chdir(ROOT)
     sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tasks")]
     _own_hypothesis_profile()
-    began = time.monotonic()
     for module in options.modules:
         # what one module's process imports must not be there for the next
         child = os.fork()
@@ -162,10 +157,12 @@ def main() -> int:
             os._exit(_status_of(lambda m=module: run_module(m, options.jobs, options.retry, options.sample)))
         if os.waitpid(child, 0)[1]:
             return 2
-        print(f"{module}: {killed_share(Record(module).read()):.1%} killed", flush=True)
-    results = {module: Record(module).read() for module in options.modules}
+    records = [Record(module, options.retry) for module in options.modules]
+    results = {record.module: record.read() for record in records}
+    for module, found in results.items():
+        print(f"{module}: {killed_share(found):.1%} killed", flush=True)
     if options.out is not None:
-        options.out.write_text(report(results, (time.monotonic() - began) / 60, options.retry))
+        options.out.write_text(report(results, sum(record.pieces.earlier_s for record in records) / 60, options.retry))
     return int(min(map(killed_share, results.values())) < WANTED)
 
 

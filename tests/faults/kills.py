@@ -2,9 +2,10 @@
 
 Usage: PYTHONPATH=tests python -m faults.kills [--kills 60] [--terms 20] [--pairs 5] [--out docs/soak/kills.md]
 
-Three ways to end a command: SIGKILL of a process of its own after a random time; SIGKILL of a fork before single steps
-that change a file; SIGTERM after a random time. After each the folder is examined as it is, the command is given again
+Four ways to end a command: SIGKILL of a process of its own after a random time, or SIGTERM; SIGKILL of a fork before
+single steps that change a file, or SIGTERM. After each the folder is examined as it is, the command is given again
 (`learn` with --resume), and the folder is compared with the straight one. Last, two commands work in it at once.
+Interrupted and started again it goes on behind what is done.
 """
 
 from __future__ import annotations
@@ -21,8 +22,10 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from support.pieces import Pieces
 from support.result_pages import heading, table, write_page
 
 from faults.processes import Ended, Fork, forked, fresh, import_all
@@ -51,6 +54,7 @@ TERMINATED = 143
 WAYS = {
     "SIGKILL": "SIGKILL after a random time, a process of its own",
     "step": "SIGKILL before a step that changes a file, a fork",
+    "asked": "SIGTERM before a step that changes a file, a fork",
     "SIGTERM": "SIGTERM after a random time, a process of its own",
     "pair": "two commands in one folder at once",
 }
@@ -74,26 +78,31 @@ class Tally:
 class Killing:
     """Ends commands in a folder and looks at what is left, beside an undisturbed run."""
 
-    def __init__(self, folder: Path, straight: Straight, tally: Tally) -> None:
-        self.folder, self.straight, self.tally = folder, straight, tally
+    def __init__(self, folder: Path, straight: Straight, tally: Tally, pieces: Pieces) -> None:
+        self.folder, self.straight, self.tally, self.pieces = folder, straight, tally, pieces
 
-    def end(self, way: str, name: str, run_it: Callable[[Path], Ended], told: str) -> Ended:
+    def end(self, way: str, name: str, number: int, run_it: Callable[[Path], Ended], told: str) -> Ended:
         """End one command in a folder of its own, look, give it again, and compare; `told` names the moment."""
+        found = self.pieces.of(f"{way} of {name}, {number}", lambda: self._end(way, name, run_it, told))
+        self.tally.sent[way, name] += 1
+        self.tally.early[way, name] += found["code"] not in FINISHED
+        self.tally.faults += found["faults"]
+        return Ended(found["code"], found["seconds"], "")
+
+    def _end(self, way: str, name: str, run_it: Callable[[Path], Ended], told: str) -> dict[str, Any]:
         place = self.folder / "killed"
         shutil.copytree(self.straight.before[name], place)
         ended = run_it(place)
-        self.tally.sent[way, name] += 1
-        self.tally.early[way, name] += ended.code not in FINISHED
         faults = [*self._left(way, ended, place), *self._after(name, place)]
-        self.tally.faults += [f"{WAYS[way]}, {name}, {told}: {fault}" for fault in faults]
         print(f"{way} of {name}, {told}: {'; '.join(faults) or 'recovered'}", file=sys.stderr, flush=True)
         shutil.rmtree(place)
-        return ended
+        faults = [f"{WAYS[way]}, {name}, {told}: {fault}" for fault in faults]
+        return {"code": ended.code, "seconds": ended.seconds, "faults": faults}
 
     def _left(self, way: str, ended: Ended, place: Path) -> Iterator[str]:
         """What is wrong with the folder as it was left."""
         yield from (f"unreadable: {fault}" for fault in unreadable(place / "run"))
-        if way != "SIGTERM":
+        if way not in ("SIGTERM", "asked"):
             return
         if ended.code not in (0, TERMINATED, -signal.SIGTERM):
             yield f"exit code {ended.code}: {ended.said[-300:]}"
@@ -116,8 +125,14 @@ class Killing:
         expected, found = self.straight.after[name], contents(place / "run")
         yield from (f"{file} differs" for file in sorted({*expected, *found}) if expected.get(file) != found.get(file))
 
-    def pair(self, name: str, delay_s: float) -> None:
+    def pair(self, name: str, number: int, delay_s: float) -> None:
         """Two commands at once: each works or is told why not, one works at least, and nothing is spoilt."""
+        found = self.pieces.of(f"{name}, {number}", lambda: self._pair(name, delay_s))
+        self.tally.sent["pair", name] += 1
+        self.tally.early["pair", name] += found["both"]
+        self.tally.faults += found["faults"]
+
+    def _pair(self, name: str, delay_s: float) -> dict[str, Any]:
         before, first, second = PAIRS[name]
         place = self.folder / "both"
         shutil.copytree(self.straight.before[before], place)
@@ -125,16 +140,15 @@ class Killing:
         time.sleep(delay_s)
         other = Fork(second, place)
         ends = [one.ended(), other.ended()]
-        self.tally.sent["pair", name] += 1
-        self.tally.early["pair", name] += all(end.code == 0 for end in ends)
         faults = [*_badly_refused(ends), *(f"unreadable: {fault}" for fault in unreadable(place / "run"))]
         faults += [f"left {strays(place)}"] if strays(place) else []
         found, whole = contents(place / "run"), self.straight.after["evaluate"]
         faults += [f"{file} is missing" for file in self.straight.after["learn"] if file not in found]
         faults += [f"{file} differs" for file in found if file in whole and found[file] != whole[file]]
-        self.tally.faults += [f"{name}, {delay_s:.3f} s apart: {fault}" for fault in faults]
         print(f"{name}, {delay_s:.3f} s apart: {'; '.join(faults) or 'in order'}", file=sys.stderr, flush=True)
         shutil.rmtree(place)
+        told = [f"{name}, {delay_s:.3f} s apart: {fault}" for fault in faults]
+        return {"both": all(end.code == 0 for end in ends), "faults": told}
 
 
 def _badly_refused(ends: list[Ended]) -> Iterator[str]:
@@ -146,36 +160,37 @@ def _badly_refused(ends: list[Ended]) -> Iterator[str]:
             yield f"exit code {end.code}: {end.said[-300:]}"
 
 
-def at_random(
-    killing: Killing, way: str, count: int, generator: np.random.Generator, seconds: dict[str, float]
-) -> None:
+def at_random(killing: Killing, way: str, count: int, seed: int, seconds: dict[str, float]) -> None:
     """End commands in processes of their own after random times, until so many were met at work."""
     sent = signal.SIGTERM if way == "SIGTERM" else signal.SIGKILL
     names = [name for name, share in SHARES.items() for _ in range(share)]
-    for name in itertools.islice(itertools.cycle(names), MOST_TRIES * count):
+    for number, name in enumerate(itertools.islice(itertools.cycle(names), MOST_TRIES * count)):
         if sum(met for (one, _), met in killing.tally.early.items() if one == way) >= count:
             return
-        after_s = float(generator.uniform(LIBRARIES_LOADED, 1.0) * seconds[name])
+        # of a sequence of its own: what is done already draws nothing
+        share = np.random.default_rng([seed, int(sent), number]).uniform(LIBRARIES_LOADED, 1.0)
+        after_s = float(share * seconds[name])
         ends = functools.partial(fresh, killing.straight.commands[name], after_s=after_s, sent=sent)
-        ended = killing.end(way, name, ends, f"after {after_s:.3f} s")
+        ended = killing.end(way, name, number, ends, f"after {after_s:.3f} s")
         if ended.code in FINISHED:  # the computer has less to do than before
             seconds[name] = ended.seconds
 
 
-def at_steps(killing: Killing, most: int) -> None:
+def at_steps(killing: Killing, most: int, way: str = "step") -> None:
     """Kill forks of all commands before steps, at most so many of each."""
+    sent = signal.SIGTERM if way == "asked" else signal.SIGKILL
     for name, whole in killing.straight.forks.items():
         for number in spread(whole.steps, most):
-            ends = functools.partial(forked, killing.straight.commands[name], at_step=number)
-            killing.end("step", name, ends, f"step {number}")
+            ends = functools.partial(forked, killing.straight.commands[name], at_step=number, sent=sent)
+            killing.end(way, name, number, ends, f"step {number}")
 
 
-def in_pairs(killing: Killing, count: int, generator: np.random.Generator) -> None:
+def in_pairs(killing: Killing, count: int, seed: int) -> None:
     """Give every pair of commands so many times, from at once to one after the other."""
-    for name in PAIRS:
+    for place, name in enumerate(PAIRS):
         for number in range(count):
-            delay_s = float(generator.uniform(0, LONGEST_DELAY_S * number / max(count - 1, 1)))
-            killing.pair(name, delay_s)
+            latest_s = LONGEST_DELAY_S * number / max(count - 1, 1)
+            killing.pair(name, number, float(np.random.default_rng([seed, place, number]).uniform(0, latest_s)))
 
 
 def spread(last: int, count: int) -> list[int]:
@@ -210,19 +225,21 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=None, help="write the result as Markdown")
     asked = parser.parse_args()
-    started, generator, tally = time.monotonic(), np.random.default_rng(asked.seed), Tally()
+    pieces, tally = Pieces(f"kills-{asked.seed}"), Tally()
     import_all()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        killing = Killing(folder, Straight(folder / "straight", COMMANDS), tally)
+        killing = Killing(folder, Straight(folder / "straight", COMMANDS), tally, pieces)
         at_steps(killing, asked.steps)
-        in_pairs(killing, asked.pairs, generator)
+        at_steps(killing, asked.steps, "asked")
+        in_pairs(killing, asked.pairs, asked.seed)
         if asked.kills + asked.terms:
-            at_steps(Killing(folder, Straight(folder / "staged", {"learn --tolerance": STAGED}), tally), asked.steps)
+            staged = Straight(folder / "staged", {"learn --tolerance": STAGED})
+            at_steps(Killing(folder, staged, tally, pieces), asked.steps)
             seconds = killing.straight.measure_fresh(folder)
-            at_random(killing, "SIGKILL", asked.kills, generator, seconds)
-            at_random(killing, "SIGTERM", asked.terms, generator, seconds)
-    parts = page(tally, asked.seed, (time.monotonic() - started) / 60)
+            at_random(killing, "SIGKILL", asked.kills, asked.seed, seconds)
+            at_random(killing, "SIGTERM", asked.terms, asked.seed, seconds)
+    parts = page(tally, asked.seed, pieces.seconds / 60)
     print("\n\n".join(parts))
     if asked.out is not None:
         write_page(asked.out, parts)

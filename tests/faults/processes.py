@@ -52,14 +52,16 @@ def import_all() -> None:
 
 
 class Fork:
-    """The program in a fork, in a folder, killed before the step of a number from 1, if one is given."""
+    """The program in a fork, in a folder, sent a signal before the step of a number from 1, if one is given."""
 
-    def __init__(self, arguments: Sequence[str], folder: Path, at_step: int = 0) -> None:
+    def __init__(
+        self, arguments: Sequence[str], folder: Path, at_step: int = 0, at_step_sent: int = signal.SIGKILL
+    ) -> None:
         self._started = time.monotonic()
         self._notes = Path(tempfile.mkdtemp())
         self._pid = os.fork()
         if self._pid == 0:
-            _be_the_program(arguments, folder, self._notes, at_step)
+            _be_the_program(arguments, folder, self._notes, at_step, at_step_sent)
 
     def ended(self, after_s: float = 0.0, sent: int = signal.SIGKILL) -> Ended:
         """How it ended; with a time, it is sent a signal then unless it has ended before."""
@@ -80,9 +82,9 @@ class Fork:
         return os.waitpid(self._pid, 0)[1]
 
 
-def forked(arguments: Sequence[str], folder: Path, *, at_step: int = 0) -> Ended:
-    """Run the program in a fork."""
-    return Fork(arguments, folder, at_step).ended()
+def forked(arguments: Sequence[str], folder: Path, *, at_step: int = 0, sent: int = signal.SIGKILL) -> Ended:
+    """Run the program in a fork; before the step of a number it sends itself a signal."""
+    return Fork(arguments, folder, at_step, sent).ended()
 
 
 def fresh(arguments: Sequence[str], folder: Path, *, after_s: float = 0.0, sent: int = 9) -> Ended:
@@ -100,7 +102,7 @@ def fresh(arguments: Sequence[str], folder: Path, *, after_s: float = 0.0, sent:
     return Ended(process.returncode, time.monotonic() - started, said)
 
 
-def _be_the_program(arguments: Sequence[str], folder: Path, notes: Path, at_step: int) -> None:
+def _be_the_program(arguments: Sequence[str], folder: Path, notes: Path, at_step: int, sent: int) -> None:
     """Never returns: whatever happens ends the fork and not what it was forked from."""
     code = 99
     try:
@@ -108,7 +110,7 @@ def _be_the_program(arguments: Sequence[str], folder: Path, notes: Path, at_step
         for stream, path in ((1, os.devnull), (2, notes / SAID)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), stream)
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        _count_steps(notes / COUNTED, at_step)
+        _count_steps(notes / COUNTED, at_step, sent)
         from lidardesign.cli.main import run
 
         run(list(arguments))
@@ -122,8 +124,8 @@ def _be_the_program(arguments: Sequence[str], folder: Path, notes: Path, at_step
         os._exit(code)
 
 
-def _count_steps(counted: Path, at_step: int) -> None:
-    """Count the steps that change files into a file, and end this process before one of them."""
+def _count_steps(counted: Path, at_step: int, sent: int) -> None:
+    """Count the steps that change files into a file, and send this process a signal before one of them."""
     tally = os.open(counted, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     done = 0
 
@@ -133,7 +135,7 @@ def _count_steps(counted: Path, at_step: int) -> None:
             done += 1
             os.pwrite(tally, str(done).encode(), 0)
             if done == at_step:
-                os.kill(os.getpid(), signal.SIGKILL)
+                os.kill(os.getpid(), sent)
             return real(*args, **options)
 
         return step

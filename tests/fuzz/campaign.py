@@ -2,6 +2,7 @@
 
     PYTHONPATH=tests python -m fuzz.campaign --inputs 100000 --out docs/soak
 
+Interrupted and started again it goes on behind the batches that are done.
 A target's inputs go through the program in batches, each in a fresh process with a memory limit. Which input is being
 read is on disk before it is read, so that one which ends or stops the process is known, and the batch goes on after it.
 """
@@ -20,10 +21,11 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 
+from support.pieces import FOLDER, Pieces
 from support.result_pages import ROOT, heading, paragraph, table, write_page
 
 WORKER = Path(__file__).with_name("fuzz_worker.py")
@@ -80,6 +82,17 @@ class Found:
             setattr(self, name, max(getattr(self, name), getattr(other, name)))
         self.places |= other.places
         self.faults.update(other.faults)
+
+
+def done_job(job: Job, kept: Path, pieces: Pieces) -> Found:
+    """One batch, if it is not done yet."""
+
+    def work() -> dict[str, object]:
+        found = run_job(job, kept)
+        return {**asdict(found), "places": sorted(found.places)}
+
+    found = pieces.of(f"{job.name}, {job.inputs} inputs of seed {job.seed}", work)
+    return Found(**{**found, "places": set(found["places"])})
 
 
 def jobs(inputs: int, only: list[str], seed: int) -> Iterator[Job]:
@@ -247,18 +260,19 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", nargs="*", default=[], help="parts of the names of targets")
     parser.add_argument("--out", type=Path, help="a folder for the report")
-    parser.add_argument("--kept", type=Path, default=Path("fuzz-found"), help="a folder for inputs that find a fault")
+    parser.add_argument("--kept", type=Path, default=FOLDER / "fuzz-found", help="a folder for what finds a fault")
     arguments = parser.parse_args()
-    began, parts = time.monotonic(), []
+    pieces, parts = Pieces("fuzz"), []
     planned = list(jobs(arguments.inputs, arguments.only, arguments.seed))
     with ThreadPoolExecutor(arguments.workers) as pool:
-        for job, found in zip(planned, pool.map(lambda job: run_job(job, arguments.kept), planned), strict=True):
+        done = pool.map(lambda job: done_job(job, arguments.kept, pieces), planned)
+        for job, found in zip(planned, done, strict=True):
             parts.append((job, found))
             print(f"{job.name}: {found.inputs} inputs, {len(found.faults)} faults", flush=True)
             for path, reason in found.faults.items():
                 print(f"  {path}: {_last_line(reason)}", flush=True)
     found = together(parts)
-    parts = report(found, arguments, time.monotonic() - began)
+    parts = report(found, arguments, pieces.seconds)
     print("\n\n".join(parts))
     if arguments.out:
         write_page(arguments.out / f"fuzz-{datetime.now(timezone.utc):%Y-%m-%d}.md", parts)

@@ -1,6 +1,7 @@
 """The long runs: `python -m soak runs`, `python -m soak seeds`, and `python -m soak one SEED` to look into a run.
 
 With tests/ on PYTHONPATH; `make soak` does that. They end with 1 where anything is not as it should be.
+Interrupted and started again they go on behind the runs that are done.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from support.pieces import Pieces
 from support.result_pages import ROOT
 
 from soak.batches import keep, soak
@@ -52,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--repeat", action="store_true", help="do it twice")
     for command, do in ((runs, _runs), (seeds, _seeds), (one, _one)):
         command.set_defaults(do=do)
-        command.add_argument("--folder", type=Path, help="where runs are kept")
+        command.add_argument("--folder", type=Path, help="where runs are made")
         if command is not one:
             command.add_argument("--jobs", type=int, default=1, help="processes at once")
     return parser
@@ -62,7 +64,7 @@ def _runs(given: argparse.Namespace, folder: Path) -> int:
     # the processes that do the runs end with this one
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     choices = {"first": given.first, "jobs": given.jobs, "repeat_every": given.repeat_every}
-    records = soak(given.whole, folder, **choices, tell=_tell)
+    records = soak(given.whole, folder, Pieces("soak-runs"), **choices, tell=_tell)
     runs_page(given.page, records, f"python -m soak runs --whole {given.whole} --first {given.first}")
     faults = sum(bool(record["faults"]) for record in records)
     _tell(f"{len(records)} runs, {faults} with faults: {given.page}")
@@ -70,7 +72,7 @@ def _runs(given: argparse.Namespace, folder: Path) -> int:
 
 
 def _seeds(given: argparse.Namespace, folder: Path) -> int:
-    learned = learn_seeds(given.tasks, range(given.count), folder, jobs=given.jobs, tell=_tell)
+    learned = learn_seeds(given.tasks, range(given.count), folder, Pieces("soak-seeds"), jobs=given.jobs, tell=_tell)
     seeds_page(given.page, learned, f"python -m soak seeds {' '.join(given.tasks)} --count {given.count}")
     faults = sum(bool(one.fault) for one in learned)
     _tell(f"{len(learned)} densities, {faults} below their ESS: {given.page}")

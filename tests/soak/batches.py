@@ -13,6 +13,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from support.pieces import Pieces
+
 from soak.plans import random_plan
 from soak.whole_runs import WHOLE, Record
 
@@ -22,15 +24,22 @@ POLL_S = 0.2
 
 
 def soak(
-    whole: int, folder: Path, *, first: int, jobs: int, repeat_every: int, tell: Callable[[str], None]
+    whole: int,
+    folder: Path,
+    pieces: Pieces,
+    *,
+    first: int,
+    jobs: int,
+    repeat_every: int,
+    tell: Callable[[str], None],
 ) -> list[dict[str, Any]]:
     """Runs from one number on until so many of them were whole: learned, fitted, constrained and evaluated.
 
-    What an earlier soak did in the same folder counts. Every so many runs one is done twice; 0: none. The records of
-    all numbers up to the last of these are given, in order, faults among them; with 0 whole ones all in the folder.
+    What is done counts. Every so many runs one is done twice; 0: none. The records of
+    all numbers up to the last of these are given, in order, faults among them; with 0 whole ones all that are done.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    records = {record["seed"]: record for record in records_in(folder)}
+    records = {record["seed"]: record for record in pieces.done.values()}
     missing = (seed for seed in itertools.count(first) if seed not in records)
     running: dict[int, tuple[subprocess.Popen[bytes], float]] = {}
     try:
@@ -44,6 +53,7 @@ def soak(
                 if record is not None:
                     del running[seed]
                     records[seed] = record
+                    pieces.keep(str(seed), record)
                     tell(f"{seed}: {record['outcome']}" + "".join(f"\n    {fault}" for fault in record["faults"]))
     finally:
         for process, _ in running.values():
@@ -51,11 +61,6 @@ def soak(
     ordered = [records[seed] for seed in sorted(records)]
     numbers = [0, *itertools.accumulate(record["outcome"] == WHOLE for record in ordered)]
     return ordered[: numbers.index(whole)] if whole else ordered
-
-
-def records_in(folder: Path) -> list[dict[str, Any]]:
-    """What is done of a soak that goes on or was ended; numbers in between may be missing."""
-    return [json.loads(path.read_text()) for path in folder.glob("record-*.json")]
 
 
 def keep(record: Record, folder: Path) -> None:

@@ -10,11 +10,12 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from support.pieces import Pieces
 from support.result_pages import heading, paragraph, table, write_page
 
 # The least effective sample size that every seed has to reach.
@@ -40,13 +41,13 @@ class Learned:
 
 
 def learn_seeds(
-    tasks: Sequence[str], seeds: Sequence[int], folder: Path, *, jobs: int, tell: Callable[[str], None]
+    tasks: Sequence[str], seeds: Sequence[int], folder: Path, pieces: Pieces, *, jobs: int, tell: Callable[[str], None]
 ) -> list[Learned]:
-    """Learn every task from every seed, by task and seed."""
+    """Learn every task from every seed that is not done, by task and seed."""
     lock = threading.Lock()
 
     def learn(task: str, seed: int) -> Learned:
-        learned = _learn(task, seed, folder)
+        learned = Learned(**pieces.of(f"{task} {seed}", lambda: asdict(_learn(task, seed, folder))))
         with lock:
             tell(f"{task} {seed}: ESS {learned.document.get('ess', 0):.3f} {learned.fault}")
         return learned
