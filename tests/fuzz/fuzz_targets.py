@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from fuzz import corpus
+from fuzz import corpus, fuzz_rigs
 from fuzz.attempts import Read, Target, of_file
 from fuzz.containers import mutate_glb, mutate_gltf, mutate_hdf5, mutate_matlab, mutate_npz, mutate_safetensors
 from fuzz.fuzz_runs import (
@@ -181,6 +181,16 @@ TARGETS = (
     Target("checkpoint (safetensors)", 1_500, checkpoints, mutate_safetensors, open_checkpoints),
     Target("progress (JSON lines)", 500, corpus.progresses, TEXTS, open_progress),
     Target("distance field (npy)", 250, corpus.distance_fields, mutate_bytes, open_fields),
+    Target("rig (SDF)", 2_000, fuzz_rigs.rigs("sdf"), TEXTS, of_file(".sdf", read_design)),
+    Target("rig (MJCF)", 2_000, fuzz_rigs.rigs("mjcf"), TEXTS, of_file(".xml", read_design)),
+    Target("rig (CSV)", 2_000, fuzz_rigs.rigs("csv"), TEXTS, of_file(".csv", read_design)),
+    Target("rig (npz)", 1_500, fuzz_rigs.rigs("npz"), mutate_npz, of_file(".npz", read_design)),
+    Target("robot (MuJoCo)", 1_500, fuzz_rigs.models, TEXTS, of_file(".xml", fuzz_rigs.read_model)),
+    Target("recording (CSV)", 1_500, fuzz_rigs.recordings_csv, TEXTS, fuzz_rigs.open_recordings(".csv")),
+    Target("recording (npz)", 1_500, fuzz_rigs.recordings_npz, mutate_npz, fuzz_rigs.open_recordings(".npz")),
+    Target("poses (CSV)", 1_500, fuzz_rigs.poses, TEXTS, of_file(".csv", fuzz_rigs.read_motion)),
+    Target("part (YAML)", 4_000, fuzz_rigs.part_files, mutate_yaml, of_file(".yaml", fuzz_rigs.read_part_file)),
+    Target("run folder", 1_500, fuzz_rigs.run_folders, fuzz_rigs.mutate_folder, fuzz_rigs.open_run_folders),
 )
 NAMES = tuple(target.name for target in TARGETS)
 

@@ -24,7 +24,7 @@ import numpy as np
 from lidardesign.design.rigs.rig import Rig, RigSensor
 from lidardesign.errors import DataError
 from lidardesign.run.xml import DEEPEST, Element, read_xml
-from lidardesign.space import angles
+from lidardesign.space import FARTHEST_M, angles
 
 ALLOWED = "an MJCF model"
 PLACE = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
@@ -173,6 +173,13 @@ def read_mjcf(path: Path) -> Rig:
         raise DataError(
             "has no rangefinder", where=str(path), allowed="<sensor> with <rangefinder site=...>, one per ray"
         )
+    for ray in rays:
+        if not (np.abs(ray.origin_m) <= FARTHEST_M).all():
+            raise DataError(
+                f"the rangefinder {ray.name!r} has the place {np.abs(ray.origin_m).max():g} m",
+                where=str(path),
+                allowed=f"at most {FARTHEST_M:g} m along each axis",
+            )
     groups = _groups(rays)
     notes = []
     if any(ray.start_m is None for ray in rays):
