@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -180,6 +181,25 @@ def test_scores_are_shown_where_a_page_is_interrupted(call, monkeypatch, error):
     result = call(*EVALUATE, "--report", "page.html")
     assert result.code == (130 if error is KeyboardInterrupt else 70)
     assert "bounding" in result.out
+
+
+@pytest.mark.parametrize("gone", ["run", "."])
+def test_scores_are_shown_where_the_run_or_the_working_folder_goes_meanwhile(call, work, tmp_path, monkeypatch, gone):
+    import lidardesign.workflow.evaluate as workflow
+
+    shutil.copytree(work, tmp_path / "moved", ignore=shutil.ignore_patterns("socket"))
+    monkeypatch.chdir(tmp_path / "moved")
+    score = workflow.score_designs
+
+    def scored(*arguments, **options):
+        shutil.rmtree(tmp_path / "moved" / gone)
+        return score(*arguments, **options)
+
+    monkeypatch.setattr(workflow, "score_designs", scored)
+    result = call(*EVALUATE, "--csv", "folder/scores.csv", "--json")
+    assert len(result.json["rows"]) > 5
+    assert result.code == (3 if gone == "." else 0)
+    assert (tmp_path / "moved" / "folder" / "scores.csv").exists() == (gone == "run")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device /dev/full")

@@ -22,6 +22,9 @@ SDF = """<sdf version="1.9"><model name="m"><link name="l"><sensor name="fan" ty
 <min_angle>-0.5</min_angle><max_angle>0.5</max_angle></horizontal></scan>
 <range><min>0.1</min><max>0.9</max></range></lidar></sensor></link></model></sdf>
 """
+MJCF = """<mujoco><worldbody><body name="b" pos="PLACE"><site name="s"/></body></worldbody>
+<sensor><rangefinder name="eye" site="s" cutoff="2"/></sensor></mujoco>
+"""
 
 
 def semicolons(text):
@@ -56,6 +59,10 @@ FAULTS = {
     "beheaded npz": ("rig.npz", archive()[8:], "is no NPZ archive"),
     "text npz": ("rig.npz", b"hello\n", "is no NPZ archive"),
     "text sdf": ("rig.sdf", b"hello\n", "is no XML"),
+    "far mjcf": ("rig.xml", MJCF.replace("PLACE", "0 1e30 0").encode(), "'eye' has the place 1e+30 m"),
+    "farther mjcf": ("rig.xml", MJCF.replace("PLACE", "-1e308 0 0").encode(), "'eye' has the place 1e+308 m"),
+    "mjcf nowhere": ("rig.xml", MJCF.replace("PLACE", "0 0 nan").encode(), "MuJoCo cannot read it"),
+    "far sdf": ("rig.sdf", SDF.replace("0.5 0 0 0", "1e12 0 0 0").encode(), "place of 'fan' is 1e+12 m"),
     "Latin-1": ("rig.csv", GOOD.replace("origin_x_m", "l\u00e4nge").encode("latin-1"), "is not UTF-8 text"),
 }
 
