@@ -95,7 +95,7 @@ def run_module(module: str, jobs: int, retry: bool, sample: int | None) -> int:
     known = record.pieces.done
     waiting = [mutant for mutant in found if key_of(mutant) not in known]
     ours = OURS | {"tests", *(folder.name for folder in (ROOT / "tests").iterdir() if folder.is_dir())}
-    return try_mutants(path, name, files, waiting, Children(jobs, record.tell), ours)
+    return try_mutants(path, name, files, waiting, Children(jobs, record.tell), ours) if waiting else 0
 
 
 def report(results: dict[str, list[Outcome]], minutes: float, retry: bool) -> str:

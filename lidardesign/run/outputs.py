@@ -7,12 +7,13 @@ import itertools
 import json
 import os
 import stat
+import tempfile
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.files import FILE_NAME as LOCK
-from lidardesign.run.files import STDIO, temporary_beside
+from lidardesign.run.files import STDIO
 from lidardesign.run.manifest import FILE_NAME as MANIFEST
 
 # What a run has beside the files that its manifest lists.
@@ -78,7 +79,7 @@ def _files_of(run: Path) -> set[str]:
 
 
 def check_writable(path: Path, *, is_folder: bool = False) -> None:
-    """Refuse a place where nothing can be written; a small file is written beside it and removed again.
+    """Refuse a place where nothing can be written; a small file without a name is written there.
 
     Arguments:
         path: The file or folder; folders above it may be missing.
@@ -106,12 +107,9 @@ def check_writable(path: Path, *, is_folder: bool = False) -> None:
             raise DataError(f"cannot be made: {there} is a file", where=str(path), hint=ELSEWHERE)
         for part in place.relative_to(there).parts:
             _look_up(there / part)  # a name may be too long
-        trial = temporary_beside(there / "trial")
-        try:
-            with trial.open("xb") as file:
-                file.write(TRIAL)
-        finally:
-            trial.unlink(missing_ok=True)
+        with tempfile.TemporaryFile(dir=there) as trial:  # it has no name: no kill leaves it behind
+            trial.write(TRIAL)
+            trial.flush()
     except OSError as error:
         reason = error.strerror or str(error)
         raise DataError(f"cannot be written: {reason}", where=str(path), hint=ELSEWHERE) from None

@@ -108,7 +108,8 @@ class Killing:
             yield f"exit code {ended.code}: {ended.said[-300:]}"
         if "Traceback" in ended.said:
             yield f"a traceback: {ended.said[-300:]}"
-        if strays(place):
+        # a step may be that of tidying up itself: then the command given again does it
+        if way == "SIGTERM" and strays(place):
             yield f"left {strays(place)}"
 
     def _after(self, name: str, place: Path) -> Iterator[str]:
