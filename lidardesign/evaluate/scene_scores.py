@@ -20,7 +20,7 @@ import numpy as np
 from lidardesign.errors import PluginError
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Returns
+from lidardesign.geometry.rays import Rays, Returns
 from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
@@ -33,6 +33,8 @@ from lidardesign.task import Metric, Score, Task
 
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000
+# So many scenes and frames show whether targets return anything; a larger share of them in which nothing does is told.
+WATCHED, MOST_SILENT = 16, 0.5
 
 
 def score_lists(
@@ -136,6 +138,33 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def silent_notes(scenes: Sequence[Scene], fired: Mapping[str, RaysPerCondition]) -> list[str]:
+    """Which sets of rays have no return from any target in most of a few scenes and frames.
+
+    Arguments:
+        scenes: The scenes, of which some are looked at, without effects.
+        fired: The rays of each set, from all its positions, by what it is called.
+    """
+    frames = [(scene, frame) for scene in scenes for frame in range(scene.frames)]
+    watched = [frames[number] for number in np.unique(np.linspace(0, len(frames) - 1, WATCHED).astype(int))]
+    casters = [SceneCaster(scene, frame) for scene, frame in watched]
+    notes = []
+    for name, positions in fired.items():
+        rays = Rays.joined(positions)
+        silent = 0
+        for (scene, _), caster in zip(watched, casters, strict=True):
+            hits = caster.first_hit(rays.origin_m, rays.direction)
+            is_target = np.array([body.is_target for body in scene.bodies])
+            in_gate = (rays.gate_m[:, 0] <= hits.range_m) & (hits.range_m < rays.gate_m[:, 1])
+            silent += not (in_gate & (hits.body >= 0) & is_target[hits.body]).any()
+        if silent > MOST_SILENT * len(watched):
+            notes.append(
+                f"in {silent} of {len(watched)} frames that were looked at, no ray of {name} returns from a target: "
+                "check that its places, directions and gates are where the targets are, and in metres"
+            )
+    return notes
 
 
 Progress = Callable[[int, int, str], None]

@@ -41,7 +41,7 @@ from lidardesign.evaluate.results import (
     effect_notes,
     summaries,
 )
-from lidardesign.evaluate.scene_scores import Progress
+from lidardesign.evaluate.scene_scores import Progress, silent_notes
 from lidardesign.evaluate.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.numerics import ROUNDING
@@ -449,6 +449,10 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:
         notes += outside_notes(design, request.space)
+    own = sorted((entry for entry in entries if not entry.baseline), key=lambda entry: entry.rays)
+    # of each design the most rays, which come last
+    fired = {f"{entry.name!r}": entry.positions for entry in own}
+    notes += silent_notes(request.test, fired)
     empty = [row for row in matched if row.rays == 0]
     if empty:
         names = ", ".join(sorted({row.design for row in empty}))

@@ -30,7 +30,8 @@ from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
 from lidardesign.evaluate.baselines.candidates import mean_mbps
-from lidardesign.evaluate.scene_scores import score_lists
+from lidardesign.evaluate.request import can_fire
+from lidardesign.evaluate.scene_scores import score_lists, silent_notes
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import versions
@@ -147,8 +148,21 @@ def fit_design(request: FitRequest, *, notes: Notes = log_note) -> FitResult:
     design = replace(design, mount=mount, provenance={**design.provenance, **origin, **further})
     with phase("writing"):
         checks = check_written(design, request)
+    for note in _silent_notes(fitter, request, design):
+        notes(note)
     # broken ones were refused
     return replace(result, design=design, constraints=checks, satisfied=True)
+
+
+def _silent_notes(fitter: Fitter, request: FitRequest, design: DesignSpec) -> list[str]:
+    """Whether the most rays of a design have hardly a return from scenes that the fit has made anyway."""
+    run, count = request.run, request.choices["rays"] or max(request.run.task.defaults.rays)
+    scenes = vars(fitter).get("first_scenes", {}).get("held back")
+    if not scenes or not can_fire(design, count):
+        return []
+    conditions = [request.at] if request.at else conditions_of(run.task, run.config.task, run.config.space)
+    fired = tuple(rays_at(design, count, fitter.samples, at=at or None) for at in conditions)
+    return silent_notes(scenes, {f"{design.name!r}": fired})
 
 
 def _best_count(fitter: Fitter, request: FitRequest) -> int:

@@ -6,7 +6,7 @@ before them, that they are hidden, that they are seen edge-on, and that sigma bl
 hardly any point can be aimed at: uniform rays of the space take their place.
 
 Each note has a measured number and its threshold. What the tasks here have is on the good side of every threshold by
-twice or more; what designs lose beyond it is in docs/meshes.md.
+far; what designs lose beyond it is in docs/meshes.md.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MOST_INSIDE = 0.5
 # Below this mean cosine of incidence surfaces are seen edge-on; from all around a convex body has 1/2.
 LEAST_COSINE = 0.1
 # Below this share of what the density prefers rays pass the targets; a sigma is named that lets the other one return.
-LEAST_RETURNING, ENOUGH_RETURNING = 0.05, 0.2
+LEAST_RETURNING, ENOUGH_RETURNING = 0.02, 0.2
 # Above so many sigmas of range, flows of any preset miss most of the density.
 MOST_SIGMAS = 500.0
 # Sigma that does not blur away what there is to see is at most this share of it.
@@ -219,15 +219,16 @@ def _sigma_notes(sample: _Sample, points: np.ndarray, met: _Met, config: RunConf
             "on average, and few return; move the design space's origins to where more of it faces them"
         ]
     low_m, high_m = sample.space.low[RANGE], sample.space.high[RANGE]
-    if high_m - low_m > MOST_SIGMAS * sigma_m:
+    least_m = (high_m - low_m) / MOST_SIGMAS
+    if sigma_m < least_m:
         ranges = points[seen, RANGE]
+        raised = f"raise density.sigma_m to {least_m:.2g} m, or " if least_m <= GOOD_SHARE * spread_m else ""
         return [
             f"sigma {sigma_m:g} m is 1/{(high_m - low_m) / sigma_m:,.0f} of the design space's range, {low_m:.3g} to "
-            f"{high_m:.3g} m: so thin a density is hardly learned; raise density.sigma_m to "
-            f"{(high_m - low_m) / MOST_SIGMAS:.2g} m, or narrow space.range_m: what is seen of the targets is "
-            f"{ranges.min():.3g} to {ranges.max():.3g} m away"
+            f"{high_m:.3g} m{_unit_doubt(least_m, sigma_m)}: so thin a density is hardly learned; {raised}narrow "
+            f"space.range_m: what is seen of the targets is {ranges.min():.3g} to {ranges.max():.3g} m away"
         ]
-    return _thin_notes(sample, config, (high_m - low_m) / MOST_SIGMAS) if sample.aims and high_m > low_m else []
+    return _thin_notes(sample, config, least_m) if sample.aims and least_m > 0 else []
 
 
 def _thin_notes(sample: _Sample, config: RunConfig, least_m: float) -> list[str]:
