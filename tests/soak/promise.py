@@ -75,7 +75,7 @@ def random_case(seed: int) -> Case:
     if kind == "wall on an edge" and detector.bin_m is not None and detector.histogram_start == "gate":
         start_m = max(round(start_m / detector.bin_m), 1) * detector.bin_m
     half_rad = _power(generator, -4, -0.4) if "wall" in kind else 0.4
-    rays = grid(20, half_rad, (start_m, start_m + width_m), scene.frame_rate_hz)
+    rays = grid(int(generator.choice([5, 20])), half_rad, (start_m, start_m + width_m), scene.frame_rate_hz)
     usual = Tolerance.of(detector)
     tolerance = Tolerance(usual.range_m * _power(generator, -1.5, 1), _power(generator, -3, -1))
     return Case(kind, scene, rays, detector, tolerance)
@@ -108,7 +108,7 @@ def _detector(generator: np.random.Generator) -> Detector:
         estimator=str(generator.choice(["peak", "matched"])),
         correction=str(generator.choice(["none", "coates"])),
         false_alarm=_power(generator, -4, -1),
-        bin_s=chosen.bin_s * (1.0 if generator.uniform() < 0.5 else _power(generator, -1, 1)),
+        bin_s=_bin_s(generator, chosen.bin_s),
         bins=None,
         jitter_sigma_s=chosen.jitter_sigma_s * _power(generator, -2, 0.5),
         pulse_sigma_s=chosen.pulse_sigma_s * _power(generator, -1, 0.3),
@@ -116,6 +116,11 @@ def _detector(generator: np.random.Generator) -> Detector:
         photons=photons,
         **common,
     )
+
+
+def _bin_s(generator: np.random.Generator, usual_s: float) -> float | None:
+    kind = generator.uniform()
+    return None if kind < 0.1 else usual_s if kind < 0.5 else usual_s * _power(generator, -1, 1)
 
 
 def _scene(generator: np.random.Generator, kind: str, bin_m: float | None) -> tuple[Scene, float]:

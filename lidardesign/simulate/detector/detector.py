@@ -282,6 +282,13 @@ def bins_start(windows_m: np.ndarray, detector: Detector) -> np.ndarray:
     return starts if detector.histogram_start == "gate" else np.floor(starts / detector.bin_m) * detector.bin_m
 
 
+def ends_of_bins(path_m: np.ndarray, windows_m: np.ndarray, detector: Detector) -> tuple[np.ndarray, np.ndarray]:
+    """Where the parts start and end that lie in windows (N, 2) of the bins of half paths (N,) [m], shapes (N,)."""
+    first = bins_start(windows_m, detector)
+    low = first + np.floor((path_m - first) / detector.bin_m) * detector.bin_m
+    return np.maximum(low, windows_m[:, 0]), np.minimum(low + detector.bin_m, windows_m[:, 1])
+
+
 # In the order in which light meets them; each is a module of `simulate.effects`, with what it could change (`bound`).
 EFFECTS = {
     "footprint": "beams have a width: mixed pixels, several returns",

@@ -13,7 +13,7 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Hits, Outcome, Rays, gate_outcomes
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector, bins_start, metres, resolution_m
+from lidardesign.simulate.detector.detector import Detector, bins_start, ends_of_bins, metres, resolution_m
 from lidardesign.simulate.light import Beams, direct_echoes
 
 # A surface that is grazed more flatly than this counts as met at it: ranges then change by up to 50 times a step aside.
@@ -191,9 +191,20 @@ class FirstHits:
 
     @cached_property
     def rounding_m(self) -> np.ndarray:
-        """How far each first hit lies from the middle of its bin, at most half a bin, shape (N,) [m]."""
-        phase_m = np.mod(self.path_m - bins_start(self.window_m, self.detector), self.detector.bin_m)
-        return np.abs(phase_m - self.detector.bin_m / 2)
+        """How far each first hit lies from where its bin is reported, (N,) [m]."""
+        low, high = ends_of_bins(self.path_m, self.window_m, self.detector)
+        if self.detector.photons is None:
+            return np.abs(self.path_m - (low + high) / 2)
+        # a histogram's first and last bin have their middle, as far as it lies in the window
+        first, bin_m = bins_start(self.window_m, self.detector), self.detector.bin_m
+        middle = first + (np.floor((self.path_m - first) / bin_m) + 0.5) * bin_m
+        return np.abs(self.path_m - np.clip(middle, low, high))
+
+    @cached_property
+    def bin_edge_m(self) -> np.ndarray:
+        """How far each first hit lies from the nearer end of its bin, or of the part that is listened to, (N,) [m]."""
+        low, high = ends_of_bins(self.path_m, self.window_m, self.detector)
+        return np.minimum(self.path_m - low, high - self.path_m)
 
     @cached_property
     def step_m(self) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector, bins_start
+from lidardesign.simulate.detector.detector import Detector, ends_of_bins
 from lidardesign.simulate.effects.expected_counts import Blindness, Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 
@@ -23,9 +23,8 @@ def round_to_bins(path_m: np.ndarray, windows_m: np.ndarray, detector: Detector)
     """Half paths (N,) at the centre of the part of their bin that lies in their window (N, 2) [m], NaN kept."""
     if detector.bin_m is None:
         return path_m
-    first = bins_start(windows_m, detector)
-    low = first + np.floor((path_m - first) / detector.bin_m) * detector.bin_m
-    return (np.maximum(low, windows_m[:, 0]) + np.minimum(low + detector.bin_m, windows_m[:, 1])) / 2
+    low, high = ends_of_bins(path_m, windows_m, detector)
+    return (low + high) / 2
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:

@@ -13,6 +13,7 @@ takes a thousand times as long as other effects, and one chance is as good as an
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -28,6 +29,8 @@ PASSED_SHARE = 0.2
 EDGE_REACH = 4.0
 # Whether a return is reported that has barely enough light is a matter of these.
 OF_BARE_LIGHT = {"photon_noise", "jitter", "quantisation"}
+# By these rays meet what their first hits are not.
+ELSEWHERE = {"footprint", "motion"}
 
 
 def with_steps(counts: Counts, bounds: dict[str, EffectBound]) -> dict[str, EffectBound]:
@@ -47,10 +50,10 @@ def with_steps(counts: Counts, bounds: dict[str, EffectBound]) -> dict[str, Effe
             share = np.minimum(counts.in_air * shift_m / counts.bin_m, 1.0)
             squared_m2, lost = squared_m2 + share * chance.squared_m2, np.minimum(lost + share * chance.lost, 1.0)
         changed[name] = replace(bounds[name], squared_m2=squared_m2, lost=lost)
-    if chance is not None and "footprint" in bounds:
-        # how much light comes of a beam that meets two surfaces is not known: it may be barely enough
-        for name in OF_BARE_LIGHT & bounds.keys():
-            changed[name] = replace(changed[name], lost=np.maximum(changed[name].lost, bounds["footprint"].lost))
+    if chance is not None:
+        # how much light comes of what a beam or a ray of another time meets is not known: it may be barely enough
+        for name, other in itertools.product(OF_BARE_LIGHT & bounds.keys(), ELSEWHERE & bounds.keys()):
+            changed[name] = replace(changed[name], lost=np.maximum(changed[name].lost, bounds[other].lost))
     return changed
 
 
@@ -72,7 +75,7 @@ def _steps_m2(counts: Counts, shift_m: np.ndarray, others_m: np.ndarray) -> np.n
     if first_hits.detector.photons is not None and first_hits.detector.estimator == "matched":
         others_m = others_m + first_hits.sigma_m()
         alone_m2 = bin_m * shift_m / np.maximum(counts.in_air, 1.0)
-    edge_m = np.maximum(bin_m / 2 - first_hits.rounding_m, SQUARABLE)
+    edge_m = np.maximum(first_hits.bin_edge_m, SQUARABLE)
     return _passed(shift_m, others_m, edge_m) * first_hits.step_m**2 + alone_m2
 
 
