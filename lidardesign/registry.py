@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, distributions, entry_points
 from typing import Any
 
-from lidardesign.errors import ConfigError, LidardesignError, PluginError
+from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError
 from lidardesign.run.clock import phase
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
 
@@ -258,7 +258,7 @@ def _known(name: str) -> list[EntryPoint]:
 
 @contextlib.contextmanager
 def plugin_guard(name: str) -> Iterator[None]:
-    """Run a plugin's code; whatever it raises, other than this program's own errors, becomes a PluginError.
+    """Run a plugin's code; whatever it raises becomes a PluginError, but for errors of this program and of files.
 
     Whatever it prints goes to stderr, so that it cannot spoil a command's output.
     """
@@ -270,6 +270,9 @@ def plugin_guard(name: str) -> Iterator[None]:
     except SystemExit as error:
         raise PluginError(f"tried to end the program (exit {error.code})", where=f"task {name}") from error
     except BaseException as error:
+        if isinstance(error, OSError) and error.filename is not None:
+            reason, hint = error.strerror or type(error).__name__, f"the task {name} reads it: check the path"
+            raise DataError(f"cannot be read: {reason}", where=str(error.filename), hint=hint) from error
         raise PluginError(
             f"{type(error).__name__}: {text_of(error)}",
             where=f"task {name}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from importlib.metadata import EntryPoint
@@ -9,7 +10,7 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from lidardesign import registry
-from lidardesign.errors import ConfigError, PluginError
+from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.registry import list_tasks, load_task, plugin_guard
 
 GOOD = """
@@ -83,3 +84,6 @@ def test_the_guard_turns_what_a_plugin_raises_into_a_plugin_error():
         raise ConfigError("mine")
     with pytest.raises(KeyboardInterrupt), plugin_guard("good"):
         raise KeyboardInterrupt
+    message = r"(?s)cannot be read: File name too long.*the task good reads it"
+    with pytest.raises(DataError, match=message), plugin_guard("good"):
+        os.stat("x" * 300)

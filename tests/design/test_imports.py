@@ -333,6 +333,7 @@ BAD_XML = {
         model_of("", '<replicate count="999"><replicate count="99"><site/></replicate></replicate>'),
         "replicates too much",
     ),
+    "too many sites": (model_of("", "<site/>" * 120_001), "too many bodies, sites and sensors"),
     "no number of copies": (model_of("", '<replicate count="many"><site/></replicate>'), "count is 'many'"),
     "another model": (model_of("", '<attach model="x"/>'), "attaches another model"),
     "no end": (model_of('<rangefinder site="a"/>'), "does not say how far 1 of its 1 rays are heard"),

@@ -25,6 +25,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.numerics import SLACK
+from lidardesign.run.inputs import MESH, read_file
 from lidardesign.scene import Mesh
 
 ALGORITHM = "narrow band 3 cells, sign by the absolute winding number, filled by distance transform, recentred, float32"
@@ -185,7 +186,7 @@ def _cache_path(mesh: Mesh, grid: Grid, name: str) -> Path:
 def _load(path: Path, size: int) -> np.ndarray | None:
     """The values of a cached field; None where the file is not whole: its hash stands behind the array."""
     try:
-        content = path.read_bytes()
+        content = read_file(path, MESH)
         if _digest(content[:-DIGEST_BYTES]) != content[-DIGEST_BYTES:]:
             return None
         values = np.load(io.BytesIO(content), allow_pickle=False)

@@ -42,6 +42,8 @@ KEPT = {
 MOST_INCLUDES = 100
 # MuJoCo takes seconds for a thousand copies with sensors, and four times as long for twice as many.
 MOST_COPIES = 1000
+# It takes ten seconds for so many sites and sensors, and four times as long for twice as many.
+MOST_KEPT = 120_000
 
 
 def stripped_model(path: Path) -> ElementTree.Element:
@@ -63,10 +65,12 @@ class _Copier:
     Arguments:
         seen: The files that were read, the model's own first.
         copies: How many elements `replicate` makes.
+        kept: How many elements are kept.
     """
 
     seen: list[Path]
     copies: int = 0
+    kept: int = 0
 
     def copy_children(
         self, source: ElementTree.Element, target: ElementTree.Element, path: Path, *, depth: int, times: int = 1
@@ -88,6 +92,9 @@ class _Copier:
                 )
             if child.tag not in KEPT:
                 continue
+            self.kept += 1
+            if self.kept > MOST_KEPT:
+                raise DataError("has too many bodies, sites and sensors", where=where, allowed=f"at most {MOST_KEPT}")
             kept = {name: child.attrib[name] for name in KEPT[child.tag] if name in child.attrib}
             inner = times
             if child.tag == "replicate":

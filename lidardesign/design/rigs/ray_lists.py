@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.design.rigs.rig import Rig, RigSensor, number_of
+from lidardesign.design.rigs.rig import MOST_SENSORS, Rig, RigSensor, number_of
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.numerics import COARSE_SLACK, SLACK
@@ -282,8 +282,10 @@ def read_sensor_csv(path: Path) -> DesignSpec:
 def _rows(path: Path) -> tuple[list[tuple[dict[str, float], str]], list[str]]:
     """Numbers by column name and the position of each row, with notes."""
     lines = csv_rows(path, RAY_TABLE)
-    if not lines:
-        raise DataError("is empty", where=str(path), allowed=f"rows of {len(SENSOR_COLUMNS)} columns")
+    if not lines or len(lines) > MOST_SENSORS + 1:
+        found = f"has {len(lines)} rows" if lines else "is empty"
+        allowed = f"rows of {len(SENSOR_COLUMNS)} columns, at most {MOST_SENSORS}"
+        raise DataError(found, where=str(path), allowed=allowed)
     first = [cell.strip() for cell in lines[0][1]]
     if any(number_of(cell) is not None for cell in first):
         names = SENSOR_COLUMNS if len(first) != len(SENSOR_COLUMNS) + 1 else (QUERY_COLUMN, *SENSOR_COLUMNS)
