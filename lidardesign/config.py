@@ -14,19 +14,18 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from lidardesign.errors import UNSET_HINT, ConfigError
+from lidardesign.numerics import COARSE_SLACK
 from lidardesign.registry import load_task, plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import verify, write_recorded
 from lidardesign.run.validation import anchor_paths, check_model, suggest
 from lidardesign.run.yaml import MAX_DEPTH, Document, KeyPath, dump_yaml, leaves, load_yaml, parse_yaml, resolve_scalar
-from lidardesign.space import DIMENSIONS, FARTHEST_M, DesignSpace
+from lidardesign.space import DIMENSIONS, FARTHEST_M, SHORTEST_M, DesignSpace
 from lidardesign.task import Task, TaskConfig
 
 Visibility = Literal["auto", "raycast", "quadrature", "off"]
 Preset = Literal["draft", "standard", "fine"]
 PRESETS: tuple[str, ...] = ("draft", "standard", "fine")
-# Between these all squares and products that the density is made of are numbers, in float32 too.
-LONGEST_M, SHORTEST_M = FARTHEST_M, 1 / FARTHEST_M
 FASTEST_PER_M = 1e12
 
 
@@ -36,7 +35,7 @@ class DensitySettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     sigma_m: float = Field(
-        0.005, ge=SHORTEST_M, le=LONGEST_M, description="standard deviation of the surface proximity [m]"
+        0.005, ge=SHORTEST_M, le=FARTHEST_M, description="standard deviation of the surface proximity [m]"
     )
     visibility: Visibility = Field("auto", description="how occlusion is computed; auto probes whether it is needed")
     attenuation_per_m: float | None = Field(
@@ -45,11 +44,16 @@ class DensitySettings(BaseModel):
     sharpness_per_m: float | None = Field(
         None, gt=0, le=FASTEST_PER_M, description="k [1/m] of the quadrature; default max(1000, 5 / sigma)"
     )
-    margin_m: float | None = Field(None, ge=0, description="m [m]: a surface does not occlude itself; default sigma")
+    margin_m: float | None = Field(
+        None, ge=0, le=FARTHEST_M, description="m [m]: a surface does not occlude itself; default sigma"
+    )
     quadrature_points: int = Field(64, ge=4, le=4096, description="midpoints of the visibility quadrature")
     field_resolution: int = Field(64, ge=8, le=512, description="grid points along the longest side of mesh fields")
     surface_tolerance_nats: float = Field(
-        16.0, gt=0, description="scenes whose surface term is this far below the best one skip visibility [nats]"
+        16.0,
+        gt=0,
+        le=1e6,
+        description="scenes whose surface term is this far below the best one skip visibility [nats]",
     )
 
 
@@ -63,7 +67,7 @@ class LearningSettings(BaseModel):
 
     steps: int = Field(1000, ge=1, le=100_000_000, description="optimiser steps")
     batch: int = Field(1024, ge=2, le=1_000_000, description="design points per step")
-    rate: float = Field(1e-2, gt=0, description="initial Adam step size")
+    rate: float = Field(1e-2, ge=COARSE_SLACK, le=1, description="initial Adam step size")
     frames: int = Field(
         256, ge=1, le=1_000_000, description="scenes and frames that stand for all in each path-wise step, drawn anew"
     )
@@ -73,17 +77,17 @@ class LearningSettings(BaseModel):
     dtype: Literal["float64", "float32"] = Field(
         "float32", description="arithmetic of training steps, while it can invert the flow; samples are always float64"
     )
-    entropy: float = Field(0.0, ge=0, description="eta of the paper; annealed to 0")
+    entropy: float = Field(0.0, ge=0, le=1e3, description="eta of the paper; annealed to 0")
     sigma_start_m: float | None = Field(
-        None, ge=SHORTEST_M, le=LONGEST_M, description="where sigma's annealing starts; default 6 sigma"
+        None, ge=SHORTEST_M, le=FARTHEST_M, description="where sigma's annealing starts; default 6 sigma"
     )
     anneal: float = Field(0.7, ge=0, le=1, description="share of the path-wise steps over which sigma falls")
     balance: float = Field(0.5, ge=0, le=1, description="share of the steps, the last ones, that balance by values")
     balance_proposals: int = Field(
         65536, ge=256, le=10_000_000, description="independent proposals that balancing draws from"
     )
-    clip_norm: float = Field(5.0, gt=0, description="gradient norm that steps are clipped to")
-    checkpoint_seconds: float = Field(20.0, gt=0, description="time between checkpoints [s]")
+    clip_norm: float = Field(5.0, ge=COARSE_SLACK, le=1e6, description="gradient norm that steps are clipped to")
+    checkpoint_seconds: float = Field(20.0, gt=0, le=86_400, description="time between checkpoints [s]")
     samples: int = Field(
         100_000, ge=1000, le=10_000_000, description="fresh samples for ESS, KL, log Z, fit and constrain"
     )
@@ -463,6 +467,9 @@ def _space(task: Task, config: TaskConfig, layers: _Layers) -> DesignSpace:
         with plugin_guard(task.name):
             base = task.space(config).as_dict()
     section = check_model(_SpaceSection, {**base, **given}, layers.origin, "space")
+    if section.range_m[0] == section.range_m[1]:
+        found = f"space.range_m: found one range, {section.range_m[0]:g}, so that gates have no width"
+        raise ConfigError(found, where=layers.origin(("space", "range_m")), allowed="[low, high]")
     try:
         return DesignSpace.from_dict(section.model_dump())
     except ConfigError as error:

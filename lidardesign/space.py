@@ -28,8 +28,11 @@ Measure = Literal["solid_angle", "angles"]
 MEASURES = ("solid_angle", "angles")
 # A million kilometres: what is further is a slip of units, and fourth powers of lengths must stay numbers.
 FARTHEST_M = 1e9
+# Between these all squares and products that densities are made of are numbers, in float32 too.
+SHORTEST_M = 1 / FARTHEST_M
 # Of an angle of many turns ever fewer digits are left; nobody needs more than one.
 MOST_TURNS = 100
+LARGEST_ANGLE_RAD = MOST_TURNS * FULL_TURN
 # Bounds such as 2 pi are written with some ten digits.
 ROUNDING_RAD = SLACK
 
@@ -110,7 +113,7 @@ class DesignSpace:
                 where="space.elevation_rad",
                 allowed="-pi/2 to pi/2 rad",
             )
-        if max(abs(self.low[AZIMUTH]), abs(self.high[AZIMUTH])) > MOST_TURNS * FULL_TURN:
+        if max(abs(self.low[AZIMUTH]), abs(self.high[AZIMUTH])) > LARGEST_ANGLE_RAD:
             raise ConfigError(
                 f"azimuth {self.low[AZIMUTH]} to {self.high[AZIMUTH]} rad is many turns away",
                 where="space.azimuth_rad",

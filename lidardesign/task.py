@@ -9,18 +9,24 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Annotated, Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
-from lidardesign.space import DIMENSIONS, DesignSpace
+from lidardesign.space import DIMENSIONS, FARTHEST_M, DesignSpace
 
 API_VERSION = 1
 Split = Literal["train", "test"]
+
+
+# Numbers of configurations: beyond these they are slips of units.
+Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+Vector = tuple[Metres, Metres, Metres]
+Interval = tuple[Metres, Metres]
 
 
 class TaskConfig(BaseModel):

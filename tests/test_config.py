@@ -18,7 +18,10 @@ from lidardesign.config import (
     save_run_config,
     with_task_settings,
 )
+from lidardesign.design.catalog.statements import PartFile
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.registry import list_tasks, load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig
@@ -152,6 +155,7 @@ BAD_FILES = {
     "preset": ("preset: quick\n", "1:9", "draft, standard, fine"),
     "seed": ("seed: -1\n", "1:7", "whole number"),
     "rule of the task": ("task:\n  low: 2\n", "", "low is above high"),
+    "one range": ("space:\n  range_m: 0.5\n", "2:12", "found one range, 0.5"),
     "nothing behind a key": ("density:\n  sigma_m:\n  margin_m: 1\n", "2:11", "density.sigma_m has no value"),
     "nothing in a list": ("space:\n  x_m:\n  - 0\n  -\n", "4:4", "space.x_m.1 has no value"),
     "duplicate": ("density:\n  sigma_m: 1\n  sigma_m: 2\n", "3:3", "given before"),
@@ -279,3 +283,25 @@ def test_what_was_learned_stays_when_a_run_is_judged(override, message):
 def test_a_key_of_many_parts_is_refused(text):
     with pytest.raises(ConfigError, match=r"(?s)has \d+ parts.*at most 32"):
         parse_override(text)
+
+
+def unlimited(schema, path=""):
+    """The numbers of a schema that have no largest or no smallest value."""
+    if isinstance(schema, dict):
+        limits = {name.removeprefix("exclusive").lower() for name in schema} & {"minimum", "maximum"}
+        if schema.get("type") in ("number", "integer") and "const" not in schema and len(limits) < 2:
+            yield path
+        for name, part in schema.items():
+            yield from unlimited(part, f"{path}.{name}")
+    elif isinstance(schema, list):
+        for part in schema:
+            yield from unlimited(part, path)
+
+
+MODELS = [DensitySettings, LearningSettings, Constraints, PartFile]
+MODELS += [load_task(item.name).Config for item in list_tasks() if item.distribution.startswith("lidardesign ")]
+
+
+@each_row("model", MODELS)
+def test_every_number_that_a_user_sets_has_limits(model):
+    assert not list(unlimited(model.model_json_schema()))

@@ -41,7 +41,7 @@ from lidardesign.run.files import write_atomic
 from lidardesign.run.inputs import DESIGN, RAY_TABLE, read_head
 from lidardesign.run.validation import LocateKey, Node
 from lidardesign.run.yaml import Document, dump_yaml, load_yaml
-from lidardesign.space import DIMENSIONS
+from lidardesign.space import DIMENSIONS, FARTHEST_M, FULL_TURN, LARGEST_ANGLE_RAD
 
 SCHEMA_VERSION = 1
 SCHEMA_FILE = Path(__file__).with_name("design.schema.json")
@@ -70,8 +70,6 @@ TRACK_KEYS = (
 )  # fmt: skip
 # Four numbers per ray and knot stay below the number of values that the YAML reader accepts in one file.
 MOST_TRACK_RAYS = 100_000
-# Beyond this double precision no longer tells places a millimetre apart.
-FURTHEST_M = 1e12
 
 
 def track_document(track: Track) -> dict[str, Any]:
@@ -90,11 +88,9 @@ def read_track(node: Node, sensors: int) -> Track:
         ConfigError: A key is missing, rows differ in length, or knots do not ascend.
     """
     keys = node.mapping(TRACK_KEYS)
-    knots = keys["knots_m"].numbers()
+    knots = keys["knots_m"].numbers(None, -FARTHEST_M, FARTHEST_M)
     if len(knots) < 2 or (knots[1:] <= knots[:-1]).any():
         raise keys["knots_m"].error("are no knots", allowed="at least two numbers, each above the one before")
-    if np.abs(knots).max() > FURTHEST_M:
-        raise keys["knots_m"].error(f"reach {np.abs(knots).max():g} m", allowed=f"within {FURTHEST_M:g} m of 0")
     index = np.array([item.integer(0, sensors - 1) for item in keys["sensor"].items()], dtype=np.int64)
     if not len(index):
         raise keys["sensor"].error("is empty", allowed="at least one ray")
@@ -105,12 +101,11 @@ def read_track(node: Node, sensors: int) -> Track:
             raise keys[key].error(f"has {len(items)} rows", allowed=f"{len(knots)}, one per knot")
         return np.stack([item.numbers(len(index), low, high) for item in items])
 
-    azimuth, elevation = rows("azimuth_rad"), rows("elevation_rad", -math.pi / 2, math.pi / 2)
-    start, end = rows("gate_start_m", 0), rows("gate_end_m", 0)
-    if (end < start).any():
-        knot, ray = (int(i) for i in np.argwhere(end < start)[0])
-        bad = keys["gate_end_m"].child(knot).child(ray)
-        raise bad.error(f"is {end[knot, ray]}, before the gate's start {start[knot, ray]}")
+    azimuth = rows("azimuth_rad", -LARGEST_ANGLE_RAD, LARGEST_ANGLE_RAD)
+    elevation = rows("elevation_rad", -math.pi / 2, math.pi / 2)
+    start, end = rows("gate_start_m", 0, FARTHEST_M), rows("gate_end_m", 0, FARTHEST_M)
+    for knot, ray in np.argwhere(end <= start).tolist():
+        raise _no_gate(keys["gate_end_m"].child(knot).child(ray), start[knot, ray])
     return Track(keys["dimension"].choice(TRAVELLED), knots, azimuth, elevation, np.stack([start, end], axis=2), index)
 
 
@@ -254,7 +249,7 @@ def design_from_document(
     keys = root.mapping(("schema_version", "sensors"), OPTIONAL)
     level = keys["level"].number(*LEVELS) if "level" in keys else DEFAULT_LEVEL
     sensors = _sensors(keys["sensors"], level)
-    rays = keys["rays"].integer(0, MOST_RAYS) if "rays" in keys else None
+    rays = keys["rays"].integer(1, MOST_RAYS) if "rays" in keys else None
     table = _ray_table(keys["ray_table"], len(sensors)) if "ray_table" in keys else None
     track = read_track(keys["track"], len(sensors)) if "track" in keys else None
     _check_rays(keys, sensors, rays, table, track)
@@ -268,7 +263,9 @@ def design_from_document(
         provenance=keys["provenance"].plain() if "provenance" in keys else {},
         level=level,
         track=track,
-        at={name: item.number() for name, item in keys["at"].mapping((), DIMENSIONS).items()} if "at" in keys else {},
+        at={name: item.number(-FARTHEST_M, FARTHEST_M) for name, item in keys["at"].mapping((), DIMENSIONS).items()}
+        if "at" in keys
+        else {},
         mount=keys["mount"].mapping(("body",))["body"].text() if "mount" in keys else None,
         gates=keys["gates"].choice(get_args(Gates)) if "gates" in keys else None,  # type: ignore[arg-type]
         further_tables=tuple(_ray_table(item, len(sensors)) for item in keys["further_tables"].items())
@@ -322,7 +319,8 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
         spread, field = spreads.get(f"{axis}_rad"), fields.get(axis)
         if spread is None and field is None:
             raise node.error(f"has neither field_of_view_rad.{axis} nor spread.{axis}_rad", hint="give one of them")
-        spread_rad.append(field.number(0, 2 * math.pi) / full if spread is None else spread.number(0))
+        widest = FULL_TURN * (1 + AGREEMENT) / full
+        spread_rad.append(field.number(0, FULL_TURN) / full if spread is None else spread.number(0, widest))
         if spread is not None and field is not None:
             _agree(field, full * spread_rad[-1], "radians", level)
     range_m, spread_range = _range(node, keys, level)
@@ -331,9 +329,11 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
         weight=keys["weight"].number(0) if "weight" in keys else 0.0,
         origin_m=mean,
         origin_covariance_m2=covariance,
-        azimuth_rad=boresight["azimuth_rad"].number(),
+        azimuth_rad=boresight["azimuth_rad"].number(-LARGEST_ANGLE_RAD, LARGEST_ANGLE_RAD),
         elevation_rad=boresight["elevation_rad"].number(-math.pi / 2, math.pi / 2),
-        roll_rad=boresight["roll_rad"].number() if "roll_rad" in boresight else 0.0,
+        roll_rad=boresight["roll_rad"].number(-LARGEST_ANGLE_RAD, LARGEST_ANGLE_RAD)
+        if "roll_rad" in boresight
+        else 0.0,
         spread_horizontal_rad=spread_rad[0],
         spread_vertical_rad=spread_rad[1],
         range_m=range_m,
@@ -388,13 +388,13 @@ def _check_travel(node: Node, sensor: Sensor) -> None:
 
 def _origin(node: Node) -> tuple[np.ndarray, np.ndarray]:
     keys = node.mapping(("mean",), ("covariance",))
-    mean = keys["mean"].numbers(3)
+    mean = keys["mean"].numbers(3, -FARTHEST_M, FARTHEST_M)
     if "covariance" not in keys:
         return mean, np.zeros((3, 3))
     rows = keys["covariance"].items()
     if len(rows) != 3:
         raise keys["covariance"].error(f"has {len(rows)} rows", allowed="3 rows of 3 numbers [m^2]")
-    covariance = np.stack([row.numbers(3) for row in rows])
+    covariance = np.stack([row.numbers(3, -(FARTHEST_M**2), FARTHEST_M**2) for row in rows])
     slack = COVARIANCE_ROUNDING * np.abs(covariance).max()
     if np.abs(covariance - covariance.T).max() > slack:
         raise keys["covariance"].error("is not symmetric")
@@ -406,17 +406,17 @@ def _origin(node: Node) -> tuple[np.ndarray, np.ndarray]:
 def _range(node: Node, keys: dict[str, Node], level: float) -> tuple[float, float]:
     """Mean and spread of the range, from two of mean, spread and gate, or from the gate alone."""
     spreads = keys["spread"].value if "spread" in keys else {}
-    spread = keys["spread"].child("range_m").number(0) if spreads.get("range_m") is not None else None
-    mean = keys["range_m"].number(0) if "range_m" in keys else None
+    spread = keys["spread"].child("range_m").number(0, FARTHEST_M) if spreads.get("range_m") is not None else None
+    mean = keys["range_m"].number(0, FARTHEST_M) if "range_m" in keys else None
     half = interval_factor(level)
     if "gate_m" not in keys:
         if spread is None or mean is None:
             raise node.error("has no gate", hint="give gate_m {start, end}, or range_m and spread.range_m")
         return mean, spread
     gate = keys["gate_m"].mapping(("start", "end"))
-    start, end = gate["start"].number(0), gate["end"].number(0)
-    if end < start:
-        raise gate["end"].error(f"is {end}, before the gate's start {start}")
+    start, end = gate["start"].number(0, FARTHEST_M), gate["end"].number(0, FARTHEST_M)
+    if end <= start:
+        raise _no_gate(gate["end"], start)
     if spread is None:
         mean = (start + end) / 2 if mean is None else mean
         spread = max(end - mean, 0.0) / half
@@ -425,6 +425,11 @@ def _range(node: Node, keys: dict[str, Node], level: float) -> tuple[float, floa
     _agree(gate["start"], max(mean - half * spread, 0.0), "m", level, scale=end)
     _agree(gate["end"], mean + half * spread, "m", level)
     return mean, spread
+
+
+def _no_gate(end: Node, start_m: float) -> ConfigError:
+    """The error of a gate that ends where or before it starts: nothing is heard in it."""
+    return end.error(f"is {end.value:g}, not beyond the gate's start {start_m:g}", allowed="a gate that has a width")
 
 
 def _agree(node: Node, expected: float, unit: str, level: float, scale: float = 0.0) -> None:
@@ -440,13 +445,14 @@ def _agree(node: Node, expected: float, unit: str, level: float, scale: float = 
 def _ray_table(node: Node, sensors: int) -> Rays:
     keys = node.mapping(TABLE_KEYS)
     count = len(keys["sensor"].items())
-    origin = np.stack([keys[key].numbers(count) for key in TABLE_KEYS[:3]], axis=1)
-    azimuth = keys["azimuth_rad"].numbers(count)
+    if not count:
+        raise keys["sensor"].error("is empty", allowed="at least one ray")
+    origin = np.stack([keys[key].numbers(count, -FARTHEST_M, FARTHEST_M) for key in TABLE_KEYS[:3]], axis=1)
+    azimuth = keys["azimuth_rad"].numbers(count, -LARGEST_ANGLE_RAD, LARGEST_ANGLE_RAD)
     elevation = keys["elevation_rad"].numbers(count, -math.pi / 2, math.pi / 2)
-    start, end = keys["gate_start_m"].numbers(count, 0), keys["gate_end_m"].numbers(count, 0)
-    if (end < start).any():
-        bad = int(np.argmax(end < start))
-        raise keys["gate_end_m"].child(bad).error(f"is {end[bad]}, before the gate's start {start[bad]}")
+    start, end = (keys[name].numbers(count, 0, FARTHEST_M) for name in ("gate_start_m", "gate_end_m"))
+    for bad in np.flatnonzero(end <= start).tolist():
+        raise _no_gate(keys["gate_end_m"].child(bad), start[bad])
     sensor = np.array([item.integer(0, sensors - 1) for item in keys["sensor"].items()], dtype=np.int64)
     return Rays.from_angles(origin, azimuth, elevation, np.stack([start, end], axis=1), sensor)
 
@@ -468,6 +474,8 @@ def _check_rays(
         if name in keys and layout != "selected":
             raise keys[name].error(f"stand beside the layout {layout or 'grid'}", allowed="the layout selected")
     own = [sensor.rays for sensor in sensors]
+    if own and not any(count is None or count for count in own):
+        raise keys["sensors"].error("fire no ray", allowed="a sensor whose rays are above 0")
     counts = {
         "rays": rays,
         "the sum of sensors[].rays": None if None in own else sum(own),

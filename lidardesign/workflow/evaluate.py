@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -11,9 +10,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.config import with_task_settings
+from lidardesign.config import MAX_SEED, with_task_settings
 from lidardesign.design.compare import outside_notes
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.design.sensor import MOST_RAYS
+from lidardesign.errors import ConfigError, DataError, check_number
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
 from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
@@ -23,6 +23,7 @@ from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numb
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
 from lidardesign.evaluate.score import evaluate as score_designs
 from lidardesign.evaluate.workers.pool import check_workers, workers_of
+from lidardesign.numerics import SLACK
 from lidardesign.run.clock import outermost_clock, phase, running
 from lidardesign.run.files import is_there
 from lidardesign.simulate.detector.files import load_detector
@@ -54,7 +55,10 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int, str], None]
 
 CMA = "cma"
-LEAST_CMA_SECONDS = 0.1
+CMA_SECONDS = (0.1, 7 * 24 * 3600.0)
+# A picometre, and further than any sensor reaches.
+RANGE_TOLERANCES_MM = (SLACK, 1e9)
+RETURN_TOLERANCES = (SLACK, 1.0)
 MILLIMETRES = 1000.0
 MOST_NAMED = 8
 COMMAND = "evaluate"
@@ -104,19 +108,22 @@ class ScoreOptions:
         self.misplacement()
         for name in self.baselines:
             baseline_of(name, where="--baseline")
-        seconds = self.cma_seconds
-        if seconds is not None and not (math.isfinite(seconds) and seconds >= LEAST_CMA_SECONDS):
-            raise ConfigError(
-                f"{seconds:g} s", where="--cma-seconds", allowed=f"a finite number from {LEAST_CMA_SECONDS:g}"
-            )
-        if seconds is not None and CMA not in self.baselines:
+        limits = {
+            "cma_seconds": CMA_SECONDS,
+            "range_tolerance_mm": RANGE_TOLERANCES_MM,
+            "return_tolerance": RETURN_TOLERANCES,
+            "seed": (0, MAX_SEED),
+            "scenes_seed": (0, MAX_SEED),
+        }
+        for name, (low, high) in limits.items():
+            if getattr(self, name) is not None:
+                check_number(getattr(self, name), f"--{name.replace('_', '-')}", low, high, whole="seed" in name)
+        for count in self.rays or ():
+            check_number(count, "--rays", 1, MOST_RAYS, whole=True)
+        if self.cma_seconds is not None and CMA not in self.baselines:
             raise ConfigError(
                 "nothing is searched for", where="--cma-seconds", hint=f"add --baseline {CMA}, or leave it out"
             )
-        tolerances = {"--range-tolerance-mm": self.range_tolerance_mm, "--return-tolerance": self.return_tolerance}
-        for option, value in tolerances.items():
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"{value:g}", where=option, allowed="a finite number above 0")
 
     def misplacement(self) -> MountError | None:
         """How carelessly sensors are mounted in further rows."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 from lidardesign.design.layouts.rays import lay_out, layout_of, own_count
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, check_number
 from lidardesign.estimates import Estimate, as_documents
 from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
@@ -31,6 +30,8 @@ from lidardesign.workflow.run_folder import (
 from lidardesign.workflow.run_samples import RunTarget, Weighting, may_need_samples, weighted_samples
 
 # Formats that hold sensors only, so that the number of rays may stay open.
+# Of frames: slower than any survey, faster than any pulse.
+RATES_HZ = (1e-3, 1e6)
 WITHOUT_RAYS = ("sensors-csv", "stl")
 
 
@@ -294,5 +295,5 @@ def check_frame_rate(rate_hz: float | None) -> None:
     Raises:
         ConfigError: So it is.
     """
-    if rate_hz is not None and not (math.isfinite(rate_hz) and rate_hz > 0):
-        raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed="a finite number above 0")
+    if rate_hz is not None:
+        check_number(rate_hz, "--rate-hz", *RATES_HZ)

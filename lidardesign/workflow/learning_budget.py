@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import RunConfig
-from lidardesign.errors import ConfigError, DataError, ThresholdError
+from lidardesign.errors import ConfigError, DataError, ThresholdError, check_number
 from lidardesign.run.clock import Clock, outermost_clock, phase
 from lidardesign.run.manifest import DAMAGED_HINT, FILE_NAME, read_manifest
 from lidardesign.run.yaml import leaves, load_yaml
@@ -24,8 +24,10 @@ if TYPE_CHECKING:
     Train = Callable[..., LearnResult]
 
 TOLERANCE, TIME_BUDGET = "--tolerance", "--time-budget"
-# More is a mistake in the unit; the numbers of steps that it makes are beyond what a file may hold.
-LONGEST_S = 366 * 24 * 3600.0
+# What can be told apart from nothing and from all.
+TOLERANCES = (1e-4, 0.9999)
+# The program takes longer to start; more than a year is a mistake in the unit, too.
+SHORTEST_S, LONGEST_S = 1.0, 366 * 24 * 3600.0
 STEPS_KEY, FIELDS_KEY = "learning.steps", "density.field_resolution"
 GOAL = "goal"
 # What passes before a command's clock runs, where the system does not tell: the program's own imports take 0.3 s.
@@ -72,13 +74,12 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
     """
     if tolerance is not None and time_budget_s is not None:
         raise ConfigError("both decide the number of steps", where=f"{TOLERANCE}, {TIME_BUDGET}", allowed="one of them")
-    if tolerance is not None and not 0 < tolerance < 1:
-        raise ConfigError(f"{tolerance:g}", where=TOLERANCE, allowed="a share between 0 and 1, as 0.1")
+    if tolerance is not None:
+        check_number(tolerance, TOLERANCE, *TOLERANCES)
     keys, path = {text.partition("=")[0].strip() for text in given["overrides"]}, given["config_file"]
     if time_budget_s is None:
         return Goal(tolerance, fixed_fields=path is not None or FIELDS_KEY in keys)
-    if not 0 < time_budget_s <= LONGEST_S:
-        raise ConfigError(f"{time_budget_s:g}", where=TIME_BUDGET, allowed="seconds above 0, a year at most")
+    check_number(time_budget_s, TIME_BUDGET, SHORTEST_S, LONGEST_S)
     if STEPS_KEY in keys:
         raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
     if path is not None:

@@ -20,7 +20,7 @@ from lidardesign.evaluate.metrics import discrete_frechet_m
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Interval, Metric, Score, Split, random_generator
 from lidardesign_tasks.robot.arm_motion import Arm, Motion
 from lidardesign_tasks.robot.arm_robot import BALL_RADIUS_M, Robot, load_robot
 from lidardesign_tasks.robot.tracking import FEWEST_FRAMES, MEAN_DEPTH, filled_path, path_information, tracked_places
@@ -50,7 +50,7 @@ class ArmConfig(Surroundings):
     elevation_max_deg: float = Field(
         -60.0, gt=-90, le=0, description="the flattest elevation of a ray; -90 looks straight down [deg]"
     )
-    range_m: tuple[float, float] = Field((0.1, 2.0), description="shortest and longest range [m]")
+    range_m: Interval = Field((0.1, 2.0), description="shortest and longest range [m]")
 
     @model_validator(mode="before")
     @classmethod

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -19,10 +19,12 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Mesh, Receiver, Scene, inverse_rigid
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Score, Split
-from lidardesign_tasks.face import FaceTask, HeadConfig, Vector, head_scenes
+from lidardesign.task import Defaults, Information, Interval, Metres, Metric, Score, Split, Vector
+from lidardesign_tasks.face import FaceTask, HeadConfig, head_scenes
 from lidardesign_tasks.importance import WEIGHING_KEYS
 from lidardesign_tasks.surface import surface_informs, surface_score
+
+FieldAngle = Annotated[float, Field(gt=0, lt=180)]
 
 
 class EmitterConfig(HeadConfig):
@@ -31,16 +33,16 @@ class EmitterConfig(HeadConfig):
     detector_m: Vector = Field((0.40, 0.0, 0.0), description="place of the detector [m]; the nose tip is at 0")
     detector_azimuth_deg: float = Field(180.0, ge=-360, le=360, description="where the detector looks [deg]")
     detector_elevation_deg: float = Field(0.0, ge=-90, le=90, description="and how far upwards [deg]")
-    field_of_view_deg: tuple[float, float] = Field(
+    field_of_view_deg: tuple[FieldAngle, FieldAngle] = Field(
         (60.0, 50.0), description="the detector's whole horizontal and vertical field of view [deg]"
     )
-    emitter_box_m: float | Vector = Field(
+    emitter_box_m: Metres | Vector = Field(
         (0.03, 0.15, 0.15), description="half size of the box of emitter places around the detector [m]"
     )
     half_angle_deg: float = Field(
         40.0, gt=0, le=80, description="emitted azimuth and elevation span +- this around the detector's [deg]"
     )
-    range_m: tuple[float, float] = Field(
+    range_m: Interval = Field(
         (0.05, 1.05), description="shortest and longest one-way range of emitters and detector [m]"
     )
 
@@ -56,13 +58,6 @@ class EmitterConfig(HeadConfig):
     def _not_negative(cls, value: float | Vector) -> float | Vector:
         if np.min(value) < 0:
             raise ValueError("half sizes are 0 m or more")
-        return value
-
-    @field_validator("field_of_view_deg")
-    @classmethod
-    def _below_a_half_turn(cls, value: tuple[float, float]) -> tuple[float, float]:
-        if not all(0 < angle < 180 for angle in value):
-            raise ValueError("both angles of a field of view lie above 0 and below 180 degrees")
         return value
 
     @property

@@ -23,14 +23,13 @@ from lidardesign.geometry.rays import Returns
 from lidardesign.meshio import check_mesh, usable_faces
 from lidardesign.scene import Body, Mesh, Receiver, Scene, Sign
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Interval, Metres, Metric, Score, Split, Vector, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_informs, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import any_direction, moving
 
-Vector = tuple[float, float, float]
 # columns: the world's x, y, z are the model's z (out of the face), x (to the head's left) and y (up)
 WORLD_AXES = [2, 0, 1]
 LARGEST_COEFFICIENT = 3.0  # identities further from the mean than this in any mode are cut: no faces are so
@@ -48,7 +47,7 @@ class HeadConfig(Importance):
     )
     train: int = Field(50, ge=1, le=10_000, description="training heads")
     test: int = Field(50, ge=1, le=10_000, description="held-out heads")
-    modes: int = Field(100, ge=1, description="use at most so many modes of the model")
+    modes: int = Field(100, ge=1, le=10_000, description="use at most so many modes of the model")
     identity_scale: float = Field(
         1.0, ge=0, le=3, description="scale of the identity coefficients; 0: the mean head"
     )
@@ -66,11 +65,11 @@ class FaceConfig(HeadConfig):
     """Heads, and where the sensor in front of them may be."""
 
     distance_m: float = Field(0.40, ge=0.1, le=5, description="from the mean nose tip to the sensor [m]")
-    origin_box_m: float | Vector = Field(
+    origin_box_m: Metres | Vector = Field(
         0.0, description="half size of the box of sensor origins [m]; 0: fixed"
     )
     half_angle_deg: float = Field(30.0, gt=0, le=80, description="azimuth and elevation span +- this [deg]")
-    range_m: tuple[float, float] = Field((0.05, 1.05), description="shortest and longest range [m]")
+    range_m: Interval = Field((0.05, 1.05), description="shortest and longest range [m]")
 
 
 class FaceTask:

@@ -17,11 +17,10 @@ from pydantic import Field, model_validator
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.surface import sample_triangles
-from lidardesign.space import FARTHEST_M, DesignSpace
-from lidardesign.task import random_generator
+from lidardesign.space import DesignSpace
+from lidardesign.task import Vector, random_generator
 from lidardesign_tasks.surroundings import Surroundings
 
-Vector = tuple[float, float, float]
 # What is flatter than this share of the mean roughness counts as if it were so rough: no part counts nothing.
 LEAST_ROUGHNESS = 0.1
 # At the rim of a surface the area in a solid angle has no bound; next to the sensor it vanishes.
@@ -72,8 +71,6 @@ class Importance(Surroundings):
             raise ValueError("a region is a ball or a box: give region_radius_m or region_half_size_m, not both")
         if self.region_half_size_m is not None and min(self.region_half_size_m) <= 0:
             raise ValueError("half sizes of a region are above 0 m")
-        if np.abs([*(self.region_centre_m or ()), *(self.region_half_size_m or ())]).max(initial=0.0) > FARTHEST_M:
-            raise ValueError(f"a region lies within {FARTHEST_M:g} m")
         return self
 
     def weights(self, vertices: np.ndarray, faces: np.ndarray, viewpoint_m: np.ndarray) -> np.ndarray | None:

@@ -24,8 +24,8 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.meshio import COLOURS, Painted, list_mesh_files, load_mesh
 from lidardesign.scene import Body, Mesh, Scene, Sign
-from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
+from lidardesign.space import FARTHEST_M, DesignSpace
+from lidardesign.task import Defaults, Information, Metres, Metric, Score, Split, Vector, random_generator
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
@@ -42,7 +42,6 @@ from lidardesign_tasks.surroundings import any_direction, moving
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 from lidardesign_tasks.view import space_around, space_around_box
 
-Vector = tuple[float, float, float]
 Axis = Literal["x", "y", "z"]
 # which of the file's axes become the world's x, y, z: turns the up axis to z without mirroring
 WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
@@ -62,7 +61,7 @@ class MeshesConfig(Importance):
     """Where meshes are, how they are read, split and moved, what counts, what is around, and where the sensor is."""
 
     folder: Path | None = Field(None, description="folder of mesh files (glb, gltf, obj, off, ply, stl)")
-    scale: float = Field(1.0, gt=0, description="factor from the files' unit to metres (0.001 for mm)")
+    scale: float = Field(1.0, gt=0, le=FARTHEST_M, description="factor from the files' unit to metres (0.001 for mm)")
     sign: Sign = Field("auto", description="inside rule: auto, solid, winding or unsigned")
     up: Axis = Field("z", description="the axis of the files that points up")
     centre: bool = Field(True, description="move the centre of each mesh's bounds to the origin")
@@ -79,10 +78,12 @@ class MeshesConfig(Importance):
         "removed", description="whether returns where bin or table are known to be are removed before scoring"
     )
     jitter_rotation_deg: float = Field(4.0, ge=0, le=180, description="standard deviation of the pose [deg]")
-    jitter_translation_m: float | None = Field(None, ge=0, description="of the place [m]; 2 % of the extent if empty")
+    jitter_translation_m: float | None = Field(
+        None, ge=0, le=FARTHEST_M, description="of the place [m]; 2 % of the extent if empty"
+    )
     occluders: Path | None = Field(None, description="folder of meshes that stand in front, in world coordinates")
     origin_m: Vector | None = Field(None, description="sensor place [m]; if empty: in front, at 2 extents")
-    origin_box_m: float | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
+    origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
     truth_points: int = Field(5000, ge=100, le=200_000, description="points of the visible surface to judge by")
     motion: Path | None = Field(
         None,

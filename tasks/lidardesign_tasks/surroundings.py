@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from lidardesign.scene import Ambient, Body, Medium, Scene
+from lidardesign.space import FARTHEST_M
 from lidardesign.task import TaskConfig
 
 # At the visibility one tells 2 % of a contrast: exp(-extinction * visibility) = 0.02 (Koschmieder 1924).
@@ -31,7 +32,9 @@ class Surroundings(TaskConfig):
         300.0, ge=0, le=200_000, description="light on the surfaces; sunlight has 100,000 [lux]"
     )
     light: Literal["indoor", "sun"] = Field("indoor", description="its spectrum: white LEDs, or the sun")
-    visibility_m: float | None = Field(None, ge=0.01, description="how far one sees through fog [m]; empty: clear air")
+    visibility_m: float | None = Field(
+        None, ge=0.01, le=FARTHEST_M, description="how far one sees through fog [m]; empty: clear air"
+    )
     reflectance: float = Field(MATT_GREY, ge=0, le=1, description="share of the light that matt surfaces send back")
     gloss: float = Field(0.0, ge=0, le=1, description="share of the light that surfaces mirror instead")
 

@@ -19,9 +19,9 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
 from lidardesign.space import DIMENSIONS, DesignSpace, X
-from lidardesign.task import Defaults, Information, Metric, Score, Split, conditions_of, random_generator
+from lidardesign.task import Defaults, Information, Interval, Metric, Score, Split, conditions_of, random_generator
 from lidardesign_tasks.surroundings import Surroundings, moving
-from lidardesign_tasks.warehouse_shelf import Interval, ShelfPlan, build_shelf
+from lidardesign_tasks.warehouse_shelf import ShelfPlan, build_shelf
 from lidardesign_tasks.warehouse_truth import BoxTruth, box_information, miss_score
 
 AISLE_M = (-0.5, 4.0)

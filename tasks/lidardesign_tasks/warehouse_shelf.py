@@ -14,8 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from lidardesign.scene import Body, Box, Role, rigid
-
-Interval = tuple[float, float]
+from lidardesign.task import Interval
 
 LEVELS = 4
 BOARD_THICKNESS_M = 0.06  # the board with the beam that carries it

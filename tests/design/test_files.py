@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.strategies import finite, length, sensors
+from support.strategies import finite, length, sensors, width
 from support.tables import each_row
 
 from lidardesign.design.files import (
@@ -36,14 +36,14 @@ words = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc"))).f
 
 @st.composite
 def ray_tables(draw, sensor_count):
-    count = draw(st.integers(0, 12))
+    count = draw(st.integers(1, 12))
     column = lambda values: np.array(draw(st.lists(values, min_size=count, max_size=count)), dtype=np.float64)  # noqa: E731
     start = column(length)
     return Rays.from_angles(
         origin_m=np.stack([column(finite) for _ in range(3)], axis=1),
         azimuth_rad=column(st.floats(-10, 10)),
         elevation_rad=column(st.floats(-math.pi / 2, math.pi / 2)),
-        gate_m=np.stack([start, start + column(length)], axis=1),
+        gate_m=np.stack([start, start + column(width)], axis=1),
         sensor=column(st.integers(0, sensor_count - 1)).astype(np.int64),
     )
 
@@ -55,9 +55,9 @@ def designs(draw):
     raw = np.array(draw(st.lists(st.floats(0.01, 1), min_size=len(names), max_size=len(names))))
     shares = raw / raw.sum()
     own = draw(st.booleans())
-    counts = draw(st.lists(st.integers(0, 9), min_size=len(names), max_size=len(names)))
+    counts = draw(st.lists(st.integers(1, 9), min_size=len(names), max_size=len(names)))
     table = draw(st.none() | ray_tables(len(names))) if not own else None
-    total = sum(counts) if own else len(table.sensor) if table is not None else draw(st.none() | st.integers(0, 999))
+    total = sum(counts) if own else len(table.sensor) if table is not None else draw(st.none() | st.integers(1, 999))
     chosen = tuple(
         draw(sensors(name, float(share), level, rays if own else None))
         for name, share, rays in zip(names, shares, counts, strict=True)
@@ -236,7 +236,8 @@ BAD = [
     ("layout: grid", "layout: gird", ":2:9", "grid or density or scan"),
     ("layout: grid", "layuot: grid", ":2:", "layout"),
     ("rays: 10", "rays: 10.5", ":3:7", "whole number"),
-    ("rays: 10", "rays: -1", ":3:7", "from 0"),
+    ("rays: 10", "rays: -1", ":3:7", "from 1"),
+    ("rays: 10", "rays: 0", ":3:7", "from 1"),
     ("rays: 10", "rays: yes", ":3:7", "whole number"),
     ("rays: 10", "rays: true", ":3:7", "whole number"),
     ("schema_version: 1", "schema_version: 2", ":1:17", "newer version"),
@@ -258,8 +259,9 @@ BAD = [
     ("elevation_rad: -1.5", "elevation_deg: -15", ":8:", "elevation_rad"),
     ("vertical: 0.2", "vertical: 7", ":9:50", "6.28"),
     (", vertical: 0.2", "", ":5:", "vertical"),
-    ("start: 0.5", "start: -0.5", ":10:19", "at least 0"),
-    ("start: 0.5", "start: 2.5", ":10:", "before the gate's start"),
+    ("start: 0.5", "start: -0.5", ":10:19", "from 0 to 1e+09"),
+    ("start: 0.5", "start: 1.5", ":10:29", "not beyond the gate's start 1.5"),
+    ("start: 0.5", "start: 2.5", ":10:", "not beyond the gate's start"),
     ("  gate_m: {start: 0.5, end: 1.5}\n", "", ":5:", "no gate"),
     ("end: 1.5}", "end: 1.5}\n  spread: {range_m: 0.5}\n  range_m: 1.0", ":10:", "the spread gives"),
     ("end: 1.5}", "end: 1.5}\n  spread: {horizontal_rad: 0.5}", ":9:", "the spread gives"),
@@ -276,7 +278,7 @@ BAD = [
         "rays: 10\n",
         TABLE.replace("gate_end_m: [1, 2]", "gate_end_m: [1, 0.5]"),
         ":10:19",
-        "before the gate's start",
+        "not beyond the gate's start",
     ),
     ("rays: 10\n", TABLE.replace("origin_x_m: [0, 0]", "origin_x_m: [0]"), ":4:", "1 numbers"),
     ("rays: 10\n", "rays: 3\n" + TABLE, ":3:", "contradicts"),

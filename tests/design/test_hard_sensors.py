@@ -64,9 +64,8 @@ def test_a_sensor_without_any_spread_fires_along_its_boresight():
     np.testing.assert_allclose(rays.gate_m, 1.0)
 
 
-def test_an_empty_ray_table_is_no_place_to_start_but_the_sensors_are():
+def test_a_ray_table_without_a_ray_is_refused():
     keys = ("origin_x_m", "origin_y_m", "origin_z_m", "azimuth_rad", "elevation_rad", "gate_start_m", "gate_end_m")
     document = {**written(), "ray_table": {key: [] for key in (*keys, "sensor")}}
-    rays = lay_out(design_from_document(document), 7)
-    assert len(rays) == 7
-    assert np.isfinite(rays.origin_m).all()
+    with pytest.raises(ConfigError, match=r"ray_table.sensor is empty"):
+        design_from_document(document)

@@ -39,7 +39,7 @@ MISTAKES = {
     "equal": ({"knots_m": [1.0, 1.0]}, "each above"),
     "one knot": ({"knots_m": [1.0]}, "at least two"),
     "nan": ({"knots_m": [0.0, float("nan")]}, "a number"),
-    "beyond all measure": ({"knots_m": [-1.7e308, 1.7e308]}, "within 1e"),
+    "beyond all measure": ({"knots_m": [-1.7e308, 1.7e308]}, "-1e.09 to 1e.09"),
     "no rays": ({"sensor": [], **EMPTY}, "at least one ray"),
     "a ray too many": ({"azimuth_rad": [[1.4, 1.5], [1.6, 1.7]]}, "has 2 numbers"),
 }

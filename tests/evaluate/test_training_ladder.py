@@ -277,7 +277,7 @@ def test_a_time_budget_writes_its_steps_into_the_configuration(lidardesign, tmp_
     assert plan["balancing_steps"] == pytest.approx(149, abs=2)  # almost all of the time turned out to be left
     assert done.json["steps"] == plan["pathwise_steps"] + plan["balancing_steps"]
     assert load_run_config(tmp_path / "run")[1].learning.steps == done.json["steps"]
-    soon = flatland(lidardesign, "soon", "--time-budget", "0.01")
+    soon = flatland(lidardesign, "soon", "--time-budget", "1")
     assert soon.code == 2
     assert "at least" in soon.err
     assert not (tmp_path / "soon").exists()

@@ -21,8 +21,8 @@ from support.tables import each_row
 from support.visibility import along_axis, both_ways, config_of, plate, transmittance_on, wall
 
 from lidardesign.config import (
+    FARTHEST_M,
     FASTEST_PER_M,
-    LONGEST_M,
     SHORTEST_M,
     DensitySettings,
     LearningSettings,
@@ -425,14 +425,14 @@ class TestSigmaAtBothEnds:
         assert "equal to" in caught.value.allowed or "greater than" in caught.value.allowed
 
     @given(
-        st.floats(math.log10(SHORTEST_M), math.log10(LONGEST_M)),
+        st.floats(math.log10(SHORTEST_M), math.log10(FARTHEST_M)),
         st.floats(-9, math.log10(FASTEST_PER_M)),
         st.floats(-9, math.log10(FASTEST_PER_M)),
         st.sampled_from([0.0, 1e-9, 0.05, 1e9]),
     )
     def test_within_the_limits_every_density_and_gradient_is_finite(self, sigma, attenuation, sharpness, margin):
         settings = DensitySettings(
-            sigma_m=min(max(10.0**sigma, SHORTEST_M), LONGEST_M),
+            sigma_m=min(max(10.0**sigma, SHORTEST_M), FARTHEST_M),
             attenuation_per_m=min(10.0**attenuation, FASTEST_PER_M),
             sharpness_per_m=min(10.0**sharpness, FASTEST_PER_M),
             margin_m=margin,

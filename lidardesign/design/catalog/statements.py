@@ -14,8 +14,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.run.validation import is_name
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+# In whatever unit a figure has: what is beyond is a slip.
+LARGEST = 1e12
+Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Percent = Annotated[float, Field(gt=0, le=100)]
 Count = Annotated[int, Field(ge=1, le=MOST_RAYS)]
 
@@ -29,7 +31,7 @@ def _check_text(text: str) -> str:
 Text = Annotated[str, Field(max_length=500), AfterValidator(_check_text)]
 Angle = Annotated[float, Field(ge=-180, le=180)]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
-Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+Pair = Annotated[list[Annotated[float, Field(ge=-LARGEST, le=LARGEST)]], Field(min_length=2, max_length=2)]
 
 
 class _Keys(BaseModel):
@@ -161,7 +163,7 @@ class Rosette(Statement):
 
     kind: Literal["rosette"]
     rotor_hz: Pair
-    deflection_deg: Annotated[list[Positive], Field(min_length=2, max_length=2)]
+    deflection_deg: Annotated[list[Annotated[float, Field(gt=0, le=90)]], Field(min_length=2, max_length=2)]
     points_per_s: Positive
 
 

@@ -35,10 +35,14 @@ from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import UNSET_HINT, ConfigError
 from lidardesign.run.validation import check_model
 from lidardesign.run.yaml import leaves
+from lidardesign.space import FARTHEST_M, MOST_TURNS, SHORTEST_M
 
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Distance = Annotated[float, Field(ge=0)]
-Positive = Annotated[float, Field(gt=0)]
+Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+Vector = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Distance = Annotated[float, Field(ge=0, le=FARTHEST_M)]
+# Between these products of constraints are numbers, whatever is narrowed to them.
+Positive = Annotated[float, Field(ge=SHORTEST_M, le=FARTHEST_M)]
+Angle = Annotated[float, Field(ge=-360 * MOST_TURNS, le=360 * MOST_TURNS)]
 # The boxes between excluded ones grow faster than their number: with so many a fit still takes seconds.
 MOST_EXCLUDED = 32
 # So many components of a mixture over all samples fill some 100 MB; a scan has its rays instead.
@@ -76,8 +80,8 @@ class DistanceRange(_Keys):
 class AngleRange(_Keys):
     """Bounds on an azimuth [degrees], any number of turns."""
 
-    min: float | None = None
-    max: float | None = None
+    min: Angle | None = None
+    max: Angle | None = None
 
 
 class ElevationRange(_Keys):
@@ -91,7 +95,7 @@ class FieldRange(_Keys):
     """Bounds on a full angle of view [degrees]."""
 
     min: Annotated[float, Field(ge=0, le=360)] | None = None
-    max: Annotated[float, Field(gt=0, le=360)] | None = None
+    max: Annotated[float, Field(ge=SHORTEST_M, le=360)] | None = None
 
 
 class SpreadLimit(_Keys):

@@ -19,7 +19,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
+from lidardesign.task import Defaults, Information, Interval, Metres, Metric, Score, Split, Vector, random_generator
 from lidardesign_tasks.robot.measures import METRICS, TOLERATED_SHARE, Measure, informs, score, with_truth
 from lidardesign_tasks.robot.motion import (
     Trajectory,
@@ -34,8 +34,9 @@ from lidardesign_tasks.surface import MILLIMETRES
 from lidardesign_tasks.surroundings import Surroundings
 from lidardesign_tasks.view import space_around
 
-Vector = tuple[float, float, float]
 # names may be given alone or as a list
+# MuJoCo shows geoms in six groups.
+Group = Annotated[int, Field(ge=0, le=5)]
 Patterns = Annotated[tuple[str, ...], BeforeValidator(lambda given: [given] if isinstance(given, str) else given)]
 SENSOR_DISTANCE = 2.0  # extents
 ROOM = 1.1  # around the sphere that holds the targets wherever they move
@@ -59,13 +60,15 @@ class MujocoConfig(Surroundings):
         ("*",), description="bodies or geoms, none of targets, whose returns are told apart: by default all"
     )
     ignored: Patterns = Field((), description="bodies or geoms that are left out")
-    groups: tuple[int, ...] | None = Field(None, description="groups of geoms that are seen; 0, 1 and 2 if empty")
+    groups: tuple[Group, ...] | None = Field(
+        None, description="groups of geoms that are seen; 0, 1 and 2 if empty"
+    )
     mount_body: str | None = Field(None, description="the body that sensors are on; in the world if empty")
     origin_m: Vector | None = Field(
         None, description="sensor place, in the mount's frame [m]; if empty: in front at 2 extents, or on the mount"
     )
-    origin_box_m: float | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
-    range_m: tuple[float, float] | None = Field(None, description="shortest and longest range [m]; of targets if empty")
+    origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
+    range_m: Interval | None = Field(None, description="shortest and longest range [m]; of targets if empty")
     metric: Measure = Field("position", description="position of targets [m], their surface [mm], or seen at all [%]")
     frames: int = Field(20, ge=1, le=1000, description="time frames of a scene")
     frame_rate_hz: float = Field(10.0, gt=0, le=10_000, description="frames per second [Hz]")
