@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.numerics import normalised_weights, systematic_draw
+from lidardesign.numerics import COARSE_SLACK, normalised_weights, systematic_draw
 from lidardesign.run.arrays import guarded, read_npz
 from lidardesign.run.clock import phase
 from lidardesign.run.inputs import parse_json
@@ -68,6 +68,13 @@ class Samples:
         """ESS = (sum w)^2 / (N sum w^2), a share of N between 0 and 1."""
         return float(1.0 / (len(self) * np.square(self.weights).sum()))
 
+    @cached_property
+    def independent(self) -> float:
+        """How many samples of equal weight they are worth, those counted once that are at one point of the space."""
+        places = np.round(self.space.to_unit(self.points) / COARSE_SLACK)
+        _, same = np.unique(places, axis=0, return_inverse=True)
+        return float(1.0 / np.square(np.bincount(same.reshape(-1), self.weights)).sum())
+
     def subset(self, keep: np.ndarray) -> Samples:
         """The samples at an index or mask."""
         return Samples(self.points[keep], self.log_prob[keep], self.log_target[keep], self.space)
@@ -95,11 +102,15 @@ def save_samples(samples: Samples, run: Path) -> None:
 
 
 @phase("samples")
-def load_samples(run: Path) -> Samples:
+def load_samples(run: Path, expected: DesignSpace | None = None) -> Samples:
     """Read the samples of a run folder.
 
+    Arguments:
+        run: The folder.
+        expected: The run's design space, where that is known.
+
     Raises:
-        DataError: The file is missing, damaged, or holds values that are not finite.
+        DataError: The file is missing, damaged, of another design space, or holds values that are not finite.
     """
     verify(run, FILE_NAME)
     path = run / FILE_NAME
@@ -118,6 +129,14 @@ def load_samples(run: Path) -> Samples:
                 hint=DAMAGED_HINT,
             )
     space = guarded(lambda: DesignSpace.from_dict(parse_json(arrays["space"].tobytes())), path, DAMAGED_HINT)
+    if expected is not None and space != expected:
+        own, theirs = space.as_dict(), expected.as_dict()
+        name = next(name for name in own if own[name] != theirs[name])
+        found = f"are samples of another design space: {name} {own[name]}"
+        raise DataError(found, where=str(path), allowed=f"{name} {theirs[name]}, as the run", hint=DAMAGED_HINT)
+    outside = int((~space.contains(points)).sum())
+    if outside:
+        raise DataError(f"has {outside} of {count} points outside its design space", where=str(path), hint=DAMAGED_HINT)
     try:
         return Samples(points, log_prob, log_target, space)
     except DataError as error:

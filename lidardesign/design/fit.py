@@ -30,7 +30,7 @@ from lidardesign.estimates import ROUNDING, Estimate, as_documents, effective_sh
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
-from lidardesign.space import DIMENSIONS
+from lidardesign.space import DIMENSIONS, DesignSpace
 
 EM_SAMPLES = 20_000
 # Of 7 fits of 10 sensors the worst is then 0.005 nats below the best on held-out samples, with 4 seeds 0.03.
@@ -128,7 +128,7 @@ def fit(
     """
     started = time.perf_counter()
     constraints, moved = snap_to_space(Constraints() if constraints is None else constraints, samples.space)
-    _check_options(constraints, samples, sensors, LAYOUTS[layout], rays)
+    check_options(constraints, samples.space, sensors, LAYOUTS[layout], rays)
     request = FitProblem(
         samples=samples,
         constraints=constraints,
@@ -162,8 +162,8 @@ def fit(
     )
 
 
-def _check_options(
-    constraints: Constraints, samples: Samples, sensors: int | str | None, layout: Layout, rays: int | None
+def check_options(
+    constraints: Constraints, space: DesignSpace, sensors: int | str | None, layout: Layout, rays: int | None
 ) -> None:
     """Options against each other and against the constraints, before anything is computed."""
     if isinstance(sensors, str) and sensors != "auto":
@@ -174,8 +174,8 @@ def _check_options(
         )
     if rays is not None and not 1 <= rays <= MOST_RAYS:
         raise ConfigError(f"{rays} rays", where="--rays", allowed=f"1 to {MOST_RAYS}")
-    if samples.space.conditioned and not layout.one_sensor_per_ray:
-        names = [DIMENSIONS[index] for index in samples.space.conditioned]
+    if space.conditioned and not layout.one_sensor_per_ray:
+        names = [DIMENSIONS[index] for index in space.conditioned]
         raise ConfigError(
             f"the density has conditions ({', '.join(names)}), and only a scan has rays for all their values",
             where=f"--layout {layout.name}",
@@ -183,7 +183,7 @@ def _check_options(
         )
     layout.check_constraints(constraints)
     count = sensors if isinstance(sensors, int) and not layout.one_sensor_per_ray else None
-    check_feasible(constraints, samples.space, sensors=count, rays=rays)
+    check_feasible(constraints, space, sensors=count, rays=rays)
 
 
 def fit_like(

@@ -22,6 +22,8 @@ from lidardesign.task import Information, Task
 
 # On so many scenes rays are chosen at first, and at most; as many as at first are held back.
 FEW_SCENES, MOST_SCENES = 50, 400
+# Rays: what candidates of more tell of scenes takes long, and gigabytes.
+MOST_SELECTED = 5000
 # Of the candidates' returns so many are chosen, or about so many: lengths follow from it, and they are no thresholds.
 CHOSEN_SHARE = 0.2
 # A return tells about what is nearer than so many mean spacings of the chosen ones: sqrt(5), so that on a surface it is

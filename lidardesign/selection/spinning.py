@@ -128,12 +128,9 @@ def choose_rings(
     """
     started, space, rings = perf_counter(), samples.space, count * max(channels, 1)
     check_feasible(constraints, space, sensors=count, rays=rays)
-    points = min(POINTS_PER_TURN, MOST_TABLE_RAYS // rings) if rays is None else rays // rings
-    low, high = space.low[4], space.high[4]
-    even = np.unique(np.linspace(low, high, CANDIDATES_PER_RAY * max(channels, 1)))
+    even, points = ring_grid(space, rays, count, channels)
     first = RingCandidates(places_of(constraints, space), even, points, (space.low[5], space.high[5]))
     elevations = len(even)
-    _refuse_wrong(space, rays, count, channels, elevations, points)
     every = np.arange(len(first))
     with phase("what returns tell"), information.choosing(rings / len(first)):
         told, _ = first.coverage(every, scenes("choice"), informs, FIRST_SHARE)
@@ -179,12 +176,16 @@ def choose_rings(
     return FitResult.of_choice(design, constraints, samples, perf_counter() - started)
 
 
-def _refuse_wrong(
-    space: DesignSpace, rays: int | None, count: int, channels: int, elevations: int, points: int
-) -> None:
-    """Raises ConfigError where so many rings cannot be chosen, or cannot share the rays."""
+def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -> tuple[np.ndarray, int]:
+    """The even elevations of candidate rings, ascending [rad], and how many rays each ring has.
+
+    Raises:
+        ConfigError: So many rings cannot be chosen, or cannot share the rays.
+    """
     rings = count * max(channels, 1)
-    most = min(elevations, MOST_TABLE_RAYS // count)
+    points = min(POINTS_PER_TURN, MOST_TABLE_RAYS // rings) if rays is None else rays // rings
+    even = np.unique(np.linspace(space.low[4], space.high[4], CANDIDATES_PER_RAY * max(channels, 1)))
+    most = min(len(even), MOST_TABLE_RAYS // count)
     faults = {
         ("the density has conditions", "--layout spinning", "tasks whose sensors rest"): space.conditioned,
         (f"{channels} channels", "--channels", f"1 to {most}, of as many elevations and rays as there are"): not (
@@ -199,6 +200,7 @@ def _refuse_wrong(
     for (fault, where, allowed), is_found in faults.items():
         if is_found:
             raise ConfigError(fault, where=where, allowed=allowed)
+    return even, points
 
 
 def places_of(constraints: Constraints, space: DesignSpace) -> np.ndarray:

@@ -14,13 +14,15 @@ from lidardesign.design.constraints.document import MOST_FITTED, Constraints
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import is_mounted, snap_to_space
 from lidardesign.design.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
+from lidardesign.design.fit import check_options
 from lidardesign.design.layouts.layout import Layout
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, layout_of
 from lidardesign.design.sensor import FITTED_LAYOUTS, LEVELS, MOST_RAYS, DesignSpec, Gates
 from lidardesign.errors import ConfigError, check_choice, check_number
 from lidardesign.run.manifest import verify
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
-from lidardesign.selection.information import informs_rays
+from lidardesign.selection.information import MOST_SELECTED, informs_rays
+from lidardesign.task import Task
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
     MANIFEST,
@@ -226,11 +228,8 @@ class FitRequest:
             InfeasibleError: The constraints contradict each other.
         """
         run, choices = self.run, self.choices
-        run.config.space.at(self.at)
+        self._check_choices()
         verify(run.folder, SAMPLES)
-        if self.constraints is not None:
-            count = choices["sensors"] if isinstance(choices["sensors"], int) else None
-            check_feasible(self.constraints, run.config.space, sensors=count, rays=choices["rays"])
         settings = {
             **choices,
             **({} if self.channels is None else {"channels": self.channels}),
@@ -248,6 +247,24 @@ class FitRequest:
             settings,
             last_time(run.folder, self.command),
         )
+
+    def _check_choices(self) -> None:
+        """Refuse at once what the fit would refuse before it computes anything."""
+        choices, space = self.choices, self.run.config.space.at(self.at)
+        constraints, count = self.constraints or Constraints(), choices["sensors"]
+        layout, count = LAYOUTS[choices["layout"]], count if isinstance(count, int) else None
+        if constraints.parts is None and layout.chosen_on_scenes:
+            check_chosen(self.run.task, layout.name)
+        if layout.name == "spinning":
+            from lidardesign.selection.spinning import CHANNELS, ring_grid
+
+            channels = CHANNELS if self.channels is None else self.channels
+            ring_grid(space, choices["rays"], 1 if count is None else count, channels)
+        elif layout.name == "selected" and choices["rays"] is not None:
+            check_number(choices["rays"], "--rays", 1, MOST_SELECTED)
+        elif constraints.parts is None and not layout.chosen_on_scenes:
+            check_options(constraints, space, count, layout, choices["rays"])
+        check_feasible(constraints, space, sensors=count, rays=choices["rays"])
 
     def _steps(self, constraints: Mapping[str, Any] | None) -> list[str]:
         choices = self.choices
@@ -270,6 +287,21 @@ class FitRequest:
         if constraints:
             steps.append(f"keep to constraints of {', '.join(constraints)}; check them on the finished file")
         return steps
+
+
+def check_chosen(task: Task, layout: str) -> None:
+    """Refuse layouts whose rays are chosen where a task does not say what returns tell.
+
+    Raises:
+        ConfigError: It does not.
+    """
+    if not informs_rays(task):
+        raise ConfigError(
+            f"the task {task.name} does not say what returns tell",
+            where=f"--layout {layout}",
+            allowed="tasks with informs",
+            hint="another --layout, or give the task a method informs(scene, returns)",
+        )
 
 
 def _with_rig(

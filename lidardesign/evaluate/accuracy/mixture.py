@@ -119,7 +119,7 @@ def _samples(request: AccuracyRequest, design: DesignSpec) -> Samples | None:
     """The samples that a design was fitted to, at its condition where it has one; None without any."""
     samples = request.request.samples.get(design.name)
     if samples is None and (request.run / FILE_NAME).exists():
-        samples = load_samples(request.run)
+        samples = load_samples(request.run, request.request.space)
     if samples is None or not samples.space.conditioned:
         return samples
     from lidardesign.density.target.prepare import prepare_target
