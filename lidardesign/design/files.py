@@ -412,6 +412,8 @@ def _range(node: Node, keys: dict[str, Node], level: float) -> tuple[float, floa
     if "gate_m" not in keys:
         if spread is None or mean is None:
             raise node.error("has no gate", hint="give gate_m {start, end}, or range_m and spread.range_m")
+        if mean + half * spread <= max(mean - half * spread, 0.0):
+            raise keys["spread"].child("range_m").error(f"is {spread:g}", allowed="a gate that has a width")
         return mean, spread
     gate = keys["gate_m"].mapping(("start", "end"))
     start, end = gate["start"].number(0, FARTHEST_M), gate["end"].number(0, FARTHEST_M)

@@ -218,7 +218,7 @@ sensors:
 def test_more_rays_than_any_computer_bears_are_refused_in_a_design(tmp_path, rays):
     for text in (design_text(rays=rays), design_text(rays="null", own=rays)):
         (tmp_path / "d.yaml").write_text(text)
-        with pytest.raises(ConfigError, match=f"from 0 to {MOST_RAYS}"):
+        with pytest.raises(ConfigError, match=f"from [01] to {MOST_RAYS}"):
             load_design(tmp_path / "d.yaml")
     with pytest.raises(ConfigError, match="rays"):
         split_budget(np.ones(2), rays)

@@ -56,12 +56,16 @@ def test_a_travel_across_the_covariance_is_refused(direction):
         design_from_document(written(travel_m={**longest, "direction": direction}))
 
 
-def test_a_sensor_without_any_spread_fires_along_its_boresight():
-    still = {"horizontal_rad": 0.0, "vertical_rad": 0.0, "range_m": 0.0}
+def test_a_sensor_whose_field_has_no_width_fires_along_its_boresight():
+    still = {"horizontal_rad": 0.0, "vertical_rad": 0.0, "range_m": 0.1}
     design = design_from_document(written(spread=still, origin_m={"mean": [0.0, 0.0, 1.0]}))
     rays = lay_out(design, 5)
     np.testing.assert_allclose(rays.direction, np.tile(design.sensors[0].boresight, (5, 1)), atol=1e-12)
-    np.testing.assert_allclose(rays.gate_m, 1.0)
+
+
+def test_a_gate_without_a_width_is_refused():
+    with pytest.raises(ConfigError, match="a gate that has a width"):
+        design_from_document(written(spread={"horizontal_rad": 0.1, "vertical_rad": 0.1, "range_m": 0.0}))
 
 
 def test_a_ray_table_without_a_ray_is_refused():

@@ -24,7 +24,7 @@ DIMENSIONS = ("x_m", "y_m", "z_m", "azimuth_rad", "elevation_rad", "range_m")
 DETECTORS = {"single-photon": 14.9, "consumer-8x8": 4.79}
 LENGTHS = {"x_m": 0, "y_m": 1, "z_m": 2}
 # Where a dimension stands when it is fixed, at home: in the middle of the line below, looking up at the curve.
-FIXED = {"x_m": 0.5, "y_m": 0.0, "z_m": 0.0, "azimuth_rad": math.pi / 2, "elevation_rad": 0.0, "range_m": 0.78}
+FIXED = {"x_m": 0.5, "y_m": 0.0, "z_m": 0.0, "azimuth_rad": math.pi / 2, "elevation_rad": 0.0}
 # Bounds of a free one; of these, one is drawn.
 FREE: dict[str, list[tuple[float, float]]] = {
     "x_m": [(0.0, 1.0), (0.2, 0.7)],
@@ -98,7 +98,8 @@ def _pick(generator: np.random.Generator, choices: list[Any]) -> Any:
 
 def _space(generator: np.random.Generator, size: float, offset: list[float]) -> dict[str, Any]:
     count = int(generator.integers(1, 7))
-    free = {DIMENSIONS[i] for i in generator.permutation(6)[:count]}
+    # a design space of one range has gates without a width
+    free = {"range_m", *(DIMENSIONS[i] for i in generator.permutation(5)[: count - 1])}
     space: dict[str, Any] = {}
     for name in DIMENSIONS:
         shift = offset[LENGTHS[name]] if name in LENGTHS else 0.0
