@@ -84,12 +84,12 @@ class LearningSettings(BaseModel):
     anneal: float = Field(0.7, ge=0, le=1, description="share of the path-wise steps over which sigma falls")
     balance: float = Field(0.5, ge=0, le=1, description="share of the steps, the last ones, that balance by values")
     balance_proposals: int = Field(
-        65536, ge=256, le=10_000_000, description="independent proposals that balancing draws from"
+        32768, ge=256, le=10_000_000, description="independent proposals that balancing draws from"
     )
     clip_norm: float = Field(5.0, ge=COARSE_SLACK, le=1e6, description="gradient norm that steps are clipped to")
     checkpoint_seconds: float = Field(20.0, gt=0, le=86_400, description="time between checkpoints [s]")
     samples: int = Field(
-        100_000, ge=1000, le=10_000_000, description="fresh samples for ESS, KL, log Z, fit and constrain"
+        100_000, ge=1000, le=10_000_000, description="samples of the flow, which are thinned for fit and constrain"
     )
     coverage_proposals: int = Field(
         8192, ge=256, le=10_000_000, description="independent proposals that coverage is measured on"
@@ -97,13 +97,7 @@ class LearningSettings(BaseModel):
 
 
 PRESET_LEARNING: dict[str, dict[str, Any]] = {
-    "draft": {
-        "steps": 350,
-        "hidden": 64,
-        "samples": 40_000,
-        "balance_proposals": 32768,
-        "coverage_proposals": 4096,
-    },
+    "draft": {"steps": 350, "hidden": 64, "samples": 40_000},
     "standard": {},
     "fine": {"steps": 2400, "batch": 4096, "layers": 4, "hidden": 128, "bins": 24, "samples": 200_000},
 }

@@ -185,7 +185,7 @@ def learn(
             probes = draw_probes(trainer.target, config.learning.coverage_proposals, generator)
         measured = measure(trainer, probes, config.learning.samples)
         with phase("writing"):
-            save_flow(trainer.flow, run, FLOW)
+            save_flow(trainer.flow, run, FLOW, **({} if measured.thinning is None else asdict(measured.thinning)))
             save_samples(measured.samples, run)
             if (run / PROGRESS).exists():
                 record(run, [PROGRESS])

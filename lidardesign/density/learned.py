@@ -13,7 +13,7 @@ import copy
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -23,12 +23,14 @@ import torch
 from lidardesign.config import LearningSettings, RunConfig
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
-from lidardesign.density.learn import FLOW, make_flow
+from lidardesign.density.learn import FLOW, make_flow, training_scenes
+from lidardesign.density.target.prepare import prepare_target
 from lidardesign.density.target.target import Target
 from lidardesign.density.target.visibility import Optics
 from lidardesign.density.training.checkpoint import load_arrays, measured_steps, stored_snapshots, twin_step
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
-from lidardesign.density.training.quality import IndependentProbes, LearnedFlow, draw_samples, log_density_of, measure
+from lidardesign.density.training.quality import IndependentProbes, measure
+from lidardesign.density.training.sampling import LearnedFlow, Thinning, draw_samples, log_density_of
 from lidardesign.density.training.training import PROGRESS, SIGMA_START_RATIO
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
@@ -37,6 +39,7 @@ from lidardesign.run.inputs import RECORD, read_file
 from lidardesign.run.manifest import verify
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
+from lidardesign.task import Task
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,22 +315,37 @@ class FlowSamples:
         return values.to(like), None if self.conditions is None else self.conditions.to(like)
 
 
+# Samples that are drawn at a time until enough are kept.
+DRAWN_AT_ONCE = 4096
+
+
 class LearnedDensity:
     """A normalised density over rays: design points (x, y, z, azimuth, elevation, range) in metres and radians.
 
+    It is the flow as the target thins it (`Thinning`), so the training scenes are made when it is first used.
+
     Arguments:
         run: The run folder.
+        task: Its task.
         config: Its configuration.
     """
 
-    def __init__(self, run: Path, config: RunConfig) -> None:
-        self._run, self._config = run, config
+    def __init__(self, run: Path, task: Task, config: RunConfig) -> None:
+        self._run, self._task, self._config = run, task, config
+
+    @cached_property
+    def _thinning(self) -> Thinning | None:
+        _, state = load_arrays(self._run, FLOW)
+        # flows that are not thinned, as of older runs, have no such numbers
+        names = [field.name for field in fields(Thinning)]
+        return Thinning(*(state[name] for name in names)) if all(name in state for name in names) else None
 
     @cached_property
     def _flow(self) -> LearnedFlow:
-        # samples of the flow alone need no target
-        nothing = FlatTarget(Optics.of(self._config.density), self.space)
-        return load_flow(self._run, FLOW, self._config, nothing, self._config.seed)
+        target = FlatTarget(Optics.of(self._config.density), self.space)
+        if self._thinning is not None:
+            target, _ = prepare_target(training_scenes(self._task, self._config), self._config)
+        return load_flow(self._run, FLOW, self._config, target, self._config.seed)
 
     @property
     def space(self) -> DesignSpace:
@@ -336,9 +354,13 @@ class LearnedDensity:
 
     def sample(self, count: int, seed: int | np.random.Generator = 0) -> np.ndarray:
         """Design points drawn from the density, shape (count, 6); the same seed gives the same points."""
-        generator = np.random.default_rng(seed)
-        self._flow.generator.manual_seed(int(generator.integers(2**63)))
-        return draw_samples(self._flow, count).points
+        self._flow.generator.manual_seed(int(np.random.default_rng(seed).integers(2**63)))
+        kept = np.empty((0, 6))
+        while len(kept) < count:
+            drawn = draw_samples(self._flow, DRAWN_AT_ONCE)
+            drawn = drawn if self._thinning is None else self._thinning.thinned(drawn, self._flow.generator)
+            kept = np.concatenate([kept, drawn.points])
+        return kept[:count]
 
     def log_prob(self, points: np.ndarray) -> np.ndarray:
         """The log density per chart volume of design points, (N, 6) to (N,); -inf outside the space.
@@ -349,5 +371,7 @@ class LearnedDensity:
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 6:
             raise ConfigError(f"points of shape {points.shape}", where="log_prob", allowed="(N, 6)")
-        with torch.no_grad():
-            return log_density_of(self._flow, points)
+        log_prob = log_density_of(self._flow, points)
+        if self._thinning is None:
+            return log_prob
+        return self._thinning.log_prob(log_prob, self._flow.target.log_density(points))

@@ -89,10 +89,10 @@ class Run(RunFolder):
 
     @property
     def density(self) -> LearnedDensity:
-        """The learned density: `sample(count)` and `log_prob(points)`; needs torch."""
+        """The learned density: `sample(count)` and `log_prob(points)`; needs torch, and makes the training scenes."""
         from lidardesign.density.learned import LearnedDensity
 
-        return LearnedDensity(self.folder, self.config)
+        return LearnedDensity(self.folder, self.task, self.config)
 
     def fit(
         self,

@@ -29,7 +29,7 @@ from lidardesign.density.training.checkpoint import (
     stored_snapshots,
     twin_step,
 )
-from lidardesign.density.training.quality import log_density_of
+from lidardesign.density.training.sampling import log_density_of
 from lidardesign.density.training.training import BETAS, Adam
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.numerics import HALF_DIGITS
@@ -116,7 +116,7 @@ def test_the_result_has_sensible_figures_and_files(finished):
     assert 0 <= result.coverage <= 1
     assert math.isfinite(result.log_z)
     samples = load_samples(run)
-    assert len(samples) == 2000
+    assert 0 < len(samples) <= 2000
     assert SPACE.contains(samples.points).all()
     assert samples.effective_sample_size == pytest.approx(result.ess, rel=1e-9)
     assert samples.log_prob.dtype == samples.log_target.dtype == np.float64
@@ -156,14 +156,15 @@ def test_samples_carry_the_density_that_the_flow_has_there(tmp_path, monkeypatch
     measure = learning.measure
 
     def keep(trainer, *rest):
-        kept["trainer"] = trainer
-        return measure(trainer, *rest)
+        kept["trainer"], kept["measured"] = trainer, measure(trainer, *rest)
+        return kept["measured"]
 
     monkeypatch.setattr(learning, "measure", keep)
     learn(BallTask(), config_of(dtype=dtype), tmp_path)
     samples = load_samples(tmp_path).subset(np.arange(500))
     again = log_density_of(kept["trainer"], samples.points)
-    np.testing.assert_allclose(again, samples.log_prob, atol=1e-6)
+    thinned = kept["measured"].thinning.log_prob(again, samples.log_target)
+    np.testing.assert_allclose(thinned, samples.log_prob, atol=1e-6)
     outside = samples.points + np.array([0, 0, 0, 0, 0, 5.0])
     assert (log_density_of(kept["trainer"], outside) == -np.inf).all()
 

@@ -1,4 +1,4 @@
-"""Effective sample size, KL, log Z, coverage and the misplaced share against closed forms of Gaussians."""
+"""Effective sample size, KL, log Z, coverage, misplaced share and thinning against closed forms of Gaussians."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from support import references
 
-from lidardesign.density.training.quality import OverlapPoints, coverage, overlap, quality
+from lidardesign.density.training.quality import OverlapPoints, coverage, overlap, quality, worse_of
+from lidardesign.density.training.sampling import Thinning
 from lidardesign.errors import NumericalError
 from lidardesign.estimates import Estimate
+from lidardesign.samples import Samples
+from lidardesign.space import DesignSpace
 
 COUNT = 200_000
 LOG_Z = 3.7
@@ -153,6 +157,80 @@ def test_shifted_gaussians_misplace_what_the_error_function_says(shift):
     expected = math.erf(shift / (2 * math.sqrt(2)))
     assert found.misplaced == pytest.approx(expected, abs=max(references.STANDARD_ERRORS * found.error, 1e-7))
     assert found.log_z == pytest.approx(LOG_Z, abs=0.15 if shift > 2 else 0.05)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.2, 1.0])
+def test_proposals_see_the_closed_forms_of_both_figures(shift):
+    # E_pi[pi / p] = exp(shift^2), KL(pi || p) = shift^2 / 2
+    generator = np.random.default_rng(8)
+    found = overlap(sides_of(generator.normal(size=FEW), gaussian, lambda x: gaussian(x, shift), generator))
+    for value, error, expected in (
+        (found.ess, found.ess_error, math.exp(-(shift**2))),
+        (found.kl_nats, found.kl_error_nats, shift**2 / 2),
+    ):
+        assert value == pytest.approx(expected, abs=references.STANDARD_ERRORS * error + 1e-3)
+
+
+def test_a_starved_mode_is_seen_by_proposals_and_leaked_mass_by_samples_and_the_worse_is_told():
+    generator = np.random.default_rng(9)
+    samples = generator.normal(6.0, size=FEW)
+
+    def starving(x):
+        return mixture(x, (1e-6, 1 - 1e-6), (-6, 6))
+
+    def both(x):
+        return mixture(x, (0.01, 0.99), (-6, 6))
+
+    starved = overlap(sides_of(samples, starving, both, generator)).estimates()
+    own = quality(starving(samples), both(samples)).estimates()
+    # E_pi[pi / p] = 0.01^2 / 1e-6 + 0.99^2, which no sample knows
+    assert own["ess"].value > 0.99
+    assert starved["ess"].value == pytest.approx(1 / (100 + 0.99**2), rel=0.1)
+    assert worse_of(own, starved)["ess"] == starved["ess"]
+    samples = np.where(generator.random(FEW) < 0.01, 20.0, 0.0) + generator.normal(size=FEW)
+
+    def leaking(x):
+        return mixture(x, (0.99, 0.01), (0, 20))
+
+    leaked = overlap(sides_of(samples, leaking, gaussian, generator)).estimates()
+    own = quality(leaking(samples), gaussian(samples)).estimates()
+    assert leaked["kl_nats"].value < 0.02
+    assert own["kl_nats"].value == pytest.approx(0.01 * 200, rel=0.2)
+    assert worse_of(own, leaked)["kl_nats"] == own["kl_nats"]
+
+
+@pytest.mark.parametrize(("shift", "spread"), [(0.0, 1.0), (0.7, 1.3), (2.0, 0.5)])
+def test_thinned_samples_have_the_lesser_of_both_densities(shift, spread):
+    x = np.random.default_rng(10).normal(size=COUNT)
+    points = np.zeros((COUNT, 6))
+    points[:, 5] = x
+    samples = Samples(points, gaussian(x), gaussian(x, shift, spread) + LOG_Z, DesignSpace((0,) * 6, (1,) * 6))
+    thinning = Thinning.of(samples.log_weights)
+    kept = thinning.thinned(samples, torch.Generator().manual_seed(0))
+    grid = np.linspace(-12, 12, 100_001)
+    lesser = np.minimum(gaussian(grid), gaussian(grid, shift, spread))
+    shared = np.trapezoid(np.exp(lesser), grid)  # 1 - TV
+    log_prob = thinning.log_prob(gaussian(grid), gaussian(grid, shift, spread) + LOG_Z)
+    assert len(kept) / COUNT == pytest.approx(shared, abs=0.01)
+    # the threshold is the samples' own estimate of Z
+    np.testing.assert_allclose(np.exp(log_prob), np.exp(lesser) / shared, rtol=0.05)
+    assert np.trapezoid(np.exp(log_prob), grid) == pytest.approx(1.0, abs=0.01)
+    np.testing.assert_allclose(kept.log_prob, thinning.log_prob(gaussian(kept.points[:, 5]), kept.log_target))
+    inside = np.abs(kept.points[:, 5]) < 0.5
+    density = np.exp(log_prob) * (np.abs(grid) < 0.5)
+    assert inside.mean() == pytest.approx(np.trapezoid(density, grid), abs=0.01)
+    least = thinning.log_least + thinning.log_share
+    assert kept.log_weights.min() == pytest.approx(least, abs=1e-9)
+    found = quality(kept.log_prob, kept.log_target)
+    assert found.log_z == pytest.approx(LOG_Z, abs=0.05)
+
+
+def test_what_the_target_rules_out_is_never_kept():
+    log_target = np.where(np.arange(1000) % 2, 0.0, -np.inf)
+    samples = Samples(np.zeros((1000, 6)), np.zeros(1000), log_target, DesignSpace((0,) * 6, (1,) * 6))
+    kept = Thinning.of(samples.log_weights).thinned(samples, torch.Generator().manual_seed(1))
+    assert len(kept) == 500
+    np.testing.assert_allclose(kept.log_prob, math.log(2.0))
 
 
 def test_its_standard_error_is_the_scatter_over_other_samples():

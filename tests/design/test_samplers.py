@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,7 +22,7 @@ from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learned import FlatTarget
 from lidardesign.density.target.visibility import Optics
 from lidardesign.density.training.losses import Pool
-from lidardesign.density.training.quality import draw_samples, log_density_of
+from lidardesign.density.training.sampling import draw_samples, log_density_of, log_prob_of_unit
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.grid import low_discrepancy
@@ -174,11 +175,29 @@ def test_conditions_and_proposals_are_drawn_as_they_say():
     assert p_value(counts_of_cells(conditions, edges), np.full(100, DRAWS / 100)) > UNLIKELY
     log_weights = np.random.default_rng(6).normal(0, 2, 400)
     pool = Pool.of(np.arange(400.0)[:, None], log_weights, np.zeros(400))
-    unit, values = pool.draw(DRAWS, generator, torch.zeros(1, dtype=torch.float64))
-    chosen = unit[:, 0].long().numpy()
-    np.testing.assert_array_equal(values.numpy(), log_weights[chosen])
     share = np.exp(log_weights) / np.exp(log_weights).sum()
-    assert p_value(np.bincount(chosen, minlength=400), DRAWS * share) > UNLIKELY
+    emphasis = np.random.default_rng(7).uniform(1, 20, 400)
+    for emphasised in (pool, replace(pool, emphasis=torch.as_tensor(emphasis))):
+        unit, values, weights = emphasised.draw(DRAWS, generator, torch.zeros(1, dtype=torch.float64))
+        chosen = unit[:, 0].long().numpy()
+        np.testing.assert_array_equal(values.numpy(), log_weights[chosen])
+        drawn = share * emphasised.emphasis.numpy()
+        assert p_value(np.bincount(chosen, minlength=400), DRAWS * drawn / drawn.sum()) > UNLIKELY
+        # with their weights they stand for the target again
+        np.testing.assert_allclose(weights.numpy() * (drawn / drawn.sum())[chosen], share[chosen])
+
+
+def test_proposals_are_drawn_by_what_the_flow_starves():
+    learned = learned_in(DesignSpace((0, 0, 0, 1.0, -0.9, 0.5), (0, 0, 0, 1.0 + 2 * math.pi, 1.2, 3.0)))
+    unit = np.random.default_rng(8).uniform(-1, 1, (4000, 3))
+    log_prob = log_prob_of_unit(learned.flow, learned.coordinates, torch.as_tensor(unit)).numpy()
+    # a target that is the flow but for a corner, which is a hundred times as dense
+    corner = (unit > 0.2).all(axis=1)
+    log_target = log_prob + np.where(corner, math.log(100.0), 0.0)
+    pool = Pool.of(unit, log_target, np.zeros(len(unit)))
+    emphasis = pool.emphasised(learned.flow, learned.coordinates).emphasis.numpy() - 1
+    np.testing.assert_allclose(emphasis[corner] / emphasis[~corner].mean(), 100.0, rtol=1e-4)
+    assert pool.weights.numpy() @ (1 / emphasis) == pytest.approx(1.0, rel=1e-4)
 
 
 # --- mixtures and single sensors

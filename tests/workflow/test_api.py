@@ -15,6 +15,7 @@ from support.small_runs import shifted
 import lidardesign
 from lidardesign.design.fit import fit
 from lidardesign.errors import ConfigError, DataError, InfeasibleError, ThresholdError
+from lidardesign.samples import load_samples
 
 SCRIPT = '''
 import lidardesign as ld
@@ -161,6 +162,8 @@ def test_the_density_draws_the_same_points_for_the_same_seed(run):
     density = run.density
     assert np.array_equal(density.sample(50, seed=3), density.sample(50, seed=3))
     assert not np.array_equal(density.sample(50, seed=3), density.sample(50, seed=4))
+    kept = load_samples(run.folder)
+    np.testing.assert_allclose(density.log_prob(kept.points[:100]), kept.log_prob[:100], atol=1e-6)
     outside = density.sample(2)
     outside[1, 5] = 1e6
     assert np.isfinite(density.log_prob(outside)).tolist() == [True, False]

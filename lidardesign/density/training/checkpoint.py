@@ -174,7 +174,7 @@ def snapshot_name(step: int) -> str:
     return f"{FOLDER}/step-{step:06d}.safetensors"
 
 
-def save_flow(flow: DesignFlow, run: Path, name: str, **state: int) -> None:
+def save_flow(flow: DesignFlow, run: Path, name: str, **state: float) -> None:
     """Write the flow's weights; no clock enters, so that a resumed run writes the same bytes."""
     weights = {key: value.detach().cpu().numpy() for key, value in flow.state_dict().items()}
     save_arrays(run, name, weights, {**state, "features": flow.features, "context": flow.context})

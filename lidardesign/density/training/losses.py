@@ -20,7 +20,8 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -29,12 +30,13 @@ from torch import Tensor
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates, log_target, log_target_values
 from lidardesign.density.target.target import Target
-from lidardesign.numerics import effective_sample_size, logsumexp
+from lidardesign.density.training.sampling import log_prob_of_unit
+from lidardesign.numerics import effective_sample_size, logsumexp, normalised_weights
 
 # Log weights further than this from the mean pull no harder.
 LARGEST_PULL_NATS = 5.0
 # Where the density is starved, a proposal counts by its weight p* / p, up to this factor: the gradient of E[w^2].
-LARGEST_EMPHASIS = 30.0
+LARGEST_EMPHASIS = 300.0
 # The share of the proposals' term beside the reverse KL on the flow's own samples, and that of the leaked ones.
 LEAK_WEIGHT = 3.0
 FORWARD_SHARE = 0.5
@@ -65,34 +67,52 @@ def pathwise_loss(
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """Proposals weighted to p*, from which samples of p* are drawn.
+    """Proposals weighted to p*, of which balancing draws the starved ones more often.
 
     Arguments:
         unit: Unit points of all free dimensions, shape (M, free).
         log_target: log p* at them, shape (M,).
-        cumulated: Cumulated normalised weights, shape (M,).
+        weights: Their normalised weights p* / q, shape (M,).
+        emphasis: How much more often than by its weight each is drawn, shape (M,).
     """
 
     unit: Tensor
     log_target: Tensor
-    cumulated: Tensor
+    weights: Tensor
+    emphasis: Tensor
 
     @classmethod
     def of(cls, unit: np.ndarray, log_target: np.ndarray, log_proposal: np.ndarray) -> Pool:
         """The pool of proposals with log p* and log q."""
-        log_weights = log_target - log_proposal
-        weights = np.exp(log_weights - log_weights.max())
-        return cls(*map(torch.as_tensor, (unit, log_target, np.cumsum(weights / weights.sum()))))
+        counting = log_target > -np.inf
+        unit, log_target, log_proposal = unit[counting], log_target[counting], log_proposal[counting]
+        weights = normalised_weights(log_target - log_proposal)
+        return cls(*map(torch.as_tensor, (unit, log_target, weights, np.ones(len(weights)))))
 
-    def draw(self, count: int, generator: torch.Generator, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit points distributed as p*, shape (count, free), and log p* at them, shape (count,)."""
+    @cached_property
+    def cumulated(self) -> Tensor:
+        """Cumulated probabilities of being drawn, shape (M,)."""
+        drawn = torch.cumsum(self.weights * self.emphasis, dim=0)
+        return drawn / drawn[-1]
+
+    def emphasised(self, flow: DesignFlow, coordinates: Coordinates) -> Pool:
+        """The same proposals, each drawn by how much the flow starves it now: in proportion to p* (1 + p* / p)."""
+        log_weights = self.log_target - log_prob_of_unit(flow, coordinates, self.unit).to(self.log_target)
+        # E_pi[p / p*] = 1 / Z
+        log_z = -torch.logsumexp(torch.log(self.weights) - log_weights, dim=0)
+        starved = (log_weights - log_z).clamp(max=float(np.log(LARGEST_EMPHASIS))).exp()
+        return replace(self, emphasis=1.0 + starved)
+
+    def draw(self, count: int, generator: torch.Generator, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Unit points, shape (count, free), log p* at them and the weights that make them samples of p*, (count,)."""
         places = torch.rand(count, generator=generator, dtype=torch.float64).to(self.cumulated.device)
         chosen = torch.searchsorted(self.cumulated, places).clamp(max=len(self.unit) - 1)
-        return self.unit[chosen].to(like), self.log_target[chosen].to(like)
+        weights = (self.weights @ self.emphasis) / self.emphasis[chosen]
+        return self.unit[chosen].to(like), self.log_target[chosen].to(like), weights.to(like)
 
     def to(self, device: torch.device) -> Pool:
         """The same on a device."""
-        return Pool(self.unit.to(device), self.log_target.to(device), self.cumulated.to(device))
+        return Pool(*(values.to(device) for values in (self.unit, self.log_target, self.weights, self.emphasis)))
 
 
 def balancing_loss(
@@ -107,13 +127,13 @@ def balancing_loss(
     centred = log_weights - log_z
     pull = centred.clamp(-LARGEST_PULL_NATS, LARGEST_PULL_NATS)
     pull = pull - pull.mean()
-    proposed, proposed_target = pool.draw(count, generator, learned)
+    proposed, proposed_target, proposed_weights = pool.draw(count, generator, learned)
     foreign = proposed[:, coordinates.learned]
     contexts = None if conditions is None else torch.cat([conditions, proposed[:, coordinates.conditions]])
     both = flow.log_prob(torch.cat([learned, foreign]), contexts)
     own, others = both[: len(learned)], both[len(learned) :]
     starved = (proposed_target - others.detach() - log_z).clamp(max=np.log(LARGEST_EMPHASIS)).exp()
-    loss = -(pull * own).sum() / count - FORWARD_SHARE * (starved * others).sum() / count
+    loss = -(pull * own).sum() / count - FORWARD_SHARE * (proposed_weights * starved * others).sum() / count
     leaked = centred < -LARGEST_PULL_NATS
     if leaked.any():
         few = None if conditions is None else conditions[leaked]

@@ -1,16 +1,20 @@
-"""What a learned density is worth, measured on fresh samples of it and on points that know nothing of it.
+"""What a learned density is worth, measured on its own samples and on points that know nothing of it.
 
-Effective sample size, KL divergence and log Z come from fresh samples of the flow with unclipped importance weights
-w = p* / p and cannot see a mode that the flow dropped. Coverage can: it is the share of the target's mass, estimated
-from independent proposals, that lies where the flow's density is at least a tenth of the normalised target's.
+Neither sees everything. Samples of the density p cannot see what it starves or dropped: where pi = p* / Z is a hundred
+times larger than p, they hardly ever are. Points of pi, which independent proposals become by their weights, see it,
+but not what leaked away to where pi is nothing. Effective sample size and KL divergence are therefore estimated on
+both sides, and the worse is told:
 
-Misplaced is the share of the density's mass in the wrong place: its total variation TV = 1/2 integral |p - pi| to the
-normalised target pi = p* / Z. It is the one unit of all errors of a density's numerical choices: by the triangle
-inequality the errors of several choices add up at most. Samples of the density alone cannot see what it dropped, and
-proposals that follow the surfaces alone cannot see what leaked away from them. The overlap of both is the mean
-of min(1, pi / p) over samples of p, and that of min(1, p / pi) over samples of pi. The two agree at one log Z only,
-which is the bridge estimate of it with the bridge min(p, p* / Z); both means are of values in [0, 1], so no weight can
-spoil them.
+    ESS = 1 / E_pi[pi / p], from weights w = p* / p of samples: (sum w)^2 / (N sum w^2);
+    KL(p || pi) on samples, KL(pi || p) on points of pi.
+
+Coverage is the share of the target's mass that lies where p is at least a tenth of pi.
+
+Misplaced is the share of the density's mass in the wrong place: its total variation TV = 1/2 integral |p - pi|. It is
+the one unit of all errors of a density's numerical choices: by the triangle inequality the errors of several choices
+add up at most. The overlap of both densities is the mean of min(1, pi / p) over samples of p, and that of min(1, p /
+pi) over points of pi. The two agree at one log Z only, which is the bridge estimate of it with the bridge min(p, p* /
+Z); both means are of values in [0, 1], so no weight can spoil them.
 
 References:
     Simulating ratios of normalizing constants via a simple identity, Meng and Wong 1996.
@@ -19,18 +23,17 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.optimize import brentq
 
-from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.target.proposals import independent_points
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.losses import TOLERANCE_NATS, round_trip_nats
+from lidardesign.density.training.sampling import LearnedFlow, Thinning, draw_samples, log_density_of
 from lidardesign.errors import NumericalError
 from lidardesign.estimates import Estimate, effective_share_error, log_mean_error, standard_error, weighted_mean_error
 from lidardesign.numerics import SLACK, TINY, logsumexp, normalised_weights
@@ -132,6 +135,8 @@ LOG_Z_TOLERANCE_NATS = SLACK
 LEAST_POINTS = 8
 # Densities that share less than this share nothing, and the division by it is safe.
 LEAST_SHARED = TINY
+# Beyond so many nats a ratio of densities is no number that can be summed.
+LARGEST_NATS = 300.0
 
 
 @dataclass(frozen=True)
@@ -142,11 +147,32 @@ class Overlap:
         misplaced: The total variation, 0 to 1.
         error: Its standard error over other samples and other proposals.
         log_z: log of the target's integral, by the bridge.
+        ess, ess_error: The effective sample size as the proposals see it, 0 to 1, and its standard error.
+        kl_nats, kl_error_nats: KL(pi || p) and its standard error over other proposals.
     """
 
     misplaced: float
     error: float
     log_z: float
+    ess: float
+    ess_error: float
+    kl_nats: float
+    kl_error_nats: float
+
+    def estimates(self) -> dict[str, Estimate]:
+        """The figures with their errors by name; log Z is told from samples."""
+        return {
+            "ess": Estimate(self.ess, self.ess_error),
+            "kl_nats": Estimate(self.kl_nats, self.kl_error_nats, "nats"),
+            "misplaced": Estimate(self.misplaced, self.error),
+        }
+
+
+def worse_of(samples: Mapping[str, Estimate], probes: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """The figures of a density, where both sides have one the worse: the lower ESS, the larger KL."""
+    ess = min(samples["ess"], probes["ess"], key=lambda estimate: estimate.value)
+    kl_nats = max(samples["kl_nats"], probes["kl_nats"], key=lambda estimate: estimate.value)
+    return {**samples, **probes, "ess": ess, "kl_nats": kl_nats}
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,11 +208,10 @@ def overlap(sides: OverlapPoints) -> Overlap:
             parts.append(_overlap(sides.at_samples[mine], sides.at_proposals[theirs], sides.log_weights[theirs]))
     if not parts:
         return _overlap(sides.at_samples, sides.at_proposals, sides.log_weights)
-    return Overlap(
-        misplaced=float(np.mean([part.misplaced for part in parts])),
-        error=float(np.linalg.norm([part.error for part in parts])) / len(parts),
-        log_z=float(np.mean([part.log_z for part in parts])),
-    )
+    values = {name: [getattr(part, name) for part in parts] for name in Overlap.__annotations__}
+    # groups have points of their own
+    spread = {name: float(np.linalg.norm(values[name])) / len(parts) for name in values if "error" in name}
+    return Overlap(**{name: float(np.mean(values[name])) for name in values} | spread)
 
 
 def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.ndarray) -> Overlap:
@@ -214,7 +239,19 @@ def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.n
     own = np.square(at_own - shared).mean() / len(at_own)
     others = float(np.square(weights * (at_others - shared)).sum())
     error = math.hypot(rare * math.sqrt(own), rest * math.sqrt(others)) / max(shared, LEAST_SHARED)
-    return Overlap(misplaced=1.0 - shared, error=error, log_z=log_z)
+    starved_nats = np.clip(at_proposals - log_z, -LARGEST_NATS, LARGEST_NATS)
+    ratios = np.exp(starved_nats)
+    mean_ratio = float(weights @ ratios)
+    return Overlap(
+        misplaced=1.0 - shared,
+        error=error,
+        log_z=log_z,
+        # rounding of the two sides may take it beyond 1
+        ess=min(1.0 / mean_ratio, 1.0),
+        ess_error=weighted_mean_error(ratios, weights) / mean_ratio**2,
+        kl_nats=max(float(weights @ starved_nats), 0.0),
+        kl_error_nats=weighted_mean_error(starved_nats, weights),
+    )
 
 
 def _bracket(gap: Callable[[float], float], start: float) -> tuple[float, float]:
@@ -228,7 +265,6 @@ def _bracket(gap: Callable[[float], float], start: float) -> tuple[float, float]
     return ends[0], ends[1]
 
 
-SAMPLE_CHUNK = 16384
 CONDITION_GROUPS = 32
 # So many samples go back to the flow's base.
 ROUND_TRIPS = 1000
@@ -236,16 +272,6 @@ NOT_COVERED = (
     "coverage could not be measured and counts as 0, and misplaced leaves out what the density dropped: "
     "no independently drawn ray fits in the space"
 )
-
-
-@dataclass(eq=False)
-class LearnedFlow:
-    """A flow, the target that it was learned for, and the stream that its samples are drawn from."""
-
-    flow: DesignFlow
-    target: Target
-    coordinates: Coordinates
-    generator: torch.Generator
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,16 +294,18 @@ class MeasuredFlow:
     """Fresh samples of a flow, and its figures with their errors.
 
     Arguments:
-        samples: The samples with both log densities.
+        samples: The thinned samples with both log densities.
         estimates: ess, kl_nats, log_z, coverage, and misplaced: the share of the mass in the wrong place.
         round_trip_nats: See `round_trip`.
         notes: What the user should know.
+        thinning: What the flow was thinned by, if it was.
     """
 
     samples: Samples
     estimates: dict[str, Estimate]
     round_trip_nats: float = 0.0
     notes: tuple[str, ...] = ()
+    thinning: Thinning | None = None
 
 
 def draw_probes(target: Target, count: int, generator: np.random.Generator) -> IndependentProbes:
@@ -289,19 +317,24 @@ def draw_probes(target: Target, count: int, generator: np.random.Generator) -> I
 
 @phase("measuring")
 def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> MeasuredFlow:
-    """The figures of a flow from `count` fresh samples and from probes.
+    """The density that `count` fresh samples of a flow are thinned to, and its figures from these and from probes.
 
     Raises:
         NumericalError: A sample has no finite weight.
     """
-    samples = draw_samples(learned, count)
-    space = samples.space
+    samples, thinning, notes = draw_samples(learned, count), None, []
+    space, log_weights = samples.space, samples.log_weights
+    # what is no number is refused with the figures
+    if not space.conditioned and np.isfinite(log_weights.max()):
+        thinning = Thinning.of(log_weights)
+        samples = thinning.thinned(samples, learned.generator)
     groups = condition_groups(space, samples.points)
-    figures = quality(samples.log_prob, samples.log_target, groups)
-    covered, notes = Estimate(0.0, None), []
+    figures, covered = quality(samples.log_prob, samples.log_target, groups), Estimate(0.0, None)
     sides = OverlapPoints(samples.log_weights, samples.log_weights, samples.log_weights, groups, groups)
     if len(probes.points):
         log_prob, theirs = log_density_of(learned, probes.points), condition_groups(space, probes.points)
+        if thinning is not None:
+            log_prob = thinning.log_prob(log_prob, probes.log_target)
         log_z = _log_z_at(probes.points, samples, groups, figures.log_z)
         covered = coverage(log_prob, probes.log_target, probes.log_proposal, log_z)
         log_weights = probes.log_target - probes.log_proposal
@@ -309,46 +342,14 @@ def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> Meas
     else:
         notes.append(NOT_COVERED)
     apart = overlap(sides)
-    estimates = {**figures.estimates(), "coverage": covered, "misplaced": Estimate(apart.misplaced, apart.error)}
+    estimates = worse_of(figures.estimates(), apart.estimates()) | {"coverage": covered}
     off = round_trip_nats(learned.flow, ROUND_TRIPS, torch.Generator().manual_seed(0))
     if off > TOLERANCE_NATS:
         notes.append(
             f"log densities are off by up to {off:.2g} nats: the flow's splines are too steep to be inverted in "
             "float64; fewer learning.layers are easier to invert"
         )
-    return MeasuredFlow(samples, estimates, off, tuple(notes))
-
-
-def draw_samples(learned: LearnedFlow, count: int) -> Samples:
-    """Fresh samples of the flow with their log density and log target, in chunks."""
-    points, log_prob, flow, coordinates = [], [], learned.flow, learned.coordinates
-    with torch.no_grad():
-        for start in range(0, count, SAMPLE_CHUNK):
-            size = min(SAMPLE_CHUNK, count - start)
-            base, conditions = flow.draw(size, learned.generator)
-            values, log_density = flow(base, conditions)
-            unit = coordinates.join(values, conditions).cpu().double().numpy()
-            points.append(coordinates.space.from_unit(unit))
-            log_prob.append(log_density.cpu().double().numpy())
-    points = np.concatenate(points)
-    offset = coordinates.log_condition_density - coordinates.log_unit_volume
-    return Samples(points, np.concatenate(log_prob) + offset, learned.target.log_density(points), coordinates.space)
-
-
-def log_density_of(learned: LearnedFlow, points: np.ndarray) -> np.ndarray:
-    """The flow's log density per chart volume at any design points, (N, 6) to (N,); -inf outside the space."""
-    flow, coordinates = learned.flow, learned.coordinates
-    # points on the space's faces may leave it by rounding
-    unit = torch.as_tensor(coordinates.space.to_unit(points).clip(-1.0, 1.0)).to(next(flow.parameters()))
-    conditions = unit[:, coordinates.conditions] if coordinates.conditions else None
-    with torch.no_grad():
-        parts = [
-            flow.log_prob(unit[rows][:, coordinates.learned], None if conditions is None else conditions[rows])
-            for rows in torch.arange(len(unit)).split(SAMPLE_CHUNK)
-        ]
-    log_prob = torch.cat(parts).cpu().double().numpy()
-    log_prob = np.where(coordinates.space.contains(points), log_prob, -np.inf)
-    return log_prob + coordinates.log_condition_density - coordinates.log_unit_volume
+    return MeasuredFlow(samples, estimates, off, tuple(notes), thinning)
 
 
 def condition_groups(space: DesignSpace, points: np.ndarray) -> np.ndarray | None:

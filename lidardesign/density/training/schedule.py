@@ -28,7 +28,8 @@ from lidardesign.config import LearningSettings, RunConfig, save_run_config
 from lidardesign.density.learn import FLOW, LearnResult, TrainingData, make_trainer
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.checkpoint import clear_snapshots
-from lidardesign.density.training.quality import draw_probes, draw_samples, log_density_of
+from lidardesign.density.training.quality import draw_probes
+from lidardesign.density.training.sampling import draw_samples, log_density_of
 from lidardesign.density.training.training import CHECKPOINT, PROGRESS, Trainer
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.manifest import DAMAGED_HINT, FILE_NAME, forget, note, read_manifest, write_manifest

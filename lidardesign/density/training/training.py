@@ -38,7 +38,7 @@ from lidardesign.density.training.checkpoint import (
     snapshot_steps,
 )
 from lidardesign.density.training.losses import TOLERANCE_NATS, Pool, balancing_loss, pathwise_loss, round_trip_nats
-from lidardesign.density.training.quality import LearnedFlow
+from lidardesign.density.training.sampling import LearnedFlow
 from lidardesign.errors import DataError, DivergenceError, NumericalError
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.clock import phase
@@ -194,7 +194,7 @@ class Trainer(LearnedFlow):
             checkpointed = time.perf_counter()
             while self.step < self.settings.steps:
                 if self.step % SNAPSHOT_STEPS == 0 or self.step == self.pathwise_steps:
-                    self._check_round_trip()
+                    self._begin_stretch()
                 if self.step % SNAPSHOT_STEPS == 0 or self._snapshot is None:
                     self._snapshot = self._state()
                     if time.perf_counter() - checkpointed > self.settings.checkpoint_seconds:
@@ -258,9 +258,19 @@ class Trainer(LearnedFlow):
         except NumericalError:  # the flow left the numbers: a step to skip like any other
             return torch.tensor(math.nan), math.nan, math.nan
 
+    def _begin_stretch(self) -> None:
+        """Prepare the balancing steps up to the next snapshot; the stream is left alone.
+
+        They are taken in float64 where float32 gets the densities wrong that they ask for, and their proposals are
+        drawn by what the flow starves now.
+        """
+        if self.step < self.pathwise_steps:
+            return
+        self._check_round_trip()
+        self.pool = self.pool.emphasised(self.flow, self.coordinates)
+
     def _check_round_trip(self) -> None:
-        """Go on in float64 where balancing asks for densities that float32 gets wrong; the stream is left alone."""
-        if self.step < self.pathwise_steps or next(self.flow.parameters()).dtype == torch.float64:
+        if next(self.flow.parameters()).dtype == torch.float64:
             return
         if round_trip_nats(self.flow, ROUND_TRIPS, torch.Generator().manual_seed(self.step)) > TOLERANCE_NATS:
             self._double(self.step)
