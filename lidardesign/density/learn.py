@@ -22,6 +22,7 @@ from lidardesign.density.training.checkpoint import clear_snapshots, save_flow
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import draw_probes, measure
 from lidardesign.density.training.training import PROGRESS, LearnProgress, Trainer
+from lidardesign.density.verdict import Verdict
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.geometry.frames import in_view
@@ -62,6 +63,11 @@ class LearnResult:
     timings: dict[str, float] = field(default_factory=dict)
     error_estimates: dict[str, Estimate] = field(default_factory=dict)
     goal: dict[str, Any] | None = None
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the density is worth."""
+        return Verdict.of(self.misplaced, self.kl_nats, self.ess)
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form."""

@@ -45,9 +45,6 @@ LEARNED_FILES = (
 )  # fmt: skip
 # The sections that learning takes its time from; a seed changes nothing of that.
 TIME_SECTIONS = ("task_name", "task", "space", "density", "learning")
-# Below these a density is too rough for figures that are meant seriously.
-LOW_ESS = 0.1
-LOW_COVERAGE = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,24 +246,13 @@ class LearnRequest:
             raise
 
 
-def learning_advice(result: LearnResult) -> list[str]:
-    """What to do about a density that was learned badly."""
-    advice = []
-    if result.ess < LOW_ESS:
-        advice.append(f"ESS below {LOW_ESS:g}: the density is rough; --preset standard or fine learns longer")
-    if result.coverage < LOW_COVERAGE:
-        advice.append(
-            f"coverage below {LOW_COVERAGE:g}: a part of the scenes was missed; learn longer or another --seed"
-        )
-    return advice
-
-
 def result_document(result: LearnResult) -> dict[str, Any]:
     """What `lidardesign learn --json` prints of a result."""
     figures = ("task", "seconds", "steps", "ess", "kl_nats", "log_z", "coverage", "misplaced", "goal")
     return {
         "run": str(result.run),
         **{name: getattr(result, name) for name in figures},
+        "verdict": result.verdict.word,
         "notes": list(result.notes),
         "error_estimates": result.as_dict()["error_estimates"],
     }

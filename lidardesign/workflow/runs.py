@@ -12,7 +12,7 @@ from lidardesign.errors import DataError, LidardesignError
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
 from lidardesign.workflow.designs import Design, html_table
 from lidardesign.workflow.fit import FitOptions, FitRequest
-from lidardesign.workflow.learn import LearnOptions, LearnRequest, learning_advice
+from lidardesign.workflow.learn import LearnOptions, LearnRequest
 from lidardesign.workflow.learning_budget import check_met
 from lidardesign.workflow.run_folder import MANIFEST, Notes, RunFolder, folder_of, log_note, reach_of, read_design
 
@@ -43,6 +43,13 @@ class LearnedQuality:
     coverage: float
     misplaced: float
     errors: Mapping[str, float | None] = field(default_factory=dict)
+
+    @property
+    def verdict(self) -> str:
+        """good, usable or poor."""
+        from lidardesign.density.verdict import Verdict
+
+        return Verdict.of(self.misplaced, self.kl_nats, self.ess).word
 
 
 class Run(RunFolder):
@@ -261,7 +268,7 @@ def learn(
     for note in request.task_notes():
         notes(note)
     result = request.run(progress)
-    for note in (*result.notes, *learning_advice(result)):
+    for note in (*result.notes, f"the density is {result.verdict.text(request.settings.preset)}"):
         notes(note)
     check_met(result, request.goal)
     return open_run(request.folder)

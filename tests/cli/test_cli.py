@@ -297,15 +297,6 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
     assert asked == [(20, decided)]
 
 
-def test_a_density_that_was_learned_badly_comes_with_advice():
-    from types import SimpleNamespace
-
-    from lidardesign.workflow.learn import learning_advice
-
-    assert learning_advice(SimpleNamespace(ess=0.6, coverage=0.98)) == []
-    assert len(learning_advice(SimpleNamespace(ess=0.01, coverage=0.1))) == 2
-
-
 def test_compiled_code_has_a_folder_where_nothing_else_can_be_written(monkeypatch):
     from lidardesign.cli import environment
 

@@ -118,7 +118,8 @@ def test_the_result_has_sensible_figures_and_files(finished):
     samples = load_samples(run)
     assert 0 < len(samples) <= 2000
     assert SPACE.contains(samples.points).all()
-    assert samples.effective_sample_size == pytest.approx(result.ess, rel=1e-9)
+    # the worse of what samples and independent points see
+    assert result.ess <= samples.effective_sample_size * (1 + 1e-9)
     assert samples.log_prob.dtype == samples.log_target.dtype == np.float64
     assert (samples.points[:, [0, 1, 2, 4]] == 0).all()
 

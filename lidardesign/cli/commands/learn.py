@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,8 +20,8 @@ if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress, LearnResult
 
 FIGURES = (
-    ("ESS", "ess", "", "share of the samples that count"),
-    ("KL", "kl_nats", " nats", "from the learned density to the target"),
+    ("ESS", "ess", "", "share of the samples that count, the worse of two estimates"),
+    ("KL", "kl_nats", " nats", "between the learned density and the target, the worse way"),
     ("log Z", "log_z", "", "of the target density"),
     ("coverage", "coverage", "", "share of the target's mass that the density reaches"),
     ("misplaced", "misplaced", "", "share of the density's mass in the wrong place"),
@@ -76,7 +75,7 @@ def learn(
     """Learn where rays are worth firing for TASK, into a run folder."""
     with command(json=json, quiet=quiet, debug=debug) as output:
         with phase("libraries"):
-            from lidardesign.workflow.learn import LearnOptions, LearnRequest, learning_advice, result_document
+            from lidardesign.workflow.learn import LearnOptions, LearnRequest, result_document
             from lidardesign.workflow.learning_budget import check_met
 
         chosen = LearnOptions(
@@ -108,9 +107,8 @@ def learn(
         with output.progress("learning", "loss", "ess", "left") as bar:
             result = request.run(_progress(bar, output), remark)
         keep_times(request.folder, "learn", output, wait_s=WAIT_S)
-        result = replace(result, notes=(*result.notes, *learning_advice(result)))
         further = [] if output.quiet else [note for note in result.notes if note not in said]
-        output.result(result_document(result), lambda rich: _show(result, further, rich))
+        output.result(result_document(result), lambda rich: _show(result, further, request.settings.preset, rich))
         check_met(result, request.goal)
 
 
@@ -135,7 +133,7 @@ def _progress(bar: Progress | None, output: Output) -> Callable[[LearnProgress],
     return show
 
 
-def _show(result: LearnResult, notes: list[str], rich: RichConsole) -> None:
+def _show(result: LearnResult, notes: list[str], preset: str, rich: RichConsole) -> None:
     rows = []
     for name, key, unit, what in FIGURES:
         estimate = result.error_estimates[key]
@@ -145,4 +143,5 @@ def _show(result: LearnResult, notes: list[str], rich: RichConsole) -> None:
     rich.print(text_table(("", "value", "standard error", ""), rows, f"learned {result.task}"))
     for note in notes:
         rich.print(f"note: {note}")
+    rich.print(f"the density is {result.verdict.text(preset)}")
     rich.print(f"run: {result.run}", soft_wrap=True)

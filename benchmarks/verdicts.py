@@ -1,0 +1,79 @@
+"""What designs lose by a density that was learned badly: figures of `learn` beside what the chosen rays leave unknown.
+
+Each task is learned with ever fewer steps, from several seeds. To every density the same number of sensors is fitted,
+and the loss of the rays that are chosen is measured on training scenes that the choice did not see, the same ones for
+all. It stands beside the least loss of the task. What was measured is kept in the folder.
+
+    python benchmarks/verdicts.py --folder verdicts
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from common import lidardesign, parser, report, run_process
+
+# label -> (task and its settings, sensors, rays)
+TASKS = {
+    "flatland": (("flatland",), 3, 32),
+    "flatland, discs": (("flatland", "scene=discs"), 3, 32),
+    "flatland, occluded": (("flatland", "scene=occluded"), 3, 32),
+    "face": (("face",), 2, 361),
+    "face, box of origins": (("face", "origin_box_m=0.15"), 3, 361),
+    "emitter": (("emitter",), 2, 300),
+    "warehouse": (("warehouse",), 2, 24),
+    "arm": (("arm",), 4, 400),
+}
+# Preset and steps, None the preset's own.
+LENGTHS = (("draft", 10), ("draft", 30), ("draft", 100), ("draft", None), ("standard", None))
+FIGURES = ("misplaced", "kl_nats", "ess")
+
+
+def measured(folder: Path, label: str, length: tuple[str, int | None], seed: int) -> dict[str, Any]:
+    """The figures of a density, and the loss of rays that are chosen with it."""
+    (task, *settings), sensors, rays = TASKS[label]
+    preset, steps = length
+    run = folder / f"{label.replace(', ', '-').replace(' ', '-')}-{preset}-{steps or 'all'}-{seed}"
+    path = run.with_suffix(".json")
+    if not path.exists():
+        settings += [] if steps is None else [f"learning.steps={steps}"]
+        words = [word for setting in settings for word in ("--set", setting)]
+        learn = ("learn", task, "--preset", preset, "--seed", str(seed), "--out", run, *words)
+        learned = run_process(lidardesign(*learn, "--json")).document()
+        fit = ("fit", run, "--seed", "0", "--sensors", str(sensors), "--rays", str(rays))
+        chosen = run_process(lidardesign(*fit, "--json")).document()["certificates"][0]
+        found = {**{name: learned[name] for name in (*FIGURES, "verdict")}, "loss": chosen["held_back_value"]}
+        path.write_text(json.dumps(found) + "\n", encoding="utf-8")
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def rows_of(folder: Path, label: str, lengths: Sequence[tuple[str, int | None]], seeds: int) -> list[list[object]]:
+    """A task's densities, from the best design to the worst."""
+    found = [(length, seed, measured(folder, label, length, seed)) for length in lengths for seed in range(seeds)]
+    least = min(one["loss"] for _, _, one in found)
+    rows = [
+        [label, f"{length[0]}, {length[1] or 'all'} steps", seed, *(one[name] for name in FIGURES), one["verdict"],
+         f"{one['loss'] / least - 1:+.1%}"]
+        for length, seed, one in found
+    ]  # fmt: skip
+    return sorted(rows, key=lambda row: float(str(row[-1]).rstrip("%")))
+
+
+def main() -> None:
+    """Measure what is missing, and print everything."""
+    made = parser(__doc__, rounds=1)
+    made.add_argument("--folder", type=Path, required=True, help="where runs and results are kept")
+    made.add_argument("--seeds", type=int, default=2, help="how many runs of each length (default %(default)s)")
+    made.add_argument("--tasks", nargs="+", choices=list(TASKS), default=list(TASKS), help="these alone")
+    options = made.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    rows = [row for label in options.tasks for row in rows_of(options.folder, label, LENGTHS, options.seeds)]
+    columns = ["task", "learned", "seed", *FIGURES, "verdict", "loss above the least"]
+    report("What designs lose by rough densities", {"held-back scenes": (columns, rows)}, [], options.json)
+
+
+if __name__ == "__main__":
+    main()
