@@ -40,7 +40,7 @@ def test_no_figure_that_is_worse_makes_a_verdict_better():
             assert ORDER.index(Verdict.of(*worse).word) >= here
 
 
-@pytest.mark.parametrize(("preset", "advice"), [("draft", "--preset standard"), ("standard", "fine"), ("fine", "steps")])
+@pytest.mark.parametrize(("preset", "advice"), [("draft", "standard"), ("standard", "fine"), ("fine", "steps")])
 def test_what_to_do_next_follows_from_the_preset(preset, advice):
     assert Verdict.of(*PERFECT).text(preset) == "good"
     text = Verdict.of(0.9, 0.1, 0.5).text(preset)

@@ -180,16 +180,16 @@ class TestSteepSplines:
         trainer = a_trainer(tmp_path)
         trainer._advance()
         trainer.step = trainer.pathwise_steps
-        trainer._check_round_trip()
+        trainer._begin_stretch()
         assert trainer.doubled_at is None
         with torch.no_grad():
             for parameter in trainer.flow.parameters():
                 parameter.mul_(50.0)
         trainer.step = 0
-        trainer._check_round_trip()  # no foreign density is asked for yet
+        trainer._begin_stretch()  # no foreign density is asked for yet
         assert trainer.doubled_at is None
         trainer.step = trainer.pathwise_steps
-        trainer._check_round_trip()
+        trainer._begin_stretch()
         assert trainer.doubled_at == trainer.pathwise_steps
         state = [v for one in trainer.optimiser.state.values() for n, v in one.items() if n != "step"]
         assert {p.dtype for p in trainer.flow.parameters()} == {v.dtype for v in state} == {torch.float64}

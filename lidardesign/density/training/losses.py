@@ -101,7 +101,8 @@ class Pool:
         # E_pi[p / p*] = 1 / Z
         log_z = -torch.logsumexp(torch.log(self.weights) - log_weights, dim=0)
         starved = (log_weights - log_z).clamp(max=float(np.log(LARGEST_EMPHASIS))).exp()
-        return replace(self, emphasis=1.0 + starved)
+        # a flow that lost its numbers says nothing of what it starves
+        return replace(self, emphasis=1.0 + torch.nan_to_num(starved, nan=0.0))
 
     def draw(self, count: int, generator: torch.Generator, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Unit points, shape (count, free), log p* at them and the weights that make them samples of p*, (count,)."""
