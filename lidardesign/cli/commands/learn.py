@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress, LearnResult
 
 FIGURES = (
-    ("ESS", "ess", "", "share of the samples that count, the worse of two estimates"),
-    ("KL", "kl_nats", " nats", "between the learned density and the target, the worse way"),
+    ("ESS", "ess", "", "share of the samples that count"),
+    ("KL", "kl_nats", " nats", "between the learned density and the target"),
     ("log Z", "log_z", "", "of the target density"),
     ("coverage", "coverage", "", "share of the target's mass that the density reaches"),
     ("misplaced", "misplaced", "", "share of the density's mass in the wrong place"),
