@@ -169,7 +169,7 @@ def read_stl(data: bytes, where: str) -> TextMesh:
         if wrong.any():
             raise DataError(f"triangle {int(np.argmax(wrong)) // 3} has a corner that is NaN or infinite", where=where)
         return TextMesh(points, np.arange(len(points)).reshape(-1, 3))
-    if not re.search(rb"(?i)\bvertex\s", data):
+    if not re.search(rb"(?im)^[ \t]*vertex\b", data):
         raise DataError(
             f"promises {promised} triangles in {STL_HEADER + promised * STL_FACET.itemsize} bytes, and has {len(data)}",
             where=where,
@@ -177,7 +177,7 @@ def read_stl(data: bytes, where: str) -> TextMesh:
         )
     data = _plain(data, where)
     corners, words = (
-        Rows(data, rb"^[ \t]*vertex[ \t]+([^\n]*)"),
+        Rows(data, rb"^[ \t]*vertex\b([^\n]*)"),
         Rows(data, rb"^[ \t]*(vertex|end ?facet|end ?solid)\b"),
     )
     # the last letters of the words: three of `vertex`, then one of `endfacet`, and so on until `endsolid`
@@ -249,6 +249,7 @@ ABSENT = np.iinfo(np.int64).min
 WHOLE_NUMBER = re.compile(rb"[-+]?\d{1,18}")
 # Faces whose corners are taken apart at once; bounds memory.
 ROWS_AT_ONCE = 100_000
+BLANKS = b" \t\v\f"
 
 
 def _references(faces: Rows, where: str) -> np.ndarray:
@@ -271,7 +272,7 @@ def _indices(text: bytes) -> np.ndarray | None:
     """Three indices of each corner, (N, 3); None where something is no corner."""
     letters = np.frombuffer(b" " + text + b" ", dtype=np.uint8)
     digit, slash = (letters >= ord("0")) & (letters <= ord("9")), letters == ord("/")
-    blank, sign = (letters == ord(" ")) | (letters == ord("\t")), (letters == ord("+")) | (letters == ord("-"))
+    blank, sign = np.isin(letters, np.frombuffer(BLANKS, dtype=np.uint8)), (letters == ord("+")) | (letters == ord("-"))
     loose_sign = sign[1:-1] & ~(digit[2:] & (blank | slash)[:-2])
     if loose_sign.any() or not (digit | slash | blank | sign).all():
         return None

@@ -281,6 +281,17 @@ def readable(path: Path, kind: str = "a design") -> Iterator[Path]:
 FILE_NAME = ".lock"
 
 
+def check_lock(run: Path) -> None:
+    """Refuse a lock that is none: one that is a link would empty what it leads to.
+
+    Raises:
+        DataError: A folder, a link, a pipe or a device stands where the lock would be.
+    """
+    path = Path(run) / FILE_NAME
+    if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
+        raise DataError("is no regular file, as a lock is", where=str(path), hint="remove it")
+
+
 @contextlib.contextmanager
 def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     """Hold a run folder's lock; what is left of a lock whose process was killed is no obstacle.
@@ -298,8 +309,7 @@ def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     path = Path(run) / FILE_NAME
-    if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
-        raise DataError("is no regular file, as a lock is", where=str(path), hint="remove it")
+    check_lock(run)
     lock = FileLock(path)
     try:
         lock.acquire(timeout=wait_s)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import os
 import stat
 import tempfile
@@ -14,6 +13,7 @@ from pathlib import Path
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.files import FILE_NAME as LOCK
 from lidardesign.run.files import STDIO
+from lidardesign.run.inputs import parse_json
 from lidardesign.run.manifest import FILE_NAME as MANIFEST
 
 # What a run has beside the files that its manifest lists.
@@ -74,7 +74,7 @@ def _check_replaced(name: str, path: Path, inputs: Iterable[Path]) -> None:
 def _files_of(run: Path) -> set[str]:
     """The names of the files of a run; whoever needs its manifest says that it is damaged."""
     with contextlib.suppress(OSError, ValueError, AttributeError, TypeError):
-        return {*RUN_FILES, *json.loads((run / MANIFEST).read_bytes()).get("files", ())}
+        return {*RUN_FILES, *parse_json((run / MANIFEST).read_bytes()).get("files", ())}
     return {*RUN_FILES}
 
 

@@ -59,6 +59,7 @@ TEXTS = {
     "obj two signs": ("obj", POINTS + "f --1 2 3\n", ":5: a corner of the face is '--1'"),
     "obj sign behind": ("obj", POINTS + "f 1- 2 3\n", ":5: a corner of the face is '1-'"),
     "obj slash alone": ("obj", POINTS + "f 1 / 2 3\n", ":5: a corner of the face is '/'"),
+    "obj line ends of printers": ("obj", POINTS + "f 1\v2\f9\n", ":5: a face names vertex 9"),
     "obj fraction": ("obj", POINTS + "f 1 2 3.0\n", ":5: a corner of the face is '3.0'"),
     "obj two corners": ("obj", POINTS + FACES + "f 1 2\n", ":9: has 2 values"),
     "obj nan": ("obj", POINTS.replace("1 0 0", "nan 0 0") + FACES, ":2: the vertex is 'nan 0 0'"),
@@ -99,6 +100,7 @@ TEXTS = {
     "stl of two corners": (
         "stl", "solid\n" + FACET.replace("vertex 0 0 0\n", "") + "endsolid\n", ":4: a facet has not 3 corners",
     ),
+    "stl of broken corners": ("stl", "solid\n" + FACET.replace("vertex ", "vertex/") + "endsolid\n", ":4: "),
     "stl cut short": ("stl", "solid\n" + FACET.format(z=0), "ends early"),
     "stl of four numbers": ("stl", "solid\n" + FACET.format(z="0 1") + "endsolid\n", ":6: has 4 values"),
     "binary stl of more": ("stl", bytes(80) + struct.pack("<I", 4_000_000_000) + bytes(50), "promises 4000000000"),

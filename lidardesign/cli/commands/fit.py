@@ -13,6 +13,7 @@ from lidardesign.cli.tables.designs import show_fit
 from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.errors import LidardesignError
 from lidardesign.run.clock import WAIT_S, phase
+from lidardesign.run.files import check_lock
 from lidardesign.run.outputs import check_writable
 
 if TYPE_CHECKING:
@@ -70,6 +71,7 @@ def run_fit(request: FitRequest, output: Output) -> None:
     from lidardesign.workflow.designs import Design
 
     check_writable(request.run.design_path(request.name))
+    check_lock(request.run.folder)
     design = Design.fitted(request, notes=output.remark)
     try:
         design.save()
