@@ -185,6 +185,16 @@ def test_points_near_a_ball_follow_its_surface_term():
     assert stats.kstest(radius[:4000], cumulated).pvalue > 1e-3
 
 
+def test_of_bodies_far_larger_than_the_space_points_are_drawn_where_it_reaches():
+    ground = Body(Sphere(1e5), "ground", "target", rigid(translation_m=(0, 0, -1e5)))
+    target = build_target([Scene((ground,))], CEILING, SETTINGS, "off")
+    points, _ = independent_points(target, 2000, np.random.default_rng(0))
+    assert len(points) == 2000
+    height_m = observed_point(points)[:, 2]
+    assert abs(height_m.mean()) < 4 * 0.03 / math.sqrt(2000)
+    assert abs(height_m.std() / 0.03 - 1) < 4 / math.sqrt(2 * 2000)
+
+
 def test_independent_points_weighted_by_their_density_integrate_the_target():
     scenes = moving_scenes(with_mesh=False)
     target = build_target(scenes, CEILING, SETTINGS.model_copy(update={"sigma_m": 0.1}), "raycast")

@@ -33,7 +33,7 @@ MOST_COLUMNS = 64
 FEWEST_RAYS = 32
 # Casting finds a point again within this share of its range.
 SAME_PLACE = 1e-3
-# Below this share of the targets' surface in the space's angles, the space looks past them.
+# Below this share of the targets' surface in the space's angles, or in its angles and range, it looks past them.
 LEAST_IN_VIEW = 0.01
 # Above this share of the surface that rays meet out of range, most of what can be seen is not heard.
 MOST_OUT_OF_RANGE = 0.5
@@ -174,27 +174,34 @@ def _view_notes(sample: _Sample, points: np.ndarray, column: np.ndarray, met: _M
             f"sensors are inside of the targets, which are {across_m:.3g} m across: are all lengths in metres? "
             "Else move the design space out of them; give walls a thickness where they are a room"
         ]
-    notes = []
+    sizes = f"they are {across_m:.3g} m across, its rays reach {reach_m:.3g} m{_unit_doubt(across_m, reach_m)}"
     if viewed.mean() < LEAST_IN_VIEW:
-        notes.append(
-            f"the design space looks past the targets: {viewed.mean():.2%} of their surface is within its angles; they "
-            f"are {across_m:.3g} m across, its rays reach {reach_m:.3g} m{_unit_doubt(across_m, reach_m)}; {LOOK_THERE}"
-        )
-    if viewed.sum() < FEWEST_RAYS:
-        return notes
+        return [
+            f"the design space looks past the targets: {viewed.mean():.2%} of their surface is within its angles; "
+            f"{sizes}; {LOOK_THERE}"
+        ]
+    notes = []
     hidden = ~met.target & (met.range_m < (1 - SAME_PLACE) * points[:, RANGE])
     if hidden[viewed].mean() > MOST_HIDDEN:
         notes.append(
             f"occluders hide {hidden[viewed].mean():.1%} of the targets' surface: hardly anything is ever visible; "
             "check the occluders' places and the bodies' roles"
         )
-    ranges = points[viewed & _visible(points, met), RANGE]
-    outside = (ranges < space.low[RANGE]) | (ranges > reach_m)
-    if RANGE in space.free and len(ranges) >= FEWEST_RAYS and outside.mean() > MOST_OUT_OF_RANGE:
+    if RANGE not in space.free:
+        return notes
+    heard = (space.low[RANGE] <= points[:, RANGE]) & (points[:, RANGE] <= reach_m)
+    seen = viewed & _visible(points, met)
+    ranges, missed = points[seen, RANGE], 1 - heard[seen].mean() if seen.any() else 0.0
+    if len(ranges) >= FEWEST_RAYS and missed > MOST_OUT_OF_RANGE:
         notes.append(
-            f"{outside.mean():.0%} of the surface that rays meet is out of the design space's range: it is "
+            f"{missed:.0%} of the surface that rays meet is out of the design space's range: it is "
             f"{ranges.min():.3g} to {ranges.max():.3g} m away, and the range is {space.low[RANGE]:.3g} to "
             f"{reach_m:.3g} m{_unit_doubt(float(np.median(ranges)), reach_m)}; set space.range_m"
+        )
+    elif (viewed & heard).mean() < LEAST_IN_VIEW:
+        notes.append(
+            f"the design space reaches {(viewed & heard).mean():.2%} of the targets' surface: {sizes}; cut the targets "
+            "to what sensors may reach, or raise space.range_m"
         )
     return notes
 

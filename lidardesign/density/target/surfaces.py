@@ -44,6 +44,8 @@ REACH_SIGMAS = 5.0
 DRAWS_AT_ONCE = 262_144
 # Bodies so thin beside their boxes that fewer draws than this share hit their surface are drawn in vain.
 MOST_ROUNDS = 400
+# Where less than this share of the first draws hits, only boxes as far as the space reaches are drawn from.
+RICH_SHARE = 1e-4
 # Few origins of a wide ceiling may see a point under the space's angles: each point is tried from several.
 ORIGINS_PER_POINT = 4
 AIMING_ROUNDS = 8
@@ -298,12 +300,16 @@ class MovingFrames(Surfaces):
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `Surfaces`."""
         parts, missing = [], count
+        reach_m = np.array(space.low[:3]) - space.high[RANGE], np.array(space.high[:3]) + space.high[RANGE]
         for _ in range(AIMING_ROUNDS):
-            surface = np.repeat(self.draw_near(missing, sigma_m, generator), ORIGINS_PER_POINT, axis=0)
+            near = self.draw_near(missing, sigma_m, generator, reach_m)
+            surface = np.repeat(near, ORIGINS_PER_POINT, axis=0)
             aimed = space.wrap(aim(space.sample(len(surface), generator)[:, :3], surface))
             parts.append(aimed[space.contains(aimed) & (aimed[:, RANGE] > 0)])
+            # further draws would be as much in vain
+            exhausted = len(near) < missing
             missing -= len(parts[-1])
-            if missing <= 0:
+            if missing <= 0 or exhausted:
                 break
         points = np.concatenate(parts)[:count]
         # each body has a term of its own, also where several are in one column
@@ -316,20 +322,38 @@ class MovingFrames(Surfaces):
             log_density[rows] = row_log_sums(terms, pairs)[0]
         return points, log_density + 2 * np.log(points[:, RANGE]) + log_chart_factor(space, points)
 
-    def draw_near(self, count: int, sigma_m: float, generator: np.random.Generator) -> np.ndarray:
+    def draw_near(
+        self,
+        count: int,
+        sigma_m: float,
+        generator: np.random.Generator,
+        reach_m: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> np.ndarray:
         """Scene points (at most count, 3) whose density is the sum over bodies of weight * exp(-d^2 / (2 sigma^2)).
 
         Uniform points of the bodies' padded boxes, each box as often as its weight times its volume, are kept with the
         probability of their own body's term: no body's integral is needed.
+
+        Arguments:
+            count: How many, fewer where bodies are too thin.
+            sigma_m: Standard deviation of the surface proximity [m].
+            generator: Of all draws.
+            reach_m: Corners of a box; of bodies much larger than it only points in there are drawn.
         """
         from lidardesign.density.fields import body_kernels
 
         bodies = self.bodies
         low, high = bodies.low - REACH_SIGMAS * sigma_m, bodies.high + REACH_SIGMAS * sigma_m
-        mass = np.exp(self.log_column_weights[bodies.column]) * (high - low).prod(axis=1)
-        cumulated = np.cumsum(mass / mass.sum())
+        weights = np.exp(self.log_column_weights[bodies.column])
+        cumulated = _cumulated(weights * (high - low).prod(axis=1))
         accepted: list[np.ndarray] = []
-        for _ in range(MOST_ROUNDS):
+        for number in range(MOST_ROUNDS):
+            if number == 1 and reach_m is not None and len(accepted[0]) < RICH_SHARE * DRAWS_AT_ONCE:
+                low, high = np.maximum(low, reach_m[0]), np.minimum(high, reach_m[1])
+                volume = np.maximum(high - low, 0.0).prod(axis=1)
+                if not volume.any():
+                    break
+                cumulated = _cumulated(weights * volume)
             body = np.searchsorted(cumulated, generator.random(DRAWS_AT_ONCE), side="right").clip(max=len(bodies) - 1)
             points = generator.uniform(low[body], high[body])
             distances = np.empty(len(points))
@@ -338,6 +362,10 @@ class MovingFrames(Surfaces):
             if sum(map(len, accepted)) >= count:
                 break
         return np.concatenate(accepted)[:count]
+
+
+def _cumulated(masses: np.ndarray) -> np.ndarray:
+    return np.cumsum(masses / masses.sum())
 
 
 def near_pairs(
