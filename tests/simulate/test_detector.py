@@ -86,7 +86,7 @@ BAD = {
     "too large to be one": ("bin_ps: 1e400", ["mine.yaml"]),
     "text": ("bin_ps: wide", ["'wide'", "a number"]),
     "truth": ("bin_ps: true", ["True", "a number"]),
-    "nothing": ("bin_ps:", ["None", "a number"]),
+    "nothing": ("bin_ps:", ["no value", "a value"]),
     "half a bin": ("bin_ps: 8\nbins: 1.5", ["1.5", "a whole number"]),
     "a list": ("- 1", ["list"]),
     "an unknown estimator": ("estimator: mean", ["'mean'", "peak, matched"]),

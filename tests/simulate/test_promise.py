@@ -8,12 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from soak.promise import kept_promise, random_case
-from support.planning import CONSUMER, SINGLE, TIMED, decisions, facing_wall, grid
+from support.planning import CONSUMER, SINGLE, TIMED, decisions, facing_wall, grid, sight
 from support.tables import each_row
 
 from lidardesign.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import Physics
+from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Physics
+from lidardesign.simulate.detector.kernels import find_returns
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import simulate
 
@@ -68,6 +70,25 @@ def test_steps_in_even_phases_are_as_likely_as_shifts_are_long():
     jitter = decisions(Planner(rounding(share)).plan(scene, [rays]))["jitter"].bound.range_m
     drawn = bin_m * math.sqrt(math.sqrt(2 / math.pi) * share)
     assert drawn <= jitter <= 2 * drawn
+
+
+@each_row("pulse_bins", [0.02, 0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 1.7, 2.5, 4.0])
+@each_row("timing_share", [0.0, 1.0, 5.0])
+@each_row("level", [0.0, 1e3, 1e6, 1e8])
+def test_the_matched_filter_leaves_no_more_of_a_step_than_bounded(pulse_bins, timing_share, level):
+    """Ten million photons of a pulse at every place in a bin, found by a filter for the pulse or a wider one."""
+    bin_s, places = SINGLE.bin_s, np.linspace(-0.499, 0.499, 41)
+    pulse_s, jitter_s = pulse_bins * bin_s, timing_share * pulse_bins * bin_s
+    detector = replace(SINGLE, pulse_sigma_s=pulse_s, jitter_sigma_s=jitter_s, divergence_rad=0.0, footprint_rays=1)
+    middles = np.arange(201) - 100.0 - places[:, None]
+    share = norm.cdf((middles + 0.5) / pulse_bins) - norm.cdf((middles - 0.5) / pulse_bins)
+    drawn = np.rint(1e7 * share + level).astype(np.int64)
+    offset, whole, known = 201 * np.arange(len(places) + 1), np.ones((len(places), 2)), np.full(len(places), level)
+    sigma = math.hypot(1.0, timing_share) * pulse_bins
+    half = int(FWHM_PER_SIGMA * sigma / 2)
+    found = find_returns(drawn.ravel(), offset, whole, 1.0, sigma, half, known, 0.5, True)
+    off = np.abs(found - 100.5 - places)
+    assert (off <= sight(facing_wall(), detector).step_m[0] / detector.bin_m / 2 + 1e-3).all()
 
 
 @each_row("place", [20.0, 20.25, 20.5])

@@ -22,8 +22,8 @@ FLATTEST_COSINE = 0.02
 NEIGHBOURS = 4
 # The matched filter takes photons up to so many standard deviations from its pulse's centre into account.
 PULSE_REACH = 4.0
-# Of a pulse r bins wide, the matched filter leaves the share exp(-3.2 r) + 0.044 / r^2 of a step between bins, at most
-FILTER_SOFTENS, FILTER_LEAVES = 3.2, 0.044
+# Of a pulse r bins wide, the matched filter leaves the share exp(-3.2 r) + 0.05 / r^2 of a step between bins, at most
+FILTER_SOFTENS, FILTER_LEAVES = 3.2, 0.05
 
 
 @dataclass(frozen=True, eq=False)
