@@ -14,7 +14,7 @@ more and returns are lost, as from fewer photons. Haze sends h counts into a bin
 for the echo with at most (B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and raises the level that an echo
 has to stand out from. A ray without a return may take it for one where any of it is counted: 1 - exp(-all of its
 counts), as one count is enough in the dark. Where a detector is blind after a count, haze before an echo leaves less of
-it (see `Blindness`).
+it (see `Blindness`), and times the first photon of a pulse, which comes later where there are fewer.
 """
 
 from __future__ import annotations
@@ -39,6 +39,9 @@ from lidardesign.simulate.light import Background, Beams, Echoes
 CELLS = 32
 # Points per cell at which the profile is integrated (Gauss and Legendre): it is smooth, so these are exact to 1e-6.
 NODES = 4
+# The first of K photons comes earlier by at most this many standard deviations per unit of ln K: (1 / sqrt(pi)) / ln 2,
+# between one and two of them; more photons change it by less
+LATER_PER_LOG = 0.82
 
 
 def through_air(
@@ -178,6 +181,9 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     changed = np.maximum(changed_share(clear, counts.in_air), changed_share(without.left, left))
     squared = counts.error_m(left, sigma_m) ** 2 * np.minimum(2 * np.sqrt(changed) + any_count, 1.0)
     squared += np.minimum(changed + any_count, 1.0) * counts.level_m2
+    # of fewer photons in a pulse the first one, which a blind detector times, comes later
+    thinned = safe_divide(counts.signal, counts.in_air, 1.0)
+    squared += (sigma_m * np.minimum(LATER_PER_LOG * np.log(thinned), Blindness.of(counts, air=False).early)) ** 2
     lost = np.where(first_hits.returned, fewer + wrong, any_count)
     medium = first_hits.scene.medium
     return EffectBound(

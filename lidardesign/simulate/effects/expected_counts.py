@@ -377,11 +377,12 @@ class Blindness:
     per_pulse: np.ndarray
 
     @classmethod
-    def of(cls, counts: Counts, *, ambient: bool = True, haze: bool = True) -> Blindness:
-        """With ambient light and dark counts, and with what the air sends back, or as if there were none."""
+    def of(cls, counts: Counts, *, ambient: bool = True, haze: bool = True, air: bool = True) -> Blindness:
+        """With ambient light and dark counts, with what the air sends back and what it takes, or without any of it."""
         first_hits, photons = counts.first_hits, counts.first_hits.detector.photons
         # what spills into a gate from outside it is an echo there
-        echo = safe_divide(counts.in_air + counts.leaked(first_hits.sigma_m()), counts.pulses)
+        arriving = (counts.in_air if air else counts.signal) + counts.leaked(first_hits.sigma_m())
+        echo = safe_divide(arriving, counts.pulses)
         from_air = counts.haze_per_pulse[0] * haze
         per_metre = counts.background_per_metre * ambient
         whole = per_metre * first_hits.width_m + from_air + echo
