@@ -202,5 +202,12 @@ def sensor_count(text: str | None) -> int | str | None:
 
 
 def part_names(text: str | None) -> list[str] | str | None:
-    """The value of `--parts`: names, or `catalog` for all parts that are shipped."""
-    return text if text in (None, "catalog") else [name.strip() for name in text.split(",")]
+    """The value of `--parts`: names, or `catalog` for all parts that are shipped.
+
+    Raises:
+        ConfigError: A name is empty.
+    """
+    names = [] if text is None else [name.strip() for name in text.split(",")]
+    if not all(names):
+        raise ConfigError(f"{text!r} leaves a part unnamed", where="--parts", allowed="NAME,NAME or catalog")
+    return text if text in (None, "catalog") else names

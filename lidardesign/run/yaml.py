@@ -27,6 +27,9 @@ MAX_NODES = 500_000
 MAX_DIGITS = 100
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _BaseDumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+QUOTE_HINT = 'text that begins with a sign, or has a colon in it, stands in quotes, as "*hand"'
+# What libyaml and its Python twin say of text without them.
+UNQUOTED = ("found character", "mapping values", "did not find expected alphabetic")
 
 _NULL = re.compile(r"~|null|Null|NULL|")
 _BOOLEAN = re.compile(r"true|True|TRUE|false|False|FALSE")
@@ -118,6 +121,7 @@ def parse_yaml(text: str, *, where: str, empty_sections: bool = False) -> Docume
         raise ConfigError(
             f"is not YAML: {error.problem or error.context}",
             where=f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where,
+            hint=QUOTE_HINT if error.problem and error.problem.startswith(UNQUOTED) else None,
         ) from None
     except yaml.YAMLError as error:
         raise ConfigError(f"is not YAML: {' '.join(str(error).split())}", where=where) from None
@@ -202,7 +206,9 @@ class _Builder:
         elif isinstance(event, yaml.AliasEvent):
             anchor = self._anchors.get(event.anchor)
             if anchor is None:
-                raise self._error(event, f"the alias *{event.anchor} has no complete anchor before it")
+                raise self._error(
+                    event, f"the alias *{event.anchor} has no complete anchor before it", hint=QUOTE_HINT
+                )
             if self._expects_key():
                 raise self._error(event, "an alias cannot be a key", "names as keys")
             if len(self._stack) + anchor.height > MAX_DEPTH:

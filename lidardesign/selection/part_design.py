@@ -83,10 +83,7 @@ def choose_parts(
         raise ConfigError(
             "the density has conditions", where="--parts", allowed="tasks whose sensors rest", hint="fit without parts"
         )
-    every = named_parts(wanted.names)
-    names = [part.name for part in every]
-    if others := set(wanted.each) - set(names):
-        raise ConfigError(f"{min(others)} is none of the parts", where="parts.each", allowed=", ".join(names))
+    every = named_parts(wanted.names, wanted.each)
     nearest = [part.name for part in every if part.value("near_m") is None]
     if nearest:
         left_out = "left out" if wanted.names == "catalog" else "taken as 0"

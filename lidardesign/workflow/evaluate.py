@@ -196,6 +196,8 @@ class ScoreRequest:
         designs, opened = collect_designs(targets, runs, notes)
         designs = _named(designs, options.designs)
         run = learned = common_run(name_apart(designs), opened)
+        for note in learned.input_notes():
+            notes(note)
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
         if options.accuracy:
             # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes

@@ -158,6 +158,8 @@ class FitRequest:
             DataError: The rig cannot be read.
             InfeasibleError: The rig stands where the run's sensors may not.
         """
+        for note in run.input_notes():
+            notes(note)
         defaults, asked = run.task.defaults, load_constraints(options.constraints, notes=notes)
         if asked is None and base is not None:
             asked = Constraints()
@@ -332,7 +334,7 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
         asked = Constraints.from_mapping({**document, "parts": {**document.get("parts", {}), "names": options.parts}})
     if asked is None or asked.parts is None:
         return asked
-    named_parts(asked.parts.names)
+    named_parts(asked.parts.names, asked.parts.each)
     lacking = {
         "how many parts is not said": not isinstance(options.sensors, int) and asked.parts.count is None,
         "parts beside --at or --weight": options.at or options.weights,

@@ -10,8 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel
-
 from lidardesign.config import RunConfig, load_run_config, resolve, save_run_config
 from lidardesign.errors import ConfigError, DataError, LidardesignError, check_choice
 from lidardesign.registry import load_task, plugin_guard
@@ -23,11 +21,14 @@ from lidardesign.task import Task, notes_of
 from lidardesign.workflow.learning_budget import GOAL, Goal, Learner, checked_goal, resumed_goal
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
+    INPUTS,
     MANIFEST,
     SAMPLES,
     EarlierRun,
     Notes,
     RequestPlan,
+    input_hashes,
+    input_paths,
     last_time,
     log_note,
     settings_texts,
@@ -172,7 +173,7 @@ class LearnRequest:
             length,
             f"draw {learning.samples:,} samples for fit and constrain, and measure how good they are",
         ]
-        reads = [path for path in (self.config_file, *_paths_in(settings.task)) if path is not None]
+        reads = [path for path in (self.config_file, *input_paths(settings.task)) if path is not None]
         if self.begun:
             reads += sorted(path for path in self.folder.iterdir() if path.is_file() and not path.name.startswith("."))
         # as other runs' files have it
@@ -208,6 +209,7 @@ class LearnRequest:
                     start_manifest(folder, command=list(self.command), seed=self.settings.seed)
                     if not self.goal.is_none:
                         note(folder, **{GOAL: self.goal.as_dict()})
+                    note(folder, **{INPUTS: input_hashes(self.settings.task)})
                     save_run_config(self.settings, folder)
                 try:
                     return learner.learn(self.settings, self.goal, resume=self.has_checkpoint)
@@ -267,20 +269,6 @@ def _time_of_twin(run: Path, settings: Mapping[str, Any]) -> EarlierRun | None:
             if before is not None and all(sections.get(name) == value for name, value in settings.items()):
                 return EarlierRun(before.seconds, f"learning {manifest.parent.name}, which has the same settings,")
     return None
-
-
-def _paths_in(config: BaseModel) -> list[Path]:
-
-    def within(value: Any) -> list[Path]:
-        if isinstance(value, dict):
-            value = list(value.values())
-        if isinstance(value, list | tuple):
-            return [path for item in value for path in within(item)]
-        if hasattr(value, "model_fields_set"):
-            return _paths_in(value)
-        return [value] if isinstance(value, Path) else []
-
-    return within([value for _, value in config])
 
 
 def check_can_start(run: Path) -> None:

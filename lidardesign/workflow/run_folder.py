@@ -20,7 +20,8 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
-from lidardesign.run.files import STDIO, is_input, is_there, readable
+from lidardesign.run.files import STDIO, is_input, is_there, readable, sha256_file
+from lidardesign.run.inputs import MESH
 from lidardesign.run.manifest import changed_since_recorded, read_manifest
 from lidardesign.run.outputs import check_writable
 from lidardesign.scene import Scene
@@ -28,10 +29,13 @@ from lidardesign.space import RANGE
 from lidardesign.task import Metric, Split, Task, metric_of, scenes_of
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
     from typing_extensions import Self
 
 DESIGN_FOLDER = "designs"
 CONFIGURATION, MANIFEST, SAMPLES = "config.yaml", "manifest.json", "samples.npz"
+# Where the manifest has what a task read, with its SHA-256.
+INPUTS = "inputs"
 
 Notes = Callable[[str], None]
 
@@ -79,6 +83,16 @@ class RunFolder:
         with plugin_guard(self.task.name):
             return list(scenes_of(self.task, self.config.task, split, seed, self.config.space))
 
+    def input_notes(self) -> list[str]:
+        """One line on what the task reads, where it is no longer as it was when the run was learned."""
+        before = read_manifest(self.folder).get(INPUTS) or {}
+        now = input_hashes(self.config.task) if before else {}
+        changed = [name for name, digest in before.items() if now.get(name) != digest]
+        if not changed:
+            return []
+        more = "" if len(changed) == 1 else f" and {len(changed) - 1} more"
+        return [f"{changed[0]}{more} changed since {self.folder} was learned: its scenes are others now"]
+
     def design_paths(self) -> list[Path]:
         """The files of this run's designs by name."""
         return sorted((self.folder / DESIGN_FOLDER).glob("*.yaml"))
@@ -98,6 +112,36 @@ class RunFolder:
             # entries of older versions have no phases
             if isinstance(seconds, dict) and all(isinstance(value, int | float) for value in seconds.values())
         }
+
+
+def input_paths(config: BaseModel) -> list[Path]:
+    """The paths that a task's configuration names."""
+
+    def within(value: Any) -> list[Path]:
+        if isinstance(value, dict):
+            value = list(value.values())
+        if isinstance(value, list | tuple):
+            return [path for item in value for path in within(item)]
+        if hasattr(value, "model_fields_set"):
+            return input_paths(value)
+        return [value] if isinstance(value, Path) else []
+
+    return within([value for _, value in config])
+
+
+def input_hashes(config: BaseModel) -> dict[str, str]:
+    """SHA-256 of the files that a task's configuration names, of those in its folders, and of its robots, by path."""
+    files = [file for path in input_paths(config) for file in _files_of(path)]
+    return {str(file): sha256_file(file) for file in files if file.is_file() and file.stat().st_size <= MESH.most_bytes}
+
+
+def _files_of(path: Path) -> list[Path]:
+    if path.suffix.lower() in (".xml", ".urdf"):
+        from lidardesign.mujoco_model import model_files
+
+        with contextlib.suppress(LidardesignError):  # whoever reads the model says what is wrong with it
+            return [Path(name) for name, *_ in model_files(path, Path(path.anchor))]
+    return sorted(path.iterdir()) if path.is_dir() else [path]
 
 
 def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = None) -> DesignSpec:

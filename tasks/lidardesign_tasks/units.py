@@ -10,6 +10,8 @@ from lidardesign.space import RANGE, DesignSpace
 
 # An object that large is more likely in another unit, and so is a way of that length, in extents of what goes it.
 DOUBTFUL_EXTENT_M, DOUBTFUL_WAY = 20.0, 50.0
+# Robots are recorded many times per second; of few moments, which people write, one may say nothing.
+DOUBTFUL_STEP_S, FEW_MOMENTS = 1.0, 10
 
 
 def doubtful_meshes(extents_m: Mapping[str, float], scale: float) -> list[str]:
@@ -53,6 +55,22 @@ def doubtful_motion(bounds_m: Mapping[str, np.ndarray], extent_m: float, space: 
     return [
         f"motion: the way of {name} is {way_m[name]:.4g} m long, of objects that are {extent_m:.3g} m long, so sensors "
         "lie far from them; its lengths are metres: is the CSV in millimetres?"
+    ]
+
+
+def doubtful_times(time_s: Mapping[str, np.ndarray]) -> list[str]:
+    """One line on recordings whose moments lie so far apart that their times may be in another unit.
+
+    Arguments:
+        time_s: The moments of each recording, by its name, ascending [s].
+    """
+    steps_s = {name: float(np.median(np.diff(times))) for name, times in time_s.items() if len(times) > FEW_MOMENTS}
+    name = max(steps_s, key=lambda name: steps_s[name], default=None)
+    if name is None or steps_s[name] < DOUBTFUL_STEP_S:
+        return []
+    return [
+        f"{name}: its moments are {steps_s[name]:.4g} s apart; times are seconds: are they milliseconds or less? "
+        "Motion is even in between"
     ]
 
 

@@ -18,15 +18,17 @@ from support.rays import rays_of_points
 from support.robots import written
 from support.tables import each_row
 
-from lidardesign.config import resolve
+from lidardesign.config import resolve, save_run_config
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Returns
 from lidardesign.geometry.surface import sample_body
+from lidardesign.run.manifest import note, start_manifest
 from lidardesign.scene import Sphere
 from lidardesign.selection.information import require_valid
 from lidardesign.space import aim
 from lidardesign.testing import check_task
+from lidardesign.workflow.run_folder import RunFolder, input_hashes
 
 TASK = MujocoTask()
 ROBOT = """<mujoco><worldbody>
@@ -142,7 +144,7 @@ BAD = {
     ),
     "degrees": (lambda t: {**t, "turn": t["turn"] + 45.0}, "are they degrees"),
     "no number": (lambda t: {**t, "turn": ["x"] * len(t["lift"])}, "turn is 'x'"),
-    "NaN": (lambda t: {**t, "turn": [np.nan] * len(t["lift"])}, "NaN"),
+    "NaN": (lambda t: {**t, "turn": [np.nan] * len(t["lift"])}, "turn is 'nan'"),
     "no quaternion": (lambda t: {**t, "parcel.qw": np.zeros(len(t["lift"]))}, "a quaternion of 'parcel' is 0"),
     "one row": (lambda t: {k: v[:1] for k, v in t.items()}, "less than 2 rows"),
 }
@@ -193,6 +195,35 @@ def test_windows_of_one_recording_stay_in_the_half_of_their_split(folder, config
     }
     assert min(map(np.min, heights["train"])) >= max(map(np.max, heights["test"])) - 1e-9
     assert "one recording" in TASK.notes(config, TASK.space(config))[1]
+
+
+@each_row(("step_s", "rows", "is_doubtful"), [(0.001, 60, False), (0.5, 60, False), (10.0, 60, True), (5.0, 8, False)])
+def test_times_in_another_unit_than_seconds_are_told(folder, configured, step_s, rows, is_doubtful):
+    moments = {"time_s": step_s * np.arange(rows)}
+    walk = write_csv(folder / "walk.csv", table(np.linspace(-1, 1, rows), **moments))
+    config = configured(motion=walk, frames=4)
+    told = [note for note in TASK.notes(config, TASK.space(config)) if "are they milliseconds" in note]
+    assert bool(told) == is_doubtful
+    assert all("walk.csv" in note and f"{step_s:.4g} s apart" in note for note in told)
+
+
+def test_a_folder_of_the_model_that_is_none_is_called_so(configured, tmp_path):
+    with pytest.raises(DataError, match="is no folder"):
+        TASK.space(configured(folder=tmp_path / "absent"))
+
+
+def test_a_run_tells_that_what_its_task_reads_has_changed(folder, tmp_path):
+    config = resolve(TASK, overrides=[f"model={folder / 'robot.xml'}", "targets=hand"])
+    run = tmp_path / "run"
+    run.mkdir()
+    start_manifest(run, command=["learn"], seed=0)
+    note(run, inputs=input_hashes(config.task))
+    save_run_config(config, run)
+    assert RunFolder.open(run).input_notes() == []
+    (folder / "robot.xml").write_text(ROBOT.replace(" ", "  ", 1))
+    assert "robot.xml changed since" in RunFolder.open(run).input_notes()[0]
+    (folder / "robot.xml").unlink()
+    assert "robot.xml changed since" in RunFolder.open(run).input_notes()[0]
 
 
 def test_keyframes_are_passed_at_rest(folder):

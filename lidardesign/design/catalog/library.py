@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -138,12 +138,30 @@ def find_part(name_or_path: str | Path, own: Sequence[Path] = ()) -> Part:
     return load_library([*own, file]).part(f"{name}:{mode}" if mode else name)
 
 
-def named_parts(names: Sequence[str] | str) -> list[Part]:
+def named_parts(names: Sequence[str] | str, bounded: Iterable[str] = ()) -> list[Part]:
     """Parts by `NAME`, `NAME:MODE`, or paths of part files and folders; `catalog` is all that are shipped.
 
+    Arguments:
+        names: See above.
+        bounded: Names of parts whose number is bounded.
+
     Raises:
-        ConfigError: A name or path that is no part.
+        ConfigError: A name or path that is no part, or a bound on what is none of the parts.
     """
+    parts = _named(names)
+    known = [part.name for part in parts]
+    for name in bounded:
+        if name not in known:
+            raise ConfigError(
+                f"{name!r} is none of the parts",
+                where="parts.each",
+                allowed=", ".join(known),
+                hint=suggest(name, known),
+            )
+    return parts
+
+
+def _named(names: Sequence[str] | str) -> list[Part]:
     if names == "catalog":
         library = load_library()
         return [library.part(name) for name in library.names]

@@ -32,6 +32,7 @@ from lidardesign_tasks.robot.recordings import Recording, read_recordings
 from lidardesign_tasks.robot.targets import Model, read_model, refuse_sensors_inside
 from lidardesign_tasks.surface import MILLIMETRES
 from lidardesign_tasks.surroundings import Surroundings
+from lidardesign_tasks.units import doubtful_times
 from lidardesign_tasks.view import space_around
 
 # names may be given alone or as a list
@@ -155,7 +156,7 @@ class MujocoTask:
                 f"{recordings[0].name}: one recording of {recordings[0].seconds:.3g} s serves both splits: scenes are "
                 f"windows of {frames} frames, of its first half for training, of its second half held out"
             )
-        return found
+        return found + doubtful_times({one.name: one.time_s for one in recordings})
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """By the metric of the configuration; see `measures`."""
