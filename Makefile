@@ -8,6 +8,7 @@
 # make soak   all long runs, a night on two cores: random whole runs, many seeds, kills, then fuzz and mutation; each
 #             also alone, as make soak-runs, soak-seeds and soak-kills; dated results go to docs/soak
 # make soak-promise  makes 2,000 random plans of effects and looks whether they keep what they promise, ten minutes
+#             what is interrupted (also fuzz, mutation and coverage) goes on when it is started again at the same commit
 # make clean  takes all of it away again
 PYTHON ?= python3
 VENV := .venv
@@ -64,8 +65,7 @@ test-arithmetic: $(BIN)/.ready
 KERNELS := NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage
 coverage: $(BIN)/.ready
 	$(BIN)/python -m coverage erase
-	$(BIN)/python -m coverage run -m pytest
-	$(BIN)/python -m coverage combine
+	$(BIN)/python tools/coverage_pieces.py
 	@mkdir -p build
 	$(KERNELS) run --rcfile=/dev/null --branch --source=lidardesign --data-file=build/kernels.coverage \
 		-m pytest -W ignore::RuntimeWarning tests/density/test_splines.py

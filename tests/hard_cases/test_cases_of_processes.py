@@ -277,9 +277,10 @@ class TestKillsFullDisksAndTwoWriters:
             assert said in result.err
 
     @pytest.mark.slow
-    def test_kills_at_steps_spread_over_learn_fit_and_evaluate_are_all_recovered(self):
+    def test_kills_at_steps_spread_over_learn_fit_and_evaluate_are_all_recovered(self, tmp_path):
         tests = str(Path(__file__).parents[1])
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([tests, os.environ.get("PYTHONPATH", "")])}
+        environment["LONG_RUNS"] = str(tmp_path)  # what was done before does not count
         command = [sys.executable, "-m", "faults.kills", "--kills", "0", "--terms", "0", "--steps", "1", "--pairs", "1"]
         ended = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
         assert ended.returncode == 0, ended.stdout + ended.stderr

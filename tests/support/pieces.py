@@ -1,7 +1,7 @@
 """Long runs that go on where they were interrupted: a line per finished piece in `build/long`, all of one commit.
 
 Whatever interrupts a run, a line is there or it is not; one that is cut does not count. Of another commit, or of a
-program that was changed meanwhile, nothing counts.
+program that was changed meanwhile, nothing counts. LONG_RUNS in the environment names another folder.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-FOLDER = ROOT / "build" / "long"
+FOLDER = Path(os.environ.get("LONG_RUNS", ROOT / "build" / "long"))
 PROGRAM = ("lidardesign", "tasks", "tests", "tools")
 
 
