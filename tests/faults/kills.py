@@ -32,7 +32,7 @@ from faults.processes import Ended, Fork, forked, fresh, import_all
 from faults.runs import COMMANDS, FINISHED, LEARN, STAGED, Straight, contents, strays, unreadable
 
 # Kills of a command per 10: learning is the longest, and writes the most.
-SHARES = {"learn": 6, "fit": 2, "evaluate": 2}
+SHARES = {"learn": 5, "fit": 2, "evaluate": 3}
 # Commands that are given at once, in a folder as it was before one of them.
 RESUME = [*LEARN, "--resume"]
 PAIRS = {

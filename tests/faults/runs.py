@@ -25,11 +25,15 @@ LEARN += [word for setting in SETTINGS for word in ("--set", setting)]
 # In stages of 5, 10, 20, 40, 80 and 160 steps, and that is not enough: exit 1, with a run that is whole.
 STAGED = [word.replace("steps=160", "steps=40") for word in LEARN] + ["--tolerance", "0.01"]
 FINISHED = (0, 1)
+# Of evaluate, what shows how long things took.
+TIMES = ("manifest.json", "page.html", "plots/times.png", "plots/times.svg")
 COMMANDS = {
     "learn": LEARN,
     "fit": ["fit", "run", "--layout", "grid", "--sensors", "2", "--quiet"],
-    "evaluate": ["evaluate", "run", "--rays", "8", "--csv", "run/rows.csv", "--report", "run/page.html", "--quiet"],
-}
+    # half of its time it writes
+    "evaluate": ["evaluate", "run", "--rays", "8", "--csv", "run/rows.csv", "--report", "run/page.html",
+                 "--plots", "run/plots", "--quiet"],
+}  # fmt: skip
 STATE = "checkpoint.safetensors"
 SAMPLES = "samples.npz"
 
@@ -59,7 +63,7 @@ def contents(run: Path) -> dict[str, object]:
     found: dict[str, object] = {}
     for path in sorted(run.rglob("*")):
         name = path.relative_to(run).as_posix()
-        if path.is_dir() or name in ("manifest.json", "page.html"):
+        if path.is_dir() or name in TIMES:
             continue
         found[name] = _plain(path, name)
     return found
