@@ -251,3 +251,14 @@ def test_a_link_is_written_through(call, work, tmp_path):
     assert call(*EXPORT, "--out", "near.csv").code == 0
     assert (work / "near.csv").is_symlink()
     assert (tmp_path / "far.csv").read_text() != "old"
+
+
+@pytest.mark.parametrize("command", [("init", "flatland"), ("schema", "config")])
+@pytest.mark.parametrize(
+    ("path", "code", "words"), [*((path, 3, words) for path, words in UNWRITABLE), ("file", 2, "is there already")]
+)
+def test_a_configuration_goes_to_a_new_file_that_can_be_written(call, work, command, path, code, words):
+    result = call("config", *command, "--out", path)
+    assert result.code == code
+    assert words in result.err.lower()
+    assert call("config", *command, "--out", "/dev/null").code == 0

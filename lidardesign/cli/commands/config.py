@@ -13,6 +13,7 @@ from lidardesign.cli.output import Output, command
 from lidardesign.cli.output_files import is_output, note_new_folders, put_on_stdout
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
+from lidardesign.run.outputs import check_writable
 
 Out = Annotated[
     Path | None,
@@ -78,7 +79,10 @@ def schema(
 
 
 def _check_new(out: Path | None) -> None:
-    if out is not None and not is_output(out) and out.exists():
+    if out is None or is_output(out):
+        return
+    check_writable(out)
+    if out.is_file():
         raise ConfigError("is there already", where=f"--out {out}", hint="give another --out, or remove it")
 
 
