@@ -265,11 +265,18 @@ def learn(
         preset=preset, out=out, seed=seed, settings=settings, config=config, device=device, resume=resume, **further
     )
     request = LearnRequest.resolve(task, options, notes)
+    said: list[str] = []
+
+    def remark(note: str) -> None:
+        if note not in said:
+            said.append(note)
+            notes(note)
+
     for note in request.task_notes():
-        notes(note)
-    result = request.run(progress)
+        remark(note)
+    result = request.run(progress, remark)
     for note in (*result.notes, f"the density is {result.verdict.text(request.settings.preset)}"):
-        notes(note)
+        remark(note)
     check_met(result, request.goal)
     return open_run(request.folder)
 
