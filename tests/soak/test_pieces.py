@@ -14,7 +14,7 @@ class InterruptedError(Exception):
 
 def run(folder, origin, until=10, **options):
     """A run of ten pieces that is interrupted before one: which were worked for, and all results."""
-    pieces, worked = Pieces("run", folder, origin, **options), []
+    pieces, worked = Pieces("run", folder, lambda: origin, **options), []
 
     def work(number):
         if number == until:
@@ -64,14 +64,23 @@ def test_a_spoilt_file_is_begun_anew(tmp_path, content):
 
 
 def test_pieces_are_kept_from_many_threads_and_their_times_add_up(tmp_path):
-    pieces = Pieces("run", tmp_path, "one")
+    pieces = Pieces("run", tmp_path, lambda: "one")
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda number: pieces.keep(str(number), number), range(200)))
-    again = Pieces("run", tmp_path, "one")
+    again = Pieces("run", tmp_path, lambda: "one")
     assert again.done == {str(number): number for number in range(200)}
     assert again.seconds >= again.earlier_s > 0
     again.only({"3", "5"})
-    assert Pieces("run", tmp_path, "one").done == {"3": 3, "5": 5}
+    assert Pieces("run", tmp_path, lambda: "one").done == {"3": 3, "5": 5}
+
+
+def test_a_run_ends_where_the_program_is_changed_meanwhile(tmp_path):
+    origins = iter(["one", "one", "two"])
+    pieces = Pieces("run", tmp_path, lambda: next(origins))
+    pieces.keep("first", 1)
+    with pytest.raises(SystemExit, match="changed meanwhile"):
+        pieces.keep("second", 2)
+    assert Pieces("run", tmp_path, lambda: "one").done == {"first": 1}
 
 
 def test_a_program_is_named_by_its_commit_and_what_was_changed():

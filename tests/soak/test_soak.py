@@ -209,15 +209,15 @@ def test_a_run_that_takes_its_process_down_or_hangs_is_a_fault_and_the_others_go
     monkeypatch.setattr(batches, "LONGEST_RUN_S", 0.5 if words == "hung" else 600.0)
     monkeypatch.setattr(batches, "_started", started)
     asked = {"first": 7, "jobs": 1, "repeat_every": 0, "tell": lambda _: None}
-    records = batches.soak(2, tmp_path, Pieces("runs", tmp_path, "one"), **asked)
+    records = batches.soak(2, tmp_path, Pieces("runs", tmp_path, lambda: "one"), **asked)
     assert [(record["seed"], record["outcome"]) for record in records] == [(7, WHOLE), (8, "fault"), (9, WHOLE)]
     assert words in records[1]["faults"][0]
     monkeypatch.setattr(batches, "_started", None)  # nothing is left to be started
-    assert batches.soak(2, tmp_path, Pieces("runs", tmp_path, "one"), **asked) == records
+    assert batches.soak(2, tmp_path, Pieces("runs", tmp_path, lambda: "one"), **asked) == records
 
 
 def test_what_an_ended_soak_did_is_read_and_its_page_names_the_runs_that_are_missing(tmp_path):
-    pieces = Pieces("runs", tmp_path, "one")
+    pieces = Pieces("runs", tmp_path, lambda: "one")
     for seed in (30, 20, 21, 22, 24):
         record = record_of(seed, ess=0.5)
         pieces.keep(str(seed), {**dataclasses.asdict(record), "outcome": record.outcome})

@@ -29,7 +29,7 @@ class Pieces:
     Arguments:
         name: The run's, and its file's.
         folder: Where that file is.
-        origin: Of which program the pieces are; the commit, and what was changed since.
+        origin: Says of which program the pieces are; the commit, and what was changed since.
         still: Which results of another program count all the same.
     """
 
@@ -37,12 +37,13 @@ class Pieces:
         self,
         name: str,
         folder: Path | None = None,
-        origin: str | None = None,
+        origin: Callable[[], str] | None = None,
         still: Callable[[Any], bool] = lambda _: False,
     ) -> None:
         self.path = (FOLDER if folder is None else folder) / f"{name}.jsonl"
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._origin = program() if origin is None else origin
+        self._program = program if origin is None else origin
+        self._origin = self._program()
         self._lock, self._began, self.earlier_s = threading.Lock(), time.monotonic(), 0.0
         begun, *lines = _lines(self.path) or [{}]
         lines = [line for line in lines if line.keys() == {"key", "value", "seconds"}]
@@ -76,7 +77,13 @@ class Pieces:
         return self.earlier_s + time.monotonic() - self._began
 
     def keep(self, key: str, value: Any) -> None:
-        """Write down what became of a piece; from any thread."""
+        """Write down what became of a piece; from any thread.
+
+        Raises:
+            SystemExit: The program is not what it was at the beginning: nobody knows of which the piece is.
+        """
+        if self._program() != self._origin:
+            raise SystemExit(f"{self.path.stem}: ends, as the program was changed meanwhile; run it in a clone")
         text = json.dumps({"key": key, "value": value, "seconds": round(self.seconds, 3)})
         with self._lock, self.path.open("a") as file:
             self._lines.append(json.loads(text))
