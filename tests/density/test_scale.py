@@ -78,7 +78,7 @@ OFF = {
     "a range in millimetres": ((BALL,), {"space": ranged(1e3, 3e3)}, "is 1e+03 to 3e+03 m", "set space.range_m"),
     "a plate seen edge-on": ((PLATE,), {"sigma_m": 0.003}, "edge-on", "move the design space"),
     "a wire": ((WIRE,), {"sigma_m": 0.05}, "thinner than sigma, 0.05 m", "with density.sigma_m=0.00"),
-    "a range of ten thousand sigmas": ((BALL,), {"sigma_m": 1.4e-4}, "1/10,000 of", "m to 0.0028 m"),
+    "a range of ten thousand sigmas": ((BALL,), {"sigma_m": 1.4e-4}, "1/10,000 of", "m to 0.0014 m"),
 }  # fmt: skip
 FITTING = {
     "a ball": ((BALL,), {}),

@@ -45,8 +45,8 @@ MOST_INSIDE = 0.5
 LEAST_COSINE = 0.1
 # Below this share of what the density prefers rays pass the targets; a sigma is named that lets the other one return.
 LEAST_RETURNING, ENOUGH_RETURNING = 0.02, 0.2
-# Above so many sigmas of range, flows of any preset miss most of the density.
-MOST_SIGMAS = 500.0
+# Above so many sigmas of range, what a flow learns in the usual time is too rough.
+MOST_SIGMAS = 1000.0
 # Sigma that does not blur away what there is to see is at most this share of it.
 GOOD_SHARE = 0.25
 LOOK_THERE = "let its origins and angles look where the targets are"
@@ -232,7 +232,7 @@ def _sigma_notes(sample: _Sample, points: np.ndarray, met: _Met, config: RunConf
         raised = f"raise density.sigma_m to {least_m:.2g} m, or " if least_m <= GOOD_SHARE * spread_m else ""
         return [
             f"sigma {sigma_m:g} m is 1/{(high_m - low_m) / sigma_m:,.0f} of the design space's range, {low_m:.3g} to "
-            f"{high_m:.3g} m{_unit_doubt(least_m, sigma_m)}: so thin a density is hardly learned; {raised}narrow "
+            f"{high_m:.3g} m{_unit_doubt(least_m, sigma_m)}: so thin a density is learned badly; {raised}narrow "
             f"space.range_m: what is seen of the targets is {ranges.min():.3g} to {ranges.max():.3g} m away"
         ]
     return _thin_notes(sample, config, least_m) if sample.aims and least_m > 0 else []
