@@ -283,6 +283,11 @@ class Counts:
         share = safe_divide(middle, self.share_in_bins(self.pulse_bins, sigma_m), 1.0)
         return self.more_missed(Echo(signal * share, sigma_m), Echo(signal, sigma_m))
 
+    def sunk(self) -> np.ndarray:
+        """How much more often echoes are missed because slanted beams spread them, shape (N,)."""
+        timed_m = np.full(len(self.first_hits), metres(self.first_hits.detector.timing_sigma_s))
+        return self.more_missed(Echo(self.in_air, timed_m), Echo(self.in_air, self.first_hits.sigma_m()))
+
     def by_chance(self, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:
         """Probability that a return is of background: taken for the echo, or where there is none, shape (N,)."""
         any_count = -np.expm1(-self.per_bin * self.bins)

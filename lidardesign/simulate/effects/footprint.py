@@ -6,11 +6,11 @@ mixed return, of distant ones it reports one.
 What it could change (`bound`), as slanted surfaces spread an echo and beams on a depth edge meet two surfaces: a beam
 of half angle h is R h wide at the range R; on a plane met at the angle theta its rim lies up to R cos(theta) /
 cos(theta + h) away, so a return is off by at most what that exceeds R by, and may leave or enter a gate that ends
-within it, or spill into it. A receiver elsewhere is further from the rim, too. An edge within R h of the ray's end
-mixes both surfaces: the return may be of either and counts as lost, or between them, as far apart as the detector does
-not tell them apart; see `edge_probability` (an estimate). What lies between rays is met by a beam but by none of them:
-one place on the rim of each beam is looked at too. Photons from all over the spread are as good as noise for the time
-of one: the spread is counted in full, not its rms of a half.
+within it, or spill into it, or sink below what is reported. A receiver elsewhere is further from the rim, too. An edge
+within R h of the ray's end mixes both surfaces: the return may be of either and counts as lost, or between them, as far
+apart as the detector does not tell them apart; see `edge_probability` (an estimate). What lies between rays is met by a
+beam but by none of them: one place on the rim of each beam is looked at too. Photons from all over the spread are as
+good as noise for the time of one: the spread is counted in full, not its rms of a half.
 """
 
 from __future__ import annotations
@@ -105,6 +105,8 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     squared = np.minimum(spread_m, first_hits.width_m) ** 2 + edge * first_hits.resolution_m**2
     lost = np.maximum(edge, (first_hits.gate_edge_m <= spread_m) | stray_rims(first_hits))
     lost = np.maximum(lost, counts.spilled(spread_m))
+    if first_hits.detector.photons is not None:
+        lost = np.maximum(lost, counts.sunk() * first_hits.returned)
     wide_m = float(np.median(2 * radius_m[first_hits.returned])) if first_hits.returned.any() else 0.0
     return EffectBound(
         squared, lost, f"beams of {1000 * wide_rad:.3g} mrad are {1000 * wide_m:.3g} mm wide where they return"
