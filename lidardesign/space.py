@@ -99,6 +99,8 @@ class DesignSpace:
             raise ConfigError(
                 f"unknown dimension {unknown[0]!r}", where="space.condition", allowed=", ".join(DIMENSIONS)
             )
+        if len(set(self.condition)) < len(self.condition):
+            raise ConfigError("a dimension is given twice", where="space.condition", allowed="each once")
         if self.measure not in MEASURES:
             raise ConfigError(f"unknown measure {self.measure!r}", where="space.measure", allowed=", ".join(MEASURES))
 

@@ -149,6 +149,7 @@ BAD_FILES = {
     "bounds of three": ("space:\n  x_m: [0, 1, 2]\n", "2:8", "at most 2 items"),
     "too steep": ("space:\n  elevation_rad: [-2, 0]\n", "2:18", "leaves the sphere"),
     "unknown dimension": ("space:\n  condition: [w_m]\n", "2:15", "x_m"),
+    "a dimension twice": ("space:\n  condition: [x_m, x_m]\n", "2:14", "given twice"),
     "section without keys": ("density: 3\n", "1:1", "keys and values"),
     "other task": ("task_name: face\n", "1:12", "toy"),
     "newer schema": ("schema_version: 2\n", "1:17", "schema version 2"),

@@ -91,3 +91,26 @@ def test_numbers_are_decimal_digits_as_in_files(lidardesign, command, option):
         result = lidardesign(*command.split(), *FIRST[command], f"{option}={value}", "--json")
         check_one_clear_message(result, 2, option.partition("=")[0])
     assert not Path("runs").exists()
+
+
+HEADER = "sensor,origin_x_m,origin_y_m,origin_z_m,azimuth_rad,elevation_rad,gate_start_m,gate_end_m"
+RAY = {"sensor": "0", "azimuth_rad": "3.14", "gate_start_m": "0.2", "gate_end_m": "0.4"}
+RAYS = [
+    ({"sensor": "-1"}, "sensor is '-1'"),
+    ({"sensor": "1e18"}, "sensor is '1e18'"),
+    ({"sensor": "0.5"}, "a whole number from 0 to 999999, or a name"),
+    ({"gate_end_m": "0.2"}, "an end beyond the start"),
+    ({"gate_start_m": "0", "gate_end_m": "0"}, "an end beyond the start"),
+    ({"gate_end_m": "1e18"}, "1e+18 m"),
+    ({"azimuth_rad": "3.1_4"}, "a finite number"),
+    ({"azimuth_rad": "３.14"}, "a finite number"),
+    ({"azimuth_rad": ""}, "a finite number"),
+    ({"gate_end_m": "inf"}, "a finite number"),
+]
+
+
+@each_row(("changed", "words"), RAYS)
+def test_a_ray_whose_numbers_mean_nothing_is_refused(lidardesign, changed, words):
+    row = [{**RAY, **changed}.get(name, "0") for name in HEADER.split(",")]
+    Path("rays.csv").write_text(f"{HEADER}\n{','.join(row)}\n", encoding="utf-8")
+    check_one_clear_message(lidardesign("show", "rays.csv", "--json"), 3, words)

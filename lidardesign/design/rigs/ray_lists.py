@@ -180,7 +180,11 @@ def read_ray_csv(path: Path) -> Rig:
     if "" in labels:
         raise DataError("sensor is empty", where=locate(labels.index(""), SENSOR), allowed="a number or a name")
     indices = np.array([number_of(label) for label in labels], dtype=np.float64)
-    if np.isfinite(indices).all() and (indices >= 0).all() and (indices % 1 == 0).all():
+    is_number, is_index = np.isfinite(indices), (indices >= 0) & (indices < MOST_RAYS) & (indices % 1 == 0)
+    for row in np.flatnonzero(is_number & ~is_index).tolist():
+        allowed = f"a whole number from 0 to {MOST_RAYS - 1}, or a name"
+        raise DataError(f"{SENSOR} is {labels[row][:LONGEST_CELL]!r}", where=locate(row, SENSOR), allowed=allowed)
+    if is_number.all():
         found, sensor = np.unique(indices, return_inverse=True)
         sensor_names = tuple(f"sensor_{int(index) + 1}" for index in found)
     else:
@@ -225,8 +229,8 @@ def read_ray_npz(path: Path) -> Rig:
             row = int(np.argmin(np.isfinite(numbers[name])))
             raise DataError(f"{name} is {numbers[name][row]}", where=locate(row, name), allowed="a finite number")
     indices = numbers.pop(SENSOR, np.zeros(shape))
-    if (indices < 0).any() or (indices % 1 != 0).any():
-        raise DataError(f"{SENSOR} is no whole number of 0 or more", where=str(path))
+    if (indices < 0).any() or (indices >= MOST_RAYS).any() or (indices % 1 != 0).any():
+        raise DataError(f"{SENSOR} is no whole number from 0 to {MOST_RAYS - 1}", where=str(path))
     used, sensor = np.unique(indices, return_inverse=True)
     if names is None:
         sensor_names = tuple(f"sensor_{int(index) + 1}" for index in used)

@@ -163,10 +163,11 @@ def _check_numbers(one: RigSensor, path: Path) -> None:
                 where=str(path),
                 allowed=f"{low:g} to {FARTHEST_M:g} m",
             )
-    reversed_gates = one.gate_m[:, 1] < one.gate_m[:, 0]
-    if reversed_gates.any():
-        start, end = one.gate_m[reversed_gates][0]
-        raise DataError(f"a gate of {one.name!r} starts at {start:g} m and ends at {end:g} m", where=str(path))
+    without_width = one.gate_m[:, 1] <= one.gate_m[:, 0]
+    if without_width.any():
+        start, end = one.gate_m[without_width][0]
+        found = f"a gate of {one.name!r} starts at {start:g} m and ends at {end:g} m"
+        raise DataError(found, where=str(path), allowed="an end beyond the start")
 
 
 def number_of(text: str) -> float | None:
