@@ -77,6 +77,13 @@ def test_a_faulty_file_is_refused_for_what_is_wrong_with_it(call, tmp_path, faul
     assert result.code == 3
 
 
+def test_what_mujoco_warns_of_is_written_to_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.xml").write_text(MJCF.replace('name="s"', 'name="s" size="nan nan"').replace("PLACE", "0 0 0"))
+    assert len(load_design(tmp_path / "rig.xml").sensors) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["rig.xml"]
+
+
 def test_good_files_are_read_as_before_whatever_they_are_called(tmp_path):
     (tmp_path / "rig.csv").write_text(GOOD)
     rig = load_design(tmp_path / "rig.csv")

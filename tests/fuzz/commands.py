@@ -11,7 +11,7 @@ from pathlib import Path
 
 from support.command_line import files_under, make_run
 
-from fuzz import corpus
+from fuzz import corpus, fuzz_rigs
 from fuzz.attempts import Read, Target
 from fuzz.containers import mutate_glb, mutate_hdf5, mutate_npz, mutate_safetensors
 from fuzz.fuzz_runs import SMALL, checkpoints, rerecord, small_config
@@ -158,6 +158,12 @@ COMMANDS = tuple(
          changed_run("samples.npz", "fit run --layout grid --json --name made")),
         ("learn --resume", 20, checkpoints, mutate_safetensors,
          changed_run("checkpoint.safetensors", "learn flatland --resume --out run --json")),
+        ("show RIG", 20, fuzz_rigs.rigs("sdf"), TEXTS, command("show INPUT --json", ".sdf")),
+        ("fit --like RIG", 20, fuzz_rigs.rigs("mjcf"), TEXTS,
+         command("fit run --like INPUT --layout grid --name made --json", ".xml")),
+        ("catalog show PART", 20, fuzz_rigs.part_files, mutate_yaml, command("catalog show INPUT --json")),
+        ("learn mujoco", 20, fuzz_rigs.models, TEXTS,
+         learning("mujoco --set model=INPUT --set targets=[hand] --set train=2 --set test=2 --json", ".xml")),
         ("learn face", 10, corpus.face_models, mutate_hdf5,
          learning("face --set model=INPUT --set train=2 --set test=2 --json", ".h5")),
     )

@@ -204,15 +204,17 @@ def read_mjcf(path: Path) -> Rig:
 
 
 def _rays(stripped: ElementTree.Element, path: Path) -> list[_Ray]:
-    import mujoco
+    from lidardesign.mujoco_model import import_mujoco, mujoco_warnings
 
+    mujoco = import_mujoco()
     try:
-        model = mujoco.MjModel.from_xml_string(ElementTree.tostring(stripped, encoding="unicode"))
+        with mujoco_warnings():
+            model = mujoco.MjModel.from_xml_string(ElementTree.tostring(stripped, encoding="unicode"))
+            data = mujoco.MjData(model)
+            mujoco.mj_kinematics(model, data)
     except ValueError as error:
         reason = " ".join(str(error).split()) or "no reason given"
         raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from None
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     rays = []
     for index in np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_RANGEFINDER)):
         site = int(model.sensor_objid[index])
