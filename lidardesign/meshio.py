@@ -213,7 +213,7 @@ def list_mesh_files(folder: str | Path) -> list[Path]:
     if not folder.is_dir():
         raise DataError("is not a folder", where=str(folder), hint="name a folder that holds mesh files")
     entries = sorted(folder.iterdir())
-    files = [p for p in entries if p.suffix.lower() in SUFFIXES and p.is_file() and not p.name.startswith(".")]
+    files = [p for p in entries if p.suffix.lower() in SUFFIXES and not (p.is_dir() or p.name.startswith("."))]
     if not files:
         raise DataError("holds no mesh file", where=str(folder), allowed=", ".join(SUFFIXES))
     return files

@@ -17,10 +17,11 @@ import numpy as np
 from lidardesign.errors import DataError
 from lidardesign.run.inputs import MESH, check_bytes, parse_json
 
-# Of all parts of a file together, as often as they are placed.
+# Of all parts of a file together, as often as they are placed; checking so many takes 5 GB.
 MOST_TRIANGLES = 10_000_000
 # Vertices and faces of a text take some hundred bytes each while they are read.
 MOST_ROWS = 5_000_000
+LONGEST_LINE = LONGEST_HEADER = 100_000
 BINARY_HINT = "export it as binary PLY or GLB"
 AGAIN_HINT = "open it in a mesh viewer and export it again"
 
@@ -206,7 +207,14 @@ def _plain(data: bytes, where: str) -> bytes:
     data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if data.count(b"\n") > MOST_ROWS:
         raise DataError("has too many lines", where=where, allowed=f"{MOST_ROWS}", hint=BINARY_HINT)
-    return data
+    ends = np.flatnonzero(np.frombuffer(data + b"\n", dtype=np.uint8) == ord("\n"))
+    longest = int(np.argmax(np.diff(ends, prepend=-1)))
+    length = int(np.diff(ends, prepend=-1)[longest])
+    if length > LONGEST_LINE:
+        raise DataError(f"has a line of {length} letters", where=f"{where}:{longest + 1}", allowed=f"{LONGEST_LINE}")
+    data = data.replace(b"\t", b" ")
+    # patterns would look at every blank several times
+    return re.sub(rb" {2,}", b" ", data) if 8 * data.count(b" " * 4) > len(data) else data
 
 
 def _column_counts(rows: Rows, least: int, where: str, most: int | None = None) -> np.ndarray:
@@ -302,6 +310,9 @@ def check_ply(data: bytes, where: str) -> None:
     header, found, body = data.partition(b"end_header")
     if not data.startswith(b"ply") or not found:
         raise DataError("has no header from `ply` to `end_header`", where=where, hint=AGAIN_HINT)
+    if len(header) > LONGEST_HEADER or (body.count(b"\n") > MOST_ROWS and b"ascii" in header):
+        allowed = f"{LONGEST_HEADER} letters of header, and {MOST_ROWS} lines of text"
+        raise DataError("has too long a header or too many lines", where=where, allowed=allowed, hint=BINARY_HINT)
     is_text, name, least, total = b"ascii" in header.partition(b"element")[0], "", 0, 0
     for line, words in enumerate((text.split() for text in header.decode(errors="replace").splitlines()), 1):
         if words[:1] == ["element"]:
@@ -315,10 +326,6 @@ def check_ply(data: bytes, where: str) -> None:
     if (total > rows) if is_text else (least > len(body)):
         has = f"{rows} lines" if is_text else f"{len(body)} bytes"
         raise DataError(f"promises {total} elements, and has {has} of them", where=where, hint="it may be cut short")
-    if is_text and body.count(b"\n") > MOST_ROWS:
-        raise DataError(
-            "has too many lines", where=where, allowed=f"{MOST_ROWS}", hint="export it as binary PLY or GLB"
-        )
 
 
 # Lists of a glTF file by the keys that hold indices into them.

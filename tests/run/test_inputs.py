@@ -23,7 +23,7 @@ from lidardesign.design.rigs.ray_lists import read_ray_csv, read_sensor_csv
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.captures.capture import load_capture
 from lidardesign.export.galvo import read_galvo
-from lidardesign.meshio import SUFFIXES, load_mesh
+from lidardesign.meshio import SUFFIXES, list_mesh_files, load_mesh
 from lidardesign.mujoco_model import model_files
 from lidardesign.run import inputs
 from lidardesign.run.arrays import read_npz
@@ -166,3 +166,13 @@ def test_a_pipe_that_nobody_reads_is_not_written_to(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with an_alarm(), pytest.raises(DataError, match="cannot be written"):
         write_atomic(tmp_path / "pipe", b"x")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_or_a_broken_link_among_meshes_is_not_left_out_in_silence(tmp_path):
+    os.mkfifo(tmp_path / "a.obj")
+    (tmp_path / "b.obj").symlink_to(tmp_path / "nowhere.obj")
+    for path in list_mesh_files(tmp_path):
+        with an_alarm(), pytest.raises(DataError, match="no regular file|No such file"):
+            load_mesh(path)
+    assert len(list_mesh_files(tmp_path)) == 2
