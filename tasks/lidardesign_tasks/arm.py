@@ -24,13 +24,13 @@ from lidardesign.task import Defaults, Information, Interval, Metric, Score, Spl
 from lidardesign_tasks.robot.arm_motion import Arm, Motion
 from lidardesign_tasks.robot.arm_robot import BALL_RADIUS_M, Robot, load_robot
 from lidardesign_tasks.robot.tracking import FEWEST_FRAMES, MEAN_DEPTH, filled_path, path_information, tracked_places
-from lidardesign_tasks.surroundings import Surroundings
+from lidardesign_tasks.surroundings import MovingSurroundings
 
 CEILING_M = 1.0
 SMALL = {"train": 4, "test": 4, "frames": 12}
 
 
-class ArmConfig(Surroundings):
+class ArmConfig(MovingSurroundings):
     """The arm, how many trajectories of how many frames, how much they differ, its surroundings, and the sensors'."""
 
     size: Literal["full", "small"] = Field(

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lidardesign.scene import Ambient, Body, Medium, Scene
 from lidardesign.space import FARTHEST_M
@@ -23,6 +23,8 @@ VISIBLE_CONTRAST = 0.02
 DROPLET_LIDAR_RATIO_SR = 18.8
 # What bodies reflect that no task gave a reflectance: then nothing needs to be said about them.
 MATT_GREY = 0.5
+# Poses of so many frames are made in a minute or two, and fill some hundred megabytes.
+MOST_FRAMES = 200_000
 
 
 class Surroundings(TaskConfig):
@@ -50,6 +52,18 @@ class Surroundings(TaskConfig):
     def _surfaced(self, body: Body) -> Body:
         """A body with these surfaces: what is mirrored is missing from what is matt."""
         return replace(body, reflectance=(1 - self.gloss) * self.reflectance, specular=self.gloss)
+
+
+class MovingSurroundings(Surroundings):
+    """The same of scenes that have `frames`; those of a split are held in memory together."""
+
+    @model_validator(mode="after")
+    def _frames_fit(self) -> MovingSurroundings:
+        for split in ("train", "test"):
+            scenes, frames = getattr(self, split), getattr(self, "frames", 1)
+            if scenes * frames > MOST_FRAMES:
+                raise ValueError(f"{split}: {scenes} scenes of {frames} frames, allowed: {MOST_FRAMES} frames in all")
+        return self
 
 
 def fog(visibility_m: float) -> Medium:

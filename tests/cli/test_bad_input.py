@@ -179,6 +179,8 @@ CASES = [
     ("learn mujoco --set model=robot.xml --set targets=[*hand]", 2, 'in quotes, as "*hand"'),
     ("learn mujoco --config alias.yaml", 2, 'in quotes, as "*hand"'),
     ("learn mujoco --config sign.yaml", 2, 'in quotes, as "*hand"'),
+    ("learn arm --set frames=1000 --set train=10000", 2, "allowed: 200000 frames in all"),
+    ("learn mujoco --set frames=1000 --set test=10000", 2, "test: 10000 scenes of 1000 frames"),
     ("fit run --layout spiral", 2, "grid, density, scan"),
     ("fit run --gates one", 2, "sensor, ray"),
     ("fit run --name ../elsewhere", 2, "no name for a design"),

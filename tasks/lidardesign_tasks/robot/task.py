@@ -31,7 +31,7 @@ from lidardesign_tasks.robot.motion import (
 from lidardesign_tasks.robot.recordings import Recording, read_recordings
 from lidardesign_tasks.robot.targets import Model, read_model, refuse_sensors_inside
 from lidardesign_tasks.surface import MILLIMETRES
-from lidardesign_tasks.surroundings import Surroundings
+from lidardesign_tasks.surroundings import MovingSurroundings
 from lidardesign_tasks.units import doubtful_times
 from lidardesign_tasks.view import space_around
 
@@ -47,7 +47,7 @@ SPACE_MOTIONS, SPACE_MOMENTS = 12, 200
 TOUCHING_M = 1e-3  # what moves less, rests
 
 
-class MujocoConfig(Surroundings):
+class MujocoConfig(MovingSurroundings):
     """The model and its motion, what is to be found of it, where sensors are, and the surroundings."""
 
     model: Path | None = Field(None, description="MJCF or URDF file of the robot and what stands around it")
