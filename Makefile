@@ -2,6 +2,7 @@
 # make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 400 MB there
 # make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
+# make test-pythons  installs and tests the core with every other Python that is found, four minutes each
 # make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak
 # make coverage  measures the lines and branches that the tests take, an hour
 # make mutation  changes the core's code in a thousand small ways and counts what its tests notice; to docs/soak
@@ -18,7 +19,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: demo test consumers system-programs test-arithmetic coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills soak-promise clean
+.PHONY: demo test consumers system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills soak-promise clean
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): once, a minute or more"
@@ -60,6 +61,10 @@ test-arithmetic: $(BIN)/.ready
 	ATEN_CPU_CAPABILITY=default MKL_CBWR=COMPATIBLE \
 		NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=$(CURDIR)/build/numba-generic \
 		$(BIN)/python -m pytest tests/docs/test_docs_run.py
+
+# What every other Python that is found makes of the installation and of the core
+test-pythons: $(BIN)/.ready
+	tools/test-pythons.sh $(BIN)/python
 
 # The suite with every line and branch that it takes; what numba compiles, apart, in a run without the compiler
 KERNELS := NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage

@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextvars import ContextVar
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +118,7 @@ def keep_timings(run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_
     from lidardesign.run.manifest import read_manifest, write_manifest
 
     entry: dict[str, Any] = {
-        "when": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "when": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": round(clock.seconds, 3),
         "peak_memory_bytes": peak_memory_bytes(),
         "phases": clock.timings(),

@@ -15,7 +15,7 @@ from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.scene import Ambient, Scene
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    from typing import Self
 
 # First hits of rays (N, 3), (N, 3) that are sent at times (N,) [s] within the frame.
 Tracer = Callable[[np.ndarray, np.ndarray, np.ndarray], Hits]

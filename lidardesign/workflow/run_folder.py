@@ -29,8 +29,9 @@ from lidardesign.space import RANGE
 from lidardesign.task import Metric, Split, Task, metric_of, scenes_of
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from pydantic import BaseModel
-    from typing_extensions import Self
 
 DESIGN_FOLDER = "designs"
 CONFIGURATION, MANIFEST, SAMPLES = "config.yaml", "manifest.json", "samples.npz"

@@ -22,7 +22,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 
 from support.pieces import FOLDER, Pieces
@@ -275,7 +275,7 @@ def main() -> int:
     parts = report(found, arguments, pieces.seconds)
     print("\n\n".join(parts))
     if arguments.out:
-        write_page(arguments.out / f"fuzz-{datetime.now(timezone.utc):%Y-%m-%d}.md", parts)
+        write_page(arguments.out / f"fuzz-{datetime.now(UTC):%Y-%m-%d}.md", parts)
     return int(any(one.faults for one in found.values()))
 
 

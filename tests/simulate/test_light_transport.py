@@ -334,7 +334,7 @@ def test_the_simulator_runs_from_any_folder_and_is_imported_in_its_own_process_a
         "assert not {'mitsuba', 'drjit', 'mitransient'} & set(sys.modules)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-P" if sys.version_info >= (3, 11) else "-s", "-c", code],
+        [sys.executable, "-P", "-c", code],
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

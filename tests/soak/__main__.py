@@ -25,7 +25,7 @@ from soak.whole_runs import plan_lines, whole_run
 
 TERMINATED = 143
 PAGES = ROOT / "docs" / "soak"
-TODAY = datetime.datetime.now(datetime.timezone.utc).date().isoformat()
+TODAY = datetime.datetime.now(datetime.UTC).date().isoformat()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -20,7 +20,7 @@ def heading(title: str, command: str) -> str:
     """A page's title, and what was run when, where and with which version."""
     found = versions()
     libraries = ", ".join(f"{name} {found[name]}" for name in ("numpy", "torch", "zuko") if name in found)
-    when = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    when = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
     said = (
         f"`{command}` on {when}, commit {commit()}, {os.cpu_count()} cores ({processor()}), Python {found['python']}, "
     )

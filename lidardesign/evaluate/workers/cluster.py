@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import importlib.metadata
 import logging
 import threading
@@ -65,7 +64,7 @@ class Cluster:
             try:
                 client.wait_for_workers(1, timeout=WORKER_SECONDS)
                 _check_versions(client)
-            except asyncio.TimeoutError:
+            except TimeoutError:
                 client.close()
                 raise ConfigError(
                     f"the scheduler at {address} had no worker within {WORKER_SECONDS:g} s",
