@@ -359,7 +359,7 @@ def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], 
     """The same, and the root of the first, a URDF's with its names settled."""
     own, allowed_folder = path.resolve().parent, (folder or path.parent).resolve()
     documents, assets, directories, roots = [path.resolve()], [], {""}, []
-    if not allowed_folder.is_dir():
+    if folder is not None and not os.path.isdir(allowed_folder):
         raise DataError("is no folder", where=str(folder), hint="name the folder that holds all files of the model")
 
     def inside(directory: str, name: str) -> Path:

@@ -173,6 +173,6 @@ def test_a_pipe_or_a_broken_link_among_meshes_is_not_left_out_in_silence(tmp_pat
     os.mkfifo(tmp_path / "a.obj")
     (tmp_path / "b.obj").symlink_to(tmp_path / "nowhere.obj")
     for path in list_mesh_files(tmp_path):
-        with an_alarm(), pytest.raises(DataError, match="no regular file|No such file"):
+        with an_alarm(), pytest.raises(DataError, match=r"no regular file|No such file"):
             load_mesh(path)
     assert len(list_mesh_files(tmp_path)) == 2
