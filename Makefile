@@ -95,9 +95,9 @@ soak: soak-runs soak-seeds soak-kills fuzz mutation
 soak-runs: $(BIN)/.ready
 	PYTHONPATH=tests $(BIN)/python -m soak runs --whole 200 --jobs $(JOBS)
 
-# The face and the arm at draft from 20 seeds each: every one learns well enough
+# The face and the arm at draft and standard from 20 seeds each: every one learns well enough
 soak-seeds: $(BIN)/.ready
-	PYTHONPATH=tests $(BIN)/python -m soak seeds face arm --count 20 --jobs $(JOBS)
+	PYTHONPATH=tests $(BIN)/python -m soak seeds --count 20 --jobs $(JOBS)
 
 # Learning, fitting and evaluating are killed at random moments: what is left can be read, and going on repeats the bytes
 soak-kills: $(BIN)/.ready

@@ -20,7 +20,7 @@ from soak.batches import keep, soak
 from soak.plans import random_plan
 from soak.runs_page import runs_page
 from soak.scaled_flatland import offer
-from soak.seeds import LEAST_ESS, learn_seeds, seeds_page
+from soak.seeds import LIMITS, learn_seeds, seeds_page
 from soak.whole_runs import plan_lines, whole_run
 
 TERMINATED = 143
@@ -45,8 +45,9 @@ def _parser() -> argparse.ArgumentParser:
     runs.add_argument("--first", type=int, default=0, help="the first seed")
     runs.add_argument("--repeat-every", type=int, default=1, help="do every n-th run twice; 0: none")
     runs.add_argument("--page", type=Path, default=PAGES / f"runs-{TODAY}.md")
-    seeds = commands.add_parser("seeds", help="learn tasks at draft from many seeds")
-    seeds.add_argument("tasks", nargs="*", default=list(LEAST_ESS), metavar="TASK")
+    seeds = commands.add_parser("seeds", help="learn tasks at presets from many seeds")
+    every = [f"{task}:{preset}" for task, preset in LIMITS]
+    seeds.add_argument("presets", nargs="*", default=every, metavar="TASK:PRESET", help=f"of {', '.join(every)}")
     seeds.add_argument("--count", type=int, default=20, help="seeds 0 to N - 1")
     seeds.add_argument("--page", type=Path, default=PAGES / f"seeds-{TODAY}.md")
     one = commands.add_parser("one", help="one random run, with its configuration")
@@ -72,10 +73,11 @@ def _runs(given: argparse.Namespace, folder: Path) -> int:
 
 
 def _seeds(given: argparse.Namespace, folder: Path) -> int:
-    learned = learn_seeds(given.tasks, range(given.count), folder, Pieces("soak-seeds"), jobs=given.jobs, tell=_tell)
-    seeds_page(given.page, learned, f"python -m soak seeds {' '.join(given.tasks)} --count {given.count}")
+    presets = [tuple(one.split(":")) for one in given.presets]
+    learned = learn_seeds(presets, range(given.count), folder, Pieces("soak-seeds"), jobs=given.jobs, tell=_tell)
+    seeds_page(given.page, learned, f"python -m soak seeds {' '.join(given.presets)} --count {given.count}")
     faults = sum(bool(one.fault) for one in learned)
-    _tell(f"{len(learned)} densities, {faults} below their ESS: {given.page}")
+    _tell(f"{len(learned)} densities, {faults} beyond their limits: {given.page}")
     return int(faults > 0)
 
 
