@@ -237,7 +237,8 @@ def test_pages_say_how_many_runs_were_whole_and_which_were_not(tmp_path):
     assert table(("bounds", "asked"), [("drawn", 1)]).splitlines()[1] == "| --- | --- |"
     document = {"ess": 0.5, "kl_nats": 0.1, "log_z": 0.0, "coverage": 0.9, "misplaced": 0.1, "seconds": 3.0}
     learned = [Learned("face", "draft", seed, 0, {**document, "ess": ess}) for seed, ess in enumerate((0.5, 0.2))]
-    seeds_page(tmp_path / "seeds.md", [*learned, Learned("face", "draft", 2, 5, {"error": {"message": "diverged"}})], "seeds")
+    learned.append(Learned("face", "draft", 2, 5, {"error": {"message": "diverged"}}))
+    seeds_page(tmp_path / "seeds.md", learned, "seeds")
     text = (tmp_path / "seeds.md").read_text()
     assert "1 of 3 end with an ESS above 0.3 and a KL below 0.5 nats" in text.replace("\n", " ")
     assert "seed 1: ESS 0.200; seed 2: exit 5: diverged" in text.replace("\n", " ")
