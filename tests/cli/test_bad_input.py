@@ -366,7 +366,10 @@ COMMANDS = {
 
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS, errno.EACCES])
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_disk_that_takes_nothing_leaves_the_old_files(lidardesign, tmp_path, monkeypatch, command, reason):
+def test_a_disk_that_takes_nothing_leaves_the_old_files(
+    lidardesign, tmp_path, tmp_path_factory, monkeypatch, command, reason
+):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path_factory.mktemp("kept")))
     make_run(tmp_path / "run", count=1000)
     (tmp_path / "good.yaml").write_text(GOOD)
     before = files_under(tmp_path)
