@@ -14,7 +14,7 @@ from lidardesign.errors import DataError
 from lidardesign.numerics import COARSE_SLACK, normalised_weights, systematic_draw
 from lidardesign.run.arrays import guarded, read_npz
 from lidardesign.run.clock import phase
-from lidardesign.run.inputs import parse_json
+from lidardesign.run.inputs import SAMPLES, parse_json
 from lidardesign.run.manifest import verify, write_recorded
 from lidardesign.space import DesignSpace
 
@@ -114,7 +114,7 @@ def load_samples(run: Path, expected: DesignSpace | None = None) -> Samples:
     """
     verify(run, FILE_NAME)
     path = run / FILE_NAME
-    arrays = read_npz(path, hint=DAMAGED_HINT)
+    arrays = read_npz(path, SAMPLES, hint=DAMAGED_HINT)
     missing = [name for name in (*NUMBERS, "space") if name not in arrays]
     if missing:
         raise DataError(f"has no {', '.join(missing)}", where=str(path), hint=DAMAGED_HINT)

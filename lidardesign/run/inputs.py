@@ -42,13 +42,15 @@ XML = Kind("robots, rigs: MJCF, URDF, SDF", 16_000_000)
 ROBOT_FILES = Kind("all files of a robot together", 512_000_000)
 TABLE = Kind("poses, joint positions: CSV", 64_000_000)
 RAY_TABLE = Kind("rays, sensors: CSV", 128_000_000)
-ARRAYS = Kind("rays, joint positions, samples: NPZ", 256_000_000, 256_000_000)
+ARRAYS = Kind("rays, joint positions: NPZ", 256_000_000, 256_000_000)
+# Ten million samples, the most that a run may have, take 640 MB.
+SAMPLES = Kind("samples of a run: NPZ", 1_000_000_000, 1_000_000_000)
 CAPTURE = Kind("captures: NPZ, MAT", 512_000_000, 512_000_000)
 MESH = Kind("meshes: GLB, glTF and its buffers, OBJ, OFF, PLY, STL", 512_000_000)
 HEAD_MODEL = Kind("head models: HDF5", 1 << 30, 512_000_000)
 STATE = Kind("checkpoints: safetensors", 1 << 30)
 RECORD = Kind("manifests, progress: JSON", 64_000_000)
-KINDS = (YAML, DESIGN, XML, ROBOT_FILES, TABLE, RAY_TABLE, ARRAYS, CAPTURE, MESH, HEAD_MODEL, STATE, RECORD)
+KINDS = (YAML, DESIGN, XML, ROBOT_FILES, TABLE, RAY_TABLE, ARRAYS, SAMPLES, CAPTURE, MESH, HEAD_MODEL, STATE, RECORD)
 # Of rows of any table, the header included, and of its columns.
 MOST_ROWS, MOST_COLUMNS = 1_000_001, 2_000
 
