@@ -206,9 +206,7 @@ class _Builder:
         elif isinstance(event, yaml.AliasEvent):
             anchor = self._anchors.get(event.anchor)
             if anchor is None:
-                raise self._error(
-                    event, f"the alias *{event.anchor} has no complete anchor before it", hint=QUOTE_HINT
-                )
+                raise self._error(event, f"the alias *{event.anchor} has no complete anchor before it", hint=QUOTE_HINT)
             if self._expects_key():
                 raise self._error(event, "an alias cannot be a key", "names as keys")
             if len(self._stack) + anchor.height > MAX_DEPTH:

@@ -61,9 +61,7 @@ class MujocoConfig(MovingSurroundings):
         ("*",), description="bodies or geoms, none of targets, whose returns are told apart: by default all"
     )
     ignored: Patterns = Field((), description="bodies or geoms that are left out")
-    groups: tuple[Group, ...] | None = Field(
-        None, description="groups of geoms that are seen; 0, 1 and 2 if empty"
-    )
+    groups: tuple[Group, ...] | None = Field(None, description="groups of geoms that are seen; 0, 1 and 2 if empty")
     mount_body: str | None = Field(None, description="the body that sensors are on; in the world if empty")
     origin_m: Vector | None = Field(
         None, description="sensor place, in the mount's frame [m]; if empty: in front at 2 extents, or on the mount"
