@@ -289,11 +289,13 @@ class Counts:
         return self.more_missed(Echo(self.in_air, timed_m), Echo(self.in_air, self.first_hits.sigma_m()))
 
     def by_chance(self, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:
-        """Probability that a return is of background: taken for the echo, or where there is none, shape (N,)."""
+        """Probability that a return is of background, taken for the echo, or of haze too where there is none, (N,)."""
+        any_haze = -np.expm1(-self.pulses * self.haze_per_pulse[0])
         any_count = -np.expm1(-self.per_bin * self.bins)
         wrong = self.mistaken(blind.left, self.per_bin, self.per_bin * blind.under, sigma_m)
         alarms = self.first_hits.detector.false_alarm + unevenness(self, blind)
-        return np.minimum(np.where(self.first_hits.returned, wrong, alarms), any_count)
+        alone = np.minimum(np.minimum(alarms, any_count) + any_haze, 1.0)
+        return np.where(self.first_hits.returned, np.minimum(wrong, any_count), alone)
 
     @cached_property
     def level_m2(self) -> np.ndarray:
