@@ -452,7 +452,7 @@ def test_a_track_is_read_back_to_the_last_bit_and_follows_the_schema(tight, tmp_
 
 @given(
     at=st.dictionaries(
-        st.sampled_from(["x_m", "y_m", "z_m", "azimuth_rad"]), st.floats(allow_nan=False, allow_infinity=False)
+        st.sampled_from(["x_m", "y_m", "z_m", "azimuth_rad"]), st.floats(-1e9, 1e9)
     )
 )
 def test_condition_values_are_read_back_to_the_last_bit(at):
@@ -475,7 +475,7 @@ BROKEN = [
     (lambda d: d["track"]["elevation_rad"][1].__setitem__(3, 2.0), r"elevation_rad\[1\]\[3\](.|\n)*from -1.57"),
     (
         lambda d: d["track"]["gate_end_m"][4].__setitem__(0, 0.2),
-        r"gate_end_m\[4\]\[0\] is 0.2, before the gate's start",
+        r"gate_end_m\[4\]\[0\] is 0.2, not beyond the gate's start",
     ),
     (lambda d: d["track"].__setitem__("dimension", "range_m"), r"dimension(.|\n)*x_m or y_m or z_m"),
     (lambda d: d["track"].__setitem__("speed", 1), "speed is an unknown key"),

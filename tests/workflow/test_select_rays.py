@@ -18,7 +18,6 @@ from lidardesign.design.layouts.rays import certificates_of, gates_of, lay_out
 from lidardesign.design.sensor import tangent_coordinates
 from lidardesign.errors import ConfigError
 from lidardesign.samples import save_samples
-from lidardesign.selection import information
 from lidardesign.task import Information
 from lidardesign.workflow import select_rays
 from lidardesign.workflow.run_folder import RunFolder
@@ -151,7 +150,7 @@ class TestTheCommand:
         ("options", "message"),
         [
             (("--weight", "variation=0.1"), "layout selected beside --weight"),
-            (("--rays", "5001"), "5001 rays in the layout selected"),
+            (("--rays", "5001"), "--rays: 5001"),
         ],
     )
     def test_what_does_not_go_together_is_refused(self, lidardesign, run, options, message):
@@ -170,7 +169,7 @@ class TestTheCommand:
         assert len(chosen(run, sensors=1, rays=1, gates="ray").specification.ray_table) == 1
 
     def test_a_task_that_does_not_say_what_returns_tell_is_refused(self, lidardesign, run, monkeypatch):
-        monkeypatch.setattr(information, "informs_rays", lambda task: False)
+        monkeypatch.setattr("lidardesign.workflow.fit.informs_rays", lambda task: False)
         refused = lidardesign("fit", run, "--layout", "selected")
         assert refused.code == 2
         assert "does not say what returns tell" in refused.err
