@@ -28,7 +28,7 @@ from lidardesign.run.clock import outermost_clock, phase, running
 from lidardesign.run.files import is_there
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
-from lidardesign.task import conditions_of, scoring_settings
+from lidardesign.task import scoring_settings
 from lidardesign.workflow.designs import Design, html_table
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
@@ -236,7 +236,7 @@ class ScoreRequest:
         counts = fired_numbers(specifications, self.rays)
         scored = sum(can_fire(design, count) for design in specifications for count in counts)
         choosable, notes = greedy_rays(
-            run.task, len(conditions_of(run.task, run.config.task, run.config.space)), counts
+            run.task, len(run.conditions()), counts
         )
         baselines = [name for name in self.baselines if name != GREEDY or choosable]
         rows, matched = scored + len(baselines) * len(counts), scored * len(baselines)

@@ -41,7 +41,7 @@ from lidardesign.scene import Scene, group_numbers
 from lidardesign.selection import information
 from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import build_casters
-from lidardesign.task import conditions_of, mount_of, random_generator
+from lidardesign.task import mount_of, random_generator
 from lidardesign.workflow import fit as fit_choices
 from lidardesign.workflow.fit import BEST, FitRequest
 from lidardesign.workflow.run_folder import Notes, log_note, relative_folder
@@ -160,7 +160,7 @@ def _silent_notes(fitter: Fitter, request: FitRequest, design: DesignSpec) -> li
     scenes = vars(fitter).get("first_scenes", {}).get("held back")
     if not scenes or not can_fire(design, count):
         return []
-    conditions = [request.at] if request.at else conditions_of(run.task, run.config.task, run.config.space)
+    conditions = [request.at] if request.at else run.conditions()
     fired = tuple(rays_at(design, count, fitter.samples, at=at or None) for at in conditions)
     return silent_notes(scenes, {f"{design.name!r}": fired})
 
@@ -207,7 +207,7 @@ def trials_of(
     run, constraints = request.run, request.constraints or Constraints()
     budgets = sorted(run.task.defaults.rays)
     rays = request.choices["rays"] or budgets[len(budgets) // 2]
-    conditions = [request.at] if request.at else conditions_of(run.task, run.config.task, run.config.space)
+    conditions = [request.at] if request.at else run.conditions()
     casters = [build_casters(scene) for scene in scenes]
     sign = 1.0 if run.metric.better == "lower" else -1.0
     low = max(constraints.sensors.min or 1, len(constraints.each))
@@ -301,7 +301,7 @@ def _fitted(fitter: Fitter, request: FitRequest, *, is_trial: bool = False) -> F
         travelled(samples.space, "selected")
     # the rays of a track have gates of their own, as those of a scan
     gates = request.choices["gates"] or ("ray" if samples.space.conditioned else LAYOUTS["selected"].usual_gates)
-    (place, *_) = conditions_of(request.run.task, request.run.config.task, samples.space)
+    (place, *_) = request.run.conditions(samples.space)
     # the gates of chosen rays keep a bandwidth; a sensor that moves along a condition looks everywhere the same way
     fitted = fitter.fit(request, near(samples, place, 1.0), layout="density", rays=counts[-1], gates="ray")
     fitted = replace(fitted, design=replace(fitted.design, gates=gates))

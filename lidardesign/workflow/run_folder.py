@@ -25,8 +25,8 @@ from lidardesign.run.inputs import MESH
 from lidardesign.run.manifest import changed_since_recorded, read_manifest
 from lidardesign.run.outputs import check_writable
 from lidardesign.scene import Scene
-from lidardesign.space import RANGE
-from lidardesign.task import Metric, Split, Task, metric_of, scenes_of
+from lidardesign.space import RANGE, DesignSpace
+from lidardesign.task import Metric, Split, Task, conditions_of, metric_of, scenes_of
 
 if TYPE_CHECKING:
     from typing import Self
@@ -73,6 +73,15 @@ class RunFolder:
         """What scores mean."""
         with plugin_guard(self.task.name):
             return metric_of(self.task, self.config.task)
+
+    def conditions(self, space: DesignSpace | None = None) -> list[dict[str, float]]:
+        """The condition values that designs are for, in the run's design space or a part of it; see `conditions_of`.
+
+        Raises:
+            PluginError: The task's own code failed.
+        """
+        with plugin_guard(self.task.name):
+            return conditions_of(self.task, self.config.task, space or self.config.space)
 
     @phase("scenes")
     def scenes(self, split: Split, seed: int) -> list[Scene]:

@@ -33,7 +33,7 @@ from lidardesign.selection.candidates import CANDIDATES_PER_RAY, gate_choices, s
 from lidardesign.selection.coverage import InformedScene
 from lidardesign.selection.information import checked_information
 from lidardesign.space import DIMENSIONS, DesignSpace
-from lidardesign.task import conditions_of, random_generator
+from lidardesign.task import random_generator
 from lidardesign.workflow.run_folder import RunFolder
 
 EVEN_SHARE = 0.25  # of the candidates that are even in the fields, where the density's samples may be sparse
@@ -159,7 +159,7 @@ class Proposals:
 
     def __init__(self, run: RunFolder, spec: DesignSpec, samples: Samples, seed: int) -> None:
         self.samples, self.seed = samples, seed
-        self.conditions = conditions_of(run.task, run.config.task, samples.space)
+        self.conditions = run.conditions(samples.space)
         sensors = tuple(replace(sensor, rays=None) for sensor in spec.sensors)
         self.spec = replace(spec, ray_table=None, rays=None, sensors=sensors)
         # rays start all over the origins of their sensors, where these are left free

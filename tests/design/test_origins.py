@@ -297,7 +297,8 @@ def test_old_parameters_are_kept_where_nothing_is_better():
 @settings(max_examples=20, deadline=None)
 @given(boxes_drawn, st.integers(1, 4), st.integers(0, 1000), st.sampled_from([None, 0.4]))
 def test_the_likelihood_never_falls_and_all_iterates_keep_out(boxes, count, number, spread):
-    constraints = Constraints.from_mapping({"origin": {"exclude": boxes, "spread_m": {"max": spread}}})
+    origin = {"exclude": boxes} | ({} if spread is None else {"spread_m": {"max": spread}})
+    constraints = Constraints.from_mapping({"origin": origin})
     if not len(free_boxes(constraints.rules[0], SPACE).low_m):
         return
     generator = np.random.default_rng(number)
