@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from lidardesign.errors import UNSET_HINT, ConfigError
+from lidardesign.errors import MAX_SEED, UNSET_HINT, ConfigError
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.registry import load_task, plugin_guard
 from lidardesign.run.clock import phase
@@ -182,7 +182,6 @@ FILE_NAME = "config.yaml"
 SCHEMA_VERSION = 1
 SECTIONS = ("task", "space", "density", "learning")
 HEADER = ("schema_version", "task_name", "seed", "preset")
-MAX_SEED = 2**63 - 1
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,7 @@ from typing import Annotated
 
 import typer
 
-from lidardesign.errors import ConfigError
-
-MOST_SEED = 2**63 - 1
+from lidardesign.errors import MAX_SEED, ConfigError
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, errors too.")]
 Seed = Annotated[
@@ -20,7 +18,7 @@ Seed = Annotated[
         "--seed",
         metavar="N",
         min=0,
-        max=MOST_SEED,
+        max=MAX_SEED,
         help="Root of every random stream.",
         show_default="the run's, or 0",
     ),

@@ -315,8 +315,8 @@ class FlowSamples:
         return values.to(like), None if self.conditions is None else self.conditions.to(like)
 
 
-# Samples that are drawn at a time until enough are kept.
-DRAWN_AT_ONCE = 4096
+# Samples to be kept of those that are drawn at a time.
+KEPT_AT_ONCE = 4096
 
 
 class LearnedDensity:
@@ -353,13 +353,22 @@ class LearnedDensity:
         return self._config.space
 
     def sample(self, count: int, seed: int | np.random.Generator = 0) -> np.ndarray:
-        """Design points drawn from the density, shape (count, 6); the same seed gives the same points."""
+        """Design points drawn from the density, shape (count, 6); the same seed gives the same points.
+
+        Raises:
+            DataError: The task's scenes have changed so much that nothing is left of the density.
+        """
         self._flow.generator.manual_seed(int(np.random.default_rng(seed).integers(2**63)))
+        if self._thinning is None:
+            return draw_samples(self._flow, count).points
         kept = np.empty((0, 6))
         while len(kept) < count:
-            drawn = draw_samples(self._flow, DRAWN_AT_ONCE)
-            drawn = drawn if self._thinning is None else self._thinning.thinned(drawn, self._flow.generator)
-            kept = np.concatenate([kept, drawn.points])
+            drawn = draw_samples(self._flow, math.ceil(KEPT_AT_ONCE * math.exp(-self._thinning.log_share)))
+            points = self._thinning.thinned(drawn, self._flow.generator).points
+            if not len(points):
+                reason = "the task's training scenes are others than those that it was learned from"
+                raise DataError(reason, where=str(self._run), hint="learn the run again")
+            kept = np.concatenate([kept, points])
         return kept[:count]
 
     def log_prob(self, points: np.ndarray) -> np.ndarray:

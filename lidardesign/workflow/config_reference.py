@@ -13,7 +13,6 @@ from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
 from lidardesign.config import (
-    MAX_SEED,
     PRESET_LEARNING,
     PRESETS,
     SCHEMA_VERSION,
@@ -25,7 +24,7 @@ from lidardesign.config import (
 )
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import SCHEMA_FILE
-from lidardesign.errors import ConfigError, check_choice
+from lidardesign.errors import MAX_SEED, ConfigError, check_choice
 from lidardesign.registry import plugin_guard
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.space import DIMENSIONS

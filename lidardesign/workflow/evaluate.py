@@ -10,10 +10,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.config import MAX_SEED, with_task_settings
+from lidardesign.config import with_task_settings
 from lidardesign.design.compare import outside_notes
 from lidardesign.design.sensor import MOST_RAYS
-from lidardesign.errors import ConfigError, DataError, check_number
+from lidardesign.errors import MAX_SEED, ConfigError, DataError, check_number
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
 from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
@@ -235,9 +235,7 @@ class ScoreRequest:
         specifications = [design.specification for design in self.designs]
         counts = fired_numbers(specifications, self.rays)
         scored = sum(can_fire(design, count) for design in specifications for count in counts)
-        choosable, notes = greedy_rays(
-            run.task, len(run.conditions()), counts
-        )
+        choosable, notes = greedy_rays(run.task, len(run.conditions()), counts)
         baselines = [name for name in self.baselines if name != GREEDY or choosable]
         rows, matched = scored + len(baselines) * len(counts), scored * len(baselines)
         names = [design.name for design in specifications]

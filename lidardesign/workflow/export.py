@@ -29,9 +29,9 @@ from lidardesign.workflow.run_folder import (
 )
 from lidardesign.workflow.run_samples import RunTarget, Weighting, may_need_samples, weighted_samples
 
-# Formats that hold sensors only, so that the number of rays may stay open.
 # Of frames: slower than any survey, faster than any pulse.
 RATES_HZ = (1e-3, 1e6)
+# Formats that hold sensors only, so that the number of rays may stay open.
 WITHOUT_RAYS = ("sensors-csv", "stl")
 
 

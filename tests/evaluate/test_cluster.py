@@ -37,10 +37,14 @@ class LocalScheduler:
 
     def __init__(self, folder):
         self._folder, self._started = folder, []
-        known = folder / "scheduler.json"
-        self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", known)
-        end = time.monotonic() + PATIENCE_S
-        while not known.exists() and time.monotonic() < end:
+        self._known = folder / "scheduler.json"
+        self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", self._known)
+
+    def wait(self):
+        """Wait until the scheduler says where it is."""
+        known, end = self._known, time.monotonic() + PATIENCE_S
+        # the scheduler makes its file before it fills it
+        while not (known.exists() and known.read_text().endswith("}")) and time.monotonic() < end:
             time.sleep(0.05)
         self.address = json.loads(known.read_text())["address"]
 
@@ -71,8 +75,11 @@ def after_one_scene(kill):
 @pytest.fixture
 def scheduler(tmp_path):
     started = LocalScheduler(tmp_path)
-    yield started
-    started.close()
+    try:
+        started.wait()
+        yield started
+    finally:
+        started.close()
 
 
 def test_a_cluster_scores_as_this_process_does_though_a_worker_is_lost(scheduler):

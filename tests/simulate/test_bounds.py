@@ -20,6 +20,7 @@ from support.planning import (
     errors,
     facing_wall,
     grid,
+    random_shapes,
     room,
     sight,
 )
@@ -356,21 +357,14 @@ STANDARD_ERRORS = 4.0
 def random_scene(generator):
     bodies = []
     for number in range(generator.integers(1, 4)):
-        shapes = (
-            Sphere(generator.uniform(0.05, 0.4)),
-            Box(tuple(generator.uniform(0.05, 0.4, 3))),
-            Capsule(generator.uniform(0.03, 0.1), generator.uniform(0.1, 0.3)),
-        )
-        turned = np.linalg.qr(generator.normal(size=(3, 3)))[0]
-        turned *= np.sign(np.linalg.det(turned))
-        place = (generator.uniform(0.6, 2.5), *generator.uniform(-0.5, 0.5, 2))
+        shapes, place = random_shapes(generator)
         speed = 10 ** generator.uniform(-3, 0.5) if generator.uniform() < 0.3 else 0.0
         surface = {"velocity_m_s": tuple(speed * generator.normal(size=3))}
         surface["reflectance"] = generator.uniform(0.05, 0.7)
         if generator.uniform() < 0.1:
             surface["specular"] = 0.3
         shape = shapes[generator.integers(3)]
-        bodies.append(Body(shape, f"body {number}", poses=rigid(turned, place), **surface))
+        bodies.append(Body(shape, f"body {number}", poses=place, **surface))
     if generator.uniform() < 0.7:
         bodies.append(Body(Box((0.05, 3, 3)), "wall", poses=rigid(translation_m=(3, 0, 0))))
     air = {}

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
-from support.planning import CONSUMER, SINGLE, TIMED, grid
+from support.planning import CONSUMER, SINGLE, TIMED, grid, random_shapes
 
 from lidardesign.geometry.rays import Rays, Returns
-from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Receiver, Scene, Sphere, rigid
+from lidardesign.scene import Ambient, Body, Box, Medium, Mesh, Receiver, Scene, rigid
 from lidardesign.simulate.detector.detector import EFFECTS, Detector, Physics
 from lidardesign.simulate.effects.first_hits import FirstHits
 from lidardesign.simulate.plan import Planner, Tolerance
@@ -157,14 +157,7 @@ def _turn(angle_rad: float) -> np.ndarray:
 
 
 def _body(generator: np.random.Generator, number: int, surface: dict) -> Body:
-    shapes = (
-        Sphere(generator.uniform(0.05, 0.4)),
-        Box(tuple(generator.uniform(0.05, 0.4, 3))),
-        Capsule(generator.uniform(0.03, 0.1), generator.uniform(0.1, 0.3)),
-    )
-    turned = np.linalg.qr(generator.normal(size=(3, 3)))[0]
-    turned *= np.sign(np.linalg.det(turned))
-    place = rigid(turned, (generator.uniform(0.6, 2.5), *generator.uniform(-0.5, 0.5, 2)))
+    shapes, place = random_shapes(generator)
     return Body(shapes[generator.integers(3)], f"body {number}", poses=place, **surface)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
-from lidardesign.scene import Body, Box, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import EFFECTS, Detector
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.effects.expected_counts import Counts
@@ -17,6 +17,18 @@ from lidardesign.space import direction
 SINGLE, CONSUMER = load_detector("single-photon"), load_detector("consumer-8x8")
 
 TIMED = Detector("timed", jitter_sigma_s=1e-11)
+
+
+def random_shapes(generator):
+    """One of each kind, and a pose somewhere before the sensors."""
+    shapes = (
+        Sphere(generator.uniform(0.05, 0.4)),
+        Box(tuple(generator.uniform(0.05, 0.4, 3))),
+        Capsule(generator.uniform(0.03, 0.1), generator.uniform(0.1, 0.3)),
+    )
+    turned = np.linalg.qr(generator.normal(size=(3, 3)))[0]
+    turned *= np.sign(np.linalg.det(turned))
+    return shapes, rigid(turned, (generator.uniform(0.6, 2.5), *generator.uniform(-0.5, 0.5, 2)))
 
 
 def grid(side=12, half_rad=0.3, gate_m=(0.1, 4.0), rate_hz=10.0):

@@ -17,7 +17,7 @@ from lidardesign.cli.output import FIRST_LINE, Output, command, keep_times, show
 from lidardesign.cli.output_files import claim_outputs, is_output, written_file
 from lidardesign.cli.tables.grids import RichConsole, number
 from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
-from lidardesign.errors import ConfigError, ThresholdError
+from lidardesign.errors import MAX_SEED, ConfigError, ThresholdError
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
@@ -188,7 +188,7 @@ def evaluate(
             "--scenes-seed",
             metavar="N",
             min=0,
-            max=options.MOST_SEED,
+            max=MAX_SEED,
             help="Root of the held-out scenes.",
             show_default="--seed, or the (first) run's",
         ),
