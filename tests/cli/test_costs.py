@@ -166,9 +166,9 @@ def test_the_table_of_times_indents_what_is_inside_and_leaves_out_what_is_next_t
 
 def test_every_phase_is_explained():
     root = Path(__file__).parents[2]
-    page = (root / "docs" / "costs.md").read_text(encoding="utf-8")
+    page = (root / "docs" / "accuracy.md").read_text(encoding="utf-8").partition("| phase |")[2]
     explained = set(re.findall(r"`([a-z -]+)`", "".join(re.findall(r"^\| (.*?) \|", page, re.MULTILINE))))
     sources = [path.read_text(encoding="utf-8") for path in (root / "lidardesign").rglob("*.py")]
     used = {name for text in sources for name in re.findall(r'phase\("([^"]+)"\)', text)}
-    assert used <= explained, f"docs/costs.md does not explain {used - explained}"
-    assert explained - used <= {"learn", "fit", "constrain", "evaluate", "export"}, explained - used
+    assert used <= explained, f"docs/accuracy.md does not explain {used - explained}"
+    assert explained <= used, explained - used
