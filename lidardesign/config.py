@@ -6,6 +6,7 @@ that an error can point at file, line and column, or at the `--set KEY=VALUE` th
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -375,7 +376,7 @@ def _header(task: Task, document: Document, preset: str | None, seed: int | None
             f"unknown section {unknown[0]!r}",
             where=document.locate((unknown[0],), key=True),
             allowed=", ".join((*HEADER, *SECTIONS)),
-            hint=suggest(unknown[0], (*HEADER, *SECTIONS)),
+            hint=suggest(unknown[0], (*HEADER, *SECTIONS)) or _meant(task, unknown[0]),
         )
     if values.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
         raise ConfigError(
@@ -439,7 +440,37 @@ def _lay_override(layers: _Layers, task: Task, override: Override) -> None:
         anchor_paths(layers.values["task"], touched, task.Config, Path.cwd())
 
 
+def _models(task: Task) -> dict[str, type[BaseModel]]:
+    """The model of each section."""
+    return {"task": task.Config, "space": _SpaceSection, "density": DensitySettings, "learning": LearningSettings}
+
+
+def _meant(task: Task, key: str, section: str = "") -> str | None:
+    """A hint at the section that has a key, or the one most like it, better than the given section does."""
+    models = _models(task)
+    own = list(models[section].model_fields) if section else []
+    keys = {name: f"{owner}.{name}" for owner, model in models.items() for name in model.model_fields}
+    names = {**{name: name for name in models}, **keys}
+    close = difflib.get_close_matches(key, [*own, *names], n=1)
+    return f"did you mean {names[close[0]]!r}?" if close and close[0] not in own else None
+
+
+def _check_keys(task: Task, layers: _Layers) -> None:
+    """Refuse a key that belongs to another section, and name that.
+
+    Raises:
+        ConfigError: At the key.
+    """
+    for section, model in _models(task).items():
+        for key in layers.values[section]:
+            hint = None if key in model.model_fields else _meant(task, str(key), section)
+            if hint is not None:
+                where, allowed = layers.origin((section, key), key=True), ", ".join(model.model_fields)
+                raise ConfigError(f"unknown key '{section}.{key}'", where=where, allowed=allowed, hint=hint)
+
+
 def _build(task: Task, header: dict[str, Any], layers: _Layers) -> RunConfig:
+    _check_keys(task, layers)
     config = check_model(task.Config, layers.values["task"], layers.origin, "task")
     return RunConfig(
         task_name=task.name,

@@ -178,6 +178,10 @@ def test_errors_in_a_file_point_at_line_and_column(write, case):
 BAD_OVERRIDES = {
     "density.sigma_m=-1": "greater than or equal to 0.000000001",
     "density.sigma=1": "did you mean 'sigma_m'",
+    "density.steps=1": "did you mean 'learning.steps'",
+    "density.count=1": "did you mean 'task.count'",
+    "sigma=1": "did you mean 'density.sigma_m'",
+    "densty.sigma_m=1": "did you mean 'density'",
     "density.sigma_m=": "sigma_m has no value",
     "density.margin_m=": "margin_m has no value",
     "label= ": "label has no value",
@@ -212,6 +216,24 @@ def test_errors_in_an_override_show_it(override):
         resolve(TASK, overrides=[override])
     assert caught.value.where == f"--set {override}" or caught.value.where.startswith(f"--set {override}:")
     assert BAD_OVERRIDES[override] in str(caught.value)
+
+
+@each_row(
+    ("section", "key"),
+    [
+        *(("density", key) for key in DensitySettings.model_fields),
+        *(("learning", key) for key in LearningSettings.model_fields),
+        *(("space", key) for key in DIMENSIONS),
+    ],
+)
+def test_a_key_without_its_section_is_named_with_it(write, section, key):
+    hint = f"did you mean '{section}.{key}'?"
+    with pytest.raises(ConfigError) as caught:
+        resolve(TASK, overrides=[f"{key}=1"])
+    assert caught.value.hint == hint
+    with pytest.raises(ConfigError) as caught:
+        resolve(TASK, config_file=write(f"{key}: 1\n"))
+    assert caught.value.hint == hint
 
 
 def test_an_override_of_a_file_takes_the_blame_for_its_value(write):

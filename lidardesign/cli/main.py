@@ -39,6 +39,7 @@ EXIT_USAGE = 2
 HELP_WORDS = ("help", "man", "usage")
 # Options that belong to commands, and are often written before them.
 COMMON_OPTIONS = ("--json", "--quiet", "-q", "--debug", "--seed")
+VERSION_HELP = "Print the version; with --json those of Python and the libraries too."
 SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 app = typer.Typer(
@@ -68,10 +69,18 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
+def _print_versions() -> int:
+    """Answer `--version --json`: the versions of all that a result depends on."""
+    from lidardesign.run.manifest import versions
+
+    print_json({"version": __version__, "versions": versions()})
+    return 0
+
+
 @app.callback()
 def program(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help=VERSION_HELP)
     ] = False,
 ) -> None:
     """Declare the options of the program itself; the typer object carries its help."""
@@ -103,6 +112,8 @@ def run(arguments: list[str] | None = None) -> None:
 def _invoke(arguments: list[str]) -> int:
     """Run typer without letting it print or exit for errors."""
     output = Output(json="--json" in arguments, debug="--debug" in arguments)
+    if sorted(arguments) == ["--json", "--version"]:
+        return _print_versions()
     try:
         code: Any = app(arguments, prog_name=PROGRAM, standalone_mode=False)
     except typer.Exit as error:

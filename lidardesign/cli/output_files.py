@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from shlex import quote
 
 from lidardesign.cli.output import Output
 from lidardesign.errors import ConfigError, DataError
@@ -110,7 +111,7 @@ def claim_outputs(
             f"{report.name} is no name of an HTML page",
             where="--report",
             allowed=", ".join(PAGE_SUFFIXES),
-            hint=f"--report {report.with_suffix('.html')}; a browser prints it as PDF",
+            hint=f"--report {quote(str(report.with_suffix('.html')))}; a browser prints it as PDF",
         )
     note_new_folders([path for path in (csv, report, plots) if path is not None], output)
 

@@ -51,7 +51,7 @@ Configuration of the task {name}: {summary}
 Scored by {metric} [{unit}], {better} is better.
 
 Lines that begin with {off}KEY have the default: take the {off} away to set them. What is left out keeps its default.
-Use it as: lidardesign learn {name} --config FILE"""
+Use it as: lidardesign learn --config FILE"""
 SPACE_WORDS = "bounds [LOW, HIGH] of every dimension, or one number that fixes it; they follow from the task"
 DIMENSION_WORDS = {"condition": "dimensions that are given, not designed", "measure": "solid_angle or angles"}
 

@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import with_task_settings
@@ -533,7 +534,9 @@ def common_run(designs: Sequence[Design], runs: Sequence[RunFolder]) -> RunFolde
             hint="evaluate them one by one: scores of different scenes do not compare",
         )
     if not designs:
-        raise DataError("the run has no designs yet", where=str(first.folder), hint=f"lidardesign fit {first.folder}")
+        raise DataError(
+            "the run has no designs yet", where=str(first.folder), hint=f"lidardesign fit {quote(str(first.folder))}"
+        )
     return first
 
 

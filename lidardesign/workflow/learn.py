@@ -8,11 +8,12 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import RunConfig, load_run_config, resolve, save_run_config
 from lidardesign.errors import ConfigError, DataError, LidardesignError, check_choice
-from lidardesign.registry import load_task, plugin_guard
+from lidardesign.registry import load_task, plugin_guard, task_names
 from lidardesign.run.clock import Clock, outermost_clock, phase
 from lidardesign.run.files import is_temporary, run_lock
 from lidardesign.run.manifest import note, read_manifest, start_manifest
@@ -102,8 +103,8 @@ class LearnRequest:
     command: Sequence[str] = ()
 
     @classmethod
-    def resolve(cls, task: str, options: LearnOptions, notes: Notes = log_note) -> LearnRequest:
-        """The request of a user's choices.
+    def resolve(cls, task: str | None, options: LearnOptions, notes: Notes = log_note) -> LearnRequest:
+        """The request of a user's choices; without a task, the one that its files name.
 
         Raises:
             ConfigError: An unknown task, settings that cannot be, or a folder that is not empty.
@@ -118,6 +119,7 @@ class LearnRequest:
             "seed": options.seed,
         }
         goal = checked_goal(options.tolerance, options.time_budget_s, choices)
+        task = task or _task_named(config_file, Path(options.out) if options.resume and options.out else None)
         plugin = load_task(task)
         folder = Path("runs") / task if options.out is None else Path(options.out)
         if options.resume and not folder.is_dir():
@@ -229,7 +231,7 @@ class LearnRequest:
             rest = f"{self.folder} keeps what the finished stages reached"
         else:
             return "before the first checkpoint; nothing was kept"
-        return f"{rest}\n  continue with: lidardesign learn {self.task.name} --out {self.folder} --resume"
+        return f"{rest}\n  continue with: lidardesign learn {self.task.name} --out {quote(str(self.folder))} --resume"
 
     @contextlib.contextmanager
     def _undone_on_failure(self) -> Iterator[None]:
@@ -258,6 +260,25 @@ def result_document(result: LearnResult) -> dict[str, Any]:
         "notes": list(result.notes),
         "error_estimates": result.as_dict()["error_estimates"],
     }
+
+
+def _task_named(config_file: Path | None, run: Path | None) -> str:
+    """The task that a configuration file names, or that of the run to resume.
+
+    Raises:
+        ConfigError: Neither names one.
+    """
+    resumed = () if run is None or not (run / CONFIGURATION).is_file() else (run / CONFIGURATION,)
+    files = (*(() if config_file is None else (config_file,)), *resumed)
+    named = [load_yaml(file, empty_sections=True).mapping.get("task_name") for file in files]
+    if not any(named):
+        raise ConfigError(
+            "no task was named",
+            where="TASK",
+            allowed=", ".join(task_names()),
+            hint="lidardesign learn TASK, or task_name: TASK in the file of --config",
+        )
+    return next(str(name) for name in named if name)
 
 
 def _time_of_twin(run: Path, settings: Mapping[str, Any]) -> EarlierRun | None:

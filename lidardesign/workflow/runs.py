@@ -229,7 +229,7 @@ def open_run(folder: Path | str) -> Run:
 
 
 def learn(
-    task: str,
+    task: str | None = None,
     *,
     preset: str | None = None,
     out: Path | str | None = None,
@@ -245,7 +245,7 @@ def learn(
     """Learn where rays are worth firing for a task, into a run folder.
 
     Arguments:
-        task: The name of a task; `lidardesign tasks` lists them.
+        task: The name of a task; `lidardesign tasks` lists them. By default the one that `config` names.
         preset: Effort: draft, standard or fine.
         out: The folder to make; runs/TASK by default.
         seed: Root of every random stream.

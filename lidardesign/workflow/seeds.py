@@ -11,6 +11,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.errors import ConfigError, DataError
@@ -224,7 +225,9 @@ def _common_names(runs: Sequence[RunFolder], wanted: Sequence[str]) -> list[str]
     sets = [{path.stem for path in run.design_paths()} for run in runs]
     for run, names in zip(runs, sets, strict=True):
         if not names:
-            raise DataError("the run has no designs yet", where=str(run.folder), hint=f"lidardesign fit {run.folder}")
+            raise DataError(
+                "the run has no designs yet", where=str(run.folder), hint=f"lidardesign fit {quote(str(run.folder))}"
+            )
     common = sorted(reduce(set.intersection, sets))
     if not common:
         raise ConfigError(

@@ -45,6 +45,13 @@ def test_the_version_is_printed(lidardesign):
     assert lidardesign("--version").out == f"lidardesign {__version__}\n"
 
 
+def test_the_versions_that_results_depend_on_are_printed_for_scripts(lidardesign):
+    for arguments in (["--version", "--json"], ["--json", "--version"]):
+        found = lidardesign(*arguments).json
+        assert found["version"] == __version__
+        assert {"lidardesign", "python", "numpy", "torch"} <= set(found["versions"])
+
+
 def test_tasks_alone_lists_them_and_json_is_one_document(lidardesign):
     assert "flatland" in lidardesign("tasks").out
     listed = lidardesign("tasks", "list", "--json").json["tasks"]

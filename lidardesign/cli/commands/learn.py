@@ -29,7 +29,14 @@ FIGURES = (
 
 
 def learn(
-    task: Annotated[str, typer.Argument(metavar="TASK", help="Name of a task; `lidardesign tasks` lists them.")],
+    task: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="TASK",
+            help="Name of a task; `lidardesign tasks` lists them.",
+            show_default="that of --config, or of the run that is resumed",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="RUN", help="Run folder to make.", show_default="runs/TASK"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any
 
 import typer
@@ -202,7 +203,7 @@ def new(
         def show_files(rich: RichConsole) -> None:
             for path in written:
                 rich.print(f"  {path}")
-            advice = f"next: pip install --editable '{folder}[test]', then lidardesign tasks check {name}"
+            advice = f"next: pip install --editable {quote(f'{folder}[test]')}, then lidardesign tasks check {name}"
             rich.print(advice, soft_wrap=True)
 
         output.result({"task": name, "folder": folder, "files": written}, show_files, show_costs=False)

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 
@@ -115,7 +116,7 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
         raise DataError(
             f"does not say how far {unknown} of its {total} rays are heard",
             where=str(path),
-            hint=f"{rig.end_hint}; or name a run whose design space says it: lidardesign evaluate RUN {path.name}",
+            hint=f"{rig.end_hint}; or name a run that says it: lidardesign evaluate RUN {quote(path.name)}",
         )
     if unknown:
         notes.append(f"how far {unknown} of {total} rays are heard is not said; {reach_m:g} m, as far as any may be")
