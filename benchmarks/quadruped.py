@@ -1,11 +1,17 @@
 """Four range cameras on a quadruped's torso that look for balls: chosen and placed, placed by hand, and by search.
 
 The model is dm_control's. MuJoCo moves it: its legs swing, and a ball rolls at it from anywhere around. By hand four
-parts of a kind look forward, backward, left and right, at several elevations. The rest are commands, see
-docs/benchmarks.md.
+parts of a kind look forward, backward, left and right, at several elevations. What docs/benchmarks.md says of it:
 
-    python benchmarks/quadruped.py quadruped.xml --recordings FOLDER
-    python benchmarks/quadruped.py quadruped.xml --by-hand RUN
+    python benchmarks/quadruped.py quadruped.xml --recordings walks
+    lidardesign learn mujoco --preset draft --set model=quadruped.xml --set motion=walks --set 'targets=[ball]' \\
+        --set 'ignored=[terrain, "wall*"]' --set mount_body=torso --set 'origin_m=[0,0,0.16]' \\
+        --set 'origin_box_m=[0.34,0.3,0.06]' --set metric=seen --set frames=12 --set frame_rate_hz=5 --set train=200 \\
+        --set test=200 --set density.sigma_m=0.05 --out runs/walks
+    python benchmarks/quadruped.py quadruped.xml --by-hand runs/walks
+    lidardesign constrain runs/walks --constraints runs/walks/parts.yaml --name chosen
+    lidardesign evaluate runs/walks/designs/vl53l8cx-30.yaml runs/walks/designs/chosen.yaml --rays 256 \\
+        --baseline cma --cma-seconds 195
 """
 
 from __future__ import annotations

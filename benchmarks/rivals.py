@@ -93,14 +93,14 @@ def measured_on() -> str:
     found = machine()
     return (
         f"Measured on {datetime.date.today():%Y-%m-%d}: {found['processor']}, {found['cores']} cores, "
-        f"{found['threads']} thread(s), Python {found['python']}, load {found['load_at_start']} at the start."
+        f"Python {found['python']}, load {found['load_at_start']} at the start."
     )
 
 
 def standing(pair: Mapping[str, Any], better: str) -> str:
     """Whether `a` is better than `b` by more than the interval."""
     if pair["ci_low"] * pair["ci_high"] <= 0:
-        return "not told apart"
+        return "no difference found"
     lower = pair["difference"] < 0
     return "better" if lower == (better == "lower") else "worse"
 
@@ -145,22 +145,68 @@ def equal_bandwidth(found: Mapping[str, Any]) -> list[list[object]]:
     return rows
 
 
+def standings(found: Mapping[str, Any], name: str, key: str) -> tuple[dict[str, bool], dict[str, bool]]:
+    """Where a design is better than rivals that choose no rays, and where it is not worse than `greedy`."""
+    others, greedy = {}, {}
+    for pair in found[key]:
+        if pair["a"] != name or pair["b"] in DESIGNS:
+            continue
+        stands = standing(pair, found["metric"]["better"])
+        if pair["b"] == "greedy":
+            greedy[f"{pair['rays']} rays"] = stands != "worse"
+        else:
+            others[f"{pair['rays']} rays, {pair['b']}"] = stands == "better"
+    return others, greedy
+
+
+PAIRED = {"paired": "rays", "paired_equal_bandwidth": "bandwidth"}
+
+
 def verdicts(found: Mapping[str, Any]) -> list[str]:
     """What is claimed of our designs, over all numbers of rays: of rivals that choose no rays, and of `greedy`."""
     lines = []
     for name in ours_of(found):
-        for key, where in (("paired", "rays"), ("paired_equal_bandwidth", "bandwidth")):
-            pairs = [pair for pair in found[key] if pair["a"] == name and pair["b"] not in DESIGNS]
-            stands = {(pair["b"], f"{pair['rays']} rays"): standing(pair, found["metric"]["better"]) for pair in pairs}
-            others = {
-                f"{count}, {other}": stand == "better" for (other, count), stand in stands.items() if other != "greedy"
-            }
-            greedy = {count: stand != "worse" for (other, count), stand in stands.items() if other == "greedy"}
+        for key, where in PAIRED.items():
+            others, greedy = standings(found, name, key)
             lines.append(
                 verdict(f"{name} is better by the interval than rivals that choose no rays, equal {where}", others)
             )
             lines.append(verdict(f"{name} is not worse than greedy by the interval, equal {where}", greedy))
     return lines
+
+
+def counted(found: Mapping[str, Any], name: str) -> str:
+    """The verdicts on one design in one sentence of numbers."""
+    others, greedy = zip(*(standings(found, name, key) for key in PAIRED), strict=True)
+    first, second = (f"{sum(stands.values())} of {len(stands)}" for stands in others)
+    third, fourth = (f"{len(stands) - sum(stands.values())} of {len(stands)}" for stands in greedy)
+    return (
+        f"`{name}` is better than rivals that choose no rays in {first} comparisons at equal rays and in {second} at "
+        f"equal bandwidth; it is worse than `greedy` in {third} and in {fourth}."
+    )
+
+
+def page_table(found: Mapping[str, Any]) -> str:
+    """One row per design or rival: its scores, its bandwidth, and what `fit` is worth beside it in the middle."""
+    rows = {(row["design"], row["rays"]): row for row in found["rows"]}
+    counts = sorted({count for _, count in rows})
+    middle = counts[(len(counts) - 1) // 2]
+    ours, better = ours_of(found)[0], found["metric"]["better"]
+    pairs = {pair["b"]: pair for pair in found["paired"] if (pair["a"], pair["rays"]) == (ours, middle)}
+    same = [row for row in found["equal_bandwidth"] if (row["matched_to"], row["matched_rays"]) == (ours, middle)]
+    matched = {row["design"]: row["value"] for row in same}
+    paired = {p["b"]: p for p in found["paired_equal_bandwidth"] if (p["a"], p["rays"]) == (ours, middle)}
+    lines = []
+    for name in dict.fromkeys(row["design"] for row in found["rows"]):
+        values = [rows[name, count]["value"] for count in counts]
+        against = told(pairs.get(name), rows[name, middle]["value"], better)
+        in_its_bandwidth = told(paired.get(name), matched[name], better) if name in matched else ""
+        lines.append([f"`{name}`", *values, rows[name, middle]["bandwidth_mbps"], against, in_its_bandwidth])
+    columns = [
+        found["metric"]["unit"], *(f"{count} rays" for count in counts), f"Mbit/s at {middle}",
+        f"{ours} against it at {middle} rays, %", "in the same bandwidth, %",
+    ]  # fmt: skip
+    return table(columns, lines)
 
 
 def tables_of(title: str, found: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[object]]]]:
@@ -223,17 +269,22 @@ def curves(found: Mapping[str, Any]) -> dict[str, dict[str, list[float]]]:
 
 
 def write_page(page: Path, everything: Mapping[str, dict[str, Any]]) -> None:
-    """Put tables and verdicts between the marks of the tasks that were measured."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-    from fill_benchmarks import filled
+    """Put tables and verdicts between the marks `<!-- TASK -->` of the tasks that were measured.
 
+    Raises:
+        SystemExit: The page does not have a mark exactly twice.
+    """
     text = page.read_text(encoding="utf-8")
     for task, found in everything.items():
-        parts = [
-            f"**{caption}**\n\n{table(*content)}" for caption, content in tables_of(CASES[task].title, found).items()
-        ]
-        listed = "\n".join(textwrap.fill(f"- {line}", 120, subsequent_indent="  ") for line in verdicts(found))
-        text = filled(text, task, "\n\n".join([textwrap.fill(found["where"], 120), *parts, listed]))
+        mark = f"<!-- {task} -->"
+        parts = text.split(mark)
+        if len(parts) != 3:
+            sys.exit(f"the page has the mark {mark} {len(parts) - 1} times, not twice")
+        metric = f"{found['metric']['name']} in {found['metric']['unit']}"
+        said = f"{metric[:1].upper()}{metric[1:]} on {found['scenes']} held-out scenes. {found['where']}"
+        lines = [textwrap.fill(f"- {counted(found, name)}", 120, subsequent_indent="  ") for name in ours_of(found)]
+        filled = "\n\n".join([textwrap.fill(said, 120), page_table(found), "\n".join(lines)])
+        text = f"{parts[0]}{mark}\n\n{filled}\n\n{mark}{parts[2]}"
     page.write_text(text, encoding="utf-8")
 
 

@@ -229,7 +229,8 @@ def rival_document(difference=-0.5, low=-0.9, high=-0.1):
 
 def test_a_rival_is_beaten_where_the_interval_says_so(script):
     rivals = script("rivals")
-    for numbers, word in (((-0.5, -0.9, -0.1), "better"), ((0.5, 0.1, 0.9), "worse"), ((-0.1, -0.5, 0.4), "not told")):
+    cases = {"better": (-0.5, -0.9, -0.1), "worse": (0.5, 0.1, 0.9), "no difference": (-0.1, -0.5, 0.4)}
+    for word, numbers in cases.items():
         found = rival_document(*numbers)
         (row,) = [row for row in rivals.equal_rays(found) if row[1] == "bounding"]
         assert word in row[-1]
@@ -239,36 +240,21 @@ def test_a_rival_is_beaten_where_the_interval_says_so(script):
         assert all(line.startswith("holds") == (word == "better") for line in rivals.verdicts(found)[::2])
 
 
-@pytest.fixture
-def fill_benchmarks(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "tools")
-    module = importlib.import_module("fill_benchmarks")
-    yield module
-    for name in (module.SHARED, "fill_benchmarks"):
-        sys.modules.pop(name, None)
-
-
-def test_figures_replace_what_stood_between_the_marks_and_nothing_else(fill_benchmarks):
-    page = "before\n\n<!-- flow -->\n\nold\n\n<!-- flow -->\n\nafter\n"
-    once = fill_benchmarks.filled(page, "flow", "new")
-    assert once == page.replace("old", "new")
-    assert fill_benchmarks.filled(once, "flow", "new") == once
-    with pytest.raises(SystemExit, match=r"em.* 0 times"):
-        fill_benchmarks.filled(page, "em", "new")
-
-
-def test_figures_name_their_date_their_machine_and_their_tables(fill_benchmarks):
-    machine = {"processor": "one", "cores": 2, "threads": 1, "python": "3.11", "load_at_start": 0.1}
-    tables = {"First": [{"a": 1, "b": 0.12345}], "Second": [{"c": "x"}]}
-    document = {"title": "Flow", "machine": machine, "tables": tables, "conclusions": ["that is so"]}
-    text = fill_benchmarks.markdown(document, "2026-01-02", ["First"])
-    assert "2026-01-02" in text
-    assert "2 cores, 1 thread," in text
-    assert "| 1 | 0.123 |" in text
-    assert "Second" not in text
-    assert text.endswith("- that is so")
-    with pytest.raises(SystemExit, match="there are: First; Second"):
-        fill_benchmarks.markdown(document, "2026-01-02", ["Third"])
+def test_a_page_takes_what_was_measured_between_its_marks_and_keeps_the_rest(script, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("before\n\n<!-- face -->\n\nold\n\n<!-- face -->\n\nafter\n")
+    found = {**rival_document(), "where": "Measured here."}
+    script("rivals").write_page(page, {"face": found})
+    once = page.read_text()
+    assert once.startswith("before\n\n<!-- face -->\n\nError in mm on 3 held-out scenes. Measured here.")
+    assert once.endswith("<!-- face -->\n\nafter\n")
+    assert "| `bounding` | 5 | 2 | -10.0 (-18.0 to -2.0), better" in " ".join(once.split())
+    assert "better than rivals that choose no rays in 1 of 1 comparisons" in once
+    assert "old" not in once
+    script("rivals").write_page(page, {"face": found})
+    assert page.read_text() == once
+    with pytest.raises(SystemExit, match=r"arm.* 0 times"):
+        script("rivals").write_page(page, {"arm": found})
 
 
 @pytest.fixture
@@ -410,7 +396,7 @@ def test_rivals_are_measured_drawn_and_put_on_their_page(run_script, tmp_path):
     assert [row["design"] for row in rows][:2] == ["fit", "uniform"]
     assert picture.stat().st_size > 10_000
     text = page.read_text()
-    assert "| fit " in text
+    assert "| `fit` " in text
     assert text.startswith("before")
     assert text.endswith("after\n")
 
