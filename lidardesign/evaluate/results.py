@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +28,7 @@ from lidardesign.task import Metric
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.cma.candidate import SearchRecord
+    from lidardesign.evaluate.rivals import StrongestRival
 
 
 def _half(low: float | None, high: float | None) -> float | None:
@@ -196,6 +198,7 @@ class Evaluation:
         accuracy: What accuracy costs in time, where that was asked for.
         searches: How the rows of `cma` were found, where they were asked for.
         seeds: Of learning and fitting, where rows and differences are means over several.
+        strongest_rival: The best baseline at `middle_rays` on training scenes; None where no rival was scored.
     """
 
     metric: Metric
@@ -213,6 +216,12 @@ class Evaluation:
     accuracy: Accuracy | None = None
     searches: Sequence[SearchRecord] = ()
     seeds: Sequence[int] = ()
+    strongest_rival: StrongestRival | None = None
+
+    @property
+    def middle_rays(self) -> int:
+        """The number of rays that a single figure is told at, see `middle_rays`."""
+        return middle_rays(self.rows)
 
     @property
     def groups(self) -> int:
@@ -252,6 +261,7 @@ class Evaluation:
             "seeds": list(self.seeds),
             "rows": [row.as_dict() for row in self.rows],
             "paired": [pair.as_dict() for pair in self.paired],
+            "strongest_rival": None if self.strongest_rival is None else self.strongest_rival.as_dict(),
             "equal_bandwidth": [row.as_dict() for row in self.equal_bandwidth],
             "paired_equal_bandwidth": [pair.as_dict() for pair in self.paired_bandwidth],
             "detector": self.detector,
@@ -264,6 +274,13 @@ class Evaluation:
         }
         asked = {"audit": self.audit, "mounting": self.mounting}
         return values | {name: found.as_dict() for name, found in asked.items() if found is not None}
+
+
+def middle_rays(rows: Sequence[Row]) -> int:
+    """The lower median of the numbers of rays at which most designs have a row, baselines where there are none."""
+    designs = Counter(row.rays for row in rows if not row.baseline) or Counter(row.rays for row in rows)
+    usual = sorted(count for count, number in designs.items() if number == max(designs.values()))
+    return usual[(len(usual) - 1) // 2]
 
 
 def leading_detail(rows: Sequence[Row]) -> str | None:

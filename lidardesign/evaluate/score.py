@@ -39,8 +39,10 @@ from lidardesign.evaluate.results import (
     Row,
     audit_rows,
     effect_notes,
+    middle_rays,
     summaries,
 )
+from lidardesign.evaluate.rivals import StrongestRival, strongest_rival
 from lidardesign.evaluate.scene_scores import Progress, silent_notes
 from lidardesign.evaluate.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.geometry.triangles import SecondCasts
@@ -307,7 +309,14 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         audit=audit,
         mounting=mounting,
         searches=searches,
+        strongest_rival=_strongest_rival(request, entries, middle_rays(plain)),
     )
+
+
+def _strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: int) -> StrongestRival | None:
+    rivals = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
+    fired = sum(entry.rays for entry in entries) * len(request.test)
+    return strongest_rival(request, {entry.name: entry.drawn for entry in rivals}, rays, fired)
 
 
 def _part(progress: Progress | None, number: int, passes: int) -> Progress | None:

@@ -17,6 +17,7 @@ import numpy as np
 
 from lidardesign.errors import NumericalError
 from lidardesign.evaluate.results import Evaluation, Mounting, Paired, Row
+from lidardesign.evaluate.rivals import mean_rival
 from lidardesign.evaluate.statistics import LEVEL, Interval, student_interval
 
 # Design, rays, and what the bandwidth is matched to; rays at equal bandwidth differ between seeds.
@@ -97,6 +98,7 @@ def over_seeds(evaluations: Sequence[Evaluation], seeds: Sequence[int], scenes_s
         searches=[search for each in evaluations for search in each.searches],
         mounting=_mean_mounting(evaluations, rows),
         seeds=tuple(seeds),
+        strongest_rival=mean_rival((each.strongest_rival for each in evaluations), first.metric.better),
     )
 
 

@@ -1,0 +1,109 @@
+"""The strongest rival: found at the middle number of rays, on training scenes that no rival was built from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.evaluations import make_row
+from support.scoring import HitTask, MissTask, design, make_request, scenes
+from support.tables import each_row
+
+from lidardesign.evaluate.baselines.greedy import GreedySource
+from lidardesign.evaluate.results import middle_rays
+from lidardesign.evaluate.rivals import FEWEST_SCENES, LARGEST_SHARE, MOST_SCENES, mean_rival
+from lidardesign.evaluate.score import entries_of, evaluate
+from lidardesign.evaluate.seeds import over_seeds
+from lidardesign.geometry.raycast import SceneCaster
+
+HELD_BACK = scenes(31, 40, side=0.3)
+
+
+def held_back_alone(purpose):
+    assert purpose == "held back"
+    return iter(HELD_BACK)
+
+
+def with_held_back(**changes):
+    return make_request(greedy=GreedySource(held_back_alone, 0.1), **changes)
+
+
+@each_row(
+    ("counts", "middle"),
+    [
+        ({"a": [9]}, 9),
+        ({"a": [9, 25]}, 9),
+        ({"a": [9, 25, 36]}, 25),
+        ({"a": [100, 9, 36, 25]}, 25),
+        # a small fixed pattern has rows at few numbers; what most designs have counts
+        ({"a": [9, 25, 36], "b": [25, 36, 49], "c": [25]}, 25),
+        ({"a": [9, 25, 36], "b": [9]}, 9),
+    ],
+)
+def test_the_middle_number_of_rays_is_where_most_designs_have_a_row(counts, middle):
+    rows = [make_row(name, count, 1.0) for name, own in counts.items() for count in own]
+    rivals = [make_row("uniform", count, 1.0, True) for count in (1, 2, 3, 4, 1000)]
+    assert middle_rays([*rows, *rivals]) == middle_rays(rows[::-1]) == middle
+    assert middle_rays(rivals) == 3
+
+
+@pytest.mark.parametrize("task", [MissTask(), HitTask()])
+def test_its_scores_are_those_of_its_rays_in_scenes_that_were_held_back(task):
+    request = with_held_back(task=task, rays=(9, 16, 25))
+    rival = evaluate(request).strongest_rival
+    values = {}
+    for entry in entries_of(request):
+        if entry.baseline and entry.rays == 16 and entry.matched_to is None:
+            values[entry.name] = np.mean([_naive(task, entry.drawn(n)[0], HELD_BACK[n]) for n in range(rival.scenes)])
+    assert rival.values == pytest.approx(values)
+    assert (rival.rays, set(rival.values)) == (16, {"uniform", "random", "bounding", "silhouette"})
+    order = sorted(values, key=values.get, reverse=request.metric.better == "higher")
+    assert rival.name == order[0]
+
+
+def _naive(task, rays, scene):
+    hits = SceneCaster(scene, 0).first_hit(rays.origin_m, rays.direction)
+    seen = int(((hits.body >= 0) & (rays.gate_m[:, 0] <= hits.range_m) & (hits.range_m < rays.gate_m[:, 1])).sum())
+    if isinstance(task, HitTask):
+        return 100.0 * seen / len(rays)
+    return task.metric.worst if seen < task.fewest_returns else 100.0 * (1 - seen / len(rays))
+
+
+def test_held_out_scenes_have_no_say():
+    first, second = (evaluate(with_held_back(test=scenes(seed, side=side))) for seed, side in ((2, 0.0), (5, 1.0)))
+    assert first.strongest_rival == second.strongest_rival
+    assert [row.value for row in first.rows] != [row.value for row in second.rows]
+
+
+@each_row(
+    ("tests", "rays", "scenes_used"),
+    [(1, (9,), FEWEST_SCENES), (100, (25,), 12), (40, (9, 100), MOST_SCENES)],
+)
+def test_it_costs_a_tenth_of_the_rays_or_few_scenes(tests, rays, scenes_used):
+    request = with_held_back(test=scenes(2, tests), rays=rays, equal_bandwidth=False)
+    found = evaluate(request).strongest_rival
+    assert found.scenes == scenes_used
+    fired = sum(entry.rays for entry in entries_of(request)) * tests
+    if found.scenes > FEWEST_SCENES:
+        assert found.scenes * found.rays * len(found.values) <= LARGEST_SHARE * fired
+
+
+def test_without_rivals_there_is_none():
+    for request in (make_request(baselines=()), make_request(baselines=("uniform",), train=())):
+        evaluation = evaluate(request)
+        assert evaluation.strongest_rival is None
+        assert evaluation.as_dict()["strongest_rival"] is None
+
+
+def test_over_seeds_it_is_the_best_of_the_means():
+    evaluations = [evaluate(make_request([design("own")], seed=seed)) for seed in range(3)]
+    joint = over_seeds(evaluations, (0, 1, 2), 7).strongest_rival
+    for name, value in joint.values.items():
+        assert value == pytest.approx(np.mean([each.strongest_rival.values[name] for each in evaluations]))
+    assert joint.name == min(joint.values, key=joint.values.get)
+    assert joint.scenes == sum(each.strongest_rival.scenes for each in evaluations)
+    assert mean_rival([evaluations[0].strongest_rival, None], "lower") is None
+    one = evaluations[0].strongest_rival
+    lacking = replace(one, values={"uniform": 3.0})
+    assert mean_rival([one, lacking], "lower").name == "uniform"
