@@ -1,5 +1,6 @@
 # make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about five minutes
 # make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 400 MB there
+# make docs   writes the documentation with a search as pages of build/site, which load nothing from elsewhere
 # make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
 # make test-pythons  installs and tests the core with every other Python that is found, four minutes each
@@ -19,7 +20,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: demo test consumers system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills soak-promise clean
+.PHONY: demo test docs consumers system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills soak-promise clean
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): once, a minute or more"
@@ -31,6 +32,15 @@ $(BIN)/.ready: pyproject.toml constraints.txt
 
 demo: $(BIN)/.ready
 	$(BIN)/python examples/demo.py
+
+$(BIN)/.docs: $(BIN)/.ready
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	@touch $@
+
+# The variable leaves out an announcement of the theme's makers
+docs: $(BIN)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "build/site/index.html"
 
 $(BIN)/.transport: $(BIN)/.ready
 	@echo "Adding the light-transport simulator: once, 200 MB"

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/idea.md: docs/overview.png, the whole way from a scene to a score, and docs/idea-*.png.
+"""Draws the pictures of docs/concepts.md: docs/overview.png (from a scene to a score) and docs/idea-*.png.
 
     python docs/figures/idea.py                 # learns a draft run on the embedded head model first
     python docs/figures/idea.py --run RUN       # from a face run that is there

@@ -6,20 +6,16 @@ One browser and one page for all tests; where there is no browser they are skipp
 from __future__ import annotations
 
 import io
-import shutil
 
 import numpy as np
 import pytest
+from support.browsers import opened_browser
 from support.report_pages import FRAMES, NASTY, PLACES, make_report
 
 from lidardesign.evaluate.figures.drawing import body_triangles, frustum_lines, origin_lines, scene_bounds
 from lidardesign.evaluate.report.report import report_html
 from lidardesign.geometry.rays import Outcome
 
-FLAGS = [
-    *("--no-sandbox", "--no-first-run", "--disable-quic", "--disable-sync", "--disable-background-networking"),
-    *("--disable-component-update", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-]
 WAIT_MS = 120_000  # software that draws in 3D on a busy machine takes its time
 DRAWN = "document.documentElement.dataset.drawn === 'yes'"
 GREEN = (0, 158, 115)  # of rays that return
@@ -32,14 +28,8 @@ def report():
 
 @pytest.fixture(scope="module")
 def browser():
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: consumers)")
-    program = shutil.which("chromium") or shutil.which("chromium-browser")
-    if program is None:
-        pytest.skip("chromium is not installed (tools/install-consumers.sh)")
-    with api.sync_playwright() as player:
-        started = player.chromium.launch(executable_path=program, args=FLAGS)
+    with opened_browser() as started:
         yield started
-        started.close()
 
 
 @pytest.fixture(scope="module")
