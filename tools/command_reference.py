@@ -7,6 +7,7 @@ python tools/command_reference.py --check   # exit 1 where it would be another
 from __future__ import annotations
 
 import inspect
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,14 +16,15 @@ from typing import Any
 import typer
 
 from lidardesign.cli.main import app
-from lidardesign.cli.manual import COMMON_EXITS, DOCS, MANUALS, Manual
+from lidardesign.cli.manual import DOCS, MANUALS, Manual
 
 PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 HEAD = """\
 # Commands
 
-Written by `tools/command_reference.py` from the program: what `lidardesign COMMAND --help` says, on one page. How they
-behave in a shell, and all exit codes: [shell.md](shell.md).
+After this page you know what every command does, and which options it has. `lidardesign COMMAND --help` adds files,
+examples and exit codes; [in the shell](shell.md) is what holds for all commands. `tools/command_reference.py` writes this
+page from the program.
 """
 # Every command has these; they are described once.
 COMMON = ("--seed", "--json", "--quiet", "--debug", "--help")
@@ -33,11 +35,10 @@ def reference() -> str:
     """The page."""
     root = typer.main.get_command(app)
     commands = list(_commands(root))
-    lines = [HEAD, "| command | what it does |", "|---|---|"]
-    lines += [f"| [`{path}`](#{_anchor(path)}) | {_first_line(command)} |" for path, command in commands]
-    lines += ["", COMMON_HEAD, "", *_option_table(_common_options(commands[0][1]))]
+    lines = [HEAD, COMMON_HEAD, "", *_option_table(_common_options(commands[0][1]))]
+    described: dict[tuple[str, str], str] = {}
     for path, command in commands:
-        lines += ["", *_section(path, command)]
+        lines += ["", *_section(path, command, described)]
     return "\n".join(lines) + "\n"
 
 
@@ -51,33 +52,27 @@ def _commands(root: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]
             yield " ".join((*path, name)), command
 
 
-def _section(path: str, command: Any) -> Iterator[str]:
+def _section(path: str, command: Any, described: dict[tuple[str, str], str]) -> Iterator[str]:
+    """A command; `described` has the options of earlier commands, which are not described again."""
     manual = MANUALS.get(path, Manual({}))
     yield f"## {path}"
     yield ""
     yield _plain(inspect.cleandoc(command.help or "").partition("\f")[0])
-    if manual.about:
-        yield f"\n{manual.about}"
     yield f"\n```text\nlidardesign {path} {_usage(command)}\n```\n"
     own = [one for one in command.params if _name(one) not in COMMON]
-    yield from _option_table(own)
-    if manual.files:
-        yield ""
-        yield from (f"- {entry}" for entry in manual.files)
+    known = [one for one in own if (_shown(one), _described(one)) in described]
+    if len(known) < len(own):
+        yield from _option_table([one for one in own if one not in known])
+    for earlier in dict.fromkeys(described[_shown(one), _described(one)] for one in known):
+        same = [f"`{_name(one)}`" for one in known if described[_shown(one), _described(one)] == earlier]
+        yield f"\nAs for `{earlier}`: {', '.join(same)}."
+    described |= {(_shown(one), _described(one)): path for one in own if one not in known}
     if manual.examples:
-        yield ""
-        yield "```sh"
-        yield from (line for example, words in manual.examples.items() for line in _example(example, words))
-        yield "```"
-    codes = {**COMMON_EXITS, **(manual.exits or {})}
-    yield ""
-    yield f"Exit codes: {'; '.join(f'{code} {words}' for code, words in sorted(codes.items()))}."
+        example, words = next(iter(manual.examples.items()))
+        yield from ("", "```sh", *([f"# {words}"] if words else []), example, "```")
     if manual.see:
+        yield ""
         yield f"See {', '.join(f'[{page}]({page})' for page in manual.see)}."
-
-
-def _example(example: str, words: str) -> list[str]:
-    return [f"# {words}", example] if words else [example]
 
 
 def _usage(command: Any) -> str:
@@ -105,11 +100,15 @@ def _shown(parameter: Any) -> str:
 
 
 def _described(parameter: Any) -> str:
-    text = _cell(" ".join((parameter.help or "").split()))
+    text = _cell(_first_sentence(" ".join((parameter.help or "").split())))
     default = parameter.show_default if isinstance(parameter.show_default, str) else parameter.default
     if parameter.required or default in (None, False) or parameter.show_default is False:
         return text
     return f"{text} Default: {_cell(str(default))}."
+
+
+def _first_sentence(text: str) -> str:
+    return re.split(r"(?<=[a-z\d)])\. (?=[A-Z])", text)[0].removesuffix(".") + "." if text else ""
 
 
 def _cell(text: str) -> str:
@@ -124,16 +123,8 @@ def _name(parameter: Any) -> str:
     return next((name for name in parameter.opts if name.startswith("--")), parameter.opts[0])
 
 
-def _first_line(command: Any) -> str:
-    return _cell(" ".join(inspect.cleandoc(command.help or "").partition("\n\n")[0].split()))
-
-
 def _plain(text: str) -> str:
     return "\n\n".join(" ".join(part.split()) for part in text.split("\n\n"))
-
-
-def _anchor(path: str) -> str:
-    return path.replace(" ", "-")
 
 
 def main() -> int:
