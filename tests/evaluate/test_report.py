@@ -16,6 +16,7 @@ from support.report_pages import (
     make_evaluation,
     make_rays,
     make_report,
+    make_row,
     make_scene,
     make_sensor,
     make_shown,
@@ -38,7 +39,7 @@ from lidardesign.evaluate.figures.drawing import (
     thinned,
 )
 from lidardesign.evaluate.figures.scene_figure import MOST_RAY_STEPS, MOST_STEPS, SceneFigure
-from lidardesign.evaluate.report.figures import curve_figure, marginal_figure, plane_figure
+from lidardesign.evaluate.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure
 from lidardesign.evaluate.report.markup import asset, script_safe
 from lidardesign.evaluate.report.report import report_html, write_report
 from lidardesign.evaluate.report.tables import (
@@ -144,7 +145,14 @@ def test_every_switch_has_a_label_and_every_table_a_caption_and_scopes():
 def test_the_page_holds_tables_verdicts_times_and_how_to_reproduce(tmp_path):
     write_report(make_report("mine"), tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    for expected in ("config: mine", "note mine", 'class="better"', "not clear", "viewport", "gate.width_m.max"):
+    for expected in (
+        "config: mine",
+        "note mine",
+        'class="better"',
+        "no difference found",
+        "viewport",
+        "gate.width_m.max",
+    ):
         assert expected in text
     assert "learn mine: 10.00 s, at most 1 MiB of memory (now)" in text
 
@@ -155,8 +163,7 @@ def test_what_is_not_there_has_no_section():
         report, density=None, density_m=None, constraints={}, times=(), evaluation=make_evaluation("plain", "plain 1")
     )
     places = {attributes["id"] for tag, attributes in parsed(report_html(bare)) if tag == "section"}
-    assert {"density", "constraints", "time", "physics", "audit"}.isdisjoint(places)
-    assert "It was not measured" in report_html(bare)
+    assert {"density", "constraints", "time", "physics", "audit", "accuracy"}.isdisjoint(places)
 
 
 def test_plotly_accepts_every_figure():
@@ -226,6 +233,13 @@ def test_a_verdict_needs_an_interval_that_excludes_zero_and_the_metrics_directio
     assert [verdict(lower, pair) for pair in lower.paired] == ["better", "open"]
     assert [verdict(higher, pair) for pair in higher.paired] == ["worse", "open"]
     assert "no clear difference from uniform" in summary_sentences(lower)[1]
+
+
+@each_row(("better", "far"), [("lower", {"awful"}), ("higher", set())])
+def test_rivals_are_hidden_at_first_where_they_are_far_worse_than_all_designs(better, far):
+    rows = [make_row("d", 9, 10.0), make_row("close", 9, 14.0, True), make_row("awful", 9, 90.0, True)]
+    metric = Metric("score", "mm", better, worst=200.0, tolerance=0.1)
+    assert far_rivals(Evaluation(metric, 1, rows, [])) == far
 
 
 EGG = Ellipsoid((0.1, 0.2, 0.3))

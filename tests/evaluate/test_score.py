@@ -14,7 +14,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.evaluate.figures.scores import curve_picture, differences_picture
 from lidardesign.evaluate.report.figures import scores_figure
-from lidardesign.evaluate.report.tables import paired_table
+from lidardesign.evaluate.report.tables import paired_tables
 from lidardesign.evaluate.results import csv_text, verdict, worse_than_threshold
 from lidardesign.evaluate.score import evaluate
 from lidardesign.evaluate.statistics import mean_interval, paired_difference
@@ -181,7 +181,7 @@ def test_scenes_of_one_group_give_no_interval_and_no_verdict():
     show_evaluation(document, [], console)
     assert "None" not in console.file.getvalue()
     assert "over other scenes" not in console.file.getvalue()
-    assert paired_table(evaluation)
+    assert paired_tables(evaluation)
     assert curve_picture(evaluation, "rays")
     assert differences_picture(evaluation)
     assert scores_figure(evaluation, "rays")

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from lidardesign.evaluate.results import Evaluation, Row
+from lidardesign.geometry.rays import Outcome
 from lidardesign.run.files import write_atomic
 
 if TYPE_CHECKING:
@@ -138,6 +139,16 @@ def plain_label(text: str, longest: int = 28) -> str:
 
 
 Against = Literal["rays", "bandwidth"]
+
+# The words of the report and of the pictures beside it.
+VERDICT_WORDS = {"better": "better", "worse": "worse", "open": "no difference found"}
+OUTCOME_WORDS = {
+    Outcome.RETURN: "return",
+    Outcome.OCCLUDED: "occluded",
+    Outcome.AFTER_GATE: "behind the gate",
+    Outcome.MISS: "nothing hit",
+    Outcome.NOT_DETECTED: "not detected",
+}
 
 # Okabe and Ito 2008, without yellow (too faint on white) and with black kept for text.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")

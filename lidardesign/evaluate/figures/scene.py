@@ -17,6 +17,7 @@ import numpy as np
 from lidardesign.design.sensor import Sensor
 from lidardesign.evaluate.figures.canvas import (
     INK,
+    OUTCOME_WORDS,
     PAGE_INCHES,
     SMALL_POINTS,
     SOFT,
@@ -347,7 +348,7 @@ def _legend_looks(kinds: Sequence[Outcome], *, receiver: bool) -> list[tuple[str
     for kind in kinds:
         colour, dash, _ = OUTCOME_LOOKS[kind]
         look = {"color": colour, "linestyle": dash, "linewidth": 1.2, "marker": "o" if kind == Outcome.RETURN else ""}
-        looks.append((kind.name.lower().replace("_", " "), look))
+        looks.append((OUTCOME_WORDS[kind], look))
     return [*looks, ("detector", RECEIVER_LOOK)] if receiver else looks
 
 

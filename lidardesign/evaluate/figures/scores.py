@@ -16,6 +16,7 @@ from lidardesign.evaluate.figures.canvas import (
     PAGE_INCHES,
     SMALL_POINTS,
     SOFT,
+    VERDICT_WORDS,
     Against,
     Series,
     add_legend,
@@ -45,12 +46,12 @@ MOST_RAY_TICKS = 7
 MOST_ROWS = 48
 ROW_INCHES, MARGIN_INCHES = 0.165, 0.75
 # By verdict: colour, marker and whether it is filled.
+LEGEND_WORDS = ("a is better", "a is worse", VERDICT_WORDS["open"])
 VERDICT_LOOKS = {
     "better": ("#0072B2", "o", True),
     "worse": ("#D55E00", "s", True),
     "open": ("#6b7280", "D", False),
 }
-VERDICT_WORDS = {"better": "a is better", "worse": "a is worse", "open": "not clear"}
 
 
 def curve_picture(evaluation: Evaluation, against: Against) -> Figure:
@@ -109,7 +110,7 @@ def _list_rows(axes: Axes, labels: Sequence[str]) -> None:
 
 
 def differences_picture(evaluation: Evaluation) -> Figure:
-    """Every paired difference with its interval, a page wide: what the scenes can tell apart, and what they cannot."""
+    """Every paired difference with its interval, a page wide: where a difference was found, and where not."""
     pairs, title = drawn_pairs(evaluation)
     figure = new_figure(PAGE_INCHES, MARGIN_INCHES + max(len(pairs), 2) * ROW_INCHES)
     axes = figure.add_subplot()
@@ -128,7 +129,7 @@ def differences_picture(evaluation: Evaluation) -> Figure:
     _soft_title(axes, title)
     looks = [
         (words, {"color": colour, "marker": mark, "markerfacecolor": colour if filled else "white", "linewidth": 1.2})
-        for words, (colour, mark, filled) in zip(VERDICT_WORDS.values(), VERDICT_LOOKS.values(), strict=True)
+        for words, (colour, mark, filled) in zip(LEGEND_WORDS, VERDICT_LOOKS.values(), strict=True)
     ]
     add_legend(figure, looks, 3)
     return figure
@@ -225,9 +226,7 @@ def constraints_picture(slacks: Mapping[str, Sequence[ConstraintSlack]]) -> Figu
         slacks: How tight each bound is, by the design's name.
     """
     # what holds for every design of the space is no constraint of anybody's
-    designs = {
-        name: rows for name, rows in slacks.items() if not all(row.name.startswith(SPACE_MARK) for row in rows)
-    }
+    designs = {name: rows for name, rows in slacks.items() if not all(row.name.startswith(SPACE_MARK) for row in rows)}
     if not designs:
         return None
     shown = dict(list(designs.items())[:MOST_DESIGNS])

@@ -17,7 +17,7 @@ from lidardesign.design.layouts.rays import certificates_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.figures.canvas import Series
 from lidardesign.evaluate.report.figures import AXIS, DASH_NAMES, LAYOUT, SYMBOLS
-from lidardesign.evaluate.report.markup import figure, paragraphs, swatch
+from lidardesign.evaluate.report.markup import figure, folded, paragraphs, swatch
 from lidardesign.evaluate.report.tables import four_digits, table
 from lidardesign.evaluate.results import Evaluation
 
@@ -104,7 +104,7 @@ def _table(chosen: Mapping[str, Sequence[Mapping[str, Any]]], axis: str) -> str:
             cells += [str(entry[column]) for column in ("candidates", "gates", "scenes")]
             lines.append((cells, "", bool(index == 0 and lines)))
     caption = "Rays chosen on training scenes, and how far from the best choice they are at most."
-    return table(headings, lines, text_columns=1, caption=caption)
+    return folded("All certificates", table(headings, lines, text_columns=1, caption=caption), len(lines))
 
 
 def _percent(share: Any) -> str:

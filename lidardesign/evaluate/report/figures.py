@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,6 +33,7 @@ from lidardesign.evaluate.figures.pareto import (
     label_places,
     panels,
 )
+from lidardesign.evaluate.report.markup import folded
 from lidardesign.evaluate.report.tables import plain_number, table
 from lidardesign.evaluate.report.view import encoded
 from lidardesign.evaluate.results import Evaluation
@@ -58,8 +59,22 @@ SYMBOLS = {
 DASH_NAMES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
 
 
-def curve_figure(evaluation: Evaluation, against: Against) -> dict[str, Any]:
-    """Score against rays or bandwidth: a line and an interval band per name."""
+FAR_SHARE = 0.5  # of the designs' scores: rivals that are worse by more at some number of rays are hidden at first
+
+
+def far_rivals(evaluation: Evaluation) -> set[str]:
+    """Rivals so much worse than all designs that a plot of both would show little of the designs."""
+    ends = [end for row in evaluation.rows if not row.baseline for end in row.drawn_interval]
+    if not ends:
+        return set()
+    reach = FAR_SHARE * max(max(ends) - min(ends), abs(max(ends) + min(ends)) / 2)
+    sign = 1.0 if evaluation.metric.better == "lower" else -1.0
+    limit = max(sign * end for end in ends) + reach
+    return {row.design for row in evaluation.rows if row.baseline and sign * row.value > limit}
+
+
+def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[str] = ()) -> dict[str, Any]:
+    """Score against rays or bandwidth: a line and an interval band per name, some of them hidden at first."""
     curves = series(evaluation)
     across, up = axis_titles(evaluation, against)
     rows = [row for curve in curves for row in curve.rows]
@@ -76,12 +91,16 @@ def curve_figure(evaluation: Evaluation, against: Against) -> dict[str, Any]:
             **axis,
             **_scale([row.value for row in rows]),
             "tickformat": "~g",
+            "automargin": True,
             "title": {"text": html.escape(up).replace(", ", "<br>"), "font": {"size": 13}},
         },
         "showlegend": False,
         "hovermode": "closest",
     }
-    return {"data": [trace for curve in curves for trace in _curve_traces(curve, against)], "layout": layout}
+    traces = [
+        {**trace, "visible": curve.name not in hidden} for curve in curves for trace in _curve_traces(curve, against)
+    ]
+    return {"data": traces, "layout": layout}
 
 
 def _scale(values: Sequence[float]) -> dict[str, Any]:
@@ -399,9 +418,8 @@ def _table(sweep: Sweep) -> str:
     chosen = sweep.chosen
     lines = [(_cells(one), "better" if one is chosen else "open", False) for one in sweep.measurements]
     words = {"better": "to choose", "open": ""}
-    return f"<h3>{html.escape(sweep.knob)}: {html.escape(sweep.verdict)}</h3><p>{html.escape(about)}</p>" + table(
-        headings, lines, text_columns=1, words=words, caption=f"Settings of {sweep.knob}."
-    )
+    content = table(headings, lines, text_columns=1, words=words, caption=f"Settings of {sweep.knob}.")
+    return folded(f"{sweep.knob}: {sweep.verdict}", f"<p>{html.escape(about)}</p>{content}")
 
 
 def _cells(measurement: Measurement) -> list[str]:

@@ -14,8 +14,6 @@ from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any
 
-# Tables of more rows are folded away; printing opens them.
-MOST_ROWS = 40
 STROKES = {
     "solid": "",
     "dash": "6 3",
@@ -64,11 +62,10 @@ def definitions(values: Sequence[tuple[str, str]]) -> str:
     return f"<dl>{''.join(items)}</dl>"
 
 
-def folded(content: str, rows: int, summary: str) -> str:
-    """Content of so many rows: folded away where there are many."""
-    if rows <= MOST_ROWS:
-        return content
-    return f"<details><summary>{html.escape(summary)} ({rows} rows)</summary>{content}</details>"
+def folded(summary: str, content: str, rows: int | None = None) -> str:
+    """Content below a line that opens it, which says how many rows it has; empty where there is none."""
+    count = "" if rows is None else f" ({rows} {'row' if rows == 1 else 'rows'})"
+    return f"<details><summary>{html.escape(summary)}{count}</summary>{content}</details>" if content else ""
 
 
 def figure(document: dict[str, Any], identifier: str, height_px: int, caption: str, kind: str = "") -> str:

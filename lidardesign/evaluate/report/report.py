@@ -29,6 +29,7 @@ from lidardesign.evaluate.report.figures import (
     MOST_DESIGNS,
     accuracy_tables,
     curve_figure,
+    far_rivals,
     marginal_figure,
     pareto_figure,
     pareto_height_px,
@@ -44,7 +45,7 @@ from lidardesign.evaluate.report.tables import (
     effects_section,
     held_out_scenes,
     mounting_table,
-    paired_table,
+    paired_tables,
     reproduction,
     rows_table,
     sensors_table,
@@ -114,45 +115,54 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
     looks = {name: replace(look, dash=DASHES[index % len(DASHES)]) for index, (name, look) in enumerate(looks.items())}
     shown = [looks[one.name] for one in designs]
     result = paragraphs(summary_sentences(evaluation)) + paragraphs(evaluation.notes, "note")
-    rivals = folded(paired_table(evaluation), len(evaluation.paired), "All paired differences")
-    matched = len(evaluation.equal_bandwidth)
-    bandwidth = folded(bandwidth_table(evaluation), matched, "All rows at equal bandwidth") if matched else ""
-    constraints = [constraints_table(name, bounds) for name, bounds in report.constraints.items()]
-    sensors = [folded(sensors_table(one), len(one.sensors), f"Sensors of {one.name}") for one in designs]
+    constraints = "".join(constraints_table(name, bounds) for name, bounds in report.constraints.items())
+    sensors = "".join(folded(f"Sensors of {one.name}", sensors_table(one), len(one.sensors)) for one in designs)
     return [
         ("result", "Result", result),
         ("scene", "Designs in a scene", view_section(report.shown, shown, report.density_m)),
-        ("curves", "Score against rays and bandwidth", _curves(evaluation)),
-        ("scores", "All scores", rows_table(evaluation)),
-        ("rivals", "Against the rivals at equal rays", rivals),
-        ("bandwidth", "Against the rivals at equal bandwidth", bandwidth),
+        ("scores", "Scores", _scores(evaluation)),
         ("mounting", "Mounted carelessly", mounting_table(evaluation)),
         ("density", "The learned density", _density(report.density, looks) if report.density else ""),
         ("choice", "Chosen rays and how far from the best", choice_section(designs, evaluation, looks)),
-        ("constraints", "Constraints and how tight each is", "".join(constraints)),
+        ("constraints", "Constraints and how tight each is", constraints),
         ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
         ("audit", "Audit of the physics", audit_section(evaluation, evaluation.audit) if evaluation.audit else ""),
         ("accuracy", "What accuracy costs", _accuracy(evaluation.accuracy.sweeps if evaluation.accuracy else ())),
-        ("sensors", "Sensors", "".join(sensors)),
+        ("sensors", "Sensors", sensors),
         ("time", "Where the time went", times_tables(report.times)),
         ("reproduce", "How to reproduce this", reproduction(report.reproduce)),
     ]
 
 
-def _curves(evaluation: Evaluation) -> str:
-    """Both curves with one legend, whose boxes switch curves in both."""
+def _scores(evaluation: Evaluation) -> str:
+    """Both curves with one legend, whose boxes switch curves in both, and all tables of scores, folded."""
+    far = far_rivals(evaluation)
     legend = "".join(
-        switch(curve.name, picture=swatch(curve.colour, curve.dash, curve.marker), curve=str(index))
+        switch(
+            curve.name,
+            picture=swatch(curve.colour, curve.dash, curve.marker),
+            checked=curve.name not in far,
+            curve=str(index),
+        )
         for index, curve in enumerate(series(evaluation))
     )
+    hidden = [curve.name for curve in series(evaluation) if curve.name in far]
+    note = paragraphs([f"Hidden at first, far worse than all designs: {', '.join(hidden)}."]) if hidden else ""
     means = f"means over {held_out_scenes(evaluation.scenes)}, with 95 % bootstrap intervals as bands."
     captions = {
         "rays": f"Score against rays per frame: {means}",
         "bandwidth": "The same scores against the bandwidth that it takes to read the gates out.",
     }
-    return f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>' + "".join(
-        figure(curve_figure(evaluation, against), f"curve-{against}", CURVE_PX, caption, "curves")
+    figures = "".join(
+        figure(curve_figure(evaluation, against, far), f"curve-{against}", CURVE_PX, caption, "curves")
         for against, caption in captions.items()
+    )
+    matched = len(evaluation.equal_bandwidth)
+    return (
+        f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>{note}{figures}'
+        + folded("All scores", rows_table(evaluation), len(evaluation.rows))
+        + paired_tables(evaluation)
+        + folded("Designs against rivals at equal bandwidth", bandwidth_table(evaluation), matched)
     )
 
 
@@ -188,7 +198,7 @@ def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
 
 def _accuracy(sweeps: Sequence[Sweep]) -> str:
     if not sweeps:
-        return "<p>It was not measured: <code>lidardesign evaluate --accuracy</code> does, in some minutes.</p>"
+        return ""
     read = (
         "Error against seconds on this machine, one panel per numerical choice. Orange is the cheapest setting inside "
         "the tolerance (dashed), a ring the one of this run; pale settings are beaten in both; triangles on the lower "
@@ -251,7 +261,7 @@ def evaluation_report(
     return Report(
         evaluation,
         pictured.shown,
-        title=f"{config.task_name}: {evaluation.metric.name} on {held_out_scenes(evaluation.scenes)}",
+        title=f"{folder.resolve().name}: {evaluation.metric.name} on {held_out_scenes(evaluation.scenes)}",
         density=pictured.density,
         density_m=points,
         constraints=pictured.slacks,

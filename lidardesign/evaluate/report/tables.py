@@ -10,7 +10,8 @@ from typing import Any
 
 from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.evaluate.report.markup import definitions
+from lidardesign.evaluate.figures.canvas import VERDICT_WORDS
+from lidardesign.evaluate.report.markup import definitions, folded
 from lidardesign.evaluate.results import (
     MILLIMETRES,
     Audit,
@@ -26,7 +27,6 @@ from lidardesign.run.clock import INSIDE, OTHER
 
 MOST_SENSORS = 60  # listed in a table
 TINY = 1e-4  # from here on the limit is shown
-VERDICTS = {"better": "better", "worse": "worse", "open": "not clear"}
 
 
 def four_digits(value: float) -> str:
@@ -100,27 +100,38 @@ def mounting_table(evaluation: Evaluation) -> str:
     return table(headings, lines, text_columns=1, caption=caption)
 
 
-def paired_table(evaluation: Evaluation) -> str:
-    """All paired differences, with a verdict in words."""
+def paired_tables(evaluation: Evaluation) -> str:
+    """All paired differences with a verdict in words, folded: designs against rivals, then against each other."""
     if not evaluation.paired:
         return "<p>There is nothing to compare with.</p>"
+    rivals = {row.design for row in evaluation.rows if row.baseline}
+    kinds = {
+        "Designs against rivals": [pair for pair in evaluation.paired if pair.b in rivals],
+        "Designs against designs": [pair for pair in evaluation.paired if pair.b not in rivals],
+    }
+    return "".join(folded(name, _paired_table(evaluation, pairs), len(pairs)) for name, pairs in kinds.items() if pairs)
+
+
+def _paired_table(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
     headings = ["a", "b", "rays", f"a - b [{evaluation.metric.unit}]", "95 % interval", "a is"]
     lines = [
         (
             [pair.a, pair.b, str(pair.rays), four_digits(pair.difference), _interval(pair), ""],
             verdict(evaluation, pair),
-            bool(index and pair.a != evaluation.paired[index - 1].a),
+            bool(index and pair.a != pairs[index - 1].a),
         )
-        for index, pair in enumerate(evaluation.paired)
+        for index, pair in enumerate(pairs)
     ]
     caption = "Differences scene by scene at equal numbers of rays, with their 95 % bootstrap intervals over scenes."
     return table(headings, lines, text_columns=2, caption=caption)
 
 
 def bandwidth_table(evaluation: Evaluation) -> str:
-    """Each design against baselines that were given as many rays as fit in its bandwidth."""
+    """Each design against rivals that were given as many rays as fit in its bandwidth; empty where there are none."""
+    if not evaluation.equal_bandwidth:
+        return ""
     unit = evaluation.metric.unit
-    headings = ["design", "baseline", "rays", "its rays", "Mbit/s", f"design [{unit}]", f"baseline [{unit}]"]
+    headings = ["design", "rival", "rays", "its rays", "Mbit/s", f"design [{unit}]", f"rival [{unit}]"]
     headings += ["difference (95 % interval)", "design is"]
     own = {(row.design, row.rays): row for row in evaluation.rows if not row.baseline}
     pairs = zip(evaluation.equal_bandwidth, evaluation.paired_bandwidth, strict=True)
@@ -131,7 +142,7 @@ def bandwidth_table(evaluation: Evaluation) -> str:
         cells += [four_digits(row.value), f"{four_digits(pair.difference)} ({_interval(pair)})", ""]
         begins = bool(index and row.design == evaluation.equal_bandwidth[0].design)
         lines.append((cells, verdict(evaluation, pair), begins))
-    caption = "Each design against baselines with as many rays (their rays) as fit in its bandwidth."
+    caption = "Each design against rivals with as many rays (their rays) as fit in its bandwidth."
     return table(headings, lines, text_columns=2, caption=caption)
 
 
@@ -182,7 +193,7 @@ def table(
     lines: Sequence[tuple[list[str], str, bool]],
     *,
     text_columns: int,
-    words: Mapping[str, str] = VERDICTS,
+    words: Mapping[str, str] = VERDICT_WORDS,
     caption: str = "",
 ) -> str:
     """An HTML table; a line is its cells, a verdict for the last cell (in `words`), and whether a group begins."""
@@ -257,7 +268,9 @@ def constraints_table(name: str, found: Sequence[ConstraintSlack]) -> str:
         return f"<p>{html.escape(name)} has no constraints.</p>"
     headings = ("constraint", "bound", "closest", "room", "used", "verdict")
     caption = f"Constraints of {name}. Closest: the sensor with the least room. Used: the share of the bound."
-    return _scrolled(headings, (0, 4), map(_constraint_row, found), caption)
+    tight = ", ".join(one.name for one in found if one.broken or one.tight) or "none"
+    content = _scrolled(headings, (0, 4), map(_constraint_row, found), caption)
+    return folded(f"{name}: {len(found)} bounds; tight: {tight}", content)
 
 
 def _constraint_row(one: ConstraintSlack) -> str:
@@ -321,7 +334,8 @@ def _times_table(one: CommandTimes) -> str:
     rest = one.seconds - math.fsum(seconds for name, seconds in shown.items() if INSIDE not in name)
     shown[OTHER] = max(rest, 0.0)
     rows = (_time_row(name, seconds, one.seconds) for name, seconds in shown.items())
-    return _scrolled(("phase", "seconds", "share", "bar"), (0, 3), rows, caption)
+    content = _scrolled(("phase", "seconds", "share", "bar"), (0, 3), rows, caption)
+    return folded(f"{one.command}: {one.seconds:.3g} s", content)
 
 
 def _time_row(name: str, seconds: float, total: float) -> str:
@@ -340,8 +354,7 @@ def reproduction(how: Reproduction) -> str:
     parts = [f"<p>{html.escape(what)}</p><pre>{html.escape(command)}</pre>" for what, command in how.commands]
     parts.append(definitions(how.facts))
     if how.config:
-        summary = "<summary>The run's configuration</summary>"
-        parts.append(f"<details>{summary}<pre>{html.escape(how.config)}</pre></details>")
+        parts.append(folded("The run's configuration", f"<pre>{html.escape(how.config)}</pre>"))
     return "".join(parts)
 
 
@@ -376,7 +389,8 @@ def effects_section(evaluation: Evaluation) -> str:
     headings = ["effect", "simulated", "reason", "range [mm]", "returns", "cost [s]"]
     caption = "The plan of effects: what was simulated, why, and what it costs."
     lines = [(_effect_cells(effect), "", False) for effect in effects]
-    return f'{head}<div class="reasons">{table(headings, lines, text_columns=3, caption=caption)}</div>'
+    content = f'<div class="reasons">{table(headings, lines, text_columns=3, caption=caption)}</div>'
+    return head + folded("All effects", content, len(lines))
 
 
 def audit_section(evaluation: Evaluation, audit: Audit) -> str:
@@ -398,7 +412,8 @@ def audit_section(evaluation: Evaluation, audit: Audit) -> str:
         for index, row in enumerate(audit.rows)
     ]
     words = {"worse": "too far", "better": "within"}
-    return head + table(headings, lines, text_columns=1, words=words, caption="Every row under the plan and under all.")
+    content = table(headings, lines, text_columns=1, words=words, caption="Every row under the plan and under all.")
+    return head + folded("All rows", content, len(lines))
 
 
 def _starts(rows: Sequence[AuditRow], index: int) -> bool:

@@ -19,7 +19,7 @@ import numpy as np
 
 from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.sensor import Sensor, interval_factor
-from lidardesign.evaluate.figures.canvas import Series
+from lidardesign.evaluate.figures.canvas import OUTCOME_WORDS, Series
 from lidardesign.evaluate.figures.drawing import (
     MOST_FACES,
     SMALLEST_SPREAD_M,
@@ -42,12 +42,15 @@ MARGIN = 1.0  # of the scene's extent: rays that go farther are cut there
 # More rays that hit nothing would hide everything else.
 MANY_RAYS, FAINT = 300, 0.22
 # What tells outcomes apart beside their colours (Okabe and Ito 2008): dashes of lines, marks at their ends.
-OUTCOMES = (
-    (Outcome.RETURN, "return", "#009E73", "solid", "plus"),
-    (Outcome.OCCLUDED, "occluded", "#D55E00", "dash", "x"),
-    (Outcome.AFTER_GATE, "behind the gate", "#0072B2", "dot", "diamond"),
-    (Outcome.MISS, "nothing hit", "#6b7280", "longdash", None),
-    (Outcome.NOT_DETECTED, "not detected", "#CC79A7", "dashdot", "square"),
+OUTCOMES = tuple(
+    (code, OUTCOME_WORDS[code], colour, dash, symbol)
+    for code, colour, dash, symbol in (
+        (Outcome.RETURN, "#009E73", "solid", "plus"),
+        (Outcome.OCCLUDED, "#D55E00", "dash", "x"),
+        (Outcome.AFTER_GATE, "#0072B2", "dot", "diamond"),
+        (Outcome.MISS, "#6b7280", "longdash", None),
+        (Outcome.NOT_DETECTED, "#CC79A7", "dashdot", "square"),
+    )
 )
 # Dashes of plotly by those of curves.
 DASHES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
