@@ -23,8 +23,8 @@ HEAD = """\
 # Commands
 
 After this page you know what every command does, and which options it has. `lidardesign COMMAND --help` adds files,
-examples and exit codes; [in the shell](shell.md) is what holds for all commands. `tools/command_reference.py` writes this
-page from the program.
+examples and exit codes; [in the shell](shell.md) is what holds for all commands.
+`tools/command_reference.py` writes this page.
 """
 # Every command has these; they are described once.
 COMMON = ("--seed", "--json", "--quiet", "--debug", "--help")
