@@ -23,7 +23,7 @@ from lidardesign.cli.commands.learn import learn
 from lidardesign.cli.commands.show import compare, show
 from lidardesign.cli.commands.tasks import tasks_app
 from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
-from lidardesign.cli.manual import ManualCommand
+from lidardesign.cli.help import WIDEST, ManualCommand, ManualGroup
 from lidardesign.cli.output import (
     EXIT_BROKEN_PIPE,
     Output,
@@ -40,10 +40,11 @@ HELP_WORDS = ("help", "man", "usage")
 # Options that belong to commands, and are often written before them.
 COMMON_OPTIONS = ("--json", "--quiet", "-q", "--debug", "--seed")
 VERSION_HELP = "Print the version; with --json those of Python and the libraries too."
-SETTINGS = {"help_option_names": ["-h", "--help"]}
+SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": WIDEST}
 
 app = typer.Typer(
     name=PROGRAM,
+    cls=ManualGroup,
     help="Design LiDARs: learn which rays are worth firing, fit sensors, prove what they are worth.",
     epilog="Exit codes: 0 ok, 1 threshold missed, 2 usage or config, 3 bad input data, "
     "4 infeasible constraints, 5 numerical failure, 6 plugin failure, 70 internal error, 130 interrupted, "
@@ -58,6 +59,8 @@ app.add_typer(catalog_app, name="catalog")
 app.add_typer(config_app, name="config")
 for subcommand in (learn, fit, constrain, evaluate, export, capture, show, compare, completion):
     app.command(context_settings=SETTINGS)(subcommand)
+for group in (tasks_app, catalog_app, config_app):
+    group.info.cls, group.info.context_settings = ManualGroup, SETTINGS
 for group in (app, tasks_app, catalog_app, config_app):
     for registered in group.registered_commands:
         registered.cls = ManualCommand

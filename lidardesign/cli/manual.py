@@ -5,17 +5,9 @@ Every example is parsed, and run where it can be, by the tests.
 
 from __future__ import annotations
 
-import shutil
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from typer.core import TyperCommand
-
-from lidardesign.errors import UNSET_HINT, ConfigError
-
-WIDEST = 100
 DOCS = "docs/"
 
 
@@ -40,73 +32,6 @@ class Manual:
 
 COMMON_EXITS = {0: "done", 2: "wrong usage or configuration", 3: "bad input data"}
 FROM_A_RUN = {4: "constraints that no design satisfies", 5: "a numerical failure", 6: "the task's plugin failed"}
-
-
-class ManualCommand(TyperCommand):
-    """A command whose help ends with its manual, and that takes no values which nobody writes on purpose."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the command line; a value that is empty, or `1_0` where a number is asked for, is a mistake.
-
-        Raises:
-            ConfigError: At the option or argument.
-        """
-        rest = list(args)
-        given = {} if ctx.resilient_parsing else self.make_parser(ctx).parse_args(args=rest)[0]
-        texts = [(parameter, text) for parameter in self.get_params(ctx) for text in _texts(given.get(parameter.name))]
-        for parameter, text in texts:
-            if not text.strip():
-                raise ConfigError("is empty", where=_name(parameter), allowed="a value", hint=UNSET_HINT)
-        left = super().parse_args(ctx, args)
-        from lidardesign.run.yaml import plain_number
-
-        for parameter, text in texts:
-            value = ctx.params.get(parameter.name)
-            values = value if isinstance(value, list | tuple) else [value]
-            if all(isinstance(each, int | float) and not isinstance(each, bool) for each in values):
-                try:
-                    plain_number(text)
-                except ValueError:
-                    raise ConfigError(repr(text), where=_name(parameter), allowed="a finite number") from None
-        return left
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help of the options, then the manual."""
-        super().format_help(ctx, formatter)
-        manual = MANUALS.get(" ".join(ctx.command_path.split()[1:]))
-        if manual is not None:
-            print(manual_text(manual, min(WIDEST, shutil.get_terminal_size().columns)))
-
-
-def _texts(given: Any) -> list[str]:
-    """What a command line gives for a parameter: nothing, one text, or several."""
-    return [text for text in (given if isinstance(given, list | tuple) else [given]) if isinstance(text, str)]
-
-
-def _name(parameter: Any) -> str:
-    """A parameter as the command line calls it."""
-    return parameter.opts[0] if parameter.param_type_name == "option" else parameter.metavar or parameter.name
-
-
-def manual_text(manual: Manual, width: int) -> str:
-    """The manual as text, so wide; examples stay on one line, so that they can be copied."""
-
-    def wrapped(text: str, indent: str = "   ", further: str = "     ", **how: bool) -> list[str]:
-        return textwrap.wrap(text, width - 1, initial_indent=indent, subsequent_indent=further, **how)
-
-    whole_words = {"break_long_words": False, "break_on_hyphens": False}
-    examples: list[str] = []
-    for example, words in manual.examples.items():
-        examples += [f"   {example}", *wrapped(words, " " * 7, " " * 7)]
-    codes = sorted({**COMMON_EXITS, **(manual.exits or {})}.items())
-    sections = {
-        "About": wrapped(manual.about, **whole_words),
-        "Files": [line for entry in manual.files for line in wrapped(entry, **whole_words)],
-        "Examples": examples,
-        "Exit codes": wrapped("; ".join(f"{code} {words}" for code, words in codes), **whole_words),
-        "See": [f"   {', '.join(DOCS + page for page in manual.see)}"] if manual.see else [],
-    }
-    return "\n".join(line for title, lines in sections.items() if lines for line in (f" {title}", *lines, ""))
 
 
 GOAL = {1: "a threshold was missed"}
