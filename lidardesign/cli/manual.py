@@ -107,7 +107,7 @@ MANUALS: dict[str, Manual] = {
             "--report, --plots, --csv: what is written",
         ),
         exits={**GOAL, 5: "a numerical failure", 6: "the task's plugin failed"},
-        see=("evaluate.md", "rivals.md", "effects.md", "shell.md"),
+        see=("evaluate.md", "rivals.md", "detectors.md", "shell.md"),
     ),
     "export": Manual(
         {
