@@ -92,7 +92,7 @@ def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], see
         retarget=RunTarget(run),
     ).design
     design = replace(design, provenance={**design.provenance, "seed": seed})
-    layouts = Layouts.of([(design, run)])
+    layouts = Layouts.of([(design, run)], run)
     request = EvaluationRequest(
         task=run.task,
         config=config.task,

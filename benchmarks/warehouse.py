@@ -91,7 +91,7 @@ def miss_rates(run_folder: Path, designs: list[Any], x_m: float, rays: int) -> d
     samples = load_samples(run.folder)
     space = config.space.at({"x_m": x_m})
     train, test = (scenes_of(run.task, config.task, split, config.seed, space) for split in ("train", "test"))
-    layouts = Layouts.of([(design, run) for design in loaded])
+    layouts = Layouts.of([(design, run) for design in loaded], run)
     request = EvaluationRequest(
         task=run.task,
         config=config.task,

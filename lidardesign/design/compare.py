@@ -16,7 +16,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.layout import shares_of
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.space import RANGE, DesignSpace
+from lidardesign.space import RANGE, DesignSpace, angles
 
 RIGHT_ANGLE_M = 1.0
 # How far a rig of others may stand beside a space, in sizes of it: the diagonal of its box of origins and its reach.
@@ -156,3 +156,27 @@ def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
             f"{space.high[RANGE]:.4g} m; {unit}"
         ]
     return []
+
+
+def outside_space(design: DesignSpec, space: DesignSpace) -> list[str]:
+    """How much of a design that was made for another design space lies outside this one, one line at most.
+
+    Arguments:
+        design: Its rays where it has a table of them, else its sensors' mean origins, boresights and gates.
+        space: The design space that it is scored in; along its conditions designs are moved.
+    """
+    table, sensors = design.ray_table, design.sensors
+    if table is not None:
+        what, origins_m, directions, gates_m = "rays", table.origin_m, table.direction, table.gate_m
+    else:
+        what, origins_m = "sensors", np.array([sensor.origin_m for sensor in sensors]).reshape(-1, 3)
+        directions = np.array([sensor.boresight for sensor in sensors]).reshape(-1, 3)
+        gates_m = np.array([sensor.gate_m for sensor in sensors]).reshape(-1, 2)
+    # what a gate hears inside the space, if anything
+    range_m = np.clip((space.low[RANGE] + space.high[RANGE]) / 2, gates_m[:, 0], gates_m[:, 1])
+    points = np.column_stack([origins_m, *angles(directions), range_m])
+    points[:, space.conditioned] = np.array(space.low)[list(space.conditioned)]
+    outside = int((~space.contains(points)).sum())
+    if not outside:
+        return []
+    return [f"{design.name}: {outside} of {len(points)} {what} start, point or listen outside the run's design space"]

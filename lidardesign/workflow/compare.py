@@ -16,8 +16,8 @@ from lidardesign.evaluate.results import Paired
 from lidardesign.evaluate.score import evaluate
 from lidardesign.evaluate.statistics import paired_difference
 from lidardesign.run.clock import phase
-from lidardesign.workflow.designs import Design
-from lidardesign.workflow.evaluate import common_run, evaluation_request
+from lidardesign.workflow.designs import Design, judging_run
+from lidardesign.workflow.evaluate import evaluation_request
 from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, reach_beside, read_design, run_of
 
 NO_SCORES: dict[str, Any] = {"metric": None, "scenes": None, "rows": [], "paired": []}
@@ -77,7 +77,7 @@ def _read(files: tuple[Path, Path], run_folder: Path | None, notes: Notes) -> tu
     if not given and all(design.run is None for design in designs):
         notes("no run says what the designs see, so there are no scores; --in RUN has scenes")
         return designs, None
-    return designs, common_run(designs, given)
+    return designs, judging_run(designs, given, notes)
 
 
 def _scores(

@@ -1,4 +1,7 @@
-"""Designs as users hold them: a specification, the run and the file that it belongs to, and what its fit found."""
+"""Designs as users hold them: a specification, the run and the file that it belongs to, and what its fit found.
+
+Also several designs beside each other: collected, named apart, and the run in whose scenes all of them are scored.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +9,20 @@ import html
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
+from lidardesign.design.compare import outside_space
 from lidardesign.design.files import design_text, save_design
 from lidardesign.design.fit import FitResult
 from lidardesign.design.layouts.rays import certificates_of
 from lidardesign.design.sensor import CERTIFICATES, DesignSpec
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import WAIT_S, phase
-from lidardesign.run.files import run_lock
+from lidardesign.run.files import is_there, run_lock
 from lidardesign.run.manifest import write_recorded
+from lidardesign.task import scoring_settings
 from lidardesign.workflow.export import (
     DesignSource,
     Exported,
@@ -26,7 +33,16 @@ from lidardesign.workflow.export import (
 )
 from lidardesign.workflow.fit import FitOptions, FitRequest
 from lidardesign.workflow.fit_design import fit_design
-from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, need_run, relative_folder
+from lidardesign.workflow.run_folder import (
+    Notes,
+    RunFolder,
+    log_note,
+    need_run,
+    reach_beside,
+    read_design,
+    relative_folder,
+    run_of,
+)
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.report.figures import Figure
@@ -193,6 +209,119 @@ class Design(DesignSource):
             for sensor in self.specification.sensors
         ]
         return html_table(repr(self)[1:-1], headings, rows)
+
+
+@phase("designs")
+def collect_designs(
+    targets: Sequence[Design | Path], runs: Sequence[RunFolder] = (), notes: Notes = log_note
+) -> tuple[list[Design], list[RunFolder]]:
+    """The designs that were named, and the runs: of folders all designs, of files the file; each once.
+
+    Raises:
+        DataError: One is not there.
+    """
+    designs: list[Design] = []
+    paths = [target for target in targets if isinstance(target, Path)]
+    opened = {path: RunFolder.open(path) for path in paths if path.is_dir()}
+    runs = [*runs, *opened.values()]
+    reach_m = reach_beside([path for path in paths if path.is_file()], runs)
+    for target in targets:
+        if isinstance(target, Design):
+            designs.append(target)
+        elif target in opened:
+            run = opened[target]
+            designs += [Design(read_design(path, notes), run, path) for path in run.design_paths()]
+        elif not is_there(target):
+            raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
+        else:
+            design = read_design(target, notes, reach_m)
+            designs.append(Design(design, run_of(design, target), target))
+    seen: dict[object, Design] = {}
+    for design in designs:
+        # they may be renamed: a user's own keep their names
+        copy = Design(design.specification, design.run, design.path)
+        seen.setdefault(id(design) if design.path is None else design.path.resolve(), copy)
+    return list(seen.values()), runs
+
+
+def named(designs: list[Design], names: Sequence[str]) -> list[Design]:
+    """The designs of these names; all of them without names.
+
+    Raises:
+        ConfigError: There is no design of a name.
+    """
+    known = {design.name for design in designs}
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"no design {name!r}", where="--designs", allowed=", ".join(sorted(known)) or "none")
+    return [design for design in designs if not names or design.name in names]
+
+
+def name_apart(designs: list[Design]) -> list[Design]:
+    """Designs that share a name take in front their run's name, or behind their file's ending, as tells them apart.
+
+    Raises:
+        ConfigError: Two are still called the same.
+    """
+    alike: dict[str, list[Design]] = {}
+    for design in designs:
+        alike.setdefault(design.name, []).append(design)
+    for name, group in alike.items():
+        # of their runs, or of their files
+        places = [each.run.folder if each.run else each.path.parent if each.path else Path() for each in group]
+        folders = [place.resolve().name for place in places]
+        for design, folder in zip(group, folders, strict=True):
+            # files of one folder, as rig.csv and rig.sdf, differ in their endings alone
+            ending = design.path.suffix if design.path is not None and folders.count(folder) > 1 else ""
+            front = f"{folder}/" if len(set(folders)) > 1 else ""
+            if len(group) > 1:
+                design.specification = replace(design.specification, name=f"{front}{name}{ending}")
+    names = [design.name for design in designs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise ConfigError(f"two designs are called {twice!r}", hint="rename one of the files")
+    return designs
+
+
+def judging_run(designs: Sequence[Design], runs: Sequence[RunFolder], notes: Notes = log_note) -> RunFolder:
+    """The run in whose scenes designs are scored: the first that was named, or else the one that they came from.
+
+    Arguments:
+        designs: The designs; of those from a run of other settings a note says whether they fit here.
+        runs: The runs that were named.
+        notes: Called with every note.
+
+    Raises:
+        ConfigError: There is none, or runs differ and no single one was named.
+        DataError: There are no designs.
+    """
+    candidates = runs or [design.run for design in designs if design.run is not None]
+    if not candidates:
+        raise ConfigError(
+            "no design names a run that is there, so the task is unknown",
+            hint="give the run folder too: lidardesign evaluate RUN DESIGN",
+        )
+    judge = candidates[0]
+    other = next((run for run in candidates if _settings(run) != _settings(judge)), None)
+    if other is not None:
+        raise ConfigError(
+            f"{judge.folder} and {other.folder} differ in task, configuration or design space",
+            hint="name the one run whose scenes judge: lidardesign evaluate RUN DESIGN ..., or compare A B --in RUN",
+        )
+    if not designs:
+        hint = f"lidardesign fit {quote(str(judge.folder))}"
+        raise DataError("the run has no designs yet", where=str(judge.folder), hint=hint)
+    for design in designs:
+        if design.run is not None and _settings(design.run) != _settings(judge):
+            notes(f"{design.name} of {design.run.folder} is scored in the scenes of {judge.folder}")
+            for line in outside_space(design.specification, judge.config.space):
+                notes(line)
+    return judge
+
+
+def _settings(run: RunFolder) -> tuple[Any, ...]:
+    """What runs share whose designs are scored in the same scenes."""
+    return run.config.task_name, scoring_settings(run.task, run.config.task), run.config.space
 
 
 def html_table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

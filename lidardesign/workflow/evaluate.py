@@ -8,13 +8,12 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import with_task_settings
 from lidardesign.design.compare import outside_notes
 from lidardesign.design.sensor import MOST_RAYS
-from lidardesign.errors import MAX_SEED, ConfigError, DataError, check_number
+from lidardesign.errors import MAX_SEED, ConfigError, check_number
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
 from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
@@ -26,11 +25,9 @@ from lidardesign.evaluate.score import evaluate as score_designs
 from lidardesign.evaluate.workers.pool import check_workers, workers_of
 from lidardesign.numerics import SLACK
 from lidardesign.run.clock import outermost_clock, phase, running
-from lidardesign.run.files import is_there
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
-from lidardesign.task import scoring_settings
-from lidardesign.workflow.designs import Design, html_table
+from lidardesign.workflow.designs import Design, collect_designs, html_table, judging_run, name_apart, named
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
     MANIFEST,
@@ -40,9 +37,6 @@ from lidardesign.workflow.run_folder import (
     RunFolder,
     last_time,
     log_note,
-    reach_beside,
-    read_design,
-    run_of,
     settings_texts,
 )
 from lidardesign.workflow.run_samples import Layouts, learned_density, twin_without_visibility
@@ -195,8 +189,8 @@ class ScoreRequest:
         """
         planner, audit = options.planner()
         designs, opened = collect_designs(targets, runs, notes)
-        designs = _named(designs, options.designs)
-        run = learned = common_run(name_apart(designs), opened)
+        designs = named(designs, options.designs)
+        run = learned = judging_run(name_apart(designs), opened, notes)
         for note in learned.input_notes():
             notes(note)
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
@@ -285,7 +279,7 @@ class ScoreRequest:
             searching: Called with how the searches of the baseline cma stand.
         """
         request = evaluation_request(
-            self.run, self.designs, self.rays, self.baselines, self.seed, self.options.scenes_seed
+            self.run, self.designs, self.rays, self.baselines, self.seed, self.options.scenes_seed, self.learned
         )
         cma = CmaSettings(SearchBudget(self.cma_seconds), searching)
         misplaced = self.options.misplacement()
@@ -444,102 +438,6 @@ class Scores:
         return html_table(caption, headings, rows)
 
 
-@phase("designs")
-def collect_designs(
-    targets: Sequence[Design | Path], runs: Sequence[RunFolder] = (), notes: Notes = log_note
-) -> tuple[list[Design], list[RunFolder]]:
-    """The designs that were named, and the runs: of folders all designs, of files the file; each once.
-
-    Raises:
-        DataError: One is not there.
-    """
-    designs: list[Design] = []
-    paths = [target for target in targets if isinstance(target, Path)]
-    opened = {path: RunFolder.open(path) for path in paths if path.is_dir()}
-    runs = [*runs, *opened.values()]
-    reach_m = reach_beside([path for path in paths if path.is_file()], runs)
-    for target in targets:
-        if isinstance(target, Design):
-            designs.append(target)
-        elif target in opened:
-            run = opened[target]
-            designs += [Design(read_design(path, notes), run, path) for path in run.design_paths()]
-        elif not is_there(target):
-            raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
-        else:
-            design = read_design(target, notes, reach_m)
-            designs.append(Design(design, run_of(design, target), target))
-    seen: dict[object, Design] = {}
-    for design in designs:
-        # they may be renamed: a user's own keep their names
-        copy = Design(design.specification, design.run, design.path)
-        seen.setdefault(id(design) if design.path is None else design.path.resolve(), copy)
-    return list(seen.values()), runs
-
-
-def _named(designs: list[Design], names: Sequence[str]) -> list[Design]:
-    known = {design.name for design in designs}
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"no design {name!r}", where="--designs", allowed=", ".join(sorted(known)) or "none")
-    return [design for design in designs if not names or design.name in names]
-
-
-def name_apart(designs: list[Design]) -> list[Design]:
-    """Designs that share a name take in front their run's name, or behind their file's ending, as tells them apart.
-
-    Raises:
-        ConfigError: Two are still called the same.
-    """
-    alike: dict[str, list[Design]] = {}
-    for design in designs:
-        alike.setdefault(design.name, []).append(design)
-    for name, group in alike.items():
-        # of their runs, or of their files
-        places = [each.run.folder if each.run else each.path.parent if each.path else Path() for each in group]
-        folders = [place.resolve().name for place in places]
-        for design, folder in zip(group, folders, strict=True):
-            # files of one folder, as rig.csv and rig.sdf, differ in their endings alone
-            ending = design.path.suffix if design.path is not None and folders.count(folder) > 1 else ""
-            front = f"{folder}/" if len(set(folders)) > 1 else ""
-            if len(group) > 1:
-                design.specification = replace(design.specification, name=f"{front}{name}{ending}")
-    names = [design.name for design in designs]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice:
-        raise ConfigError(f"two designs are called {twice!r}", hint="rename one of the files")
-    return designs
-
-
-def common_run(designs: Sequence[Design], runs: Sequence[RunFolder]) -> RunFolder:
-    """The run whose task and configuration all designs are judged by.
-
-    Raises:
-        ConfigError: There is none, or runs differ.
-        DataError: There are no designs.
-    """
-    candidates = [*runs, *(design.run for design in designs if design.run is not None)]
-    if not candidates:
-        raise ConfigError(
-            "no design names a run that is there, so the task is unknown",
-            hint="give the run folder too: lidardesign evaluate RUN DESIGN",
-        )
-
-    # what runs share whose designs are scored in the same scenes
-    keys = [(run.config.task_name, scoring_settings(run.task, run.config.task), run.config.space) for run in candidates]
-    first, others = candidates[0], [run for run, key in zip(candidates, keys, strict=True) if key != keys[0]]
-    if others:
-        raise ConfigError(
-            f"{first.folder} and {others[0].folder} differ in task, configuration or design space",
-            hint="evaluate them one by one: scores of different scenes do not compare",
-        )
-    if not designs:
-        raise DataError(
-            "the run has no designs yet", where=str(first.folder), hint=f"lidardesign fit {quote(str(first.folder))}"
-        )
-    return first
-
-
 def evaluation_request(
     run: RunFolder,
     designs: Sequence[Design],
@@ -547,6 +445,7 @@ def evaluation_request(
     baselines: Sequence[str],
     seed: int | None = None,
     scenes_seed: int | None = None,
+    learned: RunFolder | None = None,
 ) -> EvaluationRequest:
     """The request that scores designs in a run's scenes.
 
@@ -557,11 +456,12 @@ def evaluation_request(
         baselines: By name.
         seed: Root of the random streams; None: the run's.
         scenes_seed: Root of the held-out scenes; None: `seed`.
+        learned: The run as it was learned, where `run` judges by other settings.
     """
-    config = run.config
+    config, learned = run.config, learned or run
     seed = config.seed if seed is None else seed
     from_runs = [(design.specification, design.run) for design in designs if design.run is not None]
-    layouts = Layouts.of(from_runs)
+    layouts = Layouts.of(from_runs, learned)
     return EvaluationRequest(
         task=run.task,
         config=config.task,
@@ -575,7 +475,7 @@ def evaluation_request(
         test=run.scenes("test", seed if scenes_seed is None else scenes_seed),
         scenes_seed=scenes_seed,
         lay_out=layouts,
-        without_visibility=(lambda: twin_without_visibility(*from_runs[0], layouts)) if from_runs else None,
-        density=cache(lambda: learned_density(from_runs[0][1] if from_runs else run)),
+        without_visibility=(lambda: twin_without_visibility(from_runs[0][0], learned, layouts)) if from_runs else None,
+        density=cache(lambda: learned_density(learned)),
         greedy=GreedySource(partial(selection_scenes, run, seed), gate_margin_m(run)),
     )

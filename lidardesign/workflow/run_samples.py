@@ -122,15 +122,15 @@ class Layouts:
         return rays_at(design, count, samples, at=at, retarget=self.targets.get(design.name))
 
     @classmethod
-    def of(cls, designs: Sequence[tuple[DesignSpec, RunFolder]]) -> Layouts:
-        """The layouts of designs by their runs; the twin takes the first run's target without occlusion."""
+    def of(cls, designs: Sequence[tuple[DesignSpec, RunFolder]], judge: RunFolder) -> Layouts:
+        """The layouts of designs by their runs; the twin takes the judging run's target without occlusion."""
         by_folder = {run.folder: RunTarget(run) for _, run in designs}
         targets = {}
         for design, run in designs:
             weighting = Weighting.of(design)
             targets[design.name] = RunTarget(run, weighting=weighting) if weighting.settings else by_folder[run.folder]
         if designs:
-            targets[TWIN_NAME] = RunTarget(designs[0][1], visibility="off")
+            targets[TWIN_NAME] = RunTarget(judge, visibility="off")
         return cls(targets)
 
     def samples(self, designs: Sequence[tuple[DesignSpec, RunFolder]]) -> dict[str, Samples]:

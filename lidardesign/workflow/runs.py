@@ -172,7 +172,7 @@ class Run(RunFolder):
         """Score designs on held-out scenes beside uniform, random, bounding, silhouette and greedy.
 
         Arguments:
-            designs: Designs and design files; all that are saved in the run by default.
+            designs: Designs and design files, of other runs too; all that are saved in the run by default.
             rays: Numbers of rays per frame; the task's by default.
             baselines: Further baselines, as "lloyd", "occupancy", "no-visibility", "cma" or "catalog:NAME".
             seed: Root of every random stream; the run's by default.
@@ -185,7 +185,7 @@ class Run(RunFolder):
                 `ScoreOptions`.
 
         Raises:
-            ConfigError: Choices that cannot be, or designs of runs that differ.
+            ConfigError: Choices that cannot be.
             DataError: There are no designs, or one is not there.
         """
         from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest

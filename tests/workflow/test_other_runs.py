@@ -1,0 +1,160 @@
+"""Designs scored in the scenes of a run that they did not come from."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.command_line import make_run
+from support.tables import each_row
+
+import lidardesign as package
+from lidardesign.config import load_run_config, save_run_config, with_task_settings
+from lidardesign.design.compare import outside_space
+from lidardesign.design.files import load_design
+from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Rays
+from lidardesign.space import DIMENSIONS, direction
+from lidardesign.workflow.compare import compare_designs
+
+LAYOUTS = ("grid", "selected")
+OPTIONS = {"rays": [8], "baselines": ["lloyd", "occupancy", "no-visibility"]}
+
+
+def learned_elsewhere(folder, seed=5):
+    """A run of flatter curves, and fewer scenes."""
+    make_run(folder, seed=seed)
+    task, config = load_run_config(folder)
+    (folder / "config.yaml").unlink()
+    save_run_config(with_task_settings(task, config, ["variation=0.5", "train=12", "test=12"]), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A run with a design of each layout, and a run of other scenes without any."""
+    folder = tmp_path_factory.mktemp("runs")
+    run = package.open_run(make_run(folder / "own", seed=4))
+    for layout in LAYOUTS:
+        run.fit(layout=layout, sensors=2, rays=8, name=layout).save()
+    learned_elsewhere(folder / "other")
+    return folder
+
+
+@pytest.fixture
+def runs(made, tmp_path):
+    return [shutil.copytree(made / name, tmp_path / name) for name in ("own", "other")]
+
+
+def without_times(scores):
+    found = scores.as_dict() if not isinstance(scores, dict) else scores
+    rows = [{**row, "seconds": None} for key in ("rows", "equal_bandwidth") for row in found[key]]
+    return rows, [found[key] for key in ("paired", "paired_equal_bandwidth", "strongest_rival", "metric", "scenes")]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_scores_are_those_of_a_run_that_was_learned_there(runs, layout):
+    own, other = runs
+    design = own / "designs" / f"{layout}.yaml"
+    there = package.open_run(other).evaluate([design], **OPTIONS)
+    (other / "designs").mkdir()
+    shutil.copy(design, other / "designs")
+    at_home = package.open_run(other).evaluate(**OPTIONS)
+    assert without_times(there) == without_times(at_home)
+    assert len(there.rows) == 9
+    elsewhere = package.open_run(own).evaluate([design], rays=[8])
+    assert there.rows[0].value != elsewhere.rows[0].value
+
+
+def test_the_command_takes_the_run_that_is_named(lidardesign, runs):
+    own, other = runs
+    design = own / "designs" / "grid.yaml"
+    found = lidardesign("evaluate", other, design, "--rays", 8, "--json")
+    assert found.code == 0, found.err
+    assert f"grid of {own} is scored in the scenes of {other}" in " ".join(found.err.split())
+    scores = package.open_run(other).evaluate([design], rays=[8])
+    assert without_times(json.loads(found.out)) == without_times(json.loads(json.dumps(scores.as_dict())))
+    # the run that judges has a design of the name, too
+    package.open_run(other).fit(layout="grid", sensors=1, rays=8, name="grid").save()
+    both = lidardesign("evaluate", other, design, "--rays", 8, "--json").json
+    values = {row["design"]: row["value"] for row in both["rows"]}
+    assert values["own/grid"] == found.json["rows"][0]["value"]
+    assert "other/grid" in values
+
+
+def test_comparisons_are_those_of_evaluate(runs):
+    own, other = runs
+    files = tuple(own / "designs" / f"{layout}.yaml" for layout in LAYOUTS)
+    found = compare_designs(files, other)
+    scores = package.open_run(other).evaluate(files, rays=[8])
+    assert found["paired"] == [scores.paired[0].as_dict()]
+    assert [row["value"] for row in found["rows"]] == [row.value for row in scores.rows[:2]]
+
+
+def test_designs_of_two_runs_need_one_that_judges(lidardesign, runs):
+    own, other = runs
+    package.open_run(other).fit(layout="grid", sensors=1, rays=8, name="flat").save()
+    files = own / "designs" / "grid.yaml", other / "designs" / "flat.yaml"
+    for command in ("evaluate", "compare"):
+        refused = lidardesign(command, *files)
+        assert refused.code == 2
+        assert "name the one run whose scenes judge" in " ".join(refused.err.split())
+    assert lidardesign("evaluate", own, other).code == 2
+    assert lidardesign("compare", *files, "--in", own, "--rays", 8).code == 0
+
+
+def test_runs_that_differ_in_their_seed_alone_have_no_note(runs, tmp_path):
+    notes = []
+    twin = package.open_run(make_run(tmp_path / "twin", seed=9))
+    twin.evaluate([runs[0] / "designs" / "grid.yaml"], rays=[8], notes=notes.append)
+    assert notes == []
+
+
+def test_a_design_of_another_task_is_scored_where_it_can_be(runs, tmp_path):
+    own, _ = runs
+    aisle = package.open_run(make_run(tmp_path / "aisle", task="warehouse", seed=3))
+    notes = []
+    scores = aisle.evaluate(
+        [own / "designs" / "selected.yaml"],
+        rays=[8],
+        settings={"test": 2},
+        notes=notes.append,
+    )
+    assert scores.rows[0].design == "selected"
+    assert notes[0].startswith("selected of ")
+    assert "8 of 8 rays start, point or listen outside the run's design space" in notes[1]
+
+
+def test_a_track_is_refused_where_nothing_is_followed(runs, tmp_path):
+    aisle = package.open_run(make_run(tmp_path / "aisle", task="warehouse", seed=3))
+    track = aisle.fit(layout="scan", rays=4, name="track")
+    with pytest.raises(ConfigError, match="its rays follow x_m, which the task flatland does not have"):
+        package.open_run(runs[0]).evaluate([track], rays=[4])
+
+
+@each_row(
+    ("axis", "moved"),
+    [("x_m", 0.2), ("y_m", 0.01), ("z_m", -0.5), ("azimuth_rad", 1.0), ("elevation_rad", 0.1), ("range_m", 1.3)],
+)
+def test_what_lies_outside_a_design_space_is_counted(made, axis, moved):
+    run, design = package.open_run(made / "own"), load_design(made / "own" / "designs" / "selected.yaml")
+    space = run.config.space
+    generator = np.random.default_rng(6)
+    points = space.sample(50, generator)
+    points[:, 5] = generator.uniform(0.3, 1.2, 50)
+    index = DIMENSIONS.index(axis)
+    points[::3, index] = (space.low if moved < 0 else space.high)[index] + moved
+
+    def told(points):
+        gates = np.column_stack([points[:, 5] - 0.02, points[:, 5] + 0.02])
+        table = Rays(points[:, :3], direction(points[:, 3], points[:, 4]), gates, np.zeros(50, int), np.zeros(50))
+        return outside_space(replace(design, ray_table=table), space)
+
+    assert told(points) == [
+        f"selected: {(~space.contains(points)).sum()} of 50 rays start, point or listen outside the run's design space"
+    ]
+    points[::3] = points[1]
+    assert told(points) == []
