@@ -241,8 +241,8 @@ NEAR = {"gate": {"end_m": {"max": 0.5}}}
 @hard_case(
     "33",
     "Constraints that leave almost nothing of the density",
-    done="the mass inside is measured on samples that exist, once; below a thousandth, or with too few effective "
-    "samples, the fit is refused with the measured mass and what would do, exit 4",
+    done="below a thousandth of the mass, or with too few effective samples, the fit is refused with the mass and what "
+    "would do, exit 4; it is measured on samples that exist, once",
 )
 class TestAlmostNothingLeft:
     @staticmethod
@@ -462,7 +462,7 @@ weights = st.lists(st.floats(0, 1e12), min_size=1, max_size=40).filter(lambda va
 @hard_case(
     "35",
     "A ray budget of 0, of 1, below the number of sensors, or between equal weights",
-    done="largest remainders: the sum is exact, no share is a whole ray off, ties go to the first, and a fit gives "
+    done="largest remainders: the sum is exact, no share is a whole ray off, ties go to the first; a fit gives "
     "every sensor a ray or is refused",
 )
 class TestBudgetsThatDoNotDivide:

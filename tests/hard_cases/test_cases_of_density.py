@@ -168,7 +168,7 @@ def learned_at_home(tmp_path_factory):
 @hard_case(
     "6",
     "Scenes of 0.1 mm or of 100 km, or 10,000 km from the origin",
-    done="float64 throughout, fields and ray casting recentred on their meshes: densities, learned samples and fitted "
+    done="float64 throughout, fields and ray casting recentred on their meshes; densities, learned samples and fitted "
     "designs are those of the same scene at home in metres, and turn with it",
 )
 class TestScenesOfAnyScale:

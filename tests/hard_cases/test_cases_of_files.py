@@ -76,7 +76,7 @@ def readers(folder):
     "36",
     "YAML: alias bomb, duplicate keys, 1 MB or 32 levels, tags, `1e-3`, `no`, `1:30`, dates, unknown key, wrong type",
     done="a reader of its own with positions: bombs, tags, merge keys, repeats, depth and size are refused at "
-    "file:line:column, words and dates stay text, true and quoted text are no numbers; nothing is ever executed",
+    "file:line:column; words and dates stay text, true and quoted text are no numbers; nothing is ever executed",
 )
 class TestYaml:
     @staticmethod

@@ -72,7 +72,7 @@ def assert_finite(mixture):
     "29",
     "Fewer different samples than components, duplicates, or samples on a line",
     done="standard deviations have a floor relative to the data's scale, dead components are restarted where that "
-    "gains and are named, fewer different samples than sensors are named; the log-likelihood never decreases",
+    "gains and are named; fewer different samples than sensors are named; the log-likelihood never decreases",
 )
 class TestSamplesThatDoNotFillTheirSpace:
     @staticmethod
@@ -277,7 +277,7 @@ def narrow_samples(place, count=2000):
 @hard_case(
     "31",
     "An origin, or any other dimension, that is fixed",
-    done="fixed dimensions leave the density instead of getting a tiny variance: the log-likelihood counts free "
+    done="fixed dimensions leave the density instead of getting a tiny variance; the log-likelihood counts free "
     "dimensions only, wherever the others stand, and covariances of fixed axes are exactly 0",
 )
 class TestDimensionsThatAreFixed:

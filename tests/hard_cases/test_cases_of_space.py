@@ -236,8 +236,8 @@ TAUS = {"negative": -0.1, "infinite": math.inf, "not a number": math.nan}
 @hard_case(
     "3",
     "Range 0, negative, infinite or NaN",
-    done="0 is a range: the ray listens at its origin with T = 1; what is negative or not finite is refused by the "
-    "name of the field, in bounds, configurations, design files, sensor tables and by the target density",
+    done="0 is a range, where T = 1, and what is negative or not finite is refused by the name of the field; in "
+    "bounds, configurations, design files, sensor tables and by the target density",
 )
 class TestRangesThatAreNone:
     @staticmethod

@@ -1,4 +1,4 @@
-"""The page of the random runs: what they covered, how they ended, and every one of them."""
+"""The page of the random runs: what they covered and how they ended."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from typing import Any
 from support.result_pages import heading, paragraph, table, write_page
 
 from soak.whole_runs import BLIND, DONE, INFEASIBLE, ROUGH, USAGE, WHOLE
-
-COLUMNS = ("seed", "width [m]", "sigma / width", "free", "sensors", "layout", "ESS", "bounds", "outcome", "constrain")
 
 
 def runs_page(path: Path, records: Sequence[dict[str, Any]], command: str) -> None:
@@ -27,8 +25,7 @@ def runs_page(path: Path, records: Sequence[dict[str, Any]], command: str) -> No
             _constraints(records),
         ),
         "## Faults\n\n" + ("\n".join(faults) if faults else "None."),
-        "## Every run\n\n" + paragraph("`python -m soak one SEED` does a run again and shows its configuration."),
-        table(COLUMNS, [_row(r) for r in records]),
+        paragraph("`python -m soak one SEED` does a run again and shows its configuration."),
     ]
     write_page(path, parts)
 
@@ -78,11 +75,3 @@ def _constraints(records: Sequence[dict[str, Any]]) -> list[tuple[object, ...]]:
     return [
         (kind, codes.total(), codes[DONE], codes[INFEASIBLE], codes[USAGE]) for kind, codes in sorted(kinds.items())
     ]
-
-
-def _row(record: dict[str, Any]) -> tuple[object, ...]:
-    ess = "" if record["ess"] is None else f"{record['ess']:.3g}"
-    constrained = [f"{asked}: {code}" for command, asked, code, _ in record["steps"] if command == "constrain"]
-    figures = (record["seed"], f"{record['size_m']:g}", f"{record['sigma_share']:.2g}", record["free"])
-    kind = (record["sensors"], record["layout"], ess, record["bounds"], record["outcome"])
-    return (*figures, *kind, "; ".join(constrained))

@@ -90,7 +90,7 @@ def _learn(task: str, preset: str, seed: int, folder: Path) -> Learned:
 
 
 def seeds_page(path: Path, learned: Sequence[Learned], command: str) -> None:
-    """Write the page: the spread of every figure by task, then every seed."""
+    """Write the page: the spread of every figure by task."""
     parts = [heading("Learning from many seeds", command)]
     for task, preset in dict.fromkeys((one.task, one.preset) for one in learned):
         parts += _task_parts(task, preset, [one for one in learned if (one.task, one.preset) == (task, preset)])
@@ -111,10 +111,8 @@ def _task_parts(task: str, preset: str, learned: Sequence[Learned]) -> list[str]
         (name, *(f"{v:.3g}" for v in (x.min(), np.median(x), x.max(), x.std(ddof=1) if len(x) > 1 else 0.0)))
         for name, x in figures.items()
     ]
-    each = [(one.seed, *(f"{one.document[name]:.3g}" for name in SHOWN)) for one in good]
     return [
         f"## {task}, {preset}",
         paragraph(said),
         table(("figure", "least", "median", "most", "standard deviation"), spread),
-        table(("seed", *SHOWN), each),
     ]
