@@ -6,8 +6,11 @@ Exit codes (design contract): 0 ok, 1 threshold missed, 2 usage or config, 3 bad
 
 from __future__ import annotations
 
+import site
+import sys
 from collections.abc import Sequence
 from numbers import Integral, Real
+from pathlib import Path
 from typing import TypeVar
 
 # What files and options say may be quoted; nobody reads more of it than this.
@@ -17,6 +20,10 @@ Text = TypeVar("Text", str, None)
 MAX_SEED = 2**63 - 1
 # What to do where an option or a key has nothing behind it.
 UNSET_HINT = "a shell variable that is not set leaves nothing: give a value, or leave it out"
+# Where the documentation is: in a checkout, or where an installation puts it (pyproject.toml, data-files).
+_ROOT = Path(__file__).parents[1]
+_SHARED = Path("share", "doc", "lidardesign")
+DOCS_FOLDERS = (_ROOT / "docs", _ROOT, _ROOT / _SHARED, sys.prefix / _SHARED, site.getuserbase() / _SHARED)
 
 
 class LidardesignError(Exception):
@@ -146,3 +153,12 @@ def check_choice(value: str, where: str, allowed: Sequence[str]) -> str:
     if value not in allowed:
         raise ConfigError(f"{value!r}", where=where, allowed=", ".join(allowed))
     return value
+
+
+def page(name: str) -> Path:
+    """A page of the documentation that can be opened here; by its name in the checkout where none is there.
+
+    Arguments:
+        name: As `constraints.md`, or `constraints.txt` for the versions that the tests ran with.
+    """
+    return next((folder / name for folder in DOCS_FOLDERS if (folder / name).is_file()), Path("docs", name))

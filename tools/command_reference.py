@@ -16,7 +16,7 @@ from typing import Any
 import typer
 
 from lidardesign.cli.main import app
-from lidardesign.cli.manual import DOCS, MANUALS, Manual
+from lidardesign.cli.manual import MANUALS, Manual
 
 PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 HEAD = """\
@@ -135,7 +135,7 @@ def main() -> int:
         return 0
     if PAGE.read_text(encoding="utf-8") == text:
         return 0
-    print(f"{DOCS}{PAGE.name} is not what the program says: python tools/command_reference.py", file=sys.stderr)
+    print(f"docs/{PAGE.name} is not what the program says: python tools/command_reference.py", file=sys.stderr)
     return 1
 
 

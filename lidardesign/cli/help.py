@@ -8,13 +8,14 @@ import re
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from lidardesign.cli.manual import COMMON_EXITS, DOCS, MANUALS, Manual
-from lidardesign.errors import UNSET_HINT, ConfigError
+from lidardesign.cli.manual import COMMON_EXITS, MANUALS, Manual
+from lidardesign.errors import UNSET_HINT, ConfigError, page
 
 WIDEST = 100
 # Terms up to this width have their explanation beside them, longer ones below.
@@ -117,8 +118,14 @@ def _manual_sections(manual: Manual, width: int) -> dict[str, list[str]]:
             for line in (*_continued(example, width), *_wrapped(words, width, 6))
         ],
         "Exit codes": _wrapped("; ".join(f"{code} {words}" for code, words in codes), width, 2),
-        "See also": _wrapped(", ".join(DOCS + page for page in manual.see), width, 2),
+        "See also": [*_wrapped(", ".join(manual.see), width, 2), f"  in {_docs_folder()}"] if manual.see else [],
     }
+
+
+def _docs_folder() -> Path:
+    """Where the documentation is, from the current folder where it is below it."""
+    folder = page("commands.md").parent
+    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
 def _continued(example: str, width: int) -> list[str]:

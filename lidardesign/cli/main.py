@@ -48,7 +48,7 @@ app = typer.Typer(
     help="Design LiDARs: learn which rays are worth firing, fit sensors, prove what they are worth.",
     epilog="Exit codes: 0 ok, 1 threshold missed, 2 usage or config, 3 bad input data, "
     "4 infeasible constraints, 5 numerical failure, 6 plugin failure, 70 internal error, 130 interrupted, "
-    "141 output closed, 143 terminated. `lidardesign COMMAND --help` has examples; docs/commands.md has all of it.",
+    "141 output closed, 143 terminated. `lidardesign COMMAND --help` has examples and names pages to read.",
     context_settings=SETTINGS,
     add_completion=False,
     no_args_is_help=True,

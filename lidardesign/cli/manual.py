@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-DOCS = "docs/"
-
 
 @dataclass(frozen=True)
 class Manual:

@@ -33,7 +33,7 @@ from lidardesign.design.sensor import (
     Track,
     interval_factor,
 )
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, page
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.clock import phase
@@ -237,7 +237,7 @@ def design_from_document(
         raise ConfigError(
             "this is no design: it has no key `sensors`",
             where=root.locate(()),
-            hint="docs/design-file.md shows a design written by hand",
+            hint=f"{page('design-file.md')} shows a design written by hand",
         )
     version = root.value.get("schema_version", SCHEMA_VERSION)
     if type(version) is not int or version < SCHEMA_VERSION:

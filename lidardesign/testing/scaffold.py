@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from lidardesign import __version__, registry
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import ConfigError, DataError, page
 from lidardesign.run.files import write_atomic
 from lidardesign.task import API_VERSION
 
@@ -67,7 +67,9 @@ def new_task(name: str, folder: Path | None = None) -> list[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, _filled((templates / template).read_text(encoding="utf-8"), tokens).encode())
         written.append(path)
-    return written
+    versions = folder / "constraints.txt"
+    write_atomic(versions, page("constraints.txt").read_bytes())
+    return [*written, versions]
 
 
 def _filled(text: str, tokens: dict[str, str]) -> str:

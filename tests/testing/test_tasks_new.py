@@ -121,7 +121,7 @@ def test_the_command_writes_every_file_and_says_what_comes_next(lidardesign, tmp
     assert set(written) == {
         ".github/workflows/test.yml", ".gitignore", "README.md", "pyproject.toml",
         "lidardesign_landmark/__init__.py", "lidardesign_landmark/config.py", "lidardesign_landmark/task.py",
-        "tests/test_contract.py", "tests/test_task.py",
+        "tests/test_contract.py", "tests/test_task.py", "constraints.txt",
     }  # fmt: skip
     assert not [path for path, content in written.items() if b"@@" in content]
     assert "lidardesign tasks check landmark" in result.out

@@ -93,7 +93,9 @@ def constrain(
     ],
     constraints: Annotated[
         Path | None,
-        typer.Option("--constraints", metavar="FILE", help="YAML file; keys: docs/constraints.md.", show_default=False),
+        typer.Option(
+            "--constraints", metavar="FILE", help="YAML file (config schema constraints).", show_default=False
+        ),
     ] = None,
     overrides: Annotated[
         list[str] | None,

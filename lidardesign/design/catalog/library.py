@@ -30,7 +30,7 @@ from lidardesign.design.sensor import (
     boresight_of,
     interval_factor,
 )
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, page
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.run.validation import check_model, suggest
@@ -112,7 +112,7 @@ def load_library(own: Sequence[Path] = ()) -> Library:
     for path in map(Path, own):
         inside = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
         if not inside:
-            raise ConfigError(f"holds no file *{SUFFIX}", where=str(path), hint="docs/catalog.md shows a part file")
+            raise _no_part_files(path)
         paths += inside
     for path in paths:
         name = part_name(path)
@@ -168,7 +168,7 @@ def _named(names: Sequence[str] | str) -> list[Part]:
     inside = [sorted(Path(text).glob(f"*{SUFFIX}")) if Path(text).is_dir() else [text] for text in names]
     for text, found in zip(names, inside, strict=True):
         if not found:
-            raise ConfigError(f"holds no file *{SUFFIX}", where=str(text), hint="docs/catalog.md shows a part file")
+            raise _no_part_files(text)
     return [find_part(name) for name in dict.fromkeys(itertools.chain.from_iterable(inside))]
 
 
@@ -190,6 +190,10 @@ def part_name(path: Path) -> str:
     return path.stem
 
 
+def _no_part_files(path: str | Path) -> ConfigError:
+    return ConfigError(f"holds no file *{SUFFIX}", where=str(path), hint=f"{page('catalog.md')} shows a part file")
+
+
 @phase("catalog")
 def read_part(path: Path) -> PartFile:
     """Read one part file.
@@ -199,7 +203,7 @@ def read_part(path: Path) -> PartFile:
     """
     document = load_yaml(path)
     if not document.mapping:
-        raise ConfigError("says nothing about a part", where=str(path), hint="docs/catalog.md shows a part file")
+        raise ConfigError("says nothing about a part", where=str(path), hint=f"{page('catalog.md')} shows a part file")
     return check_model(PartFile, document.mapping, document.locate)
 
 

@@ -12,11 +12,11 @@ from concurrent.futures import CancelledError, Future, wait
 from typing import Any
 
 from lidardesign import __version__
-from lidardesign.errors import ConfigError, NumericalError
+from lidardesign.errors import ConfigError, NumericalError, page
 from lidardesign.evaluate.scene_scores import SceneScores
 from lidardesign.evaluate.workers.worker import SceneFailure, SceneJob, SceneSource, score_job
 
-HINT = "docs/cluster.md has the commands that start a scheduler and its workers"
+HINT = f"{page('cluster.md')} has the commands that start a scheduler and its workers"
 # A scheduler that listens answers at once; workers of a batch system may still be waiting for their machines.
 SCHEDULER_SECONDS = 10.0
 # What is given a connection, in times of that: it is tried again and again until its own time is over.

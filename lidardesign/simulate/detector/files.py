@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, page
 from lidardesign.run.validation import is_name, suggest
 from lidardesign.run.yaml import Document, load_yaml
 from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, MOST_BINS, Detector, Photons
@@ -101,7 +101,7 @@ def load_detector(name_or_path: str | Path) -> Detector:
     # an empty path is the current folder, and a name that is too long for a file is no file
     if not text.strip() or not os.path.exists(path):
         names = detector_names()
-        hint = suggest(text, names) or "docs/detectors.md says how to write one"
+        hint = suggest(text, names) or f"{page('detectors.md')} says how to write one"
         raise ConfigError(
             f"there is no detector {text!r}",
             where="--detector",
