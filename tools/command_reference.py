@@ -67,9 +67,6 @@ def _section(path: str, command: Any, described: dict[tuple[str, str], str]) -> 
         same = [f"`{_name(one)}`" for one in known if described[_shown(one), _described(one)] == earlier]
         yield f"\nAs for `{earlier}`: {', '.join(same)}."
     described |= {(_shown(one), _described(one)): path for one in own if one not in known}
-    if manual.examples:
-        example, words = next(iter(manual.examples.items()))
-        yield from ("", "```sh", *([f"# {words}"] if words else []), example, "```")
     if manual.see:
         yield ""
         yield f"See {', '.join(f'[{page}]({page})' for page in manual.see)}."
