@@ -10,16 +10,17 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from lidardesign.errors import MAX_SEED, UNSET_HINT, ConfigError
 from lidardesign.numerics import COARSE_SLACK
-from lidardesign.registry import load_task, plugin_guard
+from lidardesign.registry import UnknownTaskError, load_task, plugin_guard
 from lidardesign.run.clock import phase
-from lidardesign.run.manifest import verify, write_recorded
-from lidardesign.run.validation import anchor_paths, check_model, suggest
+from lidardesign.run.manifest import read_manifest, verify, write_recorded
+from lidardesign.run.validation import anchor_paths, check_model, is_name, suggest
 from lidardesign.run.yaml import MAX_DEPTH, Document, KeyPath, dump_yaml, leaves, load_yaml, parse_yaml, resolve_scalar
 from lidardesign.space import DIMENSIONS, FARTHEST_M, SHORTEST_M, DesignSpace
 from lidardesign.task import Task, TaskConfig
@@ -341,12 +342,24 @@ def load_run_config(run: Path) -> tuple[Task, RunConfig]:
 
     Raises:
         DataError: There is no such run, or its configuration was damaged or changed.
-        ConfigError: It is of another version of this program.
+        ConfigError: It is of another version of this program, or its task is not installed.
         PluginError: The task is installed but broken.
     """
     run = Path(run)
     verify(run, FILE_NAME)
-    return config_of(load_yaml(run / FILE_NAME))
+    document = load_yaml(run / FILE_NAME)
+    try:
+        return config_of(document)
+    except UnknownTaskError as error:
+        plugin = read_manifest(run).get("plugin")
+        package, _, version = plugin.partition(" ") if is_name(plugin) else ("", "", "")
+        raise UnknownTaskError(
+            f"the task {document.mapping.get('task_name')!r} of this run is not installed"
+            + (f"; it came with the package {package} {version}" if package else ""),
+            where=str(run),
+            allowed=error.allowed,
+            hint=f"pip install {quote(f'{package}=={version}')}" if package else "install the package that has it",
+        ) from None
 
 
 def config_of(document: Document) -> tuple[Task, RunConfig]:

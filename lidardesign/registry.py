@@ -243,11 +243,15 @@ def load_task(name: str) -> Task:
     return _load(name, _known(name))
 
 
+class UnknownTaskError(ConfigError):
+    """A task that no installed package offers."""
+
+
 def _known(name: str) -> list[EntryPoint]:
     offers = _offers()
     if name not in offers:
         close = difflib.get_close_matches(name, offers, n=1)
-        raise ConfigError(
+        raise UnknownTaskError(
             f"unknown task {name!r}",
             where="TASK",
             allowed=", ".join(sorted(offers)),
@@ -351,6 +355,12 @@ def _check_containable(name: str, value: str, path: tuple[str, ...]) -> None:
     (probe,) = probed([EntryPoint(name, value, GROUP)], IMPORT_SECONDS)
     if probe is not None and probe.contained:
         raise PluginError(str(probe.error), where=f"task {name}", hint=AUTHOR_HINT)
+
+
+def distribution_of(name: str) -> str:
+    """The installed package that a task comes with, and its version; empty where that is not known."""
+    offers = _offers().get(name, [])
+    return _distribution(offers[0]) if len(offers) == 1 and offers[0].dist else ""
 
 
 def task_names() -> list[str]:

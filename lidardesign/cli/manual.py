@@ -43,6 +43,7 @@ MANUALS: dict[str, Manual] = {
             "lidardesign learn face --tolerance 0.15 --out runs/good_enough": "until it is good enough",
             "lidardesign learn face --time-budget 60 --out runs/minute": "as well as a minute allows",
             "lidardesign learn face --out runs/face --resume": "go on after Ctrl-C, to the same bytes",
+            "lidardesign learn face --out runs/face --overwrite": "anew; the old run stays until the new one is there",
             "lidardesign learn face --out runs/face --dry-run": "what would be learned, and where to",
         },
         about="Learns which rays are worth firing. All that follows (fit, constrain, evaluate, export) works on the "

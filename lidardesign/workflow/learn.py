@@ -6,22 +6,23 @@ import contextlib
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import RunConfig, load_run_config, resolve, save_run_config
 from lidardesign.errors import ConfigError, DataError, LidardesignError, check_choice
-from lidardesign.registry import load_task, plugin_guard, task_names
-from lidardesign.run.clock import Clock, outermost_clock, phase
-from lidardesign.run.files import is_temporary, run_lock
+from lidardesign.registry import distribution_of, load_task, plugin_guard, task_names
+from lidardesign.run.clock import WAIT_S, Clock, outermost_clock, phase
+from lidardesign.run.files import is_temporary, run_lock, writer
 from lidardesign.run.manifest import note, read_manifest, start_manifest
 from lidardesign.run.yaml import dump_yaml, leaves, load_yaml, parse_yaml
 from lidardesign.task import Task, notes_of
 from lidardesign.workflow.learning_budget import GOAL, Goal, Learner, checked_goal, resumed_goal
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
+    DESIGN_FOLDER,
     INPUTS,
     MANIFEST,
     SAMPLES,
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
 
 LOCK = ".lock"
 # A run has begun once it has its configuration, which is written last; snapshots are of no use without a checkpoint.
+# How the folders beside a run that is replaced are called: of the new run, and of the old one for an instant.
+NEW, OLD = ".new", ".old"
 STARTED_FILES = {CONFIGURATION, MANIFEST, "progress.jsonl", "snapshots"}
 CHECKPOINTS = "checkpoint*"
 LEARNED_FILES = (
@@ -61,6 +64,7 @@ class LearnOptions:
         seed: Root of every random stream.
         device: auto, cpu or cuda.
         resume: Go on with an interrupted run.
+        overwrite: Replace a run that is in the folder, once the new one is learned.
         tolerance: Learn until at most this share of the density's mass is in the wrong place.
         time_budget_s: Learn as many steps as end within this time [s].
         command: What the manifest says that the run was made by.
@@ -73,6 +77,7 @@ class LearnOptions:
     seed: int | None = None
     device: str = "auto"
     resume: bool = False
+    overwrite: bool = False
     tolerance: float | None = None
     time_budget_s: float | None = None
     command: Sequence[str] = field(default_factory=lambda: tuple(sys.argv))
@@ -89,6 +94,7 @@ class LearnRequest:
         goal: What decides the number of steps, where the configuration does not.
         device: auto, cpu or cuda.
         begun: Whether a run is gone on with.
+        replaces: Whether a run is in the folder, to be replaced once the new one is learned.
         config_file: The configuration file that was given.
         command: What the manifest says that the run was made by.
     """
@@ -99,6 +105,7 @@ class LearnRequest:
     goal: Goal
     device: str = "auto"
     begun: bool = False
+    replaces: bool = False
     config_file: Path | None = None
     command: Sequence[str] = ()
 
@@ -122,26 +129,33 @@ class LearnRequest:
         task = task or _task_named(config_file, Path(options.out) if options.resume and options.out else None)
         plugin = load_task(task)
         folder = Path("runs") / task if options.out is None else Path(options.out)
-        if options.resume and not folder.is_dir():
-            raise DataError("there is no run to resume", where=str(folder), hint="leave out --resume to start it")
-        begun = options.resume and not _was_killed_before_it_began(folder)
+        replaces = options.overwrite and _holds_run(folder)
+        place = next_to(folder, NEW) if replaces else folder
+        if options.resume and not place.is_dir():
+            raise DataError("there is no run to resume", where=str(place), hint="leave out --resume to start it")
+        begun = options.resume and not _was_killed_before_it_began(place)
         if begun:
-            goal = resumed_goal(goal, folder)
-            plugin, settings = _resumed_settings(plugin, folder, choices)
+            goal = resumed_goal(goal, place)
+            plugin, settings = _resumed_settings(plugin, place, choices)
         else:
             if options.resume:
                 notes("nothing of the run was kept yet; it starts from the beginning")
-            check_can_start(folder)
+            check_can_start(place)
             settings = resolve(plugin, **choices)
-        request = cls(plugin, folder, settings, goal, options.device, begun, config_file, options.command)
+        request = cls(plugin, folder, settings, goal, options.device, begun, replaces, config_file, options.command)
         if begun and not request.has_checkpoint:
             notes("the run has no checkpoint yet; it starts from the beginning")
         return request
 
     @property
+    def place(self) -> Path:
+        """The folder that is learned in: beside the run's own as long as that holds the run to be replaced."""
+        return next_to(self.folder, NEW) if self.replaces else self.folder
+
+    @property
     def has_checkpoint(self) -> bool:
         """Whether there is one to go on from."""
-        return self.begun and any(self.folder.glob(CHECKPOINTS))
+        return self.begun and any(self.place.glob(CHECKPOINTS))
 
     @phase("scenes")
     def task_notes(self) -> list[str]:
@@ -175,9 +189,12 @@ class LearnRequest:
             length,
             f"draw {learning.samples:,} samples for fit and constrain, and measure how good they are",
         ]
+        if self.replaces:
+            designs = ", ".join(sorted(path.stem for path in (self.folder / DESIGN_FOLDER).glob("*.yaml")))
+            steps.append(f"replace the run {self.folder}" + (f", with its designs ({designs})" if designs else ""))
         reads = [path for path in (self.config_file, *input_paths(settings.task)) if path is not None]
         if self.begun:
-            reads += sorted(path for path in self.folder.iterdir() if path.is_file() and not path.name.startswith("."))
+            reads += sorted(path for path in self.place.iterdir() if path.is_file() and not path.name.startswith("."))
         # as other runs' files have it
         document = parse_yaml(dump_yaml(settings.as_document()), where=CONFIGURATION).mapping
         return RequestPlan(
@@ -200,8 +217,16 @@ class LearnRequest:
             ConfigError, DataError: Unusable settings or scenes, or a folder that cannot be written.
             DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
         """
-        folder = self.folder
-        learner = Learner(self.task, folder, self.device, progress, outermost_clock() or Clock(), remark)
+        clock = outermost_clock() or Clock()
+        result = self._learned(Learner(self.task, self.place, self.device, progress, clock, remark))
+        if not self.replaces:
+            return result
+        put_in_place(self.folder)
+        note(self.folder, learn={"run": str(self.folder)})
+        return replace(result, run=str(self.folder))
+
+    def _learned(self, learner: Learner) -> LearnResult:
+        folder = self.place
         with _new_folder(folder), run_lock(folder):
             if not self.begun:
                 check_can_start(folder)  # another process may have been faster
@@ -211,7 +236,7 @@ class LearnRequest:
                     start_manifest(folder, command=list(self.command), seed=self.settings.seed)
                     if not self.goal.is_none:
                         note(folder, **{GOAL: self.goal.as_dict()})
-                    note(folder, **{INPUTS: input_hashes(self.settings.task)})
+                    note(folder, plugin=distribution_of(self.task.name), **{INPUTS: input_hashes(self.settings.task)})
                     save_run_config(self.settings, folder)
                 try:
                     return learner.learn(self.settings, self.goal, resume=self.has_checkpoint)
@@ -224,14 +249,15 @@ class LearnRequest:
 
     def resume_hint(self) -> str:
         """What an interruption leaves, and how to go on from there."""
-        checkpoints = sorted(path.name for path in self.folder.glob(CHECKPOINTS))
+        checkpoints = sorted(path.name for path in self.place.glob(CHECKPOINTS))
         if checkpoints:
-            rest = f"the last checkpoint is {self.folder / checkpoints[-1]}"
-        elif has_stages(self.folder):
-            rest = f"{self.folder} keeps what the finished stages reached"
+            rest = f"the last checkpoint is {self.place / checkpoints[-1]}"
+        elif has_stages(self.place):
+            rest = f"{self.place} keeps what the finished stages reached"
         else:
             return "before the first checkpoint; nothing was kept"
-        return f"{rest}\n  continue with: lidardesign learn {self.task.name} --out {quote(str(self.folder))} --resume"
+        again = f"--out {quote(str(self.folder))} {'--overwrite ' if self.replaces else ''}--resume"
+        return f"{rest}\n  continue with: lidardesign learn {self.task.name} {again}"
 
     @contextlib.contextmanager
     def _undone_on_failure(self) -> Iterator[None]:
@@ -239,12 +265,12 @@ class LearnRequest:
         try:
             yield
         except BaseException:
-            entries = [entry for entry in self.folder.iterdir() if entry.name != LOCK]
+            entries = [entry for entry in self.place.iterdir() if entry.name != LOCK]
             nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
-            if not self.begun and nothing_learned and not has_stages(self.folder):
+            if not self.begun and nothing_learned and not has_stages(self.place):
                 with contextlib.suppress(OSError):
                     # without its configuration a run has not begun, whatever else is left of it
-                    (self.folder / CONFIGURATION).unlink(missing_ok=True)
+                    (self.place / CONFIGURATION).unlink(missing_ok=True)
                     for entry in entries:
                         shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
             raise
@@ -301,12 +327,54 @@ def check_can_start(run: Path) -> None:
     if run.is_file():
         raise ConfigError("is a file", where=f"--out {run}", allowed="a folder that is new or empty")
     if run.is_dir() and not _was_killed_before_it_began(run):
-        raise ConfigError(
-            "the folder is not empty",
-            where=f"--out {run}",
-            allowed="a new or empty folder",
-            hint="continue it with --resume, or give another --out",
-        )
+        hint = "continue it with --resume, replace it with --overwrite, or give another --out"
+        if run.name.endswith(NEW):
+            hint = "an interrupted replacement: continue it with --overwrite --resume, or remove it"
+        raise ConfigError("the folder is not empty", where=f"--out {run}", allowed="a new or empty folder", hint=hint)
+
+
+def _holds_run(folder: Path) -> bool:
+    """Whether there is a run to replace; a folder without anything in it is none.
+
+    Raises:
+        ConfigError: It holds something else, somebody is writing it, or what replaced a run before is left.
+    """
+    where, aside = f"--out {folder}", next_to(folder, OLD)
+    if aside.exists():
+        hint = "move or remove it"
+        if not folder.exists():
+            hint = f"the new run is finished: mv {quote(str(next_to(folder, NEW)))} {quote(str(folder))}"
+        raise ConfigError("is left of a replacement that was killed", where=str(aside), hint=hint)
+    if not folder.is_dir() or _was_killed_before_it_began(folder):
+        return False
+    if not (folder / MANIFEST).is_file():
+        raise ConfigError("holds no run", where=where, allowed="--overwrite replaces runs", hint="give another --out")
+    if at_work := writer(folder):
+        raise ConfigError(f"{at_work} is writing this run", where=where, hint="wait for it, or use another --out")
+    return True
+
+
+def next_to(folder: Path, suffix: str) -> Path:
+    """The folder of another name beside a run's, wherever a link to it leads."""
+    folder = folder.resolve() if folder.is_symlink() or folder.name in ("", "..") else folder
+    return folder.with_name(folder.name + suffix)
+
+
+def put_in_place(folder: Path) -> None:
+    """Put the run that was learned beside a folder into its place; the old one goes last.
+
+    Raises:
+        ConfigError: Somebody is writing the old one; both are kept.
+        DataError: The folders cannot be renamed; both are kept.
+    """
+    place, new, aside = (next_to(folder, suffix) for suffix in ("", NEW, OLD))
+    try:
+        with run_lock(place, wait_s=WAIT_S):
+            place.rename(aside)
+            new.rename(place)
+        shutil.rmtree(aside)
+    except OSError as error:
+        raise DataError(f"cannot replace {folder}: {error.strerror or error}", where=str(new)) from error
 
 
 def _was_killed_before_it_began(run: Path) -> bool:

@@ -255,7 +255,7 @@ def learn(
         resume: Go on with an interrupted run.
         progress: Called about every tenth step.
         notes: Called with every note; they are logged by default.
-        further: tolerance or time_budget_s, which decide the number of steps.
+        further: tolerance or time_budget_s, which decide the number of steps; overwrite, which replaces a run.
 
     Raises:
         ConfigError: An unknown task, settings that cannot be, or a folder that is not empty.

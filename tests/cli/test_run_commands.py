@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import shlex
+import sys
 
 import pytest
-from support.command_line import make_run
+from support.command_line import files_under, make_run
+from support.plugins import GOOD, install_plugins
+
+from lidardesign.errors import DataError
+from lidardesign.run.manifest import read_manifest, verify
+from lidardesign.workflow import learn as learn_module
 
 TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverage_proposals=256", "hidden=4")
 LEARN_TINY = [word for value in ("train=1", *(f"learning.{one}" for one in TINY)) for word in ("--set", value)]
@@ -46,3 +52,100 @@ def test_a_run_that_is_resumed_knows_its_task(lidardesign, flat):
 def test_hints_can_be_pasted_whatever_a_folder_is_called(lidardesign, flat):
     result = lidardesign("evaluate", flat)
     assert pasted(result.err) == ["fit", str(flat)]
+
+
+def learned(lidardesign, *arguments):
+    return lidardesign("learn", "flatland", *LEARN_TINY, "--out", "run", *arguments)
+
+
+@pytest.fixture
+def old(lidardesign, tmp_path):
+    """The files of a run that was learned with the seed 0, and has a design."""
+    assert learned(lidardesign).code == 0
+    (tmp_path / "run" / "designs").mkdir()
+    (tmp_path / "run" / "designs" / "mine.yaml").write_text("name: mine\n")
+    return files_under(tmp_path)
+
+
+def test_a_run_is_replaced_only_where_that_is_asked_for(lidardesign, old, tmp_path):
+    refused = learned(lidardesign, "--seed", 1)
+    assert refused.code == 2
+    assert "--overwrite" in refused.err
+    assert files_under(tmp_path) == old
+
+
+def test_a_replaced_run_is_the_one_that_another_folder_would_have_got(lidardesign, old, tmp_path):
+    result = learned(lidardesign, "--seed", 1, "--overwrite", "--json")
+    assert (result.code, result.json["run"]) == (0, "run")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert not (tmp_path / "run" / "designs").exists()
+    assert read_manifest(tmp_path / "run")["learn"]["run"] == "run"
+    verify(tmp_path / "run", "samples.npz")
+    lidardesign("learn", "flatland", *LEARN_TINY, "--out", "other", "--seed", 1)
+    for name in ("samples.npz", "flow.safetensors", "config.yaml"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
+
+
+def test_what_would_be_replaced_is_said_before(lidardesign, old, tmp_path):
+    plan = learned(lidardesign, "--overwrite", "--dry-run", "--json").json
+    assert any("replace the run run, with its designs (mine)" in step for step in plan["steps"])
+    assert files_under(tmp_path) == old
+
+
+# Where Ctrl-C comes, and whether anything of the new run is kept then.
+INTERRUPTIONS = {"train": False, "_advance": True}
+
+
+@pytest.mark.parametrize(("method", "kept"), INTERRUPTIONS.items())
+def test_the_old_run_stays_as_it_is_while_the_new_one_is_not_finished(
+    lidardesign, old, tmp_path, monkeypatch, method, kept
+):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(f"lidardesign.density.training.training.Trainer.{method}", interrupt)
+        result = learned(lidardesign, "--seed", 1, "--overwrite")
+    assert result.code == 130
+    now = files_under(tmp_path)
+    assert {name: now[name] for name in old} == old
+    assert (tmp_path / "run.new").exists() == kept
+    if kept:
+        assert "--overwrite --resume" in result.err
+        assert learned(lidardesign, "--seed", 1, "--overwrite").code == 2  # it would be lost
+        assert learned(lidardesign, "--overwrite", "--resume").code == 0
+        assert read_manifest(tmp_path / "run")["seed"] == 1
+        assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_both_runs_are_kept_where_the_folders_cannot_be_renamed(lidardesign, old, tmp_path, monkeypatch):
+    def refuse(folder):
+        raise DataError("cannot be renamed", where=str(folder))
+
+    monkeypatch.setattr(learn_module, "put_in_place", refuse)
+    assert learned(lidardesign, "--seed", 1, "--overwrite").code == 3
+    now = files_under(tmp_path)
+    assert {name: now[name] for name in old} == old
+    verify(tmp_path / "run.new", "samples.npz")
+
+
+def test_only_runs_are_replaced(lidardesign, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").write_text("years of work")
+    assert learned(lidardesign, "--overwrite").code == 2
+    assert (tmp_path / "run" / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_run_whose_plugin_is_gone_names_the_package(lidardesign, tmp_path, monkeypatch):
+    install_plugins(tmp_path, {"ball": GOOD}, package="balls")
+    with monkeypatch.context() as patch:
+        patch.syspath_prepend(tmp_path)
+        assert lidardesign("learn", "ball", *LEARN_TINY[2:], "--out", "run").code == 0
+    sys.modules.pop("balls_ball", None)
+    for arguments in (["fit", "run"], ["evaluate", "run"], ["learn", "--resume", "--out", "run"]):
+        result = lidardesign(*arguments)
+        assert result.code == 2
+        assert "ball" in result.err
+    result = lidardesign("fit", "run")
+    assert "run: the task 'ball' of this run is not installed; it came with the package balls 1.0" in result.err
+    assert "try: pip install balls==1.0\n" in result.err

@@ -54,6 +54,12 @@ def learn(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run from its last checkpoint.")
     ] = False,
+    overwrite: Annotated[
+        bool,
+        typer.Option(
+            "--overwrite", help="Replace the run in the folder, and its designs, once the new one is learned."
+        ),
+    ] = False,
     tolerance: Annotated[
         float | None,
         typer.Option(
@@ -93,6 +99,7 @@ def learn(
             seed=seed,
             device=device,
             resume=resume,
+            overwrite=overwrite,
             tolerance=tolerance,
             time_budget_s=time_budget,
             command=("lidardesign", *sys.argv[1:]),
