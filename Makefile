@@ -1,5 +1,5 @@
 # make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about five minutes
-# make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 400 MB there
+# make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 2 GB there
 # make docs   writes the documentation with a search as pages of build/site, which load nothing from elsewhere
 # make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
@@ -33,12 +33,8 @@ $(BIN)/.ready: pyproject.toml constraints.txt
 demo: $(BIN)/.ready
 	$(BIN)/python examples/demo.py
 
-$(BIN)/.docs: $(BIN)/.ready
-	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
-	@touch $@
-
 # The variable leaves out an announcement of the theme's makers
-docs: $(BIN)/.docs
+docs: $(BIN)/.ready
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "build/site/index.html"
 
