@@ -245,59 +245,42 @@ def _steps(edges: np.ndarray, heights: np.ndarray) -> dict[str, Any]:
     }
 
 
-COLUMNS = 2
-ROW_PX = 300
-# The share of the figure's width between panels; pixels above panels for titles, below for axes, and per line of text.
-BETWEEN, ABOVE_PX, BELOW_PX, LINE_PX = 0.13, 34, 46, 11
+# Of a panel; pixels of it above for its title, below for its axis, and per line of text.
+PANEL_PX = 300
+ABOVE_PX, BELOW_PX, LINE_PX = 34, 46, 11
 BYTES_PER_MB = 1e6
 
 
-def pareto_height_px(sweeps: Sequence[Sweep]) -> int:
-    """The height that the figure needs [px]."""
-    return ROW_PX * math.ceil(len(panels(sweeps)) / COLUMNS)
+def pareto_figures(sweeps: Sequence[Sweep]) -> list[dict[str, Any]]:
+    """One panel per sweep; hovering tells what a measurement is."""
+    return [_pareto_figure(panel) for panel in panels(sweeps)]
 
 
-def pareto_figure(sweeps: Sequence[Sweep]) -> dict[str, Any]:
-    """All panels, two beside each other; hovering tells what a measurement is."""
-    shown = panels(sweeps)
-    rows = math.ceil(len(shown) / COLUMNS)
-    layout: dict[str, Any] = {
-        **LAYOUT,
-        "margin": {"l": 62, "r": 12, "t": 4, "b": 4},
-        "hovermode": "closest",
-        "annotations": [],
+def _pareto_figure(panel: Panel) -> dict[str, Any]:
+    line = {
+        "type": "scatter",
+        "x": [mark.x for mark in panel.front],
+        "y": [mark.y for mark in panel.front],
+        "mode": "lines",
+        "line": {"color": LINE, "width": 1.5},
+        "opacity": PALE,
+        "hoverinfo": "skip",
     }
-    traces: list[dict[str, Any]] = []
-    for index, panel in enumerate(shown):
-        name = "" if index == 0 else str(index + 1)
-        where = {"xaxis": f"x{name}", "yaxis": f"y{name}", "type": "scatter"}
-        line = {
-            **where,
-            "x": [mark.x for mark in panel.front],
-            "y": [mark.y for mark in panel.front],
-            "mode": "lines",
-            "line": {"color": LINE, "width": 1.5},
-            "opacity": PALE,
-            "hoverinfo": "skip",
-        }
-        if panel.shows_tolerance:
-            traces.append({**where, **_tolerance(panel)})
-        traces += [line, {**where, **_marks(panel)}]
-        # both axes of a panel in its place: across, then down
-        row, column = divmod(index, COLUMNS)
-        width = (1 - BETWEEN) / COLUMNS
-        left = column * (width + BETWEEN)
-        across = [left, left + width]
-        up = [1 - (row + 1 - BELOW_PX / ROW_PX) / rows, 1 - (row + ABOVE_PX / ROW_PX) / rows]
-        layout[f"xaxis{name}"] = _pareto_axis(panel.seconds, across, f"y{name}", "seconds")
-        layout[f"yaxis{name}"] = _pareto_axis(panel.errors, up, f"x{name}", html.escape(panel.error_title))
-        layout["annotations"] += [_title(panel, name), *_settings(panel, name)]
-    return {"data": traces, "layout": layout}
+    layout = {
+        **LAYOUT,
+        "margin": {"l": 62, "r": 12, "t": ABOVE_PX, "b": BELOW_PX},
+        "hovermode": "closest",
+        "annotations": [_title(panel), *_settings(panel)],
+        "xaxis": _pareto_axis(panel.seconds, "seconds"),
+        "yaxis": _pareto_axis(panel.errors, html.escape(panel.error_title)),
+    }
+    return {"data": [*([_tolerance(panel)] if panel.shows_tolerance else []), line, _marks(panel)], "layout": layout}
 
 
 def _marks(panel: Panel) -> dict[str, Any]:
     marks = panel.marks
     return {
+        "type": "scatter",
         "x": [mark.x for mark in marks],
         "y": [mark.y for mark in marks],
         "mode": "markers",
@@ -325,13 +308,13 @@ def _marks(panel: Panel) -> dict[str, Any]:
     }
 
 
-def _settings(panel: Panel, name: str) -> list[dict[str, Any]]:
-    places = label_places(panel, ROW_PX - ABOVE_PX - BELOW_PX, LINE_PX)
+def _settings(panel: Panel) -> list[dict[str, Any]]:
+    places = label_places(panel, PANEL_PX - ABOVE_PX - BELOW_PX, LINE_PX)
     return [
         {
             "text": html.escape(mark.measurement.setting),
-            "xref": f"x{name}",
-            "yref": f"y{name}",
+            "xref": "x",
+            "yref": "y",
             "x": math.log10(mark.x),
             "y": math.log10(mark.y),
             "xshift": across,
@@ -359,7 +342,7 @@ def _hover_text(mark: Mark, sweep: Sweep) -> str:
     return "<br>".join(line.strip() for line in lines)
 
 
-def _pareto_axis(ends: tuple[float, float], domain: list[float], anchor: str, title: str) -> dict[str, Any]:
+def _pareto_axis(ends: tuple[float, float], title: str) -> dict[str, Any]:
     return {
         "type": "log",
         "gridcolor": "#e4e7eb",
@@ -370,17 +353,16 @@ def _pareto_axis(ends: tuple[float, float], domain: list[float], anchor: str, ti
         "range": [math.log10(end) for end in ends],
         "tickformat": "~g",
         "tickfont": {"size": 10},
-        "domain": domain,
-        "anchor": anchor,
+        "automargin": True,
         "title": {"text": title, "standoff": 4, "font": {"size": 11}},
     }
 
 
-def _title(panel: Panel, name: str) -> dict[str, Any]:
+def _title(panel: Panel) -> dict[str, Any]:
     return {
         "text": f"<b>{html.escape(panel.sweep.knob)}</b>",
-        "xref": f"x{name} domain",
-        "yref": f"y{name} domain",
+        "xref": "x domain",
+        "yref": "y domain",
         "x": 0,
         "y": 1.0,
         "yshift": 2,
@@ -394,6 +376,7 @@ def _title(panel: Panel, name: str) -> dict[str, Any]:
 def _tolerance(panel: Panel) -> dict[str, Any]:
     """A dashed line across the panel; a trace, because shapes vanish behind grid lines in the same place."""
     return {
+        "type": "scatter",
         "x": list(panel.seconds),
         "y": [panel.sweep.tolerance] * 2,
         "mode": "lines",

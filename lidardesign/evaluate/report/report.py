@@ -27,12 +27,12 @@ from lidardesign.evaluate.report.choice import choice_section
 from lidardesign.evaluate.report.figures import (
     FONT,
     MOST_DESIGNS,
+    PANEL_PX,
     accuracy_tables,
     curve_figure,
     far_rivals,
     marginal_figure,
-    pareto_figure,
-    pareto_height_px,
+    pareto_figures,
     plane_figure,
 )
 from lidardesign.evaluate.report.markup import embedded, figure, folded, page, paragraphs, section, swatch, switch
@@ -200,14 +200,15 @@ def _accuracy(sweeps: Sequence[Sweep]) -> str:
     if not sweeps:
         return ""
     read = (
-        "Error against seconds on this machine, one panel per numerical choice. Orange is the cheapest setting inside "
-        "the tolerance (dashed), a ring the one of this run; pale settings are beaten in both; triangles on the lower "
-        "edge have no error to show, references among them."
+        "Error against seconds on this machine, one picture per numerical choice. Orange is the cheapest setting "
+        "inside the tolerance (dashed), a ring the one of this run; pale settings are beaten in both; triangles on the "
+        "lower edge have no error to show, references among them."
     )
-    height = pareto_height_px(sweeps)
-    picture = figure(pareto_figure(sweeps), "accuracy-figure", height, "Error against seconds") if height else ""
-    wide = f'<div class="scroll" tabindex="0"><div class="panels">{picture}</div></div>'
-    return f"<p>{read}</p>{wide}{accuracy_tables(sweeps)}"
+    pictures = "".join(
+        figure(one, f"accuracy-{index}", PANEL_PX, "Error against seconds")
+        for index, one in enumerate(pareto_figures(sweeps))
+    )
+    return f'<p>{read}</p><div class="tiles wide">{pictures}</div>{accuracy_tables(sweeps)}'
 
 
 # Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.

@@ -42,9 +42,14 @@ def plain_number(value: float, digits: int, tiny: float = TINY) -> str:
     return f"{rounded:,.0f}" if rounded >= 10 ** (digits - 1) else f"{rounded:g}"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things in words."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def held_out_scenes(scenes: int) -> str:
     """How many held-out scenes, in words."""
-    return "1 held-out scene" if scenes == 1 else f"{scenes} held-out scenes"
+    return counted(scenes, "held-out scene")
 
 
 def summary_sentences(evaluation: Evaluation) -> list[str]:
@@ -181,7 +186,8 @@ def _comparison(evaluation: Evaluation, pair: Paired, other: float) -> str:
 def _interval(item: Row | Paired) -> str:
     if item.ci_low is None or item.ci_high is None:
         return "-"
-    return f"{four_digits(item.ci_low)} to {four_digits(item.ci_high)}"
+    # in one line, also where cells wrap
+    return f"{four_digits(item.ci_low)}\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}{four_digits(item.ci_high)}"
 
 
 def _words(name: str) -> str:
@@ -270,7 +276,7 @@ def constraints_table(name: str, found: Sequence[ConstraintSlack]) -> str:
     caption = f"Constraints of {name}. Closest: the sensor with the least room. Used: the share of the bound."
     tight = ", ".join(one.name for one in found if one.broken or one.tight) or "none"
     content = _scrolled(headings, (0, 4), map(_constraint_row, found), caption)
-    return folded(f"{name}: {len(found)} bounds; tight: {tight}", content)
+    return folded(f"{name}: {counted(len(found), 'bound')}; tight: {tight}", content)
 
 
 def _constraint_row(one: ConstraintSlack) -> str:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -39,6 +40,7 @@ from lidardesign.scene import Body
 MOST_SENSORS = 40  # drawn as frusta and switched one by one; a scan has hundreds, and its rays say it all
 MOST_BODIES = 2000  # of a scene, the largest first
 MARGIN = 1.0  # of the scene's extent: rays that go farther are cut there
+BESIDE_DEG, ABOVE_DEG = 129.0, 26.0  # of the first view: from where sensors look, and above the ground
 # More rays that hit nothing would hide everything else.
 MANY_RAYS, FAINT = 300, 0.22
 # What tells outcomes apart beside their colours (Okabe and Ito 2008): dashes of lines, marks at their ends.
@@ -52,7 +54,7 @@ OUTCOMES = tuple(
         (Outcome.NOT_DETECTED, "#CC79A7", "dashdot", "square"),
     )
 )
-# Dashes of plotly by those of curves.
+# Dashes of the view by those of curves.
 DASHES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
 
 
@@ -136,18 +138,16 @@ def is_flat(directions: np.ndarray) -> bool:
 
 
 def camera(directions: np.ndarray) -> dict[str, Any]:
-    """From behind and above the sensors; a world in the plane z = 0 is looked at from above, as on paper."""
+    """Where the first view is from [rad]: beside the sensors, a little behind and above them.
+
+    A world in the plane z = 0 is looked at from above, as on paper.
+    """
     if is_flat(directions):
-        up, center = {"x": 0, "y": 1, "z": 0}, {"x": 0, "y": 0, "z": 0}
-        return {"eye": {"x": 0, "y": 0, "z": 1.9}, "up": up, "center": center}
-    # beside the mean direction of the rays, a little behind the sensors and above them
-    mean = directions.mean(axis=0) if len(directions) else np.array([1.0, 0.0, 0.0])
-    forward = np.array([mean[0], mean[1], 0.0])
-    length = np.linalg.norm(forward)
-    forward = forward / length if length > EPSILON_FLOAT32 else np.array([1.0, 0.0, 0.0])
-    eye = 1.25 * np.array([-forward[1], forward[0], 0.0]) - 1.0 * forward + np.array([0.0, 0.0, 0.7])
-    up, center = {"x": 0, "y": 0, "z": 1}, {"x": 0, "y": 0, "z": -0.1}
-    return {"eye": dict(zip("xyz", eye.tolist(), strict=True)), "up": up, "center": center}
+        return {"turn": -math.pi / 2, "height": math.pi / 2, "flat": True}
+    x, y, _ = directions.mean(axis=0) if len(directions) else (1.0, 0.0, 0.0)
+    # what looks down or all around has no side
+    ahead = math.atan2(y, x) if math.hypot(x, y) > EPSILON_FLOAT32 else 0.0
+    return {"turn": ahead + math.radians(BESIDE_DEG), "height": math.radians(ABOVE_DEG), "flat": False}
 
 
 def _mesh(vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
@@ -227,7 +227,7 @@ def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndar
     )
     stage = (
         f'<div class="stage"><div id="view-scene" tabindex="0" role="application" aria-label="3D view of the scene. '
-        'Arrow keys turn it, plus and minus go closer and farther, Home shows the first view."></div>'
+        'Arrow keys turn it, plus and minus go closer and farther, Home shows the first view."><canvas></canvas></div>'
         '<img id="view-printed" alt="The 3D view as it stood when the page was printed">'
         f'<div class="buttons" role="group" aria-label="Camera">{buttons}'
         '<button type="button" id="view-save">Save picture</button></div></div>'

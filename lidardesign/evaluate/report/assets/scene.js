@@ -1,18 +1,10 @@
 "use strict";
-// The 3D view: puts together what is switched on and hands it to plotly. `view` is the document of scene_view.py.
+// What the 3D view shows: triangles, lines and dots of what is switched on. `view` is the document of view.py.
 
 const SHELL_STEPS = 8; // along each side of a gate's shell, as in drawing.py
 const TURN_STEPS = 24; // round an ellipse of origins
+const DENSE_RAYS = 100; // of more, lines are thinner
 const CONE = 25; // numbers per sensor: origin 3, frame 9, field of view 2, gate 2, axes of origins 9
-// Marks at the ends of rays, as lines about a point: plotly's own take far longer until they are first drawn.
-const MARK_SHARE = 0.006; // of the scene's extent
-const MARKS = {
-  plus: [[[-1, 0, 0], [1, 0, 0]], [[0, -1, 0], [0, 1, 0]], [[0, 0, -1], [0, 0, 1]]],
-  x: [[[-1, -1, -1], [1, 1, 1]], [[1, -1, -1], [-1, 1, 1]]],
-  diamond: [[[1.2, 0, 0], [0, 0, 1.2], [-1.2, 0, 0], [0, 0, -1.2], [1.2, 0, 0]], [[0, 1.2, 0], [0, 0, 1.2], [0, -1.2, 0], [0, 0, -1.2], [0, 1.2, 0]]],
-  square: [[[1, 0, 1], [-1, 0, 1], [-1, 0, -1], [1, 0, -1], [1, 0, 1]], [[0, 1, 1], [0, -1, 1], [0, -1, -1], [0, 1, -1], [0, 1, 1]]],
-};
-const LIGHT_DISTANCE = 1e4; // far away, so that light is parallel
 
 function bytesOf(text) {
   const raw = atob(text);
@@ -105,10 +97,6 @@ function gateShell(cone, mesh) {
   }
 }
 
-function meshTrace(columns, looks) {
-  return { type: "mesh3d", x: columns.x, y: columns.y, z: columns.z, i: columns.i, j: columns.j, k: columns.k, hoverinfo: "skip", ...looks };
-}
-
 // All bodies of one role at one frame as columns of a mesh.
 function bodyColumns(view, target, frame) {
   const rest = view.rest[target ? 0 : 1];
@@ -137,16 +125,6 @@ function bodyColumns(view, target, frame) {
   return columns;
 }
 
-function bodyTraces(view, state) {
-  const lighting = { ambient: 0.55, diffuse: 0.7, specular: 0.05, roughness: 0.9 };
-  const eye = view.camera.eye;
-  const lightposition = { x: LIGHT_DISTANCE * eye.x, y: LIGHT_DISTANCE * eye.y, z: LIGHT_DISTANCE * eye.z };
-  return [["scene", true, "#c9b8a8"], ["occluders", false, "#6b7280"]].map(([name, target, color]) => {
-    const columns = bodyColumns(view, target, state.frame);
-    return meshTrace(columns, { color, lighting, lightposition, visible: state.layers[name] !== false && columns.x.length > 0 });
-  });
-}
-
 // Segments of the rays of all designs and sensors that are switched on, by outcome; and how many there are of each.
 function rayPaths(view, state) {
   const paths = new Map(view.outcomes.map((one) => [one.code, { lines: new Path(), ends: new Path(), count: 0 }]));
@@ -169,34 +147,20 @@ function rayPaths(view, state) {
   return paths;
 }
 
-function markLines(ends, symbol, size) {
-  const path = new Path();
-  for (let n = 0; n < ends.x.length; n++) {
-    for (const line of MARKS[symbol]) path.line(line.map((d) => [ends.x[n] + size * d[0], ends.y[n] + size * d[1], ends.z[n] + size * d[2]]));
-  }
-  return path;
+function rayItems(view, state, paths) {
+  const shown = view.outcomes.filter(({ code }) => state.outcomes[code] !== false && paths.get(code).count).reverse();
+  const total = shown.reduce((sum, { code }) => sum + paths.get(code).count, 0);
+  const width = Math.max(1.4 * Math.sqrt(Math.min(DENSE_RAYS / total, 1)), 0.4);
+  const lines = shown.map(({ code, colour, dash, symbol }) => {
+    const { lines: path, count } = paths.get(code);
+    return { kind: "lines", path, colour, dash, width, opacity: symbol === null && count > view.many ? view.faint : 0.7 };
+  });
+  const marks = shown.filter(({ symbol }) => symbol).map(({ code, colour, symbol }) => ({ kind: "marks", path: paths.get(code).ends, colour, symbol }));
+  return [...lines, ...marks];
 }
 
-function rayTraces(view, state, paths) {
-  const traces = [];
-  const extent = Math.max(...[0, 1, 2].map((k) => view.bounds[1][k] - view.bounds[0][k]));
-  for (const { code, colour, dash, symbol } of view.outcomes) {
-    const { lines, ends, count } = paths.get(code);
-    const visible = state.outcomes[code] !== false && count > 0;
-    const faint = symbol === null && count > view.many;
-    const common = { type: "scatter3d", hoverinfo: "skip", visible };
-    traces.push({ ...common, mode: "lines", x: lines.x, y: lines.y, z: lines.z, opacity: faint ? view.faint : 0.6, line: { color: colour, width: 1.6, dash } });
-    if (symbol) {
-      const marks = markLines(ends, symbol, MARK_SHARE * extent);
-      traces.push({ ...common, mode: "lines", x: marks.x, y: marks.y, z: marks.z, line: { color: colour, width: 2 } });
-    }
-  }
-  return traces;
-}
-
-function sensorTraces(view, state) {
-  const traces = [];
-  view.designs.forEach((design, number) => {
+function sensorItems(view, state) {
+  return view.designs.flatMap((design, number) => {
     const [fields, starts, shells] = [new Path(), new Path(), Object.assign(new Path(), { i: [], j: [], k: [] })];
     for (let sensor = 0; sensor < design.sensors; sensor++) {
       if (!state.designs[number] || state.sensors[number].has(sensor)) continue;
@@ -205,46 +169,25 @@ function sensorTraces(view, state) {
       originLines(cone, starts);
       gateShell(cone, shells);
     }
-    const line = (path, name, width) => ({
-      type: "scatter3d", mode: "lines", hoverinfo: "skip", x: path.x, y: path.y, z: path.z,
-      line: { color: design.colour, width, dash: design.dash }, visible: state.layers[name] !== false && path.x.length > 0,
-    });
-    traces.push(line(fields, "fields", 3), line(starts, "starts", 4));
-    traces.push(meshTrace(shells, { color: design.colour, opacity: 0.2, visible: state.layers.gates !== false && shells.x.length > 0 }));
+    const look = { colour: design.colour, dash: design.dash, opacity: 1 };
+    const items = { gates: { kind: "mesh", columns: shells, colour: design.colour, opacity: 0.2 }, fields: { kind: "lines", path: fields, width: 1.4, ...look }, starts: { kind: "lines", path: starts, width: 2.2, ...look } };
+    return Object.entries(items).filter(([layer]) => state.layers[layer] !== false).map(([, item]) => item);
   });
-  return traces;
 }
 
-function densityTraces(view, state) {
-  if (!view.density) return [];
+function densityItems(view, state) {
+  if (!view.density || state.layers.density !== true) return [];
   const path = new Path();
   for (let n = 0; n < view.density.length; n += 3) path.add(view.density.subarray(n, n + 3));
-  const marker = { color: "#7b2d8b", size: 2, opacity: 0.55 };
-  return [{ type: "scatter3d", mode: "markers", hoverinfo: "skip", x: path.x, y: path.y, z: path.z, marker, visible: state.layers.density === true }];
+  return [{ kind: "dots", path, colour: "#7b2d8b" }];
 }
 
-function sceneTraces(view, state) {
+// Everything that is switched on, in the order in which it is painted, and how many rays there are of each outcome.
+function sceneItems(view, state) {
   const paths = rayPaths(view, state);
-  const traces = [...bodyTraces(view, state), ...sensorTraces(view, state), ...rayTraces(view, state, paths), ...densityTraces(view, state)];
-  return { traces, counts: new Map([...paths].map(([code, path]) => [code, path.count])) };
-}
-
-function sceneLayout(view, font) {
-  const axis = { backgroundcolor: "#f7f8fa", gridcolor: "#dfe3e8", showbackground: true, zeroline: false, showspikes: false };
-  const axes = {};
-  ["x", "y", "z"].forEach((name, k) => {
-    const range = [view.bounds[0][k], view.bounds[1][k]];
-    // a world in a plane has no height, and plotly draws no box without one
-    if (range[0] === range[1]) range.splice(0, 2, range[0] - 0.01, range[1] + 0.01);
-    axes[`${name}axis`] = { ...axis, range, autorange: false, title: { text: `${name} [m]` } };
-  });
-  const flat = view.camera.up.z === 0;
-  if (flat) axes.zaxis.visible = false;
-  return {
-    font: { ...font, size: 12 },
-    paper_bgcolor: "#ffffff",
-    margin: { l: 0, r: 0, t: 0, b: 0 },
-    showlegend: false,
-    scene: { aspectmode: "data", camera: view.camera, dragmode: flat ? "pan" : "orbit", ...axes },
-  };
+  const bodies = [["scene", true, "#c9b8a8"], ["occluders", false, "#8b929d"]]
+    .filter(([layer]) => state.layers[layer] !== false)
+    .map(([, target, colour]) => ({ kind: "mesh", columns: bodyColumns(view, target, state.frame), colour, opacity: 1 }));
+  const items = [...bodies, ...sensorItems(view, state), ...rayItems(view, state, paths), ...densityItems(view, state)];
+  return { items, counts: new Map([...paths].map(([code, path]) => [code, path.count])) };
 }
