@@ -233,10 +233,10 @@ def report(found: dict[str, Found], arguments: argparse.Namespace, seconds: floa
             "much memory, code of the file that ran, a file that was left or half-written)."
         ),
         paragraph(
-            "Good files of every kind are damaged by a seeded generator: bytes, numbers, words, keys and values, arrays "
-            "and headers inside archives whose checksums are right again. What is refused at a new place of the program is "
-            "damaged further. An input may take 5 s of processor time, a command 60 s, and both 2 GiB beyond what they "
-            f"begin with. Slowest: {slowest}, {found[slowest].slowest_s:.1f} s; most memory: {largest}, "
+            "Good files of every kind are damaged by a seeded generator: bytes, numbers, words, keys and values, "
+            "arrays and headers inside archives whose checksums are right again. What is refused at a new place of the "
+            "program is damaged further. An input may take 5 s of processor time, a command 60 s, both 2 GiB beyond "
+            f"what they begin with. Slowest: {slowest}, {found[slowest].slowest_s:.1f} s; most memory: {largest}, "
             f"{found[largest].memory_mib:.0f} MiB."
         ),
         paragraph(f"Kinds: {'; '.join(found)}."),
