@@ -16,7 +16,6 @@ from typing import Any
 import typer
 
 from lidardesign.cli.main import app
-from lidardesign.cli.manual import MANUALS, Manual
 
 PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 HEAD = """\
@@ -35,7 +34,7 @@ def reference() -> str:
     """The page."""
     root = typer.main.get_command(app)
     commands = list(_commands(root))
-    lines = [HEAD, COMMON_HEAD, "", *_option_table(_common_options(commands[0][1]))]
+    lines = [HEAD, COMMON_HEAD, "", *_option_list(_common_options(commands[0][1]))]
     described: dict[tuple[str, str], str] = {}
     for path, command in commands:
         lines += ["", *_section(path, command, described)]
@@ -53,8 +52,7 @@ def _commands(root: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]
 
 
 def _section(path: str, command: Any, described: dict[tuple[str, str], str]) -> Iterator[str]:
-    """A command; `described` has the options of earlier commands, which are not described again."""
-    manual = MANUALS.get(path, Manual({}))
+    """A command; `described` has options of earlier commands, which are not described again."""
     yield f"## {path}"
     yield ""
     yield _plain(inspect.cleandoc(command.help or "").partition("\f")[0])
@@ -62,14 +60,11 @@ def _section(path: str, command: Any, described: dict[tuple[str, str], str]) -> 
     own = [one for one in command.params if _name(one) not in COMMON]
     known = [one for one in own if (_shown(one), _described(one)) in described]
     if len(known) < len(own):
-        yield from _option_table([one for one in own if one not in known])
+        yield from _option_list([one for one in own if one not in known])
     for earlier in dict.fromkeys(described[_shown(one), _described(one)] for one in known):
         same = [f"`{_name(one)}`" for one in known if described[_shown(one), _described(one)] == earlier]
         yield f"\nAs for `{earlier}`: {', '.join(same)}."
     described |= {(_shown(one), _described(one)): path for one in own if one not in known}
-    if manual.see:
-        yield ""
-        yield f"See {', '.join(f'[{page}]({page})' for page in manual.see)}."
 
 
 def _usage(command: Any) -> str:
@@ -82,11 +77,8 @@ def _argument(parameter: Any) -> str:
     return name if parameter.required else f"[{name}]"
 
 
-def _option_table(parameters: list[Any]) -> Iterator[str]:
-    yield "| | |"
-    yield "|---|---|"
-    for one in parameters:
-        yield f"| {_shown(one)} | {_described(one)} |"
+def _option_list(parameters: list[Any]) -> Iterator[str]:
+    yield from (f"- {_shown(one)}: {_described(one)}" for one in parameters)
 
 
 def _shown(parameter: Any) -> str:
@@ -109,7 +101,7 @@ def _first_sentence(text: str) -> str:
 
 
 def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("<", "&lt;")
+    return text.replace("<", "&lt;")
 
 
 def _common_options(command: Any) -> list[Any]:
