@@ -23,7 +23,10 @@ from lidardesign.testing.scaffold import new_task
 ROOT = Path(__file__).parents[1]
 # All that a checkout has.
 FOLDERS = ("benchmarks", "docs", "examples", "lidardesign", "tasks", "tests", "tools")
-FILES = ("CHANGELOG.md", "LICENSE", "MANIFEST.in", "Makefile", "README.md", "constraints.txt", "pyproject.toml")
+FILES = (
+    "CHANGELOG.md", "LICENSE", "MANIFEST.in", "Makefile", "README.md", "constraints.txt", "mkdocs.yml",
+    "pyproject.toml",
+)  # fmt: skip
 PAGES = Path("share", "doc", "lidardesign")
 NOT_SOURCES = ("__pycache__", "*.egg-info", "build", "runs", "*.pyc", ".*")
 
