@@ -154,6 +154,7 @@ def source_of(command: str, parameter: Any) -> Any:
         "--format": _formats,
         "--baseline": _baselines,
         "--designs": _design_names,
+        "--fail-unless-better": _rivals,
         "--detector": _detectors,
         "--effects": _effects,
         "--at": _conditions,
@@ -202,6 +203,10 @@ def _baselines(context: Any, current: str) -> Items:
 def _design_names(context: Any, current: str) -> Items:
     files = [file for run in _given(context, "RUN|DESIGN") for file in sorted(Path(run).glob("designs/*.yaml"))]
     return [(name, "a design") for name in dict.fromkeys(file.stem for file in files)]
+
+
+def _rivals(context: Any, current: str) -> Items:
+    return [*_design_names(context, current), *_baselines(context, current)]
 
 
 def _effects(context: Any, current: str) -> Items:

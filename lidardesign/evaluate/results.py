@@ -288,16 +288,6 @@ def leading_detail(rows: Sequence[Row]) -> str | None:
     return next((name for row in rows for name in row.details), None)
 
 
-def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:
-    """Rows of designs whose mean misses a limit in the metric's unit; baselines never count.
-
-    Where lower is better, a row misses the limit by lying above it; where higher is better, by lying below
-    it: `--fail-above` then reads as "fail where worse than". A value equal to the limit meets it.
-    """
-    sign = 1.0 if evaluation.metric.better == "lower" else -1.0
-    return [row for row in evaluation.rows if not row.baseline and sign * row.value > sign * limit]
-
-
 def verdict(evaluation: Evaluation, pair: Paired) -> str:
     """`better` or `worse` where the paired interval of a excludes zero, `open` where it does not or there is none."""
     if pair.ci_low is None or pair.ci_high is None:

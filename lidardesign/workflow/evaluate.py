@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -15,9 +16,10 @@ from lidardesign.design.compare import outside_notes
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import MAX_SEED, ConfigError, check_number
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
-from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of
+from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
+from lidardesign.evaluate.gates import check_audit, check_better, check_limit
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
@@ -78,6 +80,8 @@ class ScoreOptions:
         scenes_seed: Root of the held-out scenes; `seed` by default.
         designs: Names of the designs that are scored; all by default.
         mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
+        fail_above: What no design may be worse than, in the metric's unit; `Scores.check` sees to it.
+        fail_unless_better: A baseline or design that every other design must be better than; so does this.
 
     Raises:
         ConfigError: One of them says nothing that can be done.
@@ -97,6 +101,8 @@ class ScoreOptions:
     scenes_seed: int | None = None
     designs: Sequence[str] = ()
     mount_error: str | None = None
+    fail_above: float | None = None
+    fail_unless_better: str | None = None
 
     def __post_init__(self) -> None:
         check_workers(str(self.workers))
@@ -113,6 +119,8 @@ class ScoreOptions:
         for name, (low, high) in limits.items():
             if getattr(self, name) is not None:
                 check_number(getattr(self, name), f"--{name.replace('_', '-')}", low, high, whole="seed" in name)
+        if self.fail_above is not None and not math.isfinite(self.fail_above):
+            raise ConfigError(f"{self.fail_above}", where="--fail-above", allowed="a finite number")
         for count in self.rays or ():
             check_number(count, "--rays", 1, MOST_RAYS, whole=True)
         if self.cma_seconds is not None and CMA not in self.baselines:
@@ -193,6 +201,9 @@ class ScoreRequest:
         run = learned = judging_run(name_apart(designs), opened, notes)
         for note in learned.input_notes():
             notes(note)
+        rival = options.fail_unless_better
+        _check_rival(rival, [design.name for design in designs])
+        baselines = [*ALWAYS, *options.baselines, *([rival] if rival and is_baseline(rival) else [])]
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
         if options.accuracy:
             # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes
@@ -210,7 +221,7 @@ class ScoreRequest:
             learned,
             designs,
             sorted(set(rays)),
-            tuple(dict.fromkeys([*ALWAYS, *options.baselines])),
+            tuple(dict.fromkeys(baselines)),
             run.config.seed if options.seed is None else options.seed,
             planner,
             audit,
@@ -350,6 +361,20 @@ class Scores:
         """What `lidardesign evaluate --json` prints of them."""
         return {**self.evaluation.as_dict(), "set": list(settings_texts(self.request.options.settings))}
 
+    def check(self) -> None:
+        """Hold the designs against what the request says that they must keep.
+
+        Raises:
+            ThresholdError: One is worse than `fail_above`, or not better than `fail_unless_better`; or skipped effects
+                change a score by more than the metric's tolerance, where that was audited.
+        """
+        options = self.request.options
+        if options.fail_above is not None:
+            check_limit(self.evaluation, options.fail_above)
+        if options.fail_unless_better is not None:
+            check_better(self.evaluation, options.fail_unless_better)
+        check_audit(self.evaluation)
+
     def with_accuracy(self, progress: Progress | None = None) -> Scores:
         """The scores with what accuracy costs in time here; takes minutes.
 
@@ -436,6 +461,20 @@ class Scores:
         ]
         caption = f"{metric.name}, {metric.better} is better, over {self.evaluation.scenes} held-out scenes"
         return html_table(caption, headings, rows)
+
+
+def _check_rival(name: str | None, designs: Sequence[str]) -> None:
+    """Refuse a rival that nothing can be better than."""
+    where = "--fail-unless-better"
+    if name is None:
+        return
+    if is_baseline(name):
+        baseline_of(name, where=where)
+    elif name not in designs:
+        allowed = f"a baseline, or of the designs: {', '.join(designs)}"
+        raise ConfigError(f"no baseline or design {name!r}", where=where, allowed=allowed)
+    elif len(designs) == 1:
+        raise ConfigError(f"there is no other design to compare {name} with", where=where, hint="name a baseline")
 
 
 def evaluation_request(

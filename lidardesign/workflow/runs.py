@@ -181,8 +181,8 @@ class Run(RunFolder):
             settings: Settings of the task, to judge by other scenes than were learned.
             progress: Called with the scenes done, all scenes, and the name of the scene.
             notes: Called with every note.
-            further: range_tolerance_mm, return_tolerance, workers, cma_seconds, accuracy and scenes_seed, as of
-                `ScoreOptions`.
+            further: range_tolerance_mm, return_tolerance, workers, cma_seconds, accuracy, scenes_seed, fail_above and
+                fail_unless_better, as of `ScoreOptions`; `Scores.check()` holds designs against the last two.
 
         Raises:
             ConfigError: Choices that cannot be.

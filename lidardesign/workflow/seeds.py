@@ -60,7 +60,7 @@ def evaluate_seeds(
         notes: Called with every note.
         options: designs (names; all that are common by default), scenes_seed (the first run's by default), and rays,
             baselines, effects, detector, settings, range_tolerance_mm, return_tolerance, mount_error, workers and
-            cma_seconds, as of `ScoreOptions`.
+            cma_seconds, fail_above and fail_unless_better, as of `ScoreOptions`.
 
     Raises:
         ConfigError: Runs that differ in more than their seed, one run twice, or no design of one name.

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from support.command_line import make_run
 
+import lidardesign as package
 from lidardesign import __version__
 from lidardesign.cli import output as console_module
 from lidardesign.cli.output import command, plain_json
@@ -109,6 +110,34 @@ def test_evaluate_scores_designs_and_baselines_and_holds_a_threshold(lidardesign
     assert Path("rows.csv").is_file()
     assert lidardesign(*arguments, "--fail-above", 1e9).code == 0
     assert "held-out" in lidardesign("evaluate", flat, "--rays", 16).out
+
+
+def test_evaluate_fails_unless_designs_are_better_than_a_rival(lidardesign, flat):
+    for sensors in (1, 2):
+        lidardesign("fit", flat, "--layout", "grid", "--sensors", sensors, "--rays", 16, "--name", f"s{sensors}")
+    both = [flat / "designs" / f"s{sensors}.yaml" for sensors in (1, 2)]
+    arguments = ("evaluate", both[1], "--rays", 16, "--set", "test=10")
+    passed = lidardesign(*arguments, "--fail-unless-better", "uniform")
+    assert passed.code == 0, passed.err
+    found = {
+        name: lidardesign("evaluate", *both, *arguments[2:], "--fail-unless-better", name, "--json")
+        for name in ("s1", "s2")
+    }
+    (pair,) = [pair for pair in found["s1"].json["paired"] if (pair["a"], pair["b"]) == ("s1", "s2")]
+    assert found["s1"].code == int(not pair["ci_low"] > 0)
+    assert found["s2"].code == int(not pair["ci_high"] < 0)
+    for rival, other in (("s1", "s2"), ("s2", "s1")):
+        if found[rival].code:
+            assert f"{other} and {rival} was found with 16 rays" in found[rival].err or (
+                f"{other} is worse than {rival} with 16 rays by" in found[rival].err
+            )
+    # a baseline that is not always there stands beside the designs then
+    scores = package.open_run(flat).evaluate(both[1:], rays=[16], settings={"test": 10}, fail_unless_better="lloyd")
+    assert "lloyd" in [row.design for row in scores.rows]
+    for name, words in (("other", "no baseline or design 'other'"), ("s2", "there is no other design")):
+        wrong = lidardesign(*arguments, "--fail-unless-better", name)
+        assert wrong.code == 2
+        assert words in wrong.err
 
 
 def test_further_baselines_are_built_where_they_are_asked_for(lidardesign, flat):

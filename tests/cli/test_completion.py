@@ -88,7 +88,7 @@ def test_every_option_and_argument_is_completed_or_known_to_be_free(root):
 def test_commands_and_options_are_completed_by_their_beginning(root):
     assert completed(root, "le") == ["learn"]
     assert {"list", "show", "check", "new"} <= set(completed(root, "tasks "))
-    assert completed(root, "evaluate run --fail") == ["--fail-above"]
+    assert completed(root, "evaluate run --fail") == ["--fail-above", "--fail-unless-better"]
     assert "--dry-run" in completed(root, "fit run --")
 
 
@@ -150,6 +150,7 @@ def test_keys_of_a_run_are_those_of_its_task(root, place, monkeypatch):
     assert "variation=" in completed(root, "evaluate flat --set ")
     assert "variation=" in completed(root, "evaluate flat/designs/free.yaml --set ")
     assert completed(root, "evaluate flat --designs ") == ["free"]
+    assert completed(root, "evaluate flat --fail-unless-better fr") == ["free"]
     assert "density.sigma_m=" not in completed(root, "evaluate flat --set ")
     assert completed(root, "evaluate absent --set ") == []
     assert completed(root, "fit flat --at ") == []

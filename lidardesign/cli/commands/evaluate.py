@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -15,9 +14,9 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.output import FIRST_LINE, Output, command, keep_times, show_plan
 from lidardesign.cli.output_files import claim_outputs, is_output, written_file
-from lidardesign.cli.tables.grids import RichConsole, number
+from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
-from lidardesign.errors import MAX_SEED, ConfigError, ThresholdError
+from lidardesign.errors import MAX_SEED
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from lidardesign.evaluate.cma.candidate import Show
     from lidardesign.evaluate.cma.search import Progress
     from lidardesign.evaluate.figures.scene_figure import FigureData
-    from lidardesign.evaluate.results import Evaluation
     from lidardesign.workflow.evaluate import ScoreRequest, Scores
     from lidardesign.workflow.seeds import SeedsRequest
 
@@ -154,6 +152,16 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
+    fail_unless_better: Annotated[
+        str | None,
+        typer.Option(
+            "--fail-unless-better",
+            metavar="NAME",
+            help="Exit 1 unless every design is better than this baseline or design at every number of rays, by the "
+            "interval of the difference.",
+            show_default=False,
+        ),
+    ] = None,
     workers: Annotated[
         str,
         typer.Option(
@@ -201,8 +209,6 @@ def evaluate(
     """Score designs on held-out scenes against the baselines uniform, random, bounding, silhouette and greedy."""
     with command(json=json, quiet=quiet, debug=debug) as output:
         claim_outputs(output, dry_run=dry_run, csv=csv, report=report, plots=plots)
-        if fail_above is not None and not math.isfinite(fail_above):
-            raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
         with phase("libraries"):
             from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
             from lidardesign.workflow.seeds import SeedsRequest, differing_seeds
@@ -222,6 +228,8 @@ def evaluate(
             scenes_seed=scenes_seed,
             designs=designs or (),
             mount_error=mount_error,
+            fail_above=fail_above,
+            fail_unless_better=fail_unless_better,
         )
         runs = differing_seeds(targets, output.remark)
         request: ScoreRequest | SeedsRequest = (
@@ -255,9 +263,7 @@ def evaluate(
             if accuracy:
                 scores = _with_accuracy(scores, output)
                 _write_files(scores, written, *files.values())
-        if fail_above is not None:
-            _check_threshold(scores.evaluation, fail_above)
-        _check_audit(scores.evaluation)
+        scores.check()
 
 
 def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
@@ -319,29 +325,3 @@ def _write_report(scores: Scores, written: dict[Path, None], path: Path, picture
     with written_file(path) as file:
         scores.report(file, ("lidardesign", *sys.argv[1:]), pictured())
     written[path] = None
-
-
-def _check_threshold(evaluation: Evaluation, limit: float) -> None:
-    """Exit 1 where a design is worse than the limit; baselines do not count."""
-    from lidardesign.evaluate.results import worse_than_threshold
-
-    missed, unit = worse_than_threshold(evaluation, limit), evaluation.metric.unit
-    if missed:
-        bound = "at most" if evaluation.metric.better == "lower" else "at least"
-        rows = ", ".join(f"{row.design} with {row.rays} rays: {number(row.value)} {unit}" for row in missed)
-        raise ThresholdError(rows, where="--fail-above", allowed=f"{bound} {limit:g} {unit}")
-
-
-def _check_audit(evaluation: Evaluation) -> None:
-    """Exit 1 where skipped effects change a row by more than the metric's tolerance."""
-    audit = evaluation.audit
-    if audit is not None and audit.failed:
-        rows = ", ".join(f"{row.design} with {row.rays} rays by {number(abs(row.difference))}" for row in audit.failed)
-        there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
-        raise ThresholdError(
-            f"skipped effects move {rows} {audit.unit}",
-            where="--effects audit",
-            allowed=f"at most {audit.tolerance:g} {audit.unit}, the metric's tolerance",
-            hint="--effects all, or a smaller --range-tolerance-mm or --return-tolerance; skipped: "
-            + ", ".join(name for name in audit.skipped if name in there),
-        )

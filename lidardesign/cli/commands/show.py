@@ -171,11 +171,9 @@ def _signed(value: float, decimals: int = 2) -> str:
 
 
 def _verdict(pair: dict[str, Any], metric: dict[str, Any]) -> str:
-    rays = f"{pair['rays']}" if pair.get("rays_b") in (None, pair["rays"]) else f"{pair['rays']} and {pair['rays_b']}"
-    low, high, unit = pair["ci_low"], pair["ci_high"], metric["unit"]
-    span = f"{pair['a']} minus {pair['b']}: {number(pair['difference'], 3)} {unit}, 95 % interval "
-    span += f"{interval_text(pair, ' to ', 3)}, with {rays} rays"
-    if low is None or low <= 0 <= high:
-        return f"{span}: no difference is shown"
-    first_is_better = (pair["difference"] < 0) == (metric["better"] == "lower")
-    return f"{span}: {pair['a'] if first_is_better else pair['b']} is better"
+    from lidardesign.evaluate.gates import difference_text
+    from lidardesign.evaluate.results import Paired
+
+    found = Paired(**{name: value for name, value in pair.items() if name != "half_width"})
+    numbers = f"{found.rays}" if found.rays_b in (None, found.rays) else f"{found.rays} and {found.rays_b}"
+    return difference_text(found, metric["better"], metric["unit"], f"with {numbers} rays")

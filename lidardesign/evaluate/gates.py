@@ -1,0 +1,113 @@
+"""Whether designs are good enough: no worse than a limit, better than a rival, and moved by no effect that was skipped.
+
+Each check raises a `ThresholdError`, with which commands exit 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from lidardesign.errors import ThresholdError
+from lidardesign.evaluate.results import Evaluation, Paired, Row, verdict
+
+
+def difference_text(pair: Paired, better: str, unit: str, rays: str = "") -> str:
+    """A difference as a sentence: who is better by how much, or that no difference was found.
+
+    Arguments:
+        pair: The difference.
+        better: Of the metric, `lower` or `higher`.
+        unit: The metric's.
+        rays: Where it was found, as "with 361 rays".
+    """
+    gained = -pair.difference if better == "lower" else pair.difference
+    word, by = "better" if gained > 0 else "worse", f"{abs(gained):.3g} {unit}".rstrip()
+    where = f" {rays}" if rays else ""
+    none = f"no difference between {pair.a} and {pair.b} was found{where}"
+    if pair.ci_low is None or pair.ci_high is None:
+        return f"{none} ({by} {word}, without an interval)"
+    sign = 1.0 if pair.difference > 0 else -1.0
+    low, high = sorted((sign * pair.ci_low, sign * pair.ci_high))
+    if low > 0:
+        return f"{pair.a} is {word} than {pair.b}{where} by {by} ({low:.3g} to {high:.3g})"
+    return f"{none} ({by} {word}, {low:.3g} to {high:.3g})"
+
+
+def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:
+    """Rows of designs whose mean misses a limit in the metric's unit; baselines never count.
+
+    Where lower is better, a row misses the limit by lying above it; where higher is better, by lying below
+    it: `--fail-above` then reads as "fail where worse than". A value equal to the limit meets it.
+    """
+    sign = 1.0 if evaluation.metric.better == "lower" else -1.0
+    return [row for row in evaluation.rows if not row.baseline and sign * row.value > sign * limit]
+
+
+def check_limit(evaluation: Evaluation, limit: float) -> None:
+    """Refuse designs that are worse than a limit in the metric's unit.
+
+    Raises:
+        ThresholdError: One is, at one of the numbers of rays.
+    """
+    missed, unit = worse_than_threshold(evaluation, limit), evaluation.metric.unit
+    if missed:
+        bound = "at most" if evaluation.metric.better == "lower" else "at least"
+        rows = ", ".join(f"{row.design} with {row.rays} rays: {row.value:.4g} {unit}" for row in missed)
+        raise ThresholdError(rows, where="--fail-above", allowed=f"{bound} {limit:g} {unit}")
+
+
+def check_better(evaluation: Evaluation, name: str) -> None:
+    """Refuse designs that are not better than a baseline or another design, by the interval of the difference.
+
+    Arguments:
+        evaluation: The scores.
+        name: Of the baseline or design.
+
+    Raises:
+        ThresholdError: One is worse at one of its numbers of rays, no difference was found, or there is nothing to
+            compare it with.
+    """
+    turned = {(pair.b, pair.rays): _turned(pair) for pair in evaluation.paired if pair.a == name}
+    pairs = turned | {(pair.a, pair.rays): pair for pair in evaluation.paired if pair.b == name}
+    metric, missed = evaluation.metric, []
+    for row in evaluation.rows:
+        pair = pairs.get((row.design, row.rays))
+        if row.baseline or row.design == name or (pair is not None and verdict(evaluation, pair) == "better"):
+            continue
+        rays = f"with {row.rays} rays"
+        missed.append(
+            f"{name} has no score {rays} to compare {row.design} with"
+            if pair is None
+            else difference_text(pair, metric.better, metric.unit, rays)
+        )
+    if missed:
+        raise ThresholdError(
+            "; ".join(missed),
+            where="--fail-unless-better",
+            allowed=f"better than {name} at every number of rays",
+            hint="a better design, or more held-out scenes, in which smaller differences are found",
+        )
+
+
+def _turned(pair: Paired) -> Paired:
+    ends = (None, None) if pair.ci_low is None or pair.ci_high is None else (-pair.ci_high, -pair.ci_low)
+    return replace(pair, a=pair.b, b=pair.a, difference=-pair.difference, ci_low=ends[0], ci_high=ends[1])
+
+
+def check_audit(evaluation: Evaluation) -> None:
+    """Refuse an audit in which skipped effects change a row by more than the metric's tolerance.
+
+    Raises:
+        ThresholdError: They do.
+    """
+    audit = evaluation.audit
+    if audit is not None and audit.failed:
+        rows = ", ".join(f"{row.design} with {row.rays} rays by {abs(row.difference):.4g}" for row in audit.failed)
+        there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
+        raise ThresholdError(
+            f"skipped effects move {rows} {audit.unit}",
+            where="--effects audit",
+            allowed=f"at most {audit.tolerance:g} {audit.unit}, the metric's tolerance",
+            hint="--effects all, or a smaller --range-tolerance-mm or --return-tolerance; skipped: "
+            + ", ".join(name for name in audit.skipped if name in there),
+        )

@@ -1,0 +1,108 @@
+"""Gates: what designs are held against, and in which words a miss is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.evaluations import METRIC, make_row
+from support.scoring import HitTask, design, make_request
+from support.tables import each_row
+
+from lidardesign.errors import ThresholdError
+from lidardesign.evaluate.gates import check_better, check_limit, difference_text
+from lidardesign.evaluate.results import Evaluation, Paired, verdict
+from lidardesign.evaluate.score import evaluate
+
+
+@each_row(
+    ("better", "difference", "told"),
+    [
+        ("lower", (-0.6, -0.9, -0.3), "f3 is better than greedy by 0.6 mm (0.3 to 0.9)"),
+        ("higher", (-0.6, -0.9, -0.3), "f3 is worse than greedy by 0.6 mm (0.3 to 0.9)"),
+        ("lower", (0.6, 0.3, 0.9), "f3 is worse than greedy by 0.6 mm (0.3 to 0.9)"),
+        ("higher", (0.6, 0.3, 0.9), "f3 is better than greedy by 0.6 mm (0.3 to 0.9)"),
+        ("lower", (0.05, -0.07, 0.16), "no difference between f3 and greedy was found (0.05 mm worse, -0.07 to 0.16)"),
+        (
+            "higher",
+            (0.05, -0.07, 0.16),
+            "no difference between f3 and greedy was found (0.05 mm better, -0.07 to 0.16)",
+        ),
+        (
+            "lower",
+            (-0.05, -0.16, 0.07),
+            "no difference between f3 and greedy was found (0.05 mm better, -0.07 to 0.16)",
+        ),
+        (
+            "lower",
+            (-0.5, None, None),
+            "no difference between f3 and greedy was found (0.5 mm better, without an interval)",
+        ),
+    ],
+)
+def test_a_difference_is_told_in_one_sentence(better, difference, told):
+    assert difference_text(Paired("f3", "greedy", 361, *difference), better, "mm") == told
+
+
+def evaluation_of(pairs, better="lower", names=("f3", "f4"), rays=(196, 361)):
+    rows = [make_row(name, count, 5.0) for name in names for count in rays]
+    rows += [make_row("greedy", count, 5.0, True) for count in rays]
+    return Evaluation(replace(METRIC, better=better), 5, rows, pairs)
+
+
+BETTER, WORSE, OPEN = (-0.6, -0.9, -0.3), (0.6, 0.3, 0.9), (-0.1, -0.3, 0.1)
+
+
+@pytest.mark.parametrize("better", ["lower", "higher"])
+@pytest.mark.parametrize("kinds", [(BETTER, BETTER), (BETTER, OPEN), (WORSE, BETTER), (BETTER, None)])
+def test_designs_must_be_better_at_every_number_of_rays(kinds, better):
+    sign = 1.0 if better == "lower" else -1.0
+
+    def pair(rays, kind):
+        return Paired("f3", "greedy", rays, sign * kind[0], *sorted(sign * end for end in kind[1:]))
+
+    pairs = [pair(rays, kind) for rays, kind in zip((196, 361), kinds, strict=True) if kind is not None]
+    evaluation = evaluation_of(pairs, better, names=("f3",))
+    if kinds == (BETTER, BETTER):
+        return check_better(evaluation, "greedy")
+    with pytest.raises(ThresholdError) as refused:
+        check_better(evaluation, "greedy")
+    said = {
+        OPEN: "no difference between f3 and greedy was found with 361 rays (0.1 mm better, -0.1 to 0.3)",
+        WORSE: "f3 is worse than greedy with 196 rays by 0.6 mm (0.3 to 0.9)",
+        None: "greedy has no score with 361 rays to compare f3 with",
+    }
+    (missed,) = [kind for kind in kinds if kind != BETTER]
+    assert refused.value.message == said[missed]
+    assert refused.value.exit_code == 1
+
+
+def test_a_design_is_held_against_a_design_on_either_side_of_the_pair():
+    first, second = Paired("f3", "f4", 196, *BETTER), Paired("f3", "f4", 361, *BETTER)
+    check_better(evaluation_of([first, second]), "f4")
+    with pytest.raises(ThresholdError, match="f4 is worse than f3 with 196 rays by 0"):
+        check_better(evaluation_of([first, second]), "f3")
+
+
+@pytest.mark.parametrize("task", [None, HitTask()])
+def test_the_gate_is_the_verdict_of_every_pair(task):
+    generator = np.random.default_rng(2)
+    for azimuth in generator.uniform(0.0, 0.4, 4):
+        changes = {} if task is None else {"task": task}
+        evaluation = evaluate(make_request([design("own", azimuth=azimuth)], equal_bandwidth=False, **changes))
+        for name in ("uniform", "bounding"):
+            verdicts = {verdict(evaluation, pair) for pair in evaluation.paired if pair.b == name}
+            try:
+                check_better(evaluation, name)
+            except ThresholdError:
+                assert verdicts != {"better"}
+            else:
+                assert verdicts == {"better"}
+
+
+def test_a_limit_is_told_with_its_unit():
+    with pytest.raises(ThresholdError, match="f3 with 196 rays: 5 mm") as refused:
+        check_limit(evaluation_of([], names=("f3",)), 4.5)
+    assert refused.value.allowed == "at most 4.5 mm"
+    check_limit(evaluation_of([], names=("f3",)), 5.0)
