@@ -26,6 +26,12 @@ _SHARED = Path("share", "doc", "lidardesign")
 DOCS_FOLDERS = (_ROOT / "docs", _ROOT, _ROOT / _SHARED, sys.prefix / _SHARED, site.getuserbase() / _SHARED)
 
 
+class BackgroundNote(str):
+    """A note on what was decided, which asks nobody to do anything: commands say it with --verbose only."""
+
+    __slots__ = ()
+
+
 class LidardesignError(Exception):
     """The root of every error that a user can meet.
 

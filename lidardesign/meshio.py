@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from lidardesign.errors import DataError, LidardesignError
+from lidardesign.errors import BackgroundNote, DataError, LidardesignError
 from lidardesign.geometry.mesh_formats import check_gltf, check_ply, check_triangles, read_obj, read_off, read_stl
 from lidardesign.numerics import ROUNDING
 from lidardesign.run.inputs import MESH, check_bytes, read_file
@@ -324,11 +324,11 @@ def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> n
     longest = np.einsum("fek,fek->fe", edges, edges).max(axis=1)
     degenerate = _double_areas(vertices, faces) <= FLATTEST_TRIANGLE * longest
     if degenerate.any():
-        notes.append(f"dropped {int(degenerate.sum())} degenerate faces (without area)")
+        notes.append(BackgroundNote(f"dropped {int(degenerate.sum())} degenerate faces (without area)"))
         faces = faces[~degenerate]
     first, _ = unique_rows(np.sort(faces, axis=1))
     if len(first) < len(faces):
-        notes.append(f"dropped {len(faces) - len(first)} duplicate faces")
+        notes.append(BackgroundNote(f"dropped {len(faces) - len(first)} duplicate faces"))
     return faces[np.sort(first)]
 
 
@@ -345,10 +345,10 @@ def _oriented(
         faces, turned = turned_to_agree(faces, _double_areas(vertices, faces))
         mixed_edges = edge_defects(faces)[1]
         if turned:
-            notes.append(f"turned {turned} faces that ran against their neighbours")
+            notes.append(BackgroundNote(f"turned {turned} faces that ran against their neighbours"))
     if not open_edges and not mixed_edges and signed_volume_m3(vertices, faces) < 0:
         faces = faces[:, ::-1]
-        notes.append("the mesh was inside out: all faces were turned")
+        notes.append(BackgroundNote("the mesh was inside out: all faces were turned"))
     defects = [f"{open_edges} open edges"] * bool(open_edges)
     defects += [f"{mixed_edges} edges between faces of opposite winding"] * bool(mixed_edges)
     found = " and ".join(defects)
@@ -364,7 +364,7 @@ def _oriented(
     if not found:
         return faces, "solid"
     closed = f"closed mesh with {found}: it has no outside: unsigned distances"
-    notes.append(f"open mesh ({found}): unsigned distances, no inside" if open_edges else closed)
+    notes.append(BackgroundNote(f"open mesh ({found}): unsigned distances, no inside" if open_edges else closed))
     return faces, "unsigned"
 
 

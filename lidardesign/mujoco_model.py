@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import BackgroundNote, ConfigError, DataError
 from lidardesign.geometry.surface import grid_faces
 from lidardesign.meshio import check_mesh
 from lidardesign.run.inputs import ROBOT_FILES, check_bytes, check_file, read_head
@@ -245,7 +245,7 @@ def visible_geoms(
             shape, pose = _piece(model, full, own, clip_m)
             pieces.append(ModelGeom(full, name, label, body, shape, pose))
     meshes = ((piece.name, piece.shape) for piece in pieces if isinstance(piece.shape, Mesh))
-    notes += [f"{name}: {note}" for name, mesh in meshes for note in mesh.notes]
+    notes += [type(note)(f"{name}: {note}") for name, mesh in meshes for note in mesh.notes]
     if model.nflex or model.nskin:
         notes.append(f"flexible bodies and skins are left out: {model.nflex + model.nskin}")
     return tuple(pieces), tuple(notes)
@@ -274,7 +274,8 @@ def seen_geoms(model: mujoco.MjModel, groups: Sequence[int] | None = None) -> tu
         double = collides & (bodies > 0) & np.isin(bodies, bodies[~collides]) & ~np.isin(places, places[~collides])
         chosen = chosen[~double]
         if double.any():
-            notes.append(f"shapes that collide are left out where their body has others to be seen: {double.sum()}")
+            left_out = f"shapes that collide are left out where their body has others to be seen: {double.sum()}"
+            notes.append(BackgroundNote(left_out))
     if not len(chosen):
         used = ", ".join(str(group) for group in np.unique(model.geom_group)) or "none"
         raise DataError("the model has no visible geoms", allowed=f"groups that it uses: {used}")

@@ -38,7 +38,7 @@ PROGRAM = "lidardesign"
 EXIT_USAGE = 2
 HELP_WORDS = ("help", "man", "usage")
 # Options that belong to commands, and are often written before them.
-COMMON_OPTIONS = ("--json", "--quiet", "-q", "--debug", "--seed")
+COMMON_OPTIONS = ("--json", "--quiet", "-q", "--verbose", "-v", "--debug", "--seed")
 VERSION_HELP = "Print the version; with --json those of Python and the libraries too."
 SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": WIDEST}
 

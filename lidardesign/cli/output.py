@@ -10,7 +10,7 @@ import os
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -18,14 +18,15 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 
 from lidardesign.cli.environment import TerminatedError
+from lidardesign.cli.progress import ProgressDisplay
+from lidardesign.cli.tables.grids import duration
 from lidardesign.cli.tables.scores import show_times
-from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
 from lidardesign.run.files import STDIO, offered_input
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
-    from rich.progress import Progress
 
     from lidardesign.workflow.run_folder import RequestPlan
 
@@ -42,8 +43,6 @@ NUMBA_CACHE = "numba/core/caching.py"
 NO_MEMORY = "can't allocate memory"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 STDOUT, STDERR = 1, 2
-# The line of a progress bar that is there from its beginning, as rich numbers them.
-FIRST_LINE = 0
 # Commands that only read a run wait for its writer no longer than this.
 SHORT_WAIT_S = 0.5
 
@@ -69,7 +68,8 @@ class Output:
 
     Arguments:
         json: Print one JSON document on stdout and nothing else there.
-        quiet: No progress and no notes.
+        quiet: No progress and no notes, and of a result its files alone.
+        verbose: Everything: all tables, and notes on what was decided.
         debug: Show tracebacks.
         stream: Where the result goes: the program's stdout.
         when_interrupted: What to say to the user after Ctrl-C or SIGTERM.
@@ -79,6 +79,7 @@ class Output:
 
     json: bool = False
     quiet: bool = False
+    verbose: bool = False
     debug: bool = False
     stream: TextIO = field(default_factory=lambda: sys.stdout)
     when_interrupted: Callable[[], str | None] = field(default=lambda: None)
@@ -98,18 +99,34 @@ class Output:
         if not self.quiet:
             print_message(text)
 
+    def says(self, note: str) -> bool:
+        """Whether people are told a note."""
+        return not self.quiet and (self.verbose or not isinstance(note, BackgroundNote))
+
     def remark(self, text: str) -> None:
         """Print what the program has to remark, marked as a note."""
-        self.note(f"note: {text}")
+        if self.says(text):
+            self.note(f"note: {text}")
 
-    def result(self, document: dict[str, Any], show: Callable[[RichConsole], None], *, show_costs: bool = True) -> None:
-        """Give the result, as JSON or shown for people, and where the time went until now.
+    def result(
+        self,
+        document: dict[str, Any],
+        show: Callable[[RichConsole], None],
+        *,
+        files: Mapping[str, Path] | None = None,
+        show_costs: bool = True,
+        says_time: bool = False,
+    ) -> None:
+        """Give the result, as JSON or shown for people, with the time that it took and the files that it is in.
 
         Arguments:
             document: The JSON form; `timings` and `peak_memory_bytes` are added.
             show: Prints the result for people.
-            show_costs: Whether people are shown the times, and the result is kept where it cannot be shown: not by
+            files: Paths that were written, by what they are; with --quiet they are all that is printed. None where the
+                result is in no file by its nature.
+            show_costs: Whether people are shown the time, and the result is kept where it cannot be shown: not by
                 commands that only look something up.
+            says_time: Whether `show` says the time.
 
         Raises:
             OSError: Standard output is full, or was closed.
@@ -120,16 +137,34 @@ class Output:
                 self.answered = True
                 print_json(document, self.stream)
             else:
-                rich = self.rich()
-                show(rich)
-                if show_costs and not self.quiet:
-                    show_times(document["timings"], document["peak_memory_bytes"], rich)
+                self._show(document, show, files, show_costs, says_time)
                 self.stream.flush()
         except (OSError, SystemExit) as error:
             if show_costs:  # it was worked for
                 self.keep(f"{json_text(document)}\n", ".json")
             # rich ends the process by itself where nobody reads
             raise error if isinstance(error, OSError) else BrokenPipeError from None
+
+    def _show(
+        self,
+        document: dict[str, Any],
+        show: Callable[[RichConsole], None],
+        files: Mapping[str, Path] | None,
+        show_costs: bool,
+        says_time: bool,
+    ) -> None:
+        rich, timings = self.rich(), document["timings"]
+        if self.quiet and files is not None:
+            for path in files.values():
+                rich.print(str(path), soft_wrap=True)
+            return
+        show(rich)
+        if show_costs and self.verbose:
+            show_times(timings, document["peak_memory_bytes"], rich)
+        elif show_costs and not (says_time or self.quiet):
+            rich.print(f"took {duration(self.clock.seconds)}")
+        for label, path in (files or {}).items():
+            rich.print(f"{label}: {path}", soft_wrap=True)
 
     def keep(self, content: str, suffix: str) -> None:
         """Keep what cannot be put where it belongs in a temporary file, and say where; without room, print it."""
@@ -142,19 +177,10 @@ class Output:
         else:
             print_message(f"what could not be written is kept in {place}")
 
-    @contextlib.contextmanager
-    def progress(self, label: str, *columns: str) -> Iterator[Progress | None]:
-        """A progress bar with a line (FIRST_LINE) and further fields as columns, on a terminal; else None."""
-        if self.quiet or not sys.stderr.isatty():
-            yield None
-            return
-        from rich.progress import BarColumn, Progress, TextColumn
-
-        shown = [TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %")]
-        shown += [TextColumn("{task.fields[" + name + "]}") for name in columns]
-        with Progress(*shown, console=self.rich(stderr=True), transient=True) as bar:
-            bar.add_task(label, total=None, **dict.fromkeys(columns, ""))
-            yield bar
+    def progress(self, label: str) -> ProgressDisplay:
+        """How far work has come: a bar on a terminal, elsewhere a line now and then; nothing with --quiet."""
+        on_terminal = not self.quiet and sys.stderr.isatty()
+        return ProgressDisplay(label, self.note, self.rich(stderr=True) if on_terminal else None)
 
 
 def print_message(text: str) -> None:
@@ -176,12 +202,12 @@ def json_text(document: dict[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Output]:
+def command(*, json: bool, quiet: bool, debug: bool, verbose: bool = False) -> Iterator[Output]:
     """Run a command's body: its errors become one message and an exit code.
 
     With `--json`, whatever plugins and libraries print meanwhile goes to stderr, also by processes of their own.
     """
-    output = Output(json=json, quiet=quiet, debug=debug, stream=sys.stdout)
+    output = Output(json=json, quiet=quiet, verbose=verbose and not quiet, debug=debug, stream=sys.stdout)
     try:
         with _guarded_stdout(output) if json else contextlib.nullcontext(), running(output.clock), offered_input():
             yield output

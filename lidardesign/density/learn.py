@@ -23,7 +23,7 @@ from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import draw_probes, measure
 from lidardesign.density.training.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.density.verdict import Verdict
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import BackgroundNote, ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.geometry.frames import in_view
 from lidardesign.registry import plugin_guard
@@ -215,7 +215,8 @@ def _notes(trainer: Trainer, place: torch.device) -> list[str]:
     if trainer.skipped:
         notes.append(f"{trainer.skipped} steps were not finite and skipped")
     if trainer.doubled_at is not None:
-        notes.append(f"float32 could not invert the flow's splines: from step {trainer.doubled_at} on float64")
+        splines = f"float32 could not invert the flow's splines: from step {trainer.doubled_at} on float64"
+        notes.append(BackgroundNote(splines))
     return notes
 
 

@@ -44,4 +44,8 @@ class Verdict:
 
     def text(self, preset: str) -> str:
         """The verdict in a line, with what to do next for a density that was learned with a preset."""
-        return f"{self.word}: {self.why}; {NEXT.get(preset, LAST)}" if self.why else self.word
+        return f"{self.word}: {self.advice(preset)}" if self.why else self.word
+
+    def advice(self, preset: str) -> str:
+        """Why it is no better, and what to do next."""
+        return f"{self.why}; {NEXT.get(preset, LAST)}"

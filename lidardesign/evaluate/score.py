@@ -21,7 +21,7 @@ from lidardesign.design.compare import outside_notes
 from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.layouts.track import travels
 from lidardesign.design.sensor import CERTIFICATES, DesignSpec
-from lidardesign.errors import ConfigError
+from lidardesign.errors import BackgroundNote, ConfigError
 from lidardesign.evaluate.baselines.candidates import Candidate, RaysPerCondition, mean_mbps
 from lidardesign.evaluate.baselines.catalog import part_notes
 from lidardesign.evaluate.baselines.greedy import GREEDY, USUAL_SCENES, Fired, GreedyCandidate, greedy_rays
@@ -456,7 +456,8 @@ def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], seed: int) -> 
 def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequence[Row]) -> list[str]:
     notes, positions = left_out(request.designs, request.rays), max(len(entry.positions) for entry in entries)
     if positions > 1:
-        notes.append(f"rays and bandwidth count per position; every scene is seen from {positions} positions")
+        counted = f"rays and bandwidth count per position; every scene is seen from {positions} positions"
+        notes.append(BackgroundNote(counted))
     notes += group_notes(request.test)
     if GREEDY in request.baselines and request.greedy is not None:
         notes += greedy_rays(request.task, positions, request.rays)[1]
@@ -485,7 +486,7 @@ def group_notes(scenes: Sequence[Scene]) -> list[str]:
     if groups == len(scenes):
         return []
     kind = "intervals" if groups >= FEWEST_RESAMPLED else "Student's t intervals"
-    return [f"the {len(scenes)} held-out scenes are of {groups} groups, and {kind} are over groups"]
+    return [BackgroundNote(f"the {len(scenes)} held-out scenes are of {groups} groups, and {kind} are over groups")]
 
 
 def worst_notes(rows: Sequence[Row], metric: Metric) -> list[str]:
@@ -505,14 +506,13 @@ def worst_notes(rows: Sequence[Row], metric: Metric) -> list[str]:
         note += f" ({row.failures} failed)"
     others = len(some) - 1
     further = f"{others} other rows" if others > 1 else "another row"
-    return [f"{note}; so do some of {further}" if others else note]
+    note = f"{note}; so do some of {further}" if others else note
+    return [BackgroundNote(note) if row.baseline else note]
 
 
 def slipped_notes(casts: SecondCasts) -> list[str]:
     """How many rays slipped between the triangles of meshes, where that are more than pass their outlines."""
     if casts.found <= OUTLINE_SHARE * casts.rays:
         return []
-    return [
-        f"{casts.found:,} of {casts.rays:,} rays ({casts.found / casts.rays:.2%}) had slipped between triangles, as "
-        "happens at the vertices of a mesh; a second cast from beside found what they meet"
-    ]
+    note = f"{casts.found:,} of {casts.rays:,} rays ({casts.found / casts.rays:.2%}) had slipped between triangles, as "
+    return [BackgroundNote(f"{note}happens at the vertices of a mesh; a second cast from beside found what they meet")]

@@ -158,7 +158,7 @@ def _joint_notes(evaluations: Sequence[Evaluation], seeds: Sequence[int]) -> lis
     """What all say, then what single ones say."""
     shared = [note for note in evaluations[0].notes if all(note in each.notes for each in evaluations)]
     own = [
-        f"seed {seed}: {note}"
+        type(note)(f"seed {seed}: {note}")
         for each, seed in zip(evaluations, seeds, strict=True)
         for note in each.notes
         if note not in shared

@@ -50,6 +50,7 @@ class SelectionProblem:
         name: Of the design, for messages.
         further: As many rays again, which may not be chosen: a certificate says what they would gain.
         is_trial: Whether rays alone are wanted, of the first scenes and without certificates.
+        progress: Called with every step.
     """
 
     rays: Rays
@@ -65,6 +66,7 @@ class SelectionProblem:
     name: str
     further: Rays | None = None
     is_trial: bool = False
+    progress: Callable[[str], None] = lambda step: None
 
     @phase("what returns tell")
     def inform(self, scenes: Iterator[Scene], count: int) -> list[InformedScene]:
@@ -197,6 +199,7 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
     informed: list[InformedScene] = []
     scenes, wanted, loss = problem.scenes("choice"), information.FEW_SCENES, np.inf
     while True:
+        problem.progress(f"choosing rays on {wanted} training scenes")
         informed += problem.inform(scenes, wanted - len(informed))
         gates_m = problem.gates(problem.rays, problem.visits, informed)
         coverage = problem.coverage(informed, gates_m)
@@ -221,6 +224,7 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
         gates_m = gates_m[np.arange(len(rays)), own][:, None]
     selected = []
     for count in counts:
+        problem.progress(f"choosing {count} rays")
         choices = problem.choices(coverage, count)
         gate = _gate_of(choices)
         tables = []

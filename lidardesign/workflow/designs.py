@@ -36,6 +36,7 @@ from lidardesign.workflow.fit_design import fit_design
 from lidardesign.workflow.run_folder import (
     Notes,
     RunFolder,
+    ignore,
     log_note,
     need_run,
     reach_beside,
@@ -83,9 +84,9 @@ class Design(DesignSource):
         self.result = result
 
     @classmethod
-    def fitted(cls, request: FitRequest, *, notes: Notes = log_note) -> Design:
-        """The design that a request comes to; it is not saved yet."""
-        result = fit_design(request, notes=notes)
+    def fitted(cls, request: FitRequest, *, notes: Notes = log_note, progress: Notes = ignore) -> Design:
+        """The design that a request comes to; it is not saved yet. `progress` is called with every step."""
+        result = fit_design(request, notes=notes, progress=progress)
         return cls(result.design, request.run, None, result)
 
     @property
@@ -93,11 +94,12 @@ class Design(DesignSource):
         """Its name, which is its file's and its rows'."""
         return self.specification.name
 
-    def constrain(self, *, notes: Notes = log_note, **options: Any) -> Design:
+    def constrain(self, *, notes: Notes = log_note, progress: Notes = ignore, **options: Any) -> Design:
         """Fit again in its run; what is not chosen anew stays as it is.
 
         Arguments:
             notes: Called with every note.
+            progress: Called with every step, as "choosing 361 rays".
             options: As of `FitOptions`: constraints, sensors, rays, layout, gates, level, at, name and more.
 
         Raises:
@@ -106,7 +108,7 @@ class Design(DesignSource):
         """
         run = need_run(self.run, self.name if self.path is None else self.path)
         request = FitRequest.resolve(run, FitOptions(**options), self.specification, notes=notes)
-        return Design.fitted(request, notes=notes)
+        return Design.fitted(request, notes=notes, progress=progress)
 
     def rays(
         self, count: int | None = None, *, at: Mapping[str, float] | None = None, seed: int = 0, notes: Notes = log_note

@@ -10,7 +10,7 @@ from typing import Any
 from lidardesign.design.layouts.rays import lay_out, layout_of, own_count
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import ConfigError, check_number
+from lidardesign.errors import BackgroundNote, ConfigError, check_number
 from lidardesign.estimates import Estimate, as_documents
 from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
@@ -106,7 +106,7 @@ class DesignSource:
             placed(design, at)
         if count is None and self.leaves_rays_open and not may_stay_open:
             count = self.largest_budget()
-            notes(f"the design leaves the number of rays open; {count} is the task's largest budget")
+            notes(BackgroundNote(f"the design leaves the number of rays open; {count} is the task's largest budget"))
         samples, retarget = None, None
         if count is not None and may_need_samples(design) and (self.leaves_rays_open or count != own_count(design)):
             run = self.opened_run()

@@ -28,7 +28,7 @@ from lidardesign.design.layouts.rays import LAYOUTS
 from lidardesign.design.layouts.track import travelled
 from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import DataError, InfeasibleError
+from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
 from lidardesign.evaluate.baselines.candidates import mean_mbps
 from lidardesign.evaluate.request import can_fire
 from lidardesign.evaluate.scene_scores import score_lists, silent_notes
@@ -44,7 +44,7 @@ from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import mount_of, random_generator
 from lidardesign.workflow import fit as fit_choices
 from lidardesign.workflow.fit import BEST, FitRequest
-from lidardesign.workflow.run_folder import Notes, log_note, relative_folder
+from lidardesign.workflow.run_folder import Notes, ignore, log_note, relative_folder
 from lidardesign.workflow.run_samples import KEY, RunTarget
 
 
@@ -56,8 +56,8 @@ class Fitter:
         DataError: The density is too rough, with or without the settings.
     """
 
-    def __init__(self, request: FitRequest, notes: Notes = log_note) -> None:
-        self.run, self.seed, self.notes = request.run, request.seed, notes
+    def __init__(self, request: FitRequest, notes: Notes = log_note, progress: Notes = ignore) -> None:
+        self.run, self.seed, self.notes, self.progress = request.run, request.seed, notes, progress
         self.target = RunTarget(request.run, weighting=request.weighting)
         request.run.config.space.at(request.at)
         with phase("samples"):
@@ -68,7 +68,7 @@ class Fitter:
                 self.samples = self.samples.retargeted(self.target(self.samples.points))
                 self._check_effective_samples("a setting nearer to what was learned, or learn with it")
                 now, settings = self.samples.effective_sample_size, ", ".join(request.weighting.settings)
-                notes(f"with {settings} the samples have ESS {now:.2f}, as learned {before:.2f}")
+                notes(BackgroundNote(f"with {settings} the samples have ESS {now:.2f}, as learned {before:.2f}"))
 
     def _check_effective_samples(self, hint: str) -> None:
         """Refuse samples of which too few are effective to fit anything to, whatever the constraints."""
@@ -99,7 +99,7 @@ class Fitter:
             count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (request.choices.get("rays") or 0))
             samples = at_condition(samples, request.at, self.target, count, random_generator(request.seed, "condition"))
             place, ess = condition_text(request.at), samples.effective_sample_size
-            self.notes(f"at {place} {len(samples)} samples have ESS {ess:.2f}")
+            self.notes(BackgroundNote(f"at {place} {len(samples)} samples have ESS {ess:.2f}"))
         return fit_samples(
             samples,
             constraints=request.constraints,
@@ -110,12 +110,13 @@ class Fitter:
         )
 
 
-def fit_design(request: FitRequest, *, notes: Notes = log_note) -> FitResult:
+def fit_design(request: FitRequest, *, notes: Notes = log_note, progress: Notes = ignore) -> FitResult:
     """Fit the design of a request and check it; nothing is written.
 
     Arguments:
         request: What is asked for.
         notes: Called with every note.
+        progress: Called with every step, as "choosing 361 rays".
 
     Returns:
         The fit, whose design says where it came from and whose checks are of the design's own text.
@@ -125,7 +126,7 @@ def fit_design(request: FitRequest, *, notes: Notes = log_note) -> FitResult:
         DataError: The density is too rough.
         InfeasibleError: Constraints that contradict each other, or that the design does not keep.
     """
-    run, weighting, fitter = request.run, request.weighting, Fitter(request, notes)
+    run, weighting, fitter = request.run, request.weighting, Fitter(request, notes, progress)
     if request.choices["sensors"] == BEST:
         count = _best_count(fitter, request)
         request = replace(request, choices={**request.choices, "sensors": count})
@@ -170,14 +171,17 @@ def _best_count(fitter: Fitter, request: FitRequest) -> int:
     if request.constraints is not None:
         check_feasible(request.constraints, request.run.config.space, rays=request.choices["rays"])
     scenes, metric = fitter.first_scenes["held back"], request.run.metric
-    trials = trials_of(request, fitter.samples, scenes, partial(_fitted, fitter, is_trial=True))
+
+    def fit(trial: FitRequest) -> FitResult:
+        fitter.progress(f"trying {trial.choices['sensors']} sensors")
+        return _fitted(fitter, trial, is_trial=True)
+
+    trials = trials_of(request, fitter.samples, scenes, fit)
     best = best_of(trials, scenes)
     sign = 1.0 if metric.better == "lower" else -1.0
     found = ", ".join(f"{trial.sensors}: {sign * trial.scores.mean():.4g}" for trial in trials)
-    fitter.notes(
-        f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(scenes)} training scenes "
-        f"in {trials[-1].mbps:.3g} Mbit/s by their number: {found}"
-    )
+    text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(scenes)} training scenes "
+    fitter.notes(BackgroundNote(f"{text}in {trials[-1].mbps:.3g} Mbit/s by their number: {found}"))
     return best.sensors
 
 
@@ -305,7 +309,10 @@ def _fitted(fitter: Fitter, request: FitRequest, *, is_trial: bool = False) -> F
     # the gates of chosen rays keep a bandwidth; a sensor that moves along a condition looks everywhere the same way
     fitted = fitter.fit(request, near(samples, place, 1.0), layout="density", rays=counts[-1], gates="ray")
     fitted = replace(fitted, design=replace(fitted.design, gates=gates))
-    return select_rays(run, fitted, counts, samples, request.seed, fitter.first_scenes, is_trial=is_trial)
+    progress = ignore if is_trial else fitter.progress
+    return select_rays(
+        run, fitted, counts, samples, request.seed, fitter.first_scenes, is_trial=is_trial, progress=progress
+    )
 
 
 def check_written(design: DesignSpec, request: FitRequest) -> list[ConstraintCheck]:

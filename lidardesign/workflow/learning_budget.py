@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import RunConfig
-from lidardesign.errors import ConfigError, DataError, ThresholdError, check_number
+from lidardesign.errors import BackgroundNote, ConfigError, DataError, ThresholdError, check_number
 from lidardesign.run.clock import Clock, outermost_clock, phase
 from lidardesign.run.manifest import DAMAGED_HINT, FILE_NAME, read_manifest
 from lidardesign.run.yaml import leaves, load_yaml
@@ -203,7 +203,9 @@ class Learner:
         return STARTUP_S if age is None or age - self.clock.seconds > MOST_STARTUP_S else age - self.clock.seconds
 
     def _whole(self, result: LearnResult, note: str, goal: dict[str, Any]) -> LearnResult:
-        return replace(result, notes=(*result.notes, note), goal=goal, seconds=round(self.clock.seconds, 3))
+        return replace(
+            result, notes=(*result.notes, BackgroundNote(note)), goal=goal, seconds=round(self.clock.seconds, 3)
+        )
 
 
 def _age_s() -> float | None:

@@ -41,6 +41,10 @@ INPUTS = "inputs"
 Notes = Callable[[str], None]
 
 
+def ignore(step: str) -> None:
+    """Where steps of the work go when nobody asks for them."""
+
+
 def log_note(text: str) -> None:
     """Where notes go when nobody asks for them: to the log of this package."""
     logging.getLogger("lidardesign").info(text)

@@ -14,7 +14,16 @@ from lidardesign.workflow.designs import Design, html_table
 from lidardesign.workflow.fit import FitOptions, FitRequest
 from lidardesign.workflow.learn import LearnOptions, LearnRequest
 from lidardesign.workflow.learning_budget import check_met
-from lidardesign.workflow.run_folder import MANIFEST, Notes, RunFolder, folder_of, log_note, reach_of, read_design
+from lidardesign.workflow.run_folder import (
+    MANIFEST,
+    Notes,
+    RunFolder,
+    folder_of,
+    ignore,
+    log_note,
+    reach_of,
+    read_design,
+)
 
 if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress
@@ -112,6 +121,7 @@ class Run(RunFolder):
         name: str | None = None,
         seed: int | None = None,
         notes: Notes = log_note,
+        progress: Notes = ignore,
         **further: Any,
     ) -> Design:
         """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
@@ -127,6 +137,7 @@ class Run(RunFolder):
             name: The design's name.
             seed: Root of every random stream; the run's by default.
             notes: Called with every note; they are logged by default.
+            progress: Called with every step, as "choosing 361 rays".
             further: channels, gates, level, weights and like, as of `FitOptions`.
 
         Raises:
@@ -145,7 +156,7 @@ class Run(RunFolder):
             notes=notes,
             **further,
         )
-        return Design.fitted(request, notes=notes)
+        return Design.fitted(request, notes=notes, progress=progress)
 
     def fit_request(self, *, notes: Notes = log_note, **options: Any) -> FitRequest:
         """What `fit` of the same choices would do, resolved: its `plan()` says it."""

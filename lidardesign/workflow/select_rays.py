@@ -34,7 +34,7 @@ from lidardesign.selection.coverage import InformedScene
 from lidardesign.selection.information import checked_information
 from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import random_generator
-from lidardesign.workflow.run_folder import RunFolder
+from lidardesign.workflow.run_folder import Notes, RunFolder, ignore
 
 EVEN_SHARE = 0.25  # of the candidates that are even in the fields, where the density's samples may be sparse
 MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes returned, in the density's sigma
@@ -50,6 +50,7 @@ def select_rays(
     first: Mapping[str, Sequence[Scene]],
     *,
     is_trial: bool = False,
+    progress: Notes = ignore,
 ) -> FitResult:
     """The design of a fit with rays that were chosen, one table or track for each number of rays.
 
@@ -61,6 +62,7 @@ def select_rays(
         seed: Root of the random streams.
         first: The first scenes to choose on, and to hold back, by purpose.
         is_trial: Whether rays are chosen on these alone, without certificates.
+        progress: Called with every step.
 
     Raises:
         ConfigError: More rays than can be chosen.
@@ -94,6 +96,7 @@ def select_rays(
         name=spec.name,
         further=None if is_trial or len(visits) > 1 else proposals.further(len(rays)),
         is_trial=is_trial,
+        progress=progress,
     )
     selected = select(problem, counts)
     provenance = {**spec.provenance, CERTIFICATES: [one.certificate for one in selected]}

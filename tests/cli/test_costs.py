@@ -115,13 +115,16 @@ def test_a_run_that_cannot_be_written_is_still_read(lidardesign, flat, tmp_path)
     assert (tmp_path / "rays.csv").is_file()
 
 
-def test_tables_are_for_people_who_did_not_ask_for_quiet(lidardesign, flat):
-    loud = lidardesign(f"fit {flat} --layout grid --sensors 2 --name one")
+def test_the_time_is_a_line_a_table_with_verbose_and_nothing_with_quiet(lidardesign, flat):
+    usual = lidardesign(f"fit {flat} --layout grid --sensors 2 --name one")
+    assert re.search("^took .* s$", usual.out, re.MULTILINE)
+    assert TITLE not in usual.out
+    loud = lidardesign(f"fit {flat} --layout grid --sensors 2 --name one --verbose")
     assert TITLE in loud.out
     assert "fitting" in loud.out
     assert "log-likelihood" in loud.out
     assert "+-" in loud.out
-    assert TITLE not in lidardesign(f"fit {flat} --layout grid --sensors 2 --name one --quiet").out
+    assert lidardesign(f"fit {flat} --layout grid --sensors 2 --name one --quiet").out == f"{flat}/designs/one.yaml\n"
     # what only looks something up does not tell people how long that took
     assert TITLE not in lidardesign(f"show {flat}/designs/one.yaml").out
     assert TITLE not in lidardesign("tasks list").out
@@ -141,8 +144,8 @@ class Page:
 
         return getattr(Console(width=self.width), name)
 
-    def print(self, what, **options):
-        self.printed.append(what)
+    def print(self, *what, **options):
+        self.printed.extend(what)
 
 
 def rows_of(timings):

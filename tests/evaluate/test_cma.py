@@ -15,7 +15,6 @@ from support.scoring import HitTask, MissTask
 from support.tables import each_row
 
 from lidardesign.cli.commands.evaluate import search_display
-from lidardesign.cli.output import Output
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
@@ -495,17 +494,14 @@ class Bar:
     def __init__(self):
         self.lines, self.updates = [], []
 
-    def add_task(self, label, **fields):
-        self.lines.append(label)
-        return len(self.lines) - 1
-
-    def update(self, line, **fields):
-        self.updates.append((self.lines[line], fields))
+    def show(self, done, total, *, line, **fields):
+        self.lines += [line] * (line not in self.lines)
+        self.updates.append((line, {"share": done / total, **fields}))
 
 
 def shown_settings(bar):
     request = SimpleNamespace(cma_seconds=FAST.seconds, run=SimpleNamespace(metric=AnyMissTask.metric))
-    return CmaSettings(FAST, search_display(request, Output(), bar))
+    return CmaSettings(FAST, search_display(request, bar))
 
 
 def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():
@@ -514,17 +510,10 @@ def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():
     candidate_of("grid", settings).positions([], 12)
     candidate_of("grid", settings).positions([], 13)
     assert bar.lines == ["cma, 12 rays", "cma, 13 rays"]
-    shares = [fields["completed"] for label, fields in bar.updates if label == "cma, 12 rays"]
+    shares = [fields["share"] for label, fields in bar.updates if label == "cma, 12 rays"]
     assert shares == sorted(shares)
-    assert bar.updates[-1][1]["row"].startswith("best ")
-    assert bar.updates[-1][1]["row"].endswith(" %")
-
-
-def test_without_a_terminal_a_search_is_announced_once(capsys):
-    settings = shown_settings(None)
-    candidate_of("grid", settings).positions([], 12)
-    said = capsys.readouterr().err
-    assert said.count("cma, 12 rays: searching") == 1
+    assert bar.updates[-1][1]["detail"].startswith("best ")
+    assert bar.updates[-1][1]["detail"].endswith(" %")
 
 
 def test_from_several_places_every_sensor_may_look_at_all_returns():

@@ -180,7 +180,8 @@ def test_scenes_of_one_group_give_no_interval_and_no_verdict():
     assert all(estimate["error"] is None for estimate in document["error_estimates"].values())
     assert ",,,0,4," in csv_text(evaluation)
     console = Console(file=StringIO(), width=200)
-    show_evaluation(document, [], console)
+    for verbose in (False, True):
+        show_evaluation(document, evaluation, console, verbose=verbose)
     assert "None" not in console.file.getvalue()
     assert "over other scenes" not in console.file.getvalue()
     assert paired_tables(evaluation)

@@ -81,10 +81,11 @@ def capture(
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
     debug: options.Debug = False,
 ) -> None:
     """Score designs by a captured scan: with their gates, without, and beside even rays."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
         claim_outputs(output, csv=csv)
         check_outputs({"--csv": csv}, [file, *designs, *([] if reference is None else [reference])])
         if not 0 < false_alarm < 1:
@@ -115,7 +116,8 @@ def capture(
 
         def show_result() -> None:
             document = {"capture": str(file), **evaluation.as_dict(), "files": [str(path) for path in written]}
-            output.result(document, lambda rich: _show(document, evaluation, rich))
+            files = dict(zip(("csv",), written, strict=False))
+            output.result(document, lambda rich: _show(document, evaluation, rich, verbose=output.verbose), files=files)
 
         with ExitStack() as rest:  # the scores are shown whatever becomes of the file
             rest.callback(show_result)
@@ -166,22 +168,23 @@ def _distinct_names(files: list[Path]) -> list[str]:
     return [str(path) if names.count(name) > 1 else name for name, path in zip(names, files, strict=True)]
 
 
-def _show(document: dict[str, Any], evaluation: CaptureEvaluation, rich: RichConsole) -> None:
+def _show(document: dict[str, Any], evaluation: CaptureEvaluation, rich: RichConsole, *, verbose: bool) -> None:
     start, end = document["window_m"]
-    rich.print(
-        f"{document['pixels']} pixels, {document['bins']} bins of {number(document['bin_ps'])} ps from {start:.4g} to "
-        f"{end:.4g} m; estimator {document['estimator']}; pixels within {number(document['within_deg'], 3)} degrees",
-        soft_wrap=True,
-    )
+    if verbose:
+        rich.print(
+            f"{document['pixels']} pixels, {document['bins']} bins of {number(document['bin_ps'])} ps from {start:.4g} "
+            f"to {end:.4g} m; estimator {document['estimator']}; pixels within "
+            f"{number(document['within_deg'], 3)} degrees",
+            soft_wrap=True,
+        )
     rich.print(f"outliers: more than {number(document['outlier_mm'])} mm from {evaluation.ranges_from}", soft_wrap=True)
-    if evaluation.surface_from is not None:
+    if verbose and evaluation.surface_from is not None:
         rich.print(f"Chamfer distance: to {evaluation.surface_from}", soft_wrap=True)
     text = ("design", "gate")
     lines = [[row["design"], row["gate"], *(number(row[name]) for name in COLUMNS)] for row in document["rows"]]
     print_table(None, (*text, *COLUMNS.values()), lines, rich, text=text)
-    rich.print(_standard_errors(evaluation), soft_wrap=True)
-    for path in document["files"]:
-        rich.print(f"wrote {path}", soft_wrap=True)
+    if verbose:
+        rich.print(_standard_errors(evaluation), soft_wrap=True)
 
 
 def _standard_errors(evaluation: CaptureEvaluation) -> str:

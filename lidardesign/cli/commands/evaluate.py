@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import FIRST_LINE, Output, command, keep_times, show_plan
+from lidardesign.cli.output import Output, command, keep_times, show_plan
 from lidardesign.cli.output_files import claim_outputs, is_output, written_file
 from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
@@ -21,8 +21,7 @@ from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
-    from rich.progress import Progress as RichProgress
-
+    from lidardesign.cli.progress import ProgressDisplay
     from lidardesign.evaluate.cma.candidate import Show
     from lidardesign.evaluate.cma.search import Progress
     from lidardesign.evaluate.figures.scene_figure import FigureData
@@ -204,10 +203,11 @@ def evaluate(
     ] = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
     debug: options.Debug = False,
 ) -> None:
     """Score designs on held-out scenes against the baselines uniform, random, bounding, silhouette and greedy."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
         claim_outputs(output, dry_run=dry_run, csv=csv, report=report, plots=plots)
         with phase("libraries"):
             from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
@@ -247,13 +247,14 @@ def evaluate(
 
         def show_result() -> None:
             document = {**scores.as_dict(), "files": [str(path) for path in written]}
+            notes = [note for note in scores.evaluation.notes if output.says(note)]
 
             def show(rich: RichConsole) -> None:
                 if scores.evaluation.accuracy is not None:
-                    show_accuracy(scores.evaluation.accuracy, rich)
-                show_evaluation({**document, "notes": []} if output.quiet else document, list(written), rich)
+                    show_accuracy(scores.evaluation.accuracy, rich, verbose=output.verbose)
+                show_evaluation({**document, "notes": notes}, scores.evaluation, rich, verbose=output.verbose)
 
-            output.result(document, show)
+            output.result(document, show, files={_kind(path, files): path for path in written})
 
         with ExitStack() as rest:  # the scores are shown whatever becomes of the files and of what is measured further
             rest.callback(show_result)
@@ -267,41 +268,28 @@ def evaluate(
 
 
 def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
-    with output.progress("evaluating", "row") as bar:
+    with output.progress("evaluating") as progress:
 
         def show(done: int, total: int, row: str = "") -> None:
-            if bar is not None:
-                bar.update(FIRST_LINE, completed=done, total=total, row=row)
+            progress.show(done, total, detail=row)
 
-        return request.score(show, search_display(request, output, bar))
+        return request.score(show, search_display(request, progress))
 
 
-def search_display(request: ScoreRequest | SeedsRequest, output: Output, bar: RichProgress | None) -> Show:
-    """What shows the best score of each search in a bar; without one, a note when it begins."""
-    lines: dict[str, Any] = {}
+def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDisplay) -> Show:
+    """What shows the best score of each search, in a line of its own."""
 
-    def show(label: str, progress: Progress) -> None:
-        if label not in lines:
-            lines[label] = bar.add_task(label, total=1.0, row="") if bar else None
-            if bar is None:
-                output.note(f"{label}: searching for {request.cma_seconds:g} s ...")
-        if bar is not None:
-            best = f"best {progress.best:.4g} {request.run.metric.unit}"
-            bar.update(lines[label], completed=progress.share, row=best)
+    def show(label: str, now: Progress) -> None:
+        best = f"best {now.best:.4g} {request.run.metric.unit}"
+        left_s = (1 - now.share) * request.cma_seconds
+        progress.show(now.share, 1.0, label=label, detail=best, left_s=left_s, line=label)
 
     return show
 
 
 def _with_accuracy(scores: Scores, output: Output) -> Scores:
-    with output.progress("measuring accuracy", "sweep") as bar:
-
-        def show(done: int, total: int, sweep: str) -> None:
-            if bar is not None:
-                bar.update(FIRST_LINE, completed=done, total=total, sweep=sweep)
-            elif sweep:
-                output.note(f"accuracy: {sweep} ...")
-
-        return scores.with_accuracy(show)
+    with output.progress("measuring accuracy") as progress:
+        return scores.with_accuracy(lambda done, total, sweep: progress.show(done, total, detail=sweep))
 
 
 @phase("writing")
@@ -319,6 +307,11 @@ def _write_files(
             with written_file(csv) as file:
                 scores.to_csv(file)
             written[csv] = None
+
+
+def _kind(path: Path, files: Mapping[str, Path | None]) -> str:
+    """What a written file is: of pictures its name."""
+    return next((option.removeprefix("--") for option, given in files.items() if given == path), path.name)
 
 
 def _write_report(scores: Scores, written: dict[Path, None], path: Path, pictured: Callable[[], FigureData]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,11 @@ from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
+
+# What a note says before it explains itself.
+HEAD = re.compile(r"[^:;]+")
+# Below it rounding is told with --verbose alone, whether of metres, radians or seconds.
+LEAST_ERROR = 1e-4
 
 
 def export(
@@ -56,10 +62,11 @@ def export(
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
     debug: options.Debug = False,
 ) -> None:
     """Write a design in another program's format."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
         with phase("libraries"):
             from lidardesign.workflow.export import (
                 DesignSource,
@@ -86,22 +93,30 @@ def export(
         check_outputs({"--out": target}, plan.reads, ("--out",) if exporter.folder else ())
         if dry_run:
             return show_plan(plan, output)
+        notes: list[str] = []
         with written_file(target, exporter.suffix) as file:
-            exported = request.write(file, output.remark)
+            exported = request.write(file, notes.append)
+        for note in notes:
+            if output.verbose or note not in exported.notes:
+                output.remark(note)
+        if exported.notes and not output.verbose:
+            output.remark(f"{'; '.join(HEAD.match(note)[0] for note in exported.notes)} (-v says more)")
         if source.folder is not None:
             keep_times(source.folder, "export", output)
 
         def show(rich: RichConsole) -> None:
             content = f"{exported.rays} rays" if exported.rays else f"{exported.sensors} sensors"
+            least = 0.0 if output.verbose else LEAST_ERROR
             lost = [
                 f"{name.removesuffix(f'_{estimate.unit}')} {estimate.error:.2g} {estimate.unit}".rstrip()
                 for name, estimate in exported.rounding.items()
-                if estimate.error
+                if estimate.error and estimate.error > least
             ]
-            rich.print(f"wrote {target} ({content})", soft_wrap=True)
-            rich.print(f"read back: {'off by at most ' if lost else 'exact'}{', '.join(lost)}", soft_wrap=True)
+            off = f"; read back, they are off by at most {', '.join(lost)}" if lost else ""
+            rich.print(f"wrote {target} ({content}{off})", soft_wrap=True)
 
-        output.result({"design": str(design), **exported.as_dict()}, show)
+        document = {"design": str(design), **exported.as_dict()}
+        output.result(document, show, files={"wrote": target} if output.quiet else None, says_time=True)
 
 
 def _list(output: Output) -> None:

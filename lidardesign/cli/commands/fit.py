@@ -37,10 +37,11 @@ def fit(
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
     debug: options.Debug = False,
 ) -> None:
     """Fit sensors to the density of RUN."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
         with phase("libraries"):
             from lidardesign.workflow.fit import FitOptions, FitRequest
             from lidardesign.workflow.run_folder import RunFolder
@@ -72,7 +73,8 @@ def run_fit(request: FitRequest, output: Output) -> None:
 
     check_writable(request.run.design_path(request.name))
     check_lock(request.run.folder)
-    design = Design.fitted(request, notes=output.remark)
+    with output.progress("fitting") as progress:
+        design = Design.fitted(request, notes=output.remark, progress=lambda step: progress.show(label=step))
     try:
         design.save()
     except LidardesignError:
@@ -82,9 +84,10 @@ def run_fit(request: FitRequest, output: Output) -> None:
     keep_times(request.run.folder, request.command, output, wait_s=WAIT_S)
 
     def show(rich: RichConsole) -> None:
-        show_fit(document, design.specification, design.result.constraints if design.result else (), rich)
+        checks = design.result.constraints if design.result else ()
+        show_fit(document, design.specification, checks, rich, verbose=output.verbose)
 
-    output.result(document, show)
+    output.result(document, show, files={"design": Path(document["design"])})
 
 
 def constrain(
@@ -118,10 +121,11 @@ def constrain(
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
     debug: options.Debug = False,
 ) -> None:
     """Fit sensors again under constraints; nothing is learned again."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
         with phase("libraries"):
             from lidardesign.design.constraints.document import Constraints
             from lidardesign.workflow.fit import FitOptions, FitRequest, load_constraints

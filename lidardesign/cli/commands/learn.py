@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import FIRST_LINE, Output, command, keep_times, show_plan
-from lidardesign.cli.tables.grids import RichConsole, text_table
+from lidardesign.cli.output import command, keep_times, show_plan
+from lidardesign.cli.tables.grids import RichConsole, duration, text_table
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
+    from lidardesign.cli.progress import ProgressDisplay
     from lidardesign.density.learn import LearnProgress, LearnResult
 
 FIGURES = (
@@ -83,10 +82,11 @@ def learn(
     dry_run: options.DryRun = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
     debug: options.Debug = False,
 ) -> None:
     """Learn where rays are worth firing for TASK, into a run folder."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
         with phase("libraries"):
             from lidardesign.workflow.learn import LearnOptions, LearnRequest, result_document
             from lidardesign.workflow.learning_budget import check_met
@@ -118,44 +118,43 @@ def learn(
                 remark(note)
             return show_plan(request.plan(), output)
         output.when_interrupted = request.resume_hint
-        with output.progress("learning", "loss", "ess", "left") as bar:
-            result = request.run(_progress(bar, output), remark)
+        with output.progress("learning") as progress:
+            result = request.run(partial(_show_progress, progress), remark)
         keep_times(request.folder, "learn", output, wait_s=WAIT_S)
-        further = [] if output.quiet else [note for note in result.notes if note not in said]
-        output.result(result_document(result), lambda rich: _show(result, further, request.settings.preset, rich))
+        for note in result.notes:
+            if note not in said:
+                output.remark(note)
+
+        def show(rich: RichConsole) -> None:
+            if output.verbose:
+                _show_figures(result, rich)
+            _show(result, request.settings.preset, rich)
+
+        output.result(result_document(result), show, files={"run": Path(result.run)}, says_time=True)
         check_met(result, request.goal)
 
 
-def _progress(bar: Progress | None, output: Output) -> Callable[[LearnProgress], None]:
-    begun: list[str] = []
-
-    def show(now: LearnProgress) -> None:
-        if bar is not None:
-            bar.update(
-                FIRST_LINE,
-                description=now.phase,
-                completed=now.step,
-                total=now.steps or None,
-                loss=f"loss {now.loss:.3f}" if now.loss is not None else "",
-                ess=f"ESS {now.ess:.2f}" if now.ess is not None else "",
-                left=f"{now.seconds_left:.0f} s left" if now.seconds_left is not None else "",
-            )
-        elif begun[-1:] != [now.phase]:
-            begun.append(now.phase)
-            output.note(f"{now.phase} ...")
-
-    return show
+def _show_progress(progress: ProgressDisplay, now: LearnProgress) -> None:
+    figures = (("loss {:.3f}", now.loss), ("ESS {:.2f}", now.ess))
+    detail = ", ".join(text.format(value) for text, value in figures if value is not None)
+    progress.show(now.step, now.steps or 0, label=now.phase, detail=detail, left_s=now.seconds_left)
 
 
-def _show(result: LearnResult, notes: list[str], preset: str, rich: RichConsole) -> None:
+def _show(result: LearnResult, preset: str, rich: RichConsole) -> None:
+    verdict = result.verdict
+    rich.print(
+        f"learned {result.task} in {duration(result.seconds)} ({result.steps} steps); the density is {verdict.word}: "
+        f"{100 * result.misplaced:.2g} % misplaced, KL {result.kl_nats:.2g} nats, ESS {result.ess:.2f}",
+        soft_wrap=True,
+    )
+    if verdict.why:
+        rich.print(verdict.advice(preset), soft_wrap=True)
+
+
+def _show_figures(result: LearnResult, rich: RichConsole) -> None:
     rows = []
     for name, key, unit, what in FIGURES:
         estimate = result.error_estimates[key]
         error = "unknown" if estimate.error is None else f"{estimate.error:.2g}"
         rows.append((name, f"{estimate.value:.3f}{unit}", error, what))
-    rows.append(("time", f"{result.seconds:.1f} s", "", f"{result.steps} steps"))
-    rich.print(text_table(("", "value", "standard error", ""), rows, f"learned {result.task}"))
-    for note in notes:
-        rich.print(f"note: {note}")
-    rich.print(f"the density is {result.verdict.text(preset)}")
-    rich.print(f"run: {result.run}", soft_wrap=True)
+    rich.print(text_table(("", "value", "standard error", ""), rows))

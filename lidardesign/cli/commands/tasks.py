@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import FIRST_LINE, command
+from lidardesign.cli.output import command
 from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.run.clock import phase
 
@@ -148,11 +148,10 @@ def check(
 
         request = CheckRequest(name, config, tuple(overrides or ()), seed, Limits(seconds, memory_mb * 2**20))
         findings = []
-        with output.progress("contract", "law") as bar, phase("contract"):
+        with output.progress("contract") as progress, phase("contract"):
             for finding in check_in_process(request):
                 findings.append(finding)
-                if bar is not None:
-                    bar.update(FIRST_LINE, completed=len(findings), total=len(LAWS) + 1, law=finding.law)
+                progress.show(len(findings), len(LAWS) + 1, detail=finding.law)
         counts = {outcome: sum(finding.outcome == outcome for finding in findings) for outcome in OUTCOMES}
         document = {
             "task": name,

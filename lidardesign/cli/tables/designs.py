@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.cli.tables.grids import RichConsole, number, text_table
+from lidardesign.cli.tables.grids import RichConsole, number, print_table, text_table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from lidardesign.design.sensor import DesignSpec, Sensor, Track
 
 MOST_ROWS = 20
+MOST_NAMED = 4
+# Constraints that leave more of the density than this cost it nothing.
+MOST_ADMISSIBLE = 0.995
 ERROR_DIGITS = 2
 # Relative errors below what `number` shows of a figure are left out.
 SMALLEST_ERROR = 1e-4
@@ -39,9 +42,7 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
         return
     rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
     sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
-    title = f"{design.name}: {sensors}, layout {design.layout}, {rays}"
-    if design.at:
-        title += ", at " + ", ".join(f"{name}={value:g}" for name, value in design.at.items())
+    title = f"{design.name}: {sensors}, layout {design.layout}, {rays}{_condition(design)}"
     places = [_place(sensor) for sensor in design.sensors]
     together = len(set(places)) == 1
     if together:
@@ -120,6 +121,10 @@ def _span(values: np.ndarray, decimals: int) -> str:
     return low if low == high else f"{low} .. {high}"
 
 
+def _condition(design: DesignSpec) -> str:
+    return "".join(f", at {name}={value:g}" for name, value in design.at.items())
+
+
 def _place(sensor: Sensor) -> str:
     # -0.0 is the same place as 0.0
     place = " ".join(f"{round(value, 3) + 0.0:.3f}" for value in sensor.origin_m)
@@ -158,8 +163,19 @@ def _left(room: float | None, share: float | None) -> str:
     return number(room, 3) if share is None else f"{number(room, 3)} ({number(100 * share, 2)} %)"
 
 
-def show_fit(document: dict[str, Any], design: DesignSpec, checks: Sequence[Any], rich: RichConsole) -> None:
-    """Print what `fit` and `constrain` made."""
+def show_fit(
+    document: dict[str, Any], design: DesignSpec, checks: Sequence[Any], rich: RichConsole, *, verbose: bool
+) -> None:
+    """Print what `fit` and `constrain` made: sensors, how rays were chosen, which constraints limit them; or all."""
+    if not verbose:
+        _show_sensors(design, rich)
+        _show_choice(design, rich)
+        mass = document["error_estimates"].get("admissible_mass")
+        if mass is not None and mass["value"] < MOST_ADMISSIBLE:
+            rich.print(f"the constraints leave {100 * mass['value']:.2g} % of the density")
+        if checks:
+            rich.print(_tight(checks, [sensor.name for sensor in design.sensors]), soft_wrap=True)
+        return
     show_design(design, rich)
     show_constraints(checks, rich)
     figures = {"log-likelihood": "log_likelihood", "ESS": "ess", "admissible mass": "admissible_mass"}
@@ -170,4 +186,65 @@ def show_fit(document: dict[str, Any], design: DesignSpec, checks: Sequence[Any]
     rays = estimates.get("rays")
     if rays is not None and rays["error"] > 0:
         rich.print(f"whole rays: {number(rays['error'], 2)} of {rays['value']:.0f} are not where the weights say")
-    rich.print(f"design: {document['design']}", soft_wrap=True)
+
+
+def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:
+    """A line per sensor; rays are those of the largest number that was chosen."""
+    from lidardesign.design.layouts.rays import certificates_of
+
+    counts = [str(entry["rays"]) for entry in certificates_of(design)] or [str(design.rays)] * bool(design.rays)
+    several = f"{', '.join(counts[:-1])} or " if counts[:-1] else ""
+    rays = f"{several}{counts[-1]} rays per frame" if counts else "any number of rays"
+    sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
+    rich.print(f"{design.name}: {sensors}, {rays} (layout {design.layout}){_condition(design)}", soft_wrap=True)
+    columns: dict[str, Callable[[Sensor], str]] = {
+        "origin [m]": _place,
+        f"rays of {counts[-1]}" if several else "rays": lambda sensor: number(sensor.rays),
+        "azimuth [deg]": lambda sensor: f"{math.degrees(sensor.azimuth_rad):.2f}",
+        "elevation [deg]": lambda sensor: f"{math.degrees(sensor.elevation_rad):.2f}",
+        "field of view [deg]": lambda sensor: " x ".join(f"{math.degrees(a):.2f}" for a in sensor.field_of_view_rad),
+        "gate [m]": lambda sensor: " - ".join(f"{end:.3f}" for end in sensor.gate_m),
+    }
+    if len(set(map(_place, design.sensors))) == 1:
+        del columns["origin [m]"]
+    shown = design.sensors[:MOST_ROWS]
+    names = [sensor.name if sensor.part is None else f"{sensor.name} {sensor.part}" for sensor in shown]
+    lines = [[name, *(cell(sensor) for cell in columns.values())] for name, sensor in zip(names, shown, strict=True)]
+    print_table(None, ("sensor", *columns), lines, rich, text=("sensor",))
+    if len(shown) < len(design.sensors):
+        rich.print(f"... and {len(design.sensors) - MOST_ROWS} more sensors; --json lists all")
+
+
+def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
+    """Among how many rays, on how many scenes, and how far from the best choice that may be."""
+    from lidardesign.design.layouts.rays import certificates_of
+
+    entries = certificates_of(design)
+    if entries:
+        gap, last = max(entry["gap"] for entry in entries), entries[-1]
+        rich.print(
+            f"chosen among {last['candidates']} rays on {last['scenes']} training scenes; any other choice lowers the "
+            f"loss by {100 * gap:.1f} % at most",
+            soft_wrap=True,
+        )
+
+
+def _tight(checks: Sequence[ConstraintCheck], sensors: Sequence[str]) -> str:
+    """The constraints that limit the design, with the sensors that lean on them."""
+    from lidardesign.design.constraints.slack import room_of, split_name
+
+    tight: dict[str, list[str]] = {}
+    for check in checks:
+        if SPACE_MARK not in check.name and room_of(check).is_tight:
+            owner, key = split_name(check.name, sensors)
+            tight.setdefault(key, []).extend([owner] * bool(owner))
+
+    def owners(names: Sequence[str]) -> str:
+        if len(names) == len(sensors) > 1:
+            return " (all sensors)"
+        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        return f" ({', '.join(names[:MOST_NAMED])}{more})" if names else ""
+
+    if not tight:
+        return "no constraint limits it"
+    return f"tight: {', '.join(f'{key}{owners(names)}' for key, names in tight.items())}"

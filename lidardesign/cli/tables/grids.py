@@ -33,6 +33,15 @@ def interval_text(entry: Mapping[str, Any], between: str = " - ", digits: int = 
     return "-" if None in ends else between.join(number(end, digits) for end in ends)
 
 
+def duration(seconds: float) -> str:
+    """A time for people, as `0.4 s`, `33 s`, `3 min 20 s` or `2 h 5 min`."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
 def text_table(
     headings: Sequence[str],
     rows: Iterable[Sequence[Any]] = (),
@@ -51,7 +60,7 @@ def text_table(
     """
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for heading in headings:
         table.add_column(heading, justify="right" if heading in figures else "left", **column)
     for row in rows:
@@ -67,10 +76,10 @@ def print_table(
     text: Sequence[str] = ("design",),
     wraps: bool = False,
 ) -> None:
-    """Print a table; where it is too wide it loses its lines, then brackets go below, then columns follow in parts.
+    """Print a table; where it is too wide brackets go below, then columns follow in parts.
 
     Arguments:
-        title: Above the table, if there is one.
+        title: Above the table, if there is one; an empty line then ends it.
         headings: One per column.
         lines: The cells of each line, plain text.
         rich: Where it is printed.
@@ -82,17 +91,17 @@ def print_table(
         rich.print(title, style="italic", soft_wrap=True)
     table = _grid([headings, *lines], text)
     if not _fits(table, rich):
-        _lighten(table)
-        if not _fits(table, rich):
-            folded = [
-                [cell if name in text else cell.replace(" (", "\n(") for cell, name in zip(line, headings, strict=True)]
-                for line in (headings, *lines)
-            ]
-            table = _lighten(_grid(folded, text))
-            if not wraps and not _fits(table, rich):
-                _print_parts(folded, text, rich)
-                return
+        folded = [
+            [cell if name in text else cell.replace(" (", "\n(") for cell, name in zip(line, headings, strict=True)]
+            for line in (headings, *lines)
+        ]
+        table = _grid(folded, text)
+        if not wraps and not _fits(table, rich):
+            _print_parts(folded, text, rich)
+            return
     rich.print(table)
+    if title is not None:
+        rich.print()
 
 
 def _print_parts(lines: Sequence[Sequence[str]], text: Sequence[str], rich: RichConsole) -> None:
@@ -101,23 +110,16 @@ def _print_parts(lines: Sequence[Sequence[str]], text: Sequence[str], rich: Rich
     rest = [column for column in range(len(lines[0])) if column not in names]
     while rest:
         for count in range(len(rest), 0, -1):
-            table = _lighten(_grid([[line[column] for column in names + rest[:count]] for line in lines], text))
+            table = _grid([[line[column] for column in names + rest[:count]] for line in lines], text)
             if _fits(table, rich):
                 break
         rich.print(table)
+        rich.print()
         rest = rest[count:]
 
 
 def _grid(lines: Sequence[Sequence[str]], text: Sequence[str]) -> Table:
     return text_table(lines[0], lines[1:], figures=[heading for heading in lines[0] if heading not in text])
-
-
-def _lighten(table: Table) -> Table:
-    """Leave out all lines but the one under the headings."""
-    from rich import box
-
-    table.box, table.show_edge, table.pad_edge, table.padding = box.SIMPLE, False, False, (0, 1, 0, 0)
-    return table
 
 
 def _fits(table: Table, rich: RichConsole) -> bool:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.cli.tables.grids import RichConsole, interval_text, number, print_table
+from lidardesign.cli.tables.grids import RichConsole, duration, interval_text, number, print_table
 from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.accuracy.settings import Accuracy, Measurement, Sweep
+    from lidardesign.evaluate.results import Evaluation
 
 
 Entry = dict[str, Any]
@@ -21,20 +22,105 @@ SHORT_S = 0.01
 DECIMALS = 4
 
 
-def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) -> None:
-    """Print an evaluation for people; its JSON form holds more (all pairs, all intervals)."""
+def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, *, verbose: bool) -> None:
+    """Print an evaluation for people: a row per design at one number of rays, with a verdict; or all tables.
+
+    Its JSON form holds more (all pairs, all intervals).
+    """
+    if verbose:
+        _show_all(document, rich)
+    else:
+        _show_designs(document, evaluation, rich)
+    for note in document.get("notes", []):
+        rich.print(f"note: {note}", soft_wrap=True)
+
+
+def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
+    """Every design at one number of rays, against the strongest rival there; what else was asked for in a line each."""
+    metric, rival, count = document["metric"], document["strongest_rival"], evaluation.middle_rays
+    names = list(dict.fromkeys(row.design for row in evaluation.rows if not row.baseline))
+    nearest = [
+        min((row for row in document["rows"] if row["design"] == name), key=lambda row: abs(row["rays"] - count))
+        for name in names
+    ]
+    columns = {
+        "rays": [str(row["rays"]) for row in nearest],
+        "value": [number(row["value"], 3) for row in nearest],
+        "95 % interval": [interval_text(row, digits=3) for row in nearest],
+        "failures": [str(row["failures"]) for row in nearest],
+        "Mbit/s": [number(row["bandwidth_mbps"], 3) for row in nearest],
+    }
+    if all(row["rays"] == count for row in nearest):
+        del columns["rays"]
+    if not any(row["failures"] for row in nearest):
+        del columns["failures"]
+    pairs = [] if rival is None else [
+        pair for pair in document["paired"] if (pair["b"], pair["rays"]) == (rival["name"], count)
+    ]  # fmt: skip
+    if pairs:
+        apart = {pair["a"]: f"{pair['difference']:+.3g} ({interval_text(pair, ' to ', 3)})" for pair in pairs}
+        columns[f"difference to {rival['name']}"] = [apart.get(name, "-") for name in names]
+    title = f"{metric['name']} [{metric['unit']}] at {count} rays, {_scenes(document)} ({metric['better']} is better)"
+    rich.print(title, soft_wrap=True)
+    print_table(None, ("design", *columns), list(zip(names, *columns.values(), strict=True)), rich)
+    if pairs and None not in [pair["ci_low"] for pair in pairs]:
+        rich.print(_sentence(pairs, metric), soft_wrap=True)
+    if "mounting" in document:
+        shown = [any(row is one for one in nearest) for row in document["rows"]]
+        _show_mounting(document, rich, shown)
+    if "audit" in document:
+        rich.print(_audit_title(document["audit"], document["effects"]), soft_wrap=True)
+    simulated = [_words(effect["name"]) for effect in document["effects"] if effect["on"]]
+    if simulated:
+        rich.print(f"effects with the detector {document['detector']}: {', '.join(simulated)}", soft_wrap=True)
+
+
+def _scenes(document: Entry) -> str:
+    seeds = document.get("seeds", [])
+    scenes = f"{document['scenes']} held-out scenes" + (f" and {len(seeds)} seeds" if seeds else "")
+    return ", ".join([scenes, *document.get("set", [])])
+
+
+def _sentence(pairs: Sequence[Entry], metric: Entry) -> str:
+    """What designs are against the strongest rival."""
+    sign, rival = (
+        1.0 if metric["better"] == "lower" else -1.0,
+        f"{pairs[0]['b']}, the strongest rival on training scenes",
+    )
+    groups: dict[str, list[Entry]] = {}
+    for pair in pairs:
+        low, high = sorted(sign * pair[end] for end in ("ci_low", "ci_high"))
+        groups.setdefault("better" if high < 0 else "worse" if low > 0 else "", []).append(pair)
+    if len(pairs) == 1:
+        ((word, (pair,)),) = groups.items()
+        if not word:
+            return f"no difference between {pair['a']} and {rival}, was found"
+        low, high = sorted(abs(pair[end]) for end in ("ci_low", "ci_high"))
+        by = f"{number(abs(pair['difference']), 3)} {metric['unit']} ({number(low, 3)} to {number(high, 3)})"
+        return f"{pair['a']} is {word} than {rival}, by {by}"
+    parts = []
+    for word in ("better", "worse", ""):
+        names = [pair["a"] for pair in groups.get(word, [])]
+        listed = " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+        if names:
+            parts.append(
+                f"{listed} {'is' if len(names) == 1 else 'are'} {word}"
+                if word
+                else f"no difference was found for {listed}"
+            )
+    return f"against {rival}: {'; '.join(parts)}"
+
+
+def _show_all(document: Entry, rich: RichConsole) -> None:
     metric, matched = document["metric"], document["equal_bandwidth"]
     _show_rows(document, rich)
     _show_errors(document, rich)
     designs = {row["design"] for row in document["rows"]} - {row["design"] for row in matched}
     against = [pair for pair in document["paired"] if pair["b"] not in designs]
     if "mounting" in document:
-        _show_mounting(document, rich)
+        _show_mounting(document, rich, [True] * len(document["rows"]))
     title = f"difference to each baseline [{metric['unit']}], scene by scene, with its 95 % interval"
-    cells = [
-        f"{number(pair['difference'], 3)} ({interval_text(pair, ' to ', 3)})"
-        for pair in against
-    ]
+    cells = [f"{number(pair['difference'], 3)} ({interval_text(pair, ' to ', 3)})" for pair in against]
     _show_grid(title, [(pair["a"], pair["rays"], pair["b"]) for pair in against], cells, rich)
     title = f"baselines with as much bandwidth as the design: value [{metric['unit']}] (rays)"
     cells = [f"{number(row['value'])} ({row['rays']})" for row in matched]
@@ -42,18 +128,11 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
     _show_effects(document, rich)
     if "audit" in document:
         _show_audit(document["audit"], document["effects"], rich)
-    for note in document.get("notes", []):
-        rich.print(f"note: {note}", soft_wrap=True)
-    for path in written:
-        rich.print(f"wrote {path}", soft_wrap=True)
 
 
 def _show_rows(document: Entry, rich: RichConsole) -> None:
     metric, rows = document["metric"], document["rows"]
-    title = f"{metric['name']} [{metric['unit']}], {metric['better']} is better, over {document['scenes']} held-out "
-    seeds = document.get("seeds", [])
-    scenes = f"scenes and {len(seeds)} seeds" if seeds else "scenes"
-    title += ", ".join([scenes, *document.get("set", [])])
+    title = f"{metric['name']} [{metric['unit']}], {metric['better']} is better, over {_scenes(document)}"
     details = [name for row in rows for name in row["details"]][:1]
     further = [name.replace("_", " ") for name in details]
     headings = ("design", "rays", "value", "95 % interval", "failures", *further, "Mbit/s", "seconds")
@@ -63,16 +142,16 @@ def _show_rows(document: Entry, rich: RichConsole) -> None:
         cells = (row["rays"], row["value"], interval_text(row), row["failures"], *extra, row["bandwidth_mbps"])
         lines.append([row["design"], *(number(cell) for cell in cells), number(row["seconds"], 2)])
     print_table(title, headings, lines, rich)
-    places = [(row["design"], row["rays"], f"seed {seed}") for row in rows for seed in seeds]
+    places = [(row["design"], row["rays"], f"seed {seed}") for row in rows for seed in document.get("seeds", [])]
     cells = [number(value) for row in rows for value in row.get("per_seed", [])]
     _show_grid(f"value of each seed [{metric['unit']}]", places, cells, rich)
 
 
-def _show_mounting(document: Entry, rich: RichConsole) -> None:
+def _show_mounting(document: Entry, rich: RichConsole, shown: Sequence[bool]) -> None:
     found, unit, exact = document["mounting"], document["metric"]["unit"], document["rows"]
     off = f"{MILLIMETRES * found['place_m']:.3g} mm and {math.degrees(found['angle_rad']):.3g} degrees"
     lines = []
-    for row, own in zip(found["rows"], exact, strict=True):
+    for row, own in compress(zip(found["rows"], exact, strict=True), shown):
         cost = f"{number(row['cost']['difference'], 3)} ({interval_text(row['cost'], ' to ', 3)})"
         figures = map(number, (row["rays"], own["value"], row["value"], row["failures"]))
         lines.append([row["design"], *figures, cost])
@@ -80,12 +159,15 @@ def _show_mounting(document: Entry, rich: RichConsole) -> None:
     print_table(f"mounted carelessly: every sensor off by {off} per axis", headings, lines, rich)
 
 
-def _show_audit(audit: Entry, effects: Sequence[Entry], rich: RichConsole) -> None:
-    unit, tolerance = audit["unit"], audit["tolerance"]
+def _audit_title(audit: Entry, effects: Sequence[Entry]) -> str:
     there = {effect["name"] for effect in effects if effect["bound"] or effect["lost"]}
     skipped = ", ".join(_words(name) for name in audit["skipped"] if name in there) or "nothing that is there"
     verdict = "passed" if audit["passed"] else "failed"
-    title = f"audit {verdict}: the plan skips {skipped}; rows may move by {tolerance:g} {unit}"
+    return f"audit {verdict}: the plan skips {skipped}; rows may move by {audit['tolerance']:g} {audit['unit']}"
+
+
+def _show_audit(audit: Entry, effects: Sequence[Entry], rich: RichConsole) -> None:
+    unit, tolerance = audit["unit"], audit["tolerance"]
     scores = (f"planned\n[{unit}]", f"all effects\n[{unit}]", "difference (95 % interval)")
     headings = ("design", "bandwidth\nof", "rays", *scores, "seconds\nof both")
     # as many as show hundredths of what is tolerated
@@ -98,7 +180,7 @@ def _show_audit(audit: Entry, effects: Sequence[Entry], rich: RichConsole) -> No
         cells = (str(row["rays"]), number(row["planned"]), number(row["everything"]), f"{moved} ({low} to {high})")
         times = f"{number(row['seconds'], 2)}, {number(row['seconds_everything'], 2)}"
         lines.append([row["design"], row.get("matched_to", "-"), *cells, times])
-    print_table(title, headings, lines, rich, text=headings[:2])
+    print_table(_audit_title(audit, effects), headings, lines, rich, text=headings[:2])
 
 
 def _show_errors(document: Entry, rich: RichConsole) -> None:
@@ -174,11 +256,11 @@ def show_times(timings: Mapping[str, float], memory_bytes: int | None, rich: Ric
     print_table(f"where the time went{memory}", ("phase", "seconds", "share"), lines, rich, text=("phase",))
 
 
-def show_accuracy(accuracy: Accuracy, rich: RichConsole) -> None:
-    """Print every sweep, the roughest measurement first, and the verdict on each."""
+def show_accuracy(accuracy: Accuracy, rich: RichConsole, *, verbose: bool) -> None:
+    """Print the verdicts that ask for another setting; or every sweep, the roughest measurement first."""
     from rich.text import Text
 
-    for sweep in accuracy.sweeps:
+    for sweep in accuracy.sweeps if verbose else ():
         unit = f" [{sweep.unit}]" if sweep.unit else ""
         title = f"{sweep.knob}: {sweep.error_of}{unit}, against {sweep.against}; seconds of {sweep.work}"
         further = list(dict.fromkeys(name for measurement in sweep.measurements for name in measurement.values))
@@ -193,9 +275,8 @@ def show_accuracy(accuracy: Accuracy, rich: RichConsole) -> None:
         if sweep.note:
             rich.print(f"note: {sweep.note}")
         rich.print()
-    taken = sum(accuracy.seconds.values())
-    marks = (("*", "bold"), " is what to choose, (run) what this run does")
-    rich.print(Text.assemble(f"accuracy measured in {taken:.0f} s; ", *marks))
+    marks = ("; ", ("*", "bold"), " is what to choose, (run) what this run does") if verbose else ()
+    rich.print(Text.assemble(f"accuracy measured in {duration(sum(accuracy.seconds.values()))}", *marks))
     for sweep in accuracy.sweeps:
         if sweep.default is not None and sweep.chosen is not sweep.default:
             rich.print(f"note: {sweep.knob}: {sweep.verdict}")

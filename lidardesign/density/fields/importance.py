@@ -34,6 +34,7 @@ from lidardesign.density.fields.grids import (
     narrow_band,
     nearest_known,
 )
+from lidardesign.errors import BackgroundNote
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Body, Mesh, Scene
 
@@ -236,7 +237,7 @@ def importance_notes(scenes: Sequence[Scene]) -> list[str]:
         return []
     ranges = np.array([log_weight_range(body) for scene in scenes for body in scene.bodies if body.is_target])
     least, largest = np.exp([ranges[:, 0].min(), ranges[:, 1].max()])
-    return [f"importance: parts of the targets count from {least:.2g} to {largest:.2g}"]
+    return [BackgroundNote(f"importance: parts of the targets count from {least:.2g} to {largest:.2g}")]
 
 
 def log_weight_range(body: Body) -> tuple[float, float]:

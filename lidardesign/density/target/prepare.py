@@ -21,7 +21,7 @@ from lidardesign.density.target.proposals import occluded_share, propose
 from lidardesign.density.target.quadrature import Quadrature
 from lidardesign.density.target.target import Target, build_target
 from lidardesign.density.target.visibility import Optics, RayBatch, Raycast
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import BackgroundNote, ConfigError, DataError
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
@@ -107,11 +107,14 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
     optics = Optics.of(config.density)
     proposals = propose(scenes, config.space, PROBES, optics.sigma_m, generator)
     if not len(proposals.points):
-        return "raycast", "visibility by ray casting, to be safe: no probed ray of the space meets a target"
+        reason = "visibility by ray casting, to be safe: no probed ray of the space meets a target"
+        return "raycast", BackgroundNote(reason)
     share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
     if share < OCCLUDED_SHARE_TO_CARE:
-        return "off", f"visibility off: of {len(proposals.points)} probed rays {share:.2%} had anything in the way"
-    return "raycast", f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
+        reason = f"visibility off: of {len(proposals.points)} probed rays {share:.2%} had anything in the way"
+        return "off", BackgroundNote(reason)
+    reason = f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
+    return "raycast", BackgroundNote(reason)
 
 
 def refine_quadrature(target: Target, probes: np.ndarray) -> tuple[Target, list[str]]:
@@ -145,7 +148,7 @@ def refine_quadrature(target: Target, probes: np.ndarray) -> tuple[Target, list[
     missed = float((passed > TRANSPARENT).mean())
     notes = []
     if visibility.points != first:
-        notes.append(f"visibility quadrature refined from {first} to {visibility.points} points")
+        notes.append(BackgroundNote(f"visibility quadrature refined from {first} to {visibility.points} points"))
     if missed > MISSED_SHARE_TO_CARE:
         step_m = visibility.field.grid.step if isinstance(visibility.field, TableField) else 0.0
         opaque_m = -np.log(OPAQUE) / target.optics.attenuation_per_m

@@ -80,11 +80,8 @@ def constraint_slack(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) 
         sensors: The names of the design's sensors.
     """
     groups: dict[tuple[str, str], list[tuple[str, ConstraintCheck, Room]]] = {}
-    # the longest name first: one sensor's name may begin with another's
-    names = sorted(sensors, key=len, reverse=True)
     for check in checks:
-        owner = next((name for name in names if check.name.startswith(f"{name}.")), "")
-        key = check.name.removeprefix(f"{owner}.") if owner else check.name
+        owner, key = split_name(check.name, sensors)
         groups.setdefault((key, repr(check.bound)), []).append((owner, check, room_of(check)))
     rows = []
     for (key, _), group in groups.items():
@@ -95,6 +92,14 @@ def constraint_slack(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) 
         broken = sum(not check.satisfied for _, check, _ in group)
         rows.append(ConstraintSlack(key, check.bound, check.value, owner, room, share, len(group), tight, broken))
     return rows
+
+
+def split_name(name: str, sensors: Sequence[str]) -> tuple[str, str]:
+    """The sensor that a check is of, empty where it is of the whole design, and the key of its bound."""
+    # one sensor's name may begin with another's
+    owners = [sensor for sensor in sensors if name.startswith(f"{sensor}.")]
+    owner = max(owners, key=len, default="")
+    return owner, name.removeprefix(f"{owner}.") if owner else name
 
 
 def room_of(check: ConstraintCheck) -> Room:

@@ -20,7 +20,7 @@ from lidardesign.design.mixture.mixture import (
     mean_directions,
     responsibilities,
 )
-from lidardesign.errors import NumericalError
+from lidardesign.errors import BackgroundNote, NumericalError
 from lidardesign.numerics import ROUNDING, TINY, effective_count, wrap_angle
 
 # Iterations stop when the mean log-likelihood gains less than this per iteration [nats].
@@ -236,6 +236,6 @@ def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator
         if again.log_likelihood < result.log_likelihood:
             notes.append(f"{len(dead)} of {len(bounds)} sensors explain almost no samples")
             break
-        notes.append(f"restarted {len(dead)} of {len(bounds)} sensors that had lost their samples")
+        notes.append(BackgroundNote(f"restarted {len(dead)} of {len(bounds)} sensors that had lost their samples"))
         result = again
     return replace(result, notes=tuple(notes))

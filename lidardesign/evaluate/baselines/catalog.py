@@ -44,7 +44,7 @@ from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import Mixture
 from lidardesign.design.sensor import DEFAULT_LEVEL, interval_factor
-from lidardesign.errors import ConfigError
+from lidardesign.errors import BackgroundNote, ConfigError
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition, rays_within, whole_range
 from lidardesign.evaluate.baselines.views import TrainingViews, dense_points
 from lidardesign.geometry.rays import Rays
@@ -340,11 +340,11 @@ def part_notes(rows: Sequence[tuple[str, RaysPerCondition]]) -> list[str]:
     for name, positions in rows:
         if name.startswith(f"{FAMILY}:"):
             parts.setdefault(name, {})[len(positions[0])] = len(np.unique(positions[0].sensor))
-    return [
-        f"{name} is {', '.join(f'{number} parts at {rays} rays' for rays, number in found.items() if number > 1)}"
+    several = {
+        name: [f"{number} parts at {rays} rays" for rays, number in found.items() if number > 1]
         for name, found in parts.items()
-        if max(found.values()) > 1
-    ]
+    }
+    return [BackgroundNote(f"{name} is {', '.join(texts)}") for name, texts in several.items() if texts]
 
 
 def scene_points(views: TrainingViews, seed: int, density: Density | None) -> ScenePoints:

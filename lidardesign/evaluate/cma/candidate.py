@@ -22,6 +22,7 @@ from lidardesign.design.constraints.origins import mounts_of
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec
+from lidardesign.errors import BackgroundNote
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition, opened_gate, whole_range
 from lidardesign.evaluate.baselines.simple import CMA
 from lidardesign.evaluate.baselines.views import TrainingViews
@@ -83,7 +84,8 @@ class SearchRecord:
         found = self.found
         limit = "" if self.limit_mbps is None else f" in {self.limit_mbps:.3g} Mbit/s"
         broken = f"; it breaks {', '.join(self.broken)}" if self.broken else ""
-        return (
+        kind = str if self.broken else BackgroundNote
+        return kind(
             f"cma at {self.rays} rays{limit}: {found.model.size} numbers of the sensors of {followed} varied for "
             f"{found.seconds:.0f} s, {found.candidates} candidates, {found.start_value:.4g} to {found.value:.4g} "
             f"{metric.unit} on {found.scenes} training scenes{broken}"

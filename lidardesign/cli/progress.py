@@ -1,0 +1,81 @@
+"""How far work has come: a bar that changes on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Self
+
+from lidardesign.cli.tables.grids import duration
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
+# Between two lines away from a terminal: so long, or such a share of all the time that it takes.
+LEAST_S = 10.0
+SHARE = 0.1
+
+
+class ProgressDisplay:
+    """Shows how far work has come, while it is a context.
+
+    Arguments:
+        label: What is done, where `show` does not say.
+        say: Prints a line away from a terminal.
+        console: The terminal's, or None.
+    """
+
+    def __init__(self, label: str, say: Callable[[str], None], console: Console | None) -> None:
+        self.label, self.say, self.console = label, say, console
+        self.began_s = self.said_s = time.monotonic()
+        self.bar: Progress | None = None
+        self.lines: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        if self.console is not None:
+            from rich.progress import BarColumn, Progress, TextColumn
+
+            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[detail]}"))
+            self.bar = Progress(*columns, console=self.console, transient=True)
+            self.bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+
+    def show(
+        self,
+        done: float = 0,
+        total: float = 0,
+        *,
+        label: str | None = None,
+        detail: str = "",
+        left_s: float | None = None,
+        line: str = "",
+    ) -> None:
+        """Show where the work is.
+
+        Arguments:
+            done: How much of it is done.
+            total: How much there is; 0 where that is not known.
+            label: What is done now.
+            detail: More of it.
+            left_s: The time that remains; by default what follows from the time until now [s].
+            line: The name of the line, where there are several.
+        """
+        now_s, label = time.monotonic(), self.label if label is None else label
+        passed_s = now_s - self.began_s
+        if left_s is None and 0 < done <= total:
+            left_s = passed_s * (total / done - 1)
+        share = f"{100 * done / total:.0f} %" if done and total else ""
+        left = f"{duration(left_s)} left" if left_s is not None else ""
+        text = ", ".join(filter(None, [share, detail, left]))
+        if self.bar is not None:
+            if line not in self.lines:
+                self.lines[line] = self.bar.add_task(label, total=None, detail="")
+            self.bar.update(self.lines[line], description=label, completed=done, total=total or None, detail=text)
+        elif now_s - self.said_s >= max(LEAST_S, SHARE * (passed_s + (left_s or 0.0))):
+            self.said_s = now_s
+            self.say(f"{label}: {text}" if text else f"{label} ...")
