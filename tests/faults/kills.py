@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 from support.pieces import Pieces
-from support.result_pages import heading, table, write_page
+from support.result_pages import heading, write_page
 
 from faults.processes import Ended, Fork, forked, fresh, import_all
 from faults.runs import COMMANDS, FINISHED, LEARN, STAGED, Straight, contents, strays, unreadable
@@ -201,7 +201,6 @@ def spread(last: int, count: int) -> list[int]:
 
 def page(tally: Tally, seed: int, minutes: float) -> list[str]:
     """The parts of the result's page."""
-    rows = [(WAYS[way], name, count, tally.early[way, name]) for (way, name), count in sorted(tally.sent.items())]
     killed, met, both, worked = (
         sum(count for (way, _), count in counted.items() if (way == "pair") == pairs)
         for pairs in (False, True)
@@ -211,7 +210,6 @@ def page(tally: Tally, seed: int, minutes: float) -> list[str]:
         heading("Kills", f"python -m faults.kills --seed {seed}"),
         f"- {minutes:.0f} minutes\n- killed or terminated: {killed}, of them while the command was at work: {met}\n"
         f"- two at once: {both}, of them both worked: {worked}\n- not recovered: {len(tally.faults)}",
-        table(("how", "command", "times", "at work, or both worked"), rows),
         "\n".join(tally.faults) or RECOVERED,
     ]
 

@@ -233,13 +233,12 @@ def report(found: dict[str, Found], arguments: argparse.Namespace, seconds: floa
             "much memory, code of the file that ran, a file that was left or half-written)."
         ),
         paragraph(
-            "Good files of every kind are damaged by a seeded generator: bytes, numbers, words, keys and values, "
-            "arrays and headers inside archives whose checksums are right again. What is refused at a new place of the "
-            "program is damaged further. An input may take 5 s of processor time, a command 60 s, both 2 GiB beyond "
+            f"Good files of {len(found)} kinds are damaged by a seeded generator: bytes, numbers, words, keys, "
+            "values, arrays and headers in archives whose checksums are right again. What is refused at a new place is "
+            "damaged further. An input may take 5 s of processor time, a command 60 s, both 2 GiB beyond "
             f"what they begin with. Slowest: {slowest}, {found[slowest].slowest_s:.1f} s; most memory: {largest}, "
             f"{found[largest].memory_mib:.0f} MiB."
         ),
-        paragraph(f"Kinds: {'; '.join(found)}."),
         table(("file", "inputs", "faults"), rows) if rows else "",
         *(f"`{Path(path).name}`: {_last_line(reason)}" for path, reason in faults.items()),
     ]

@@ -271,7 +271,7 @@ FAR_AWAY = {
 @hard_case(
     "7",
     "All scenes far away: log p* below -1e5",
-    done="the target stays in log space, without any log(p + epsilon): loss and gradient are finite and lead to the "
+    done="the target stays in log space, without any log(p + epsilon); loss and gradient are finite and lead to the "
     "scene",
 )
 class TestScenesFarAway:
@@ -356,7 +356,7 @@ LIMITS = {
     "8",
     "Sigma far below what the field resolves, or above the size of the scene",
     done="below a hundredth of a mesh field's step, or below the rounding of coordinates, it is an error that says "
-    "both (a flat face is exact on any grid, so from there to half a step is a note); a sigma that flattens the "
+    "both; a flat face is exact on any grid, so from there to half a step is a note; a sigma that flattens the "
     "density is noted with the nats that are left; what would overflow is refused by name",
 )
 class TestSigmaAtBothEnds:

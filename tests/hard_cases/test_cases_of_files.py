@@ -187,7 +187,7 @@ def run(tmp_path, monkeypatch):
 @hard_case(
     "37",
     "A checkpoint that is truncated, bit-flipped, of a newer version or another flow, or a pickle renamed to it",
-    done="safetensors only, its SHA-256 in the manifest, its numbers finite, its format and its parts checked before "
+    done="safetensors only, its SHA-256 in the manifest, its numbers finite; its format and its parts checked before "
     "they are used; each damage has a message of its own and no file is ever unpickled",
 )
 class TestCheckpoints:

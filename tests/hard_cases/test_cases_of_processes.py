@@ -506,7 +506,7 @@ def on_a_terminal(*arguments, **environment) -> bytes:
 @hard_case(
     "40",
     "Stdout closed early, no terminal, NO_COLOR, a locale that is not UTF-8, odd paths, SIGTERM and Ctrl-C",
-    done="streams that nobody reads end the program quietly or swallow what is said, names are escaped where they "
+    done="streams that nobody reads end the program quietly or swallow what is said; names are escaped where they "
     "cannot be shown, signals leave a checkpoint, one JSON document and exit 130 or 143",
 )
 class TestStreamsLocalesAndSignals:

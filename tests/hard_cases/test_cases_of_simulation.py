@@ -75,7 +75,7 @@ def random_rays(count=300, seed=3):
 @hard_case(
     "19",
     "No hit, a hit before or after the gate, or a surface exactly at the gate's edge",
-    done="start <= range < end is a return, nearer hides, further comes too late, nothing is a miss: every ray has "
+    done="start <= range < end is a return, nearer hides, further comes too late, nothing is a miss; every ray has "
     "exactly one outcome, and gates side by side share no surface and lose none",
 )
 class TestHitsAtTheEdgesOfGates:

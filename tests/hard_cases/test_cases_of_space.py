@@ -59,7 +59,7 @@ elevations = st.floats(-math.pi / 2, math.pi / 2)
 @hard_case(
     "1",
     "Azimuth across 0 and 2 pi, azimuth = 2 pi, negative azimuths",
-    done="angles count modulo a turn everywhere: wrapped into the bounds, densities the same on both sides of the "
+    done="angles count modulo a turn everywhere; wrapped into the bounds, densities the same on both sides of the "
     "seam, means taken of directions, boresights in tangent planes",
 )
 class TestAzimuthAcrossTheSeam:
