@@ -36,6 +36,7 @@ from lidardesign.evaluate.report.figures import (
     plane_figure,
 )
 from lidardesign.evaluate.report.markup import embedded, figure, folded, page, paragraphs, section, swatch, switch
+from lidardesign.evaluate.report.result import result_section
 from lidardesign.evaluate.report.tables import (
     CommandTimes,
     Reproduction,
@@ -49,7 +50,6 @@ from lidardesign.evaluate.report.tables import (
     reproduction,
     rows_table,
     sensors_table,
-    summary_sentences,
     times_tables,
 )
 from lidardesign.evaluate.report.view import view_section
@@ -114,11 +114,10 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
     looks = {curve.name: curve for curve in series(evaluation)}
     looks = {name: replace(look, dash=DASHES[index % len(DASHES)]) for index, (name, look) in enumerate(looks.items())}
     shown = [looks[one.name] for one in designs]
-    result = paragraphs(summary_sentences(evaluation)) + paragraphs(evaluation.notes, "note")
     constraints = "".join(constraints_table(name, bounds) for name, bounds in report.constraints.items())
     sensors = "".join(folded(f"Sensors of {one.name}", sensors_table(one), len(one.sensors)) for one in designs)
     return [
-        ("result", "Result", result),
+        ("result", "Result", result_section(evaluation, designs)),
         ("scene", "Designs in a scene", view_section(report.shown, shown, report.density_m)),
         ("scores", "Scores", _scores(evaluation)),
         ("mounting", "Mounted carelessly", mounting_table(evaluation)),

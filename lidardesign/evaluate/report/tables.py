@@ -1,4 +1,4 @@
-"""The report's tables and sentences: who is better and by how much, constraints, effects, times, how to reproduce."""
+"""The report's tables: scores, differences, constraints, effects, times, how to reproduce."""
 
 from __future__ import annotations
 
@@ -52,26 +52,6 @@ def held_out_scenes(scenes: int) -> str:
     return counted(scenes, "held-out scene")
 
 
-def summary_sentences(evaluation: Evaluation) -> list[str]:
-    """One sentence per design at the largest number of rays, against each baseline."""
-    metric = evaluation.metric
-    sentences = [
-        f"{metric.name} in {metric.unit}, {metric.better} is better, mean over {held_out_scenes(evaluation.scenes)}. "
-        f"A scene in which too few rays return counts as {metric.worst:g} {metric.unit}."
-    ]
-    values = {(row.design, row.rays): row.value for row in evaluation.rows}
-    baselines = {row.design for row in evaluation.rows if row.baseline}
-    for name in dict.fromkeys(row.design for row in evaluation.rows if not row.baseline):
-        most = max(row.rays for row in evaluation.rows if row.design == name)
-        pairs = [p for p in evaluation.paired if p.a == name and p.rays == most and p.b in baselines]
-        comparisons = ", ".join(_comparison(evaluation, pair, values[pair.b, most]) for pair in pairs)
-        sentences.append(
-            f"{name} with {most} rays: {four_digits(values[name, most])} {metric.unit}"
-            + (f"; {comparisons}." if comparisons else ".")
-        )
-    return sentences
-
-
 def rows_table(evaluation: Evaluation) -> str:
     """All rows at equal rays."""
     metric, detail = evaluation.metric, leading_detail(evaluation.rows)
@@ -80,7 +60,7 @@ def rows_table(evaluation: Evaluation) -> str:
     headings += [*map(_words, details), "Mbit/s", "seconds"]
     lines = []
     for index, row in enumerate(evaluation.rows):
-        cells = [row.design, str(row.rays), four_digits(row.value), _interval(row), str(row.failures)]
+        cells = [row.design, str(row.rays), four_digits(row.value), interval(row), str(row.failures)]
         cells += [four_digits(row.details[name]) if name in row.details else "-" for name in details]
         cells += [four_digits(row.bandwidth_mbps), f"{row.seconds:.2f}"]
         lines.append((cells, "", bool(index and row.design != evaluation.rows[index - 1].design)))
@@ -98,7 +78,7 @@ def mounting_table(evaluation: Evaluation) -> str:
     lines = []
     for index, (row, own, cost) in enumerate(zip(mounting.rows, evaluation.rows, mounting.costs, strict=True)):
         values = map(four_digits, (own.value, row.value))
-        cells = [row.design, str(row.rays), *values, str(row.failures), four_digits(cost.difference), _interval(cost)]
+        cells = [row.design, str(row.rays), *values, str(row.failures), four_digits(cost.difference), interval(cost)]
         begins = bool(index and row.design != mounting.rows[index - 1].design)
         lines.append(([*cells, ""], verdict(evaluation, cost), begins))
     caption = f"Every sensor off by {mounting.error} per axis in every scene, against itself mounted exactly."
@@ -121,7 +101,7 @@ def _paired_table(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
     headings = ["a", "b", "rays", f"a - b [{evaluation.metric.unit}]", "95 % interval", "a is"]
     lines = [
         (
-            [pair.a, pair.b, str(pair.rays), four_digits(pair.difference), _interval(pair), ""],
+            [pair.a, pair.b, str(pair.rays), four_digits(pair.difference), interval(pair), ""],
             verdict(evaluation, pair),
             bool(index and pair.a != pairs[index - 1].a),
         )
@@ -144,7 +124,7 @@ def bandwidth_table(evaluation: Evaluation) -> str:
     for index, (row, pair) in enumerate(pairs):
         mine = own[pair.a, pair.rays]
         cells = [pair.a, pair.b, str(pair.rays), str(row.rays), *map(four_digits, (mine.bandwidth_mbps, mine.value))]
-        cells += [four_digits(row.value), f"{four_digits(pair.difference)} ({_interval(pair)})", ""]
+        cells += [four_digits(row.value), f"{four_digits(pair.difference)} ({interval(pair)})", ""]
         begins = bool(index and row.design == evaluation.equal_bandwidth[0].design)
         lines.append((cells, verdict(evaluation, pair), begins))
     caption = "Each design against rivals with as many rays (their rays) as fit in its bandwidth."
@@ -175,19 +155,14 @@ def sensors_table(design: DesignSpec) -> str:
     return table(headings, lines, text_columns=1, caption=caption) + more
 
 
-def _comparison(evaluation: Evaluation, pair: Paired, other: float) -> str:
-    word = verdict(evaluation, pair)
-    if word == "open":
-        return f"no clear difference from {pair.b} ({four_digits(other)})"
-    share = f"{abs(pair.difference) / abs(other):.0%} " if other else ""
-    return f"{share}{word} than {pair.b} ({four_digits(other)})"
-
-
-def _interval(item: Row | Paired) -> str:
+def interval(item: Row | Paired, digits: int | None = None) -> str:
+    """The interval of a row or pair, with four digits or fewer; a dash where it has none."""
     if item.ci_low is None or item.ci_high is None:
         return "-"
     # in one line, also where cells wrap
-    return f"{four_digits(item.ci_low)}\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}{four_digits(item.ci_high)}"
+    return "\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}".join(
+        four_digits(end) if digits is None else f"{end:.{digits}g}" for end in (item.ci_low, item.ci_high)
+    )
 
 
 def _words(name: str) -> str:

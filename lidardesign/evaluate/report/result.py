@@ -1,0 +1,120 @@
+"""The report's first section: every design at one number of rays, against the strongest rival on training scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lidardesign.design.layouts.rays import certificates_of
+from lidardesign.design.sensor import DesignSpec
+from lidardesign.evaluate.report.markup import folded, paragraphs
+from lidardesign.evaluate.report.tables import counted, held_out_scenes, interval, table
+from lidardesign.evaluate.results import Evaluation, Paired, Row, verdict
+
+MOST_SENTENCES = 3  # of designs that have one each; a table says the same of all
+MOST_NOTES = 2  # that are not folded
+DIGITS = 3
+
+
+def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str:
+    """Who is better and by how much, how far chosen rays are from the best, and what a reader should know.
+
+    Arguments:
+        evaluation: The scores.
+        designs: The designs, whose chosen rays may have certificates.
+    """
+    rows, pairs = headline_rows(evaluation), headline_pairs(evaluation)
+    said = [headline(evaluation, pairs[name]) for name in rows if name in pairs]
+    if not said:
+        metric = evaluation.metric
+        said = [f"{row.design}: {_digits(row.value)} {metric.unit} at {row.rays} rays." for row in rows.values()]
+    # a long list says less than the table below it
+    said = said if len(said) <= MOST_SENTENCES else []
+    notes = [paragraphs([note], "note") for note in evaluation.notes]
+    further = folded("Further notes", "".join(notes[MOST_NOTES:]), len(notes) - MOST_NOTES)
+    return (
+        paragraphs(said, "verdict")
+        + _table(evaluation, rows, pairs)
+        + paragraphs([*_about(evaluation), *_certificates(evaluation, designs)])
+        + "".join(notes[:MOST_NOTES])
+        + further
+    )
+
+
+def headline_rows(evaluation: Evaluation) -> dict[str, Row]:
+    """Every design's row by its name: at the middle number of rays, or the closest that it has."""
+    count = evaluation.middle_rays
+    rows = [row for row in evaluation.rows if not row.baseline]
+    closest = sorted(rows, key=lambda row: abs(row.rays - count), reverse=True)
+    found = {row.design: row for row in closest}
+    return {name: found[name] for name in dict.fromkeys(row.design for row in rows)}
+
+
+def headline_pairs(evaluation: Evaluation) -> dict[str, Paired]:
+    """Every design against the strongest rival, by the design's name, at the rival's number of rays."""
+    rival = evaluation.strongest_rival
+    if rival is None:
+        return {}
+    return {pair.a: pair for pair in evaluation.paired if (pair.b, pair.rays) == (rival.name, rival.rays)}
+
+
+def headline(evaluation: Evaluation, pair: Paired) -> str:
+    """A pair in a sentence: who is better and by how much, or that no difference was found."""
+    word, unit = verdict(evaluation, pair), evaluation.metric.unit
+    size, ends = f"{_digits(abs(pair.difference))} {unit}", [pair.ci_low, pair.ci_high]
+    known = [end for end in ends if end is not None]
+    if word != "open":
+        low, high = sorted(map(abs, known))
+        return f"{pair.a} is {word} than {pair.b} by {size} ({_digits(low)} to {_digits(high)}) at {pair.rays} rays."
+    lower = evaluation.metric.better == "lower"
+    side = "better" if (pair.difference < 0) == lower else "worse"
+    between = f", {_digits(known[0])} to {_digits(known[1])}" if known else ""
+    return f"No difference between {pair.a} and {pair.b} was found at {pair.rays} rays ({size} {side}{between})."
+
+
+def _table(evaluation: Evaluation, rows: dict[str, Row], pairs: dict[str, Paired]) -> str:
+    metric, rival = evaluation.metric, evaluation.strongest_rival
+    shown = list(rows.values())
+    if rival is not None:
+        shown += [row for row in evaluation.rows if (row.design, row.rays) == (rival.name, rival.rays)]
+    headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "Mbit/s"]
+    if rival is not None:
+        headings += [f"difference to {rival.name}", "design is"]
+    lines = []
+    for row in shown:
+        cells = [row.design, str(row.rays), _digits(row.value), interval(row, DIGITS), _digits(row.bandwidth_mbps)]
+        pair = pairs.get(row.design)
+        if rival is not None:
+            cells += ["", ""] if pair is None else [f"{pair.difference:+.{DIGITS}g} ({interval(pair, DIGITS)})", ""]
+        lines.append((cells, "" if pair is None else verdict(evaluation, pair), row.baseline))
+    return table(headings, lines, text_columns=1, caption="Designs, and the strongest rival on training scenes.")
+
+
+def _about(evaluation: Evaluation) -> list[str]:
+    metric, rival = evaluation.metric, evaluation.strongest_rival
+    about = (
+        f"Means over {held_out_scenes(evaluation.scenes)}; a scene in which too few "
+        f"rays return counts as {metric.worst:g} {metric.unit}."
+    )
+    if rival is None:
+        return [about]
+    against = f"the best of {len(rival.values)} rivals" if len(rival.values) > 1 else "the only rival"
+    return [f"{about} {rival.name} is {against} on {counted(rival.scenes, 'training scene')}."]
+
+
+def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list[str]:
+    """How far chosen rays are from the best, in one sentence for all designs; none where no rays were chosen."""
+    count = evaluation.middle_rays
+    gaps = [
+        f"{100 * entry['gap']:.1f} % ({design.name})"
+        for design in designs
+        for entry in certificates_of(design)
+        if entry["rays"] == count
+    ]
+    if not gaps:
+        return []
+    said = f"Certificate: no other choice of {count} of the same candidates lowers the loss on training scenes by more"
+    return [f"{said} than {', '.join(gaps)}."]
+
+
+def _digits(value: float) -> str:
+    return f"{value:.{DIGITS}g}"

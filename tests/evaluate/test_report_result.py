@@ -1,0 +1,95 @@
+"""The report's first section: designs against the strongest rival at the middle number of rays."""
+
+import re
+from dataclasses import replace
+
+import pytest
+from support.report_pages import NASTY, make_evaluation, make_row, make_sensor
+from support.tables import each_row
+
+from lidardesign.design.sensor import CERTIFICATES, DesignSpec
+from lidardesign.evaluate.report.result import headline, headline_pairs, headline_rows, result_section
+from lidardesign.evaluate.results import Evaluation, Paired
+from lidardesign.evaluate.rivals import StrongestRival
+from lidardesign.task import Metric
+
+RIVAL = StrongestRival("greedy", 25, 20, {"greedy": 5.5, "uniform": 20.0})
+
+
+def evaluation_of(*pairs, better="lower", rival=RIVAL, notes=()):
+    names = list(dict.fromkeys(pair.a for pair in pairs)) or ["f"]
+    rows = [make_row(name, rays, value) for name in names for rays, value in ((9, 10.0), (25, 5.0), (64, 2.0))]
+    rows += [make_row(name, rays, 5.5, True) for name in ("greedy", "uniform") for rays in (9, 25, 64)]
+    metric = Metric("score", "mm", better, worst=200.0, tolerance=0.1)
+    return Evaluation(metric, 8, rows, pairs, notes=notes, strongest_rival=rival)
+
+
+def pair(difference, low, high, rays=25, name="f"):
+    return Paired(name, "greedy", rays, difference, low, high)
+
+
+@each_row(
+    ("better", "found", "sentence"),
+    [
+        ("lower", (-0.6, -0.9, -0.3), "f is better than greedy by 0.6 mm (0.3 to 0.9) at 25 rays."),
+        ("higher", (-0.6, -0.9, -0.3), "f is worse than greedy by 0.6 mm (0.3 to 0.9) at 25 rays."),
+        ("lower", (0.6, 0.3, 0.9), "f is worse than greedy by 0.6 mm (0.3 to 0.9) at 25 rays."),
+        (
+            "lower",
+            (0.05, -0.07, 0.16),
+            "No difference between f and greedy was found at 25 rays (0.05 mm worse, -0.07 to 0.16).",
+        ),
+        (
+            "higher",
+            (0.05, -0.07, 0.16),
+            "No difference between f and greedy was found at 25 rays (0.05 mm better, -0.07 to 0.16).",
+        ),
+        ("lower", (0.05, None, None), "No difference between f and greedy was found at 25 rays (0.05 mm worse)."),
+    ],
+)
+def test_a_pair_is_told_in_a_sentence(better, found, sentence):
+    assert headline(evaluation_of(pair(*found), better=better), pair(*found)) == sentence
+
+
+def test_only_pairs_at_the_rivals_number_of_rays_are_told():
+    told = pair(-0.6, -0.9, -0.3)
+    evaluation = evaluation_of(pair(1.0, 0.5, 1.5, rays=9), told, Paired("f", "uniform", 25, -9.0, -9.0, -9.0))
+    assert headline_pairs(evaluation) == {"f": told}
+    text = result_section(evaluation, [])
+    assert text.count('class="verdict"') == 1
+    assert "the best of 2 rivals on 20 training scenes" in text
+
+
+def test_a_design_without_the_middle_number_of_rays_is_shown_at_the_closest():
+    evaluation = evaluation_of(pair(-0.6, -0.9, -0.3), pair(-0.6, -0.9, -0.3, name="g"))
+    rows = [row for row in evaluation.rows if row.design != "g"]
+    fewer = replace(evaluation, rows=[*rows, make_row("g", 30, 2.5)])
+    assert {name: row.rays for name, row in headline_rows(fewer).items()} == {"f": 25, "g": 30}
+
+
+def test_without_rivals_every_design_has_its_score():
+    text = result_section(evaluation_of(rival=None), [])
+    assert "f: 5 mm at 25 rays." in text
+    assert "difference" not in text
+
+
+def test_many_designs_are_told_by_the_table_alone_and_many_notes_are_folded():
+    pairs = [pair(-0.6, -0.9, -0.3, name=f"f{number}") for number in range(5)]
+    text = result_section(evaluation_of(*pairs, notes=[f"note {number}" for number in range(5)]), [])
+    assert 'class="verdict"' not in text
+    assert len(re.findall("<td class=.better.>better", text)) == 5
+    assert "<summary>Further notes (3 rows)</summary>" in text
+
+
+@pytest.mark.parametrize("rays", [25, 9])
+def test_the_certificate_of_the_rays_that_are_told_about_is_told(rays):
+    entry = {"value": 0.8, "bound": 0.76, "gap": 0.05, "held_back_value": 0.9, "candidates": 125, "gates": 5}
+    design = DesignSpec("f", (make_sensor(),), provenance={CERTIFICATES: [{**entry, "rays": rays, "scenes": 50}]})
+    text = result_section(evaluation_of(pair(-0.6, -0.9, -0.3)), [design])
+    assert ("by more than 5.0 % (f)." in text) == (rays == 25)
+
+
+def test_no_name_becomes_markup():
+    evaluation = make_evaluation(NASTY)
+    rival = StrongestRival("uniform", 9, 1, {"uniform": 20.0})
+    assert "<img" not in result_section(replace(evaluation, strongest_rival=rival, notes=[NASTY] * 4), [])
