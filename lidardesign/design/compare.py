@@ -158,8 +158,8 @@ def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
     return []
 
 
-def outside_space(design: DesignSpec, space: DesignSpace) -> list[str]:
-    """How much of a design that was made for another design space lies outside this one, one line at most.
+def outside_space(design: DesignSpec, space: DesignSpace) -> str:
+    """How much of a design lies outside a design space, as "3 of 361 rays ... outside"; nothing where all is inside.
 
     Arguments:
         design: Its rays where it has a table of them, else its sensors' mean origins, boresights and gates.
@@ -177,6 +177,4 @@ def outside_space(design: DesignSpec, space: DesignSpace) -> list[str]:
     points = np.column_stack([origins_m, *angles(directions), range_m])
     points[:, space.conditioned] = np.array(space.low)[list(space.conditioned)]
     outside = int((~space.contains(points)).sum())
-    if not outside:
-        return []
-    return [f"{design.name}: {outside} of {len(points)} {what} start, point or listen outside the run's design space"]
+    return f"{outside} of {len(points)} {what} start, point or listen outside" if outside else ""

@@ -315,9 +315,9 @@ def judging_run(designs: Sequence[Design], runs: Sequence[RunFolder], notes: Not
         raise DataError("the run has no designs yet", where=str(judge.folder), hint=hint)
     for design in designs:
         if design.run is not None and _settings(design.run) != _settings(judge):
-            notes(f"{design.name} of {design.run.folder} is scored in the scenes of {judge.folder}")
-            for line in outside_space(design.specification, judge.config.space):
-                notes(line)
+            outside = outside_space(design.specification, judge.config.space)
+            there = f"; {outside} its design space" if outside else ""
+            notes(f"{design.name} of {design.run.folder} is scored in the scenes of {judge.folder}{there}")
     return judge
 
 
