@@ -1,4 +1,4 @@
-"""What an evaluation found: rows, paired differences, the effects that were simulated, and an audit of their plan.
+"""What an evaluation found: rows, paired differences, and an audit of the effects that were skipped.
 
 A mean over scenes says little where scenes differ more than designs do. Differences are therefore taken scene
 by scene, and their intervals are the ones that tell two designs apart. The audit has every row under all effects and
@@ -19,11 +19,10 @@ import numpy as np
 
 from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
 from lidardesign.evaluate.accuracy.settings import Accuracy
+from lidardesign.evaluate.effects import EffectSummary
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.statistics import paired_difference
 from lidardesign.run.files import write_atomic
-from lidardesign.simulate.detector.detector import EFFECTS
-from lidardesign.simulate.plan import Choice, EffectPlan, Tolerance
 from lidardesign.task import Metric
 
 if TYPE_CHECKING:
@@ -31,16 +30,28 @@ if TYPE_CHECKING:
     from lidardesign.evaluate.rivals import StrongestRival
 
 
-def _half(low: float | None, high: float | None) -> float | None:
-    return None if low is None or high is None else (high - low) / 2
+ROW_KEYS = (
+    "design", "rays", "value", "ci_low", "ci_high", "half_width", "failures", "bandwidth_mbps", "seconds",
+)  # fmt: skip
 
 
-def _drawn(middle: float, low: float | None, high: float | None) -> tuple[float, float]:
-    return (middle, middle) if low is None or high is None else (low, high)
+class _WithInterval:
+    """A figure with the ends of its 95 % interval; None where all scenes are of one group."""
+
+    ci_low: float | None
+    ci_high: float | None
+
+    @property
+    def half_width(self) -> float | None:
+        """Half of the interval: how far the figure may be off over other scenes, in the metric's unit."""
+        return None if self.ci_low is None or self.ci_high is None else (self.ci_high - self.ci_low) / 2
+
+    def _drawn(self, middle: float) -> tuple[float, float]:
+        return (middle, middle) if self.ci_low is None or self.ci_high is None else (self.ci_low, self.ci_high)
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class Row(_WithInterval):
     """One design or baseline at one number of rays.
 
     Arguments:
@@ -77,29 +88,13 @@ class Row:
     per_seed: tuple[float, ...] = ()
 
     @property
-    def half_width(self) -> float | None:
-        """Half of the interval: how far the value may be off over other scenes, in the metric's unit."""
-        return _half(self.ci_low, self.ci_high)
-
-    @property
     def drawn_interval(self) -> tuple[float, float]:
         """What pictures show: the interval, without width where there is none."""
-        return _drawn(self.value, self.ci_low, self.ci_high)
+        return self._drawn(self.value)
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's keys, `half_width`, `details`, and at equal bandwidth the design that it was matched to."""
-        values: dict[str, Any] = {
-            "design": self.design,
-            "rays": self.rays,
-            "value": self.value,
-            "ci_low": self.ci_low,
-            "ci_high": self.ci_high,
-            "half_width": self.half_width,
-            "failures": self.failures,
-            "bandwidth_mbps": self.bandwidth_mbps,
-            "seconds": self.seconds,
-            "details": dict(self.details),
-        }
+        values = {name: getattr(self, name) for name in ROW_KEYS} | {"details": dict(self.details)}
         if self.matched_to is not None:
             values |= {"matched_to": self.matched_to, "matched_rays": self.matched_rays}
         if self.per_seed:
@@ -108,7 +103,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Paired:
+class Paired(_WithInterval):
     """The mean over scenes of a's score minus b's, in the metric's unit, with its 95 % interval.
 
     Arguments:
@@ -128,14 +123,9 @@ class Paired:
     rays_b: int | None = None
 
     @property
-    def half_width(self) -> float | None:
-        """Half of the interval, in the metric's unit."""
-        return _half(self.ci_low, self.ci_high)
-
-    @property
     def drawn_interval(self) -> tuple[float, float]:
         """What pictures show: the interval, without width where there is none."""
-        return _drawn(self.difference, self.ci_low, self.ci_high)
+        return self._drawn(self.difference)
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's keys and `half_width`, with `rays_b` at equal bandwidth."""
@@ -396,95 +386,6 @@ def audit_rows(planned: Sequence[Row], everything: Sequence[Row], seed: int) -> 
         )
         for row, other in zip(planned, everything, strict=True)
     ]
-
-
-MILLIMETRES = 1000.0
-
-
-@dataclass(frozen=True)
-class EffectSummary:
-    """An effect over all scenes.
-
-    Arguments:
-        name: Of the effect.
-        scenes_on: The share of scenes in which it was simulated.
-        range_m: Its largest bound on ranges, in any scene [m].
-        lost: Its largest bound on the share of returns.
-        tolerance: Of all skipped effects together.
-        reason: Why, in the scene where it could change most.
-        seconds: What simulating it in all scenes takes, predicted [s].
-        missing: What its simulation needs and is not there.
-    """
-
-    name: str
-    scenes_on: float
-    range_m: float
-    lost: float
-    tolerance: Tolerance
-    reason: str
-    seconds: float
-    missing: str | None = None
-
-    @property
-    def on(self) -> bool:
-        """Whether it was simulated anywhere."""
-        return self.scenes_on > 0
-
-    @property
-    def exceeds(self) -> bool:
-        """Whether it could change more than is tolerated."""
-        return self.range_m > self.tolerance.range_m or self.lost > self.tolerance.lost
-
-    def as_dict(self) -> dict[str, Any]:
-        """The contract's keys for ranges; the same for returns, and what it costs."""
-        return {
-            "name": self.name,
-            "on": self.on,
-            "bound": self.range_m,
-            "tolerance": self.tolerance.range_m,
-            "unit": "m",
-            "reason": self.reason,
-            "lost": self.lost,
-            "lost_tolerance": self.tolerance.lost,
-            "scenes_on": self.scenes_on,
-            "seconds": self.seconds,
-            "missing": self.missing,
-        }
-
-
-def summaries(plans: Sequence[EffectPlan]) -> list[EffectSummary]:
-    """One line per effect, in the order in which light meets them."""
-    return [_summary(name, plans) for name in EFFECTS]
-
-
-def _summary(name: str, plans: Sequence[EffectPlan]) -> EffectSummary:
-    tolerance = plans[0].tolerance
-    decisions = [decision for plan in plans for decision in plan.decisions if decision.name == name]
-    worst = max(decisions, key=lambda decision: decision.bound.relative(tolerance))
-    return EffectSummary(
-        worst.name,
-        sum(decision.on for decision in decisions) / len(decisions),
-        max(decision.bound.range_m for decision in decisions),
-        max(decision.bound.lost for decision in decisions),
-        tolerance,
-        worst.bound.reason,
-        sum(decision.seconds for decision in decisions),
-        worst.missing,
-    )
-
-
-def effect_notes(effects: Sequence[EffectSummary], choice: Choice) -> list[str]:
-    """What was not simulated although it matters."""
-    notes = [
-        f"{effect.name} is not simulated ({effect.missing}): it may move ranges by up to "
-        f"{MILLIMETRES * effect.range_m:.3g} mm and change {effect.lost:.2g} of the returns"
-        for effect in effects
-        if effect.missing is not None and effect.exceeds
-    ]
-    left_out = [effect.name for effect in effects if effect.exceeds and not effect.on and effect.missing is None]
-    if left_out and choice != "auto":
-        notes.append(f"not simulated, as asked, though beyond the tolerance: {', '.join(left_out)}")
-    return notes
 
 
 def csv_text(evaluation: Evaluation) -> str:

@@ -29,6 +29,7 @@ from lidardesign.evaluate.baselines.simple import CMA, Baselines, Option, TwinCa
 from lidardesign.evaluate.baselines.views import TrainingViews
 from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
 from lidardesign.evaluate.cma.search import TrainingObjective
+from lidardesign.evaluate.effects import effect_notes, effect_summaries
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out
 from lidardesign.evaluate.results import (
@@ -38,9 +39,7 @@ from lidardesign.evaluate.results import (
     Paired,
     Row,
     audit_rows,
-    effect_notes,
     middle_rays,
-    summaries,
 )
 from lidardesign.evaluate.rivals import StrongestRival, strongest_rival
 from lidardesign.evaluate.scene_scores import Progress, silent_notes
@@ -287,7 +286,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     passes = 1 + request.audit + (request.mount_error is not None)
     scored = _score_all(request, entries, request.planner, _part(progress, 0, passes))
     rows = _rows(request, entries, scored)
-    effects = summaries(scored.plans)
+    effects = effect_summaries(scored.plans)
     audit = _audit(request, entries, rows, scored.plans, _part(progress, 1, passes)) if request.audit else None
     last = _part(progress, passes - 1, passes)
     mounting = request.mount_error and _mounting(request, request.mount_error, entries, rows, scored.plans, last)
@@ -342,7 +341,7 @@ def _audit(
     """The same entries under all effects that there are, with the same random numbers."""
     planner = replace(request.planner, choice="all")
     scored = _score_all(request, entries, planner, progress, [planner.chosen_from(plan) for plan in plans])
-    paired = list(zip(summaries(plans), summaries(scored.plans), strict=True))
+    paired = list(zip(effect_summaries(plans), effect_summaries(scored.plans), strict=True))
     metric = request.metric
     return Audit(
         metric.tolerance,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -16,13 +16,14 @@ from lidardesign.design.compare import outside_notes
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import MAX_SEED, ConfigError, check_number
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
-from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of, is_baseline
+from lidardesign.evaluate.baselines.simple import ALWAYS, CMA, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
 from lidardesign.evaluate.gates import check_audit, check_better, check_limit
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
+from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.score import evaluate as score_designs
 from lidardesign.evaluate.workers.pool import check_workers, workers_of
 from lidardesign.numerics import SLACK
@@ -49,9 +50,6 @@ if TYPE_CHECKING:
     from lidardesign.evaluate.figures.scene_figure import FigureData
     from lidardesign.evaluate.report.figures import Figure
 
-Progress = Callable[[int, int, str], None]
-
-CMA = "cma"
 CMA_SECONDS = (0.1, 7 * 24 * 3600.0)
 # A picometre, and further than any sensor reaches.
 RANGE_TOLERANCES_MM = (SLACK, 1e9)

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.request import usual_numbers
+from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.seeds import over_seeds
 from lidardesign.run.clock import outermost_clock, running
 from lidardesign.workflow.designs import Design
-from lidardesign.workflow.evaluate import Progress, ScoreOptions, ScoreRequest, Scores
+from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest, Scores
 from lidardesign.workflow.run_folder import Notes, RequestPlan, RunFolder, log_note, read_design
 
 if TYPE_CHECKING:

@@ -11,8 +11,9 @@ from support.command_line import make_run
 from support.planning import SINGLE
 from support.scoring import MissTask, design, make_request, scenes
 
+from lidardesign.evaluate.effects import effect_notes, effect_summaries
 from lidardesign.evaluate.report.tables import audit_section, effects_section
-from lidardesign.evaluate.results import Audit, AuditRow, effect_notes, summaries
+from lidardesign.evaluate.results import Audit, AuditRow
 from lidardesign.evaluate.score import evaluate
 from lidardesign.scene import Ambient, Scene
 from lidardesign.simulate import plan as plan_module
@@ -115,12 +116,12 @@ def test_what_cannot_be_simulated_is_noted_where_it_may_matter():
     decision = Planner(SINGLE).plan(sunny(1)[0], [make_request().lay_out(design(), 9, None)])
     found = [
         replace(effect, range_m=0.5, missing="not installed: mitsuba") if effect.name == "multipath" else effect
-        for effect in summaries([decision])
+        for effect in effect_summaries([decision])
     ]
     notes = effect_notes(found, "auto")
     expected = "multipath is not simulated (not installed: mitsuba): it may move ranges by up to 500 mm and change 0"
     assert any(note.startswith(expected) for note in notes)
-    assert not effect_notes(summaries([decision]), "auto")
+    assert not effect_notes(effect_summaries([decision]), "auto")
 
 
 def test_documents_hold_effects_and_audits_as_plain_json():

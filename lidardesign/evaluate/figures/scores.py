@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.design.constraints.slack import SPACE_MARK, ConstraintSlack
+from lidardesign.evaluate.effects import MILLIMETRES, EffectSummary
 from lidardesign.evaluate.figures.canvas import (
     BAND_OPACITY,
     COLOURS,
@@ -30,7 +31,7 @@ from lidardesign.evaluate.figures.canvas import (
     position,
     series,
 )
-from lidardesign.evaluate.results import MILLIMETRES, EffectSummary, Evaluation, Paired, verdict
+from lidardesign.evaluate.results import Evaluation, Paired, verdict
 from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:

@@ -10,13 +10,12 @@ from typing import Any
 
 from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.design.sensor import DesignSpec
+from lidardesign.evaluate.effects import MILLIMETRES, EffectSummary
 from lidardesign.evaluate.figures.canvas import VERDICT_WORDS
 from lidardesign.evaluate.report.markup import definitions, folded
 from lidardesign.evaluate.results import (
-    MILLIMETRES,
     Audit,
     AuditRow,
-    EffectSummary,
     Evaluation,
     Paired,
     Row,
