@@ -134,6 +134,7 @@ MANUALS: dict[str, Manual] = {
     ),
     "show": Manual(
         {
+            "lidardesign show runs/face": "its density, designs and last scores, and what can be done next",
             "lidardesign show runs/face/designs/free.yaml": "its sensors, constraints and cost",
             "lidardesign show runs/warehouse/designs/track.yaml --at x_m=3.91": "its rays at one position",
             "lidardesign show robot.sdf": "the lidars of a Gazebo model",

@@ -326,13 +326,15 @@ def _damaged_cache(error: BaseException) -> str | None:
     return None
 
 
-def keep_times(run: Path, name: str, output: Output, *, wait_s: float = SHORT_WAIT_S) -> None:
-    """Enter the times of a command in the manifest of its run; where that cannot be, a note says so.
+def keep_times(
+    run: Path, name: str, output: Output, *, wait_s: float = SHORT_WAIT_S, further: Mapping[str, Any] | None = None
+) -> None:
+    """Enter the times of a command, and further entries, in the manifest of its run; where that cannot be, say so.
 
     The work is done by then: that its times are not kept is no reason to fail.
     """
     try:
-        keep_timings(run, name, output.clock, wait_s=wait_s)
+        keep_timings(run, name, output.clock, wait_s=wait_s, further=further)
     except (ConfigError, DataError, OSError) as error:
         message = error.message if isinstance(error, ConfigError | DataError) else error.strerror or error
         output.note(f"note: the times of {name} are not kept in {run}: {message}")

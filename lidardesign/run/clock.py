@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from pathlib import Path
@@ -107,8 +107,17 @@ def peak_memory_bytes() -> int | None:
     return peak if sys.platform == "darwin" else peak * KIBIBYTE
 
 
-def keep_timings(run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_S) -> None:
+def keep_timings(
+    run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_S, further: Mapping[str, Any] | None = None
+) -> None:
     """Enter a command's times in a run's manifest, in place of those of the last time, under the run's lock.
+
+    Arguments:
+        run: The run folder.
+        command: Its name.
+        clock: Its clock.
+        wait_s: How long to wait for another writer.
+        further: Mappings of the manifest that get further entries, by name.
 
     Raises:
         ConfigError, DataError: The run is being written, or cannot be.
@@ -126,4 +135,5 @@ def keep_timings(run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_
     with run_lock(run, wait_s=wait_s):
         manifest = read_manifest(run)
         commands = {name: times for name, times in manifest.get("timings", {}).items() if isinstance(times, dict)}
-        write_manifest(run, {**manifest, "timings": {**commands, command: entry}})
+        merged = {name: {**(manifest.get(name) or {}), **entries} for name, entries in (further or {}).items()}
+        write_manifest(run, {**manifest, "timings": {**commands, command: entry}, **merged})

@@ -20,6 +20,7 @@ from lidardesign.evaluate.baselines.simple import ALWAYS, CMA, baseline_of, is_b
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
 from lidardesign.evaluate.gates import check_audit, check_better, check_limit
+from lidardesign.evaluate.last_scores import SCORES, last_scores_of
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
@@ -33,6 +34,7 @@ from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.workflow.designs import Design, collect_designs, html_table, judging_run, name_apart, named
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
+    DESIGN_FOLDER,
     MANIFEST,
     SAMPLES,
     Notes,
@@ -372,6 +374,12 @@ class Scores:
         if options.fail_unless_better is not None:
             check_better(self.evaluation, options.fail_unless_better)
         check_audit(self.evaluation)
+
+    def last_scores(self) -> dict[str, Any]:
+        """What the run's manifest keeps of them: the scores of the designs that lie in the run."""
+        folder = (self.run.folder / DESIGN_FOLDER).resolve()
+        files = {one.name: one.path for one in self.request.designs if one.path and one.path.resolve().parent == folder}
+        return {SCORES: last_scores_of(self.evaluation, files, settings_texts(self.request.options.settings))}
 
     def with_accuracy(self, progress: Progress | None = None) -> Scores:
         """The scores with what accuracy costs in time here; takes minutes.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.design.constraints.document import Constraints
@@ -28,6 +29,7 @@ from lidardesign.workflow.run_folder import (
 if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress
     from lidardesign.density.learned import LearnedDensity
+    from lidardesign.density.verdict import Verdict
     from lidardesign.workflow.evaluate import Scores
 
 FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
@@ -56,9 +58,17 @@ class LearnedQuality:
     @property
     def verdict(self) -> str:
         """good, usable or poor."""
+        return self._verdict.word
+
+    def advice(self, preset: str) -> str | None:
+        """Why it is no better, and what to do next where it was learned with a preset; None where it is good."""
+        return self._verdict.advice(preset) if self._verdict.why else None
+
+    @property
+    def _verdict(self) -> Verdict:
         from lidardesign.density.verdict import Verdict
 
-        return Verdict.of(self.misplaced, self.kl_nats, self.ess).word
+        return Verdict.of(self.misplaced, self.kl_nats, self.ess)
 
 
 class Run(RunFolder):
@@ -166,6 +176,48 @@ class Run(RunFolder):
         """The designs that are saved in the run, by name."""
         return [Design(read_design(path), self, path) for path in self.design_paths()]
 
+    def summary(self) -> dict[str, Any]:
+        """What the run has: how good its density is, designs with what they scored last, and what can be done next.
+
+        Raises:
+            DataError: The manifest is damaged.
+        """
+        manifest, config = read_manifest(self.folder), self.config
+        learned = manifest.get("learn")
+        quality = None if learned is None else self.quality
+        designs = [_design_entry(path, manifest) for path in self.design_paths()]
+        return {
+            "run": str(self.folder),
+            "task": config.task_name,
+            "preset": config.preset,
+            "seed": config.seed,
+            "metric": {"name": self.metric.name, "unit": self.metric.unit, "better": self.metric.better},
+            "quality": None if quality is None else {name: getattr(quality, name) for name in FIGURES},
+            "verdict": None if quality is None else quality.verdict,
+            "advice": None if quality is None else quality.advice(config.preset),
+            "seconds": learned.get("seconds") if learned else None,
+            "steps": learned.get("steps") if learned else None,
+            "designs": designs,
+            "next": self._next_commands(designs, finished=learned is not None),
+        }
+
+    def _next_commands(self, designs: Sequence[Mapping[str, Any]], *, finished: bool) -> list[str]:
+        """Command lines that go on from here."""
+        run = quote(str(self.folder))
+        if not finished:
+            return [f"lidardesign learn {self.config.task_name} --out {run} --resume"]
+        scored = [entry for entry in designs if entry["score"] is not None]
+        if not scored:
+            return [f"lidardesign evaluate {run} --report report.html" if designs else f"lidardesign fit {run}"]
+        best = (min if self.metric.better == "lower" else max)(scored, key=lambda entry: entry["score"]["value"])
+        unscored = [entry for entry in designs if entry["score"] is None and "error" not in entry]
+        return [
+            *([f"lidardesign evaluate {run} --report report.html"] if unscored else []),
+            f"lidardesign show {quote(best['path'])}",
+            f"lidardesign constrain {run} --set gate.width_m.max=0.1 --name narrow",
+            f"lidardesign export {quote(best['path'])} --format csv --out rays.csv",
+        ]
+
     def evaluate(
         self,
         designs: Sequence[Design | Path | str] | None = None,
@@ -228,6 +280,19 @@ class Run(RunFolder):
             ("designs", ", ".join(path.stem for path in self.design_paths()) or "none"),
         ]
         return html_table(f"run {self.folder}", (), rows)
+
+
+def _design_entry(path: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """A design of a run and its last score; one that cannot be read says why."""
+    from lidardesign.evaluate.last_scores import last_score
+
+    entry: dict[str, Any] = {"name": path.stem, "path": str(path), "score": None}
+    try:
+        design, score = read_design(path), last_score(manifest, path)
+    except LidardesignError as error:
+        return {**entry, "error": error.message}
+    shape = {"sensors": len(design.sensors), "rays": design.rays, "layout": design.layout}
+    return {**entry, **shape, "score": None if score is None else asdict(score)}
 
 
 def open_run(folder: Path | str) -> Run:

@@ -10,7 +10,7 @@ from support.command_line import files_under, make_run
 from support.plugins import GOOD, install_plugins
 
 from lidardesign.errors import DataError
-from lidardesign.run.manifest import read_manifest, verify
+from lidardesign.run.manifest import note, read_manifest, verify
 from lidardesign.workflow import learn as learn_module
 
 TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverage_proposals=256", "hidden=4")
@@ -149,3 +149,79 @@ def test_a_run_whose_plugin_is_gone_names_the_package(lidardesign, tmp_path, mon
     result = lidardesign("fit", "run")
     assert "run: the task 'ball' of this run is not installed; it came with the package balls 1.0" in result.err
     assert "try: pip install balls==1.0\n" in result.err
+
+
+FIGURES = {"ess": 0.8, "kl_nats": 0.1, "log_z": -2.0, "coverage": 0.99, "misplaced": 0.1}
+
+
+@pytest.fixture
+def finished(flat):
+    note(flat, learn={**FIGURES, "seconds": 33.0, "steps": 350})
+    return flat
+
+
+def follow(lidardesign, shown):
+    """Whether every command that is named as next can be done: planned, or else done."""
+    lines = shown[shown.index("next:\n") :].splitlines()[1:]
+    assert lines
+    for line in lines:
+        words = shlex.split(line)[1:]
+        result = lidardesign(*words, *([] if words[0] == "show" else ["--dry-run"]))
+        assert result.code == 0, (line, result.err)
+    return [shlex.split(line)[1] for line in lines]
+
+
+def test_a_run_that_is_not_finished_is_gone_on_with(lidardesign, flat):
+    shown = lidardesign("show", flat)
+    assert (shown.code, "learning was not finished" in shown.out) == (0, True)
+    assert follow(lidardesign, shown.out) == ["learn"]
+
+
+def test_a_run_says_what_it_has_and_what_can_be_done_next(lidardesign, finished):
+    shown = lidardesign("show", finished).out
+    assert "the density is good: 10 % misplaced, KL 0.1 nats, ESS 0.8" in shown
+    assert "no designs yet" in shown
+    assert follow(lidardesign, shown) == ["fit"]
+    lidardesign("fit", finished, "--layout", "grid", "--sensors", 1)
+    shown = lidardesign("show", finished).out
+    assert "no scores are kept yet" in shown
+    assert follow(lidardesign, shown) == ["evaluate"]
+    scores = lidardesign("evaluate", finished, "--rays", 9, "--json").json
+    shown = lidardesign("show", finished).out
+    assert follow(lidardesign, shown) == ["show", "constrain", "export"]
+    (row,) = [row for row in scores["rows"] if row["design"] == "fit"]
+    rival = scores["strongest_rival"]["name"]
+    (pair,) = [pair for pair in scores["paired"] if (pair["a"], pair["b"]) == ("fit", rival)]
+    (design,) = lidardesign("show", finished, "--json").json["designs"]
+    kept = design["score"]
+    assert (design["name"], design["sensors"], kept["rays"], kept["rival"]) == ("fit", 1, 9, rival)
+    assert {name: kept[name] for name in ("value", "ci_low", "ci_high")} == {
+        name: row[name] for name in ("value", "ci_low", "ci_high")
+    }
+    assert kept["difference"] == pair["difference"]
+    assert f"to {rival}" in shown
+
+
+def test_a_score_is_of_the_design_as_it_was_scored(lidardesign, finished):
+    lidardesign("fit", finished, "--layout", "grid", "--sensors", 1)
+    lidardesign("evaluate", finished, "--rays", 9, "--quiet")
+    assert lidardesign("show", finished, "--json").json["designs"][0]["score"] is not None
+    lidardesign("fit", finished, "--layout", "grid", "--sensors", 2)
+    assert lidardesign("show", finished, "--json").json["designs"][0]["score"] is None
+
+
+def test_a_rough_density_says_what_would_make_it_better(lidardesign, finished):
+    note(finished, learn={"misplaced": 0.6})
+    assert "the density is poor" in (shown := lidardesign("show", finished).out)
+    assert "--preset standard learns longer" in shown
+
+
+def test_what_cannot_be_read_is_said_beside_what_can(lidardesign, finished):
+    lidardesign("fit", finished, "--layout", "grid", "--sensors", 1)
+    (finished / "designs" / "cut.yaml").write_text("name: [")
+    shown = lidardesign("show", finished)
+    assert shown.code == 0
+    assert "cut cannot be read: " in shown.out
+    note(finished, scores={"fit": {"value": "many"}})
+    assert "no scores are kept yet" in lidardesign("show", finished).out
+    assert lidardesign("show", finished, "--at", "x_m=1").code == 2

@@ -258,7 +258,7 @@ def evaluate(
 
         with ExitStack() as rest:  # the scores are shown whatever becomes of the files and of what is measured further
             rest.callback(show_result)
-            rest.callback(keep_times, request.run.folder, "evaluate", output)
+            rest.callback(keep_times, request.run.folder, "evaluate", output, further=scores.last_scores())
             # accuracy takes minutes: what was scored by then is written already
             _write_files(scores, written, *(None if accuracy and is_output(path) else path for path in files.values()))
             if accuracy:

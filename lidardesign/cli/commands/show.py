@@ -1,17 +1,18 @@
-"""`lidardesign show` and `compare`: a design for people, and two designs beside each other."""
+"""`lidardesign show` and `compare`: a run or a design for people, and two designs beside each other."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import command
+from lidardesign.cli.output import Output, command
 from lidardesign.cli.tables.designs import show_constraints, show_design
-from lidardesign.cli.tables.grids import RichConsole, interval_text, number, print_table
-from lidardesign.errors import LidardesignError
+from lidardesign.cli.tables.grids import RichConsole, duration, interval_text, number, print_table
+from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
@@ -20,7 +21,10 @@ if TYPE_CHECKING:
 
 def show(
     design: Annotated[
-        Path, typer.Argument(metavar="DESIGN", readable=False, help="A design file, or the file of a rig.")
+        Path,
+        typer.Argument(
+            metavar="RUN|DESIGN", readable=False, help="A run folder, a design file, or the file of a rig."
+        ),
     ],
     at: options.At = None,
     space_of: options.SpaceOf = None,
@@ -29,8 +33,10 @@ def show(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """Print a design for people (or, with --json, for scripts): its sensors, rays, bandwidth and constraints."""
+    """Show what a run has and what can be done next, or a design: its sensors, rays, bandwidth and constraints."""
     with command(json=json, quiet=quiet, debug=debug) as output:
+        if design.is_dir():
+            return _show_run(design, {"--at": at, "--in": space_of}, output)
         with phase("libraries"):
             from lidardesign.design.compare import outside_notes, readout_of
             from lidardesign.design.constraints.check import check_design
@@ -82,6 +88,58 @@ def show(
         output.result(document, show_all, show_costs=False)
 
 
+def _show_run(folder: Path, given: Mapping[str, Any], output: Output) -> None:
+    with phase("libraries"):
+        from lidardesign.workflow.runs import open_run
+
+    for option in (option for option, value in given.items() if value):
+        raise ConfigError("is for a design", where=option, hint="give a design of the run, or leave it out")
+    document = open_run(folder).summary()
+    output.result(document, lambda rich: _show_summary(document, rich), show_costs=False)
+
+
+def _show_summary(document: dict[str, Any], rich: RichConsole) -> None:
+    quality, designs, metric = document["quality"], document["designs"], document["metric"]
+    rich.print("run: {run}\ntask {task}, preset {preset}, seed {seed}".format_map(document), soft_wrap=True)
+    if quality is None:
+        rich.print("learning was not finished")
+    else:
+        misplaced, kl, ess = 100 * quality["misplaced"], quality["kl_nats"], quality["ess"]
+        rich.print(
+            f"learned in {duration(document['seconds'])} ({document['steps']} steps); the density is "
+            f"{document['verdict']}: {misplaced:.2g} % misplaced, KL {kl:.2g} nats, ESS {ess:.2f}",
+            soft_wrap=True,
+        )
+        if document["advice"] is not None:
+            rich.print(document["advice"], soft_wrap=True)
+    fine = [entry for entry in designs if "error" not in entry]
+    scored = any(entry["score"] for entry in fine)
+    if fine:
+        title = f"{metric['name']} [{metric['unit']}] the last time, {metric['better']} is better"
+        columns = DESIGN_COLUMNS + VALUE_COLUMNS * scored
+        rows = [_design_row(entry)[: len(columns)] for entry in fine]
+        print_table(title if scored else None, columns, rows, rich, text=("design", "layout"))
+    for entry in (entry for entry in designs if "error" in entry):
+        rich.print(f"{entry['name']} cannot be read: {entry['error']}", soft_wrap=True)
+    if quality is not None and not scored:
+        rich.print("no scores are kept yet" if fine else "no designs yet")
+    rich.print("\n".join(["next:", *(f"  {line}" for line in document["next"])]), soft_wrap=True)
+
+
+def _design_row(entry: dict[str, Any]) -> list[str]:
+    """A design and its last score; dashes where none is kept."""
+    shape, score = [entry["name"], entry["layout"], number(entry["sensors"])], entry["score"]
+    if score is None:
+        return [*shape, number(entry["rays"]), "-", "-", "-"]
+    difference = "-"
+    if score["rival"] is not None:
+        ends = {"ci_low": score["difference_low"], "ci_high": score["difference_high"]}
+        difference = f"{score['difference']:+.3g} ({interval_text(ends, ' to ', 3)}) to {score['rival']}"
+    under = [*score["settings"], *([score["detector"]] if score["detector"] != IDEAL else [])]
+    value = [number(score["rays"]), number(score["value"], 3), interval_text(score, digits=3)]
+    return [*shape, *value, ", ".join([difference, *under])]
+
+
 def _show_readout(readout: BandwidthUse, rich: RichConsole) -> None:
     model, low, high = readout.model, number(readout.low_mbps), number(readout.high_mbps)
     span = low if low == high else f"{low} .. {high}"
@@ -90,6 +148,8 @@ def _show_readout(readout: BandwidthUse, rich: RichConsole) -> None:
     rich.print(f"bandwidth: {span} Mbit/s for {rays}\n{bins}", soft_wrap=True)
 
 
+DESIGN_COLUMNS, VALUE_COLUMNS = ("design", "layout", "sensors", "rays"), ("value", "95 % interval", "difference")
+IDEAL = "ideal"
 # What rounding leaves of no difference is none.
 DECIMALS = 6
 SCORE_COLUMNS = ("design", "rays", "value", "95 % interval", "failures", "Mbit/s")
