@@ -186,8 +186,8 @@ def counted(found: Mapping[str, Any], name: str) -> str:
     )
 
 
-def page_table(found: Mapping[str, Any]) -> str:
-    """One row per design or rival: its scores, its bandwidth, and what `fit` is worth beside it in the middle."""
+def page_tables(found: Mapping[str, Any]) -> list[str]:
+    """Scores at each number of rays, and in the middle what the first design is worth beside the others."""
     rows = {(row["design"], row["rays"]): row for row in found["rows"]}
     counts = sorted({count for _, count in rows})
     middle = counts[(len(counts) - 1) // 2]
@@ -196,17 +196,16 @@ def page_table(found: Mapping[str, Any]) -> str:
     same = [row for row in found["equal_bandwidth"] if (row["matched_to"], row["matched_rays"]) == (ours, middle)]
     matched = {row["design"]: row["value"] for row in same}
     paired = {p["b"]: p for p in found["paired_equal_bandwidth"] if (p["a"], p["rays"]) == (ours, middle)}
-    lines = []
+    scores, differences = [], []
     for name in dict.fromkeys(row["design"] for row in found["rows"]):
         values = [rows[name, count]["value"] for count in counts]
-        against = told(pairs.get(name), rows[name, middle]["value"], better)
-        in_its_bandwidth = told(paired.get(name), matched[name], better) if name in matched else ""
-        lines.append([f"`{name}`", *values, rows[name, middle]["bandwidth_mbps"], against, in_its_bandwidth])
-    columns = [
-        found["metric"]["unit"], *(f"{count} rays" for count in counts), f"Mbit/s at {middle}",
-        f"{ours} against it at {middle} rays, %", "in the same bandwidth, %",
-    ]  # fmt: skip
-    return table(columns, lines)
+        scores.append([f"`{name}`", *values, rows[name, middle]["bandwidth_mbps"]])
+        if name in pairs:
+            at_its_bandwidth = told(paired.get(name), matched.get(name, 0.0), better)
+            differences.append([f"`{name}`", told(pairs[name], values[counts.index(middle)], better), at_its_bandwidth])
+    columns = [found["metric"]["unit"], *(f"{count} rays" for count in counts), f"Mbit/s at {middle}"]
+    against = [f"`{ours}` against", f"at {middle} rays, %", "in the same bandwidth, %"]
+    return [table(columns, scores), table(against, differences)]
 
 
 def tables_of(title: str, found: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[object]]]]:
@@ -283,7 +282,7 @@ def write_page(page: Path, everything: Mapping[str, dict[str, Any]]) -> None:
         metric = f"{found['metric']['name']} in {found['metric']['unit']}"
         said = f"{metric[:1].upper()}{metric[1:]} on {found['scenes']} held-out scenes. {found['where']}"
         lines = [textwrap.fill(f"- {counted(found, name)}", 120, subsequent_indent="  ") for name in ours_of(found)]
-        filled = "\n\n".join([textwrap.fill(said, 120), page_table(found), "\n".join(lines)])
+        filled = "\n\n".join([textwrap.fill(said, 120), *page_tables(found), "\n".join(lines)])
         text = f"{parts[0]}{mark}\n\n{filled}\n\n{mark}{parts[2]}"
     page.write_text(text, encoding="utf-8")
 
