@@ -23,7 +23,7 @@ from common import fitted, installed, learned, parser, report, run_options, with
 DESIGNS = 20
 WIDTHS = {"1440": (1440, 900), "390": (390, 844)}
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-DRAWN = "document.documentElement.dataset.drawn === 'yes'"
+DRAWN = "html[data-drawn]"
 WAIT_MS = 300_000
 MEGABYTE = 1e6
 LIMIT_MB, LIMIT_S = 8.0, 3.0
@@ -57,7 +57,7 @@ def timed(browser: Any, page: Path, size: tuple[int, int], rounds: int) -> list[
     for _ in range(rounds):
         opened = browser.new_page(viewport={"width": size[0], "height": size[1]})
         opened.goto(page.absolute().as_uri(), wait_until="commit", timeout=WAIT_MS)
-        opened.wait_for_function(DRAWN, timeout=WAIT_MS)
+        opened.wait_for_selector(DRAWN, state="attached", timeout=WAIT_MS)
         marks = opened.evaluate(
             "Object.fromEntries(performance.getEntriesByType('mark').map(m => [m.name, m.startTime]))"
         )

@@ -59,6 +59,7 @@ from lidardesign.evaluate.report.view import (
     view_notes,
 )
 from lidardesign.evaluate.results import Evaluation, leading_detail, verdict
+from lidardesign.evaluate.rivals import StrongestRival
 from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.task import Metric
@@ -233,11 +234,15 @@ def test_a_verdict_needs_an_interval_that_excludes_zero_and_the_metrics_directio
     assert [verdict(higher, pair) for pair in higher.paired] == ["worse", "open"]
 
 
-@each_row(("better", "far"), [("lower", {"awful"}), ("higher", set())])
-def test_rivals_are_hidden_at_first_where_they_are_far_worse_than_all_designs(better, far):
+@each_row(
+    ("better", "strongest", "far"),
+    [("lower", "close", {"awful"}), ("lower", "awful", set()), ("higher", "close", set())],
+)
+def test_rivals_are_hidden_at_first_where_they_are_far_worse_than_all_designs(better, strongest, far):
     rows = [make_row("d", 9, 10.0), make_row("close", 9, 14.0, True), make_row("awful", 9, 90.0, True)]
     metric = Metric("score", "mm", better, worst=200.0, tolerance=0.1)
-    assert far_rivals(Evaluation(metric, 1, rows, [])) == far
+    rival = StrongestRival(strongest, 9, 20, {})
+    assert far_rivals(Evaluation(metric, 1, rows, [], strongest_rival=rival)) == far
 
 
 EGG = Ellipsoid((0.1, 0.2, 0.3))

@@ -64,13 +64,14 @@ FAR_SHARE = 0.5  # of the designs' scores: rivals that are worse by more at some
 
 def far_rivals(evaluation: Evaluation) -> set[str]:
     """Rivals so much worse than all designs that a plot of both would show little of the designs."""
-    ends = [end for row in evaluation.rows if not row.baseline for end in row.drawn_interval]
-    if not ends:
+    sign, rival = (1.0 if evaluation.metric.better == "lower" else -1.0), evaluation.strongest_rival
+    values = [sign * row.value for row in evaluation.rows if not row.baseline]
+    if not values:
         return set()
-    reach = FAR_SHARE * max(max(ends) - min(ends), abs(max(ends) + min(ends)) / 2)
-    sign = 1.0 if evaluation.metric.better == "lower" else -1.0
-    limit = max(sign * end for end in ends) + reach
-    return {row.design for row in evaluation.rows if row.baseline and sign * row.value > limit}
+    low, high = min(values), max(values)
+    limit = high + FAR_SHARE * max(high - low, abs(high + low) / 2)
+    far = {row.design for row in evaluation.rows if row.baseline and sign * row.value > limit}
+    return far - {rival.name if rival is not None else ""}
 
 
 def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[str] = ()) -> dict[str, Any]:
@@ -79,6 +80,7 @@ def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[st
     across, up = axis_titles(evaluation, against)
     rows = [row for curve in curves for row in curve.rows]
     places = [position(row, against) for row in rows]
+    ends = [end for curve in curves if curve.name not in hidden for row in curve.rows for end in row.drawn_interval]
     ticks = {"tickvals": sorted(set(places))} if against == "rays" else {}
     axis = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside"}
     layout = {
@@ -89,7 +91,7 @@ def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[st
         "xaxis": {**axis, **_scale(places), **ticks, "tickformat": "~g", "title": {"text": across}},
         "yaxis": {
             **axis,
-            **_scale([row.value for row in rows]),
+            **_scale([row.value for row in rows], ends),
             "tickformat": "~g",
             "automargin": True,
             "title": {"text": html.escape(up).replace(", ", "<br>"), "font": {"size": 13}},
@@ -103,8 +105,12 @@ def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[st
     return {"data": traces, "layout": layout}
 
 
-def _scale(values: Sequence[float]) -> dict[str, Any]:
-    return {"type": "log", "tickvals": log_ticks(values)} if logarithmic(values) else {"type": "linear"}
+def _scale(values: Sequence[float], shown: Sequence[float] = ()) -> dict[str, Any]:
+    """The scale of an axis that holds some values; as many ticks as are needed among those that are shown at first."""
+    if not logarithmic(values):
+        return {"type": "linear"}
+    positive = [value for value in shown if value > 0]
+    return {"type": "log", "tickvals": sorted({*log_ticks(values), *(log_ticks(positive) if positive else ())})}
 
 
 def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:

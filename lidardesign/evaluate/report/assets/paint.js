@@ -3,7 +3,7 @@
 // they may hide. It needs no WebGL: it stands as soon as the page is read, and is the same on every machine.
 
 const LENS = 1.6; // focal length over the larger side of the picture
-const LABELS_PX = 44; // round the first view, for the axes' labels
+const LABELS_PX = 42; // round the first view, for the axes' labels
 const NEAR = 0.02; // of the first distance: what is closer to the eye is not drawn
 const SLACK = 0.004; // of the first distance: what lies on a surface is not hidden by it
 const PIECE_PX = 4; // lines are hidden in pieces of this length
@@ -262,8 +262,13 @@ function paintBox(pen, [low, high], lens, scale) {
     if (!inFront(edge(low[axis]), edge(high[axis]))) return [];
     const [center, half] = [lens.seen(...middle), lens.seen(...edge(middle[axis]))];
     const away = [half[0] - center[0], half[1] - center[1]].map((value, _, both) => value / (Math.hypot(...both) || 1));
+    // text is wider than high
+    const beside = Math.abs(away[0]);
     const label = (text, value, gap) => lens.seen(...edge(value)).slice(0, 2).map((place, k) => place + gap * scale * away[k]).concat([text]);
-    return [...ticks[axis].map((tick) => label(String(tick), tick, 13)), label(`${"xyz"[axis]} [m]`, middle[axis], axis === 2 ? 42 : 31)];
+    const [x, y] = lens.seen(...edge(high[axis]));
+    // that of z stands on its axis, where there is always room
+    const title = axis === 2 ? [x, y - 14 * scale, "z [m]"] : label(`${"xy"[axis]} [m]`, middle[axis], 28 + 22 * beside);
+    return [...ticks[axis].map((tick) => label(String(tick), tick, 11 + 6 * beside)), title];
   });
 }
 
