@@ -11,25 +11,24 @@ from lidardesign.errors import ThresholdError
 from lidardesign.evaluate.results import Evaluation, Paired, Row, verdict
 
 
-def difference_text(pair: Paired, better: str, unit: str, rays: str = "") -> str:
+def difference_text(pair: Paired, better: str, unit: str) -> str:
     """A difference as a sentence: who is better by how much, or that no difference was found.
 
     Arguments:
         pair: The difference.
         better: Of the metric, `lower` or `higher`.
         unit: The metric's.
-        rays: Where it was found, as "with 361 rays".
     """
-    gained = -pair.difference if better == "lower" else pair.difference
-    word, by = "better" if gained > 0 else "worse", f"{abs(gained):.3g} {unit}".rstrip()
-    where = f" {rays}" if rays else ""
-    none = f"no difference between {pair.a} and {pair.b} was found{where}"
-    if pair.ci_low is None or pair.ci_high is None:
-        return f"{none} ({by} {word}, without an interval)"
     sign = 1.0 if pair.difference > 0 else -1.0
+    word = "better" if (sign < 0) == (better == "lower") else "worse"
+    by = f"{abs(pair.difference):.3g} {unit}".rstrip()
+    rays = f"at {pair.rays} rays" if pair.rays_b in (None, pair.rays) else f"at {pair.rays} and {pair.rays_b} rays"
+    none = f"no difference between {pair.a} and {pair.b} was found {rays}"
+    if pair.ci_low is None or pair.ci_high is None:
+        return f"{none} ({by} {word})"
     low, high = sorted((sign * pair.ci_low, sign * pair.ci_high))
     if low > 0:
-        return f"{pair.a} is {word} than {pair.b}{where} by {by} ({low:.3g} to {high:.3g})"
+        return f"{pair.a} is {word} than {pair.b} by {by} ({low:.3g} to {high:.3g}) {rays}"
     return f"{none} ({by} {word}, {low:.3g} to {high:.3g})"
 
 
@@ -52,7 +51,7 @@ def check_limit(evaluation: Evaluation, limit: float) -> None:
     missed, unit = worse_than_threshold(evaluation, limit), evaluation.metric.unit
     if missed:
         bound = "at most" if evaluation.metric.better == "lower" else "at least"
-        rows = ", ".join(f"{row.design} with {row.rays} rays: {row.value:.4g} {unit}" for row in missed)
+        rows = ", ".join(f"{row.design} at {row.rays} rays: {row.value:.4g} {unit}" for row in missed)
         raise ThresholdError(rows, where="--fail-above", allowed=f"{bound} {limit:g} {unit}")
 
 
@@ -74,11 +73,10 @@ def check_better(evaluation: Evaluation, name: str) -> None:
         pair = pairs.get((row.design, row.rays))
         if row.baseline or row.design == name or (pair is not None and verdict(evaluation, pair) == "better"):
             continue
-        rays = f"with {row.rays} rays"
         missed.append(
-            f"{name} has no score {rays} to compare {row.design} with"
+            f"{name} has no score at {row.rays} rays to compare {row.design} with"
             if pair is None
-            else difference_text(pair, metric.better, metric.unit, rays)
+            else difference_text(pair, metric.better, metric.unit)
         )
     if missed:
         raise ThresholdError(
@@ -102,7 +100,7 @@ def check_audit(evaluation: Evaluation) -> None:
     """
     audit = evaluation.audit
     if audit is not None and audit.failed:
-        rows = ", ".join(f"{row.design} with {row.rays} rays by {abs(row.difference):.4g}" for row in audit.failed)
+        rows = ", ".join(f"{row.design} at {row.rays} rays by {abs(row.difference):.4g}" for row in audit.failed)
         there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
         raise ThresholdError(
             f"skipped effects move {rows} {audit.unit}",

@@ -128,8 +128,8 @@ def test_evaluate_fails_unless_designs_are_better_than_a_rival(lidardesign, flat
     assert found["s2"].code == int(not pair["ci_high"] < 0)
     for rival, other in (("s1", "s2"), ("s2", "s1")):
         if found[rival].code:
-            assert f"{other} and {rival} was found with 16 rays" in found[rival].err or (
-                f"{other} is worse than {rival} with 16 rays by" in found[rival].err
+            assert f"{other} and {rival} was found at 16 rays" in found[rival].err or (
+                f"{other} is worse than {rival} by" in found[rival].err
             )
     # a baseline that is not always there stands beside the designs then
     scores = package.open_run(flat).evaluate(both[1:], rays=[16], settings={"test": 10}, fail_unless_better="lloyd")

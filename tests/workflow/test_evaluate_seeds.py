@@ -54,7 +54,7 @@ def test_designs_of_one_name_are_one_row_over_seeds_and_scenes(lidardesign, runs
 
 
 def test_people_see_every_seed(lidardesign, runs):
-    result = lidardesign("evaluate", *runs, *SMALL)
+    result = lidardesign("evaluate", *runs, *SMALL, "-v")
     assert "over 5 held-out scenes and 3 seeds, test=5" in " ".join(result.out.split())
     assert "value of each seed" in result.out
     assert "seed 3" in result.out

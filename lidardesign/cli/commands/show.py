@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 def show(
     design: Annotated[
         Path,
-        typer.Argument(
-            metavar="RUN|DESIGN", readable=False, help="A run folder, a design file, or the file of a rig."
-        ),
+        typer.Argument(metavar="RUN|DESIGN", readable=False, help="A run folder, a design file, or the file of a rig."),
     ],
     at: options.At = None,
     space_of: options.SpaceOf = None,
@@ -178,15 +176,17 @@ def compare(
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
     debug: options.Debug = False,
 ) -> None:
     """Compare two designs: what differs in their sensors, and in their scores on held-out scenes of a run."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
         with phase("libraries"):
             from lidardesign.workflow.compare import compare_designs
 
         document = compare_designs((first, second), space_of, rays, seed, output.remark)
-        output.result(document, lambda rich: _show(document, rich))
+        show = _show_verdicts if output.quiet else _show
+        output.result(document, lambda rich: show(document, rich))
 
 
 def _show(document: dict[str, Any], rich: RichConsole) -> None:
@@ -195,35 +195,44 @@ def _show(document: dict[str, Any], rich: RichConsole) -> None:
         cost = design["bandwidth"]
         rays = "rays left open" if cost["rays"] is None else f"{cost['rays']} rays, {number(cost['high_mbps'])} Mbit/s"
         rich.print(f"{place}: {design['name']}, {sensors}, layout {design['layout']}, {rays}", soft_wrap=True)
-    lines = []
-    for pair in document["sensors"]:
-        apart, cells = pair["difference"], ["-"] * len(SENSOR_COLUMNS[2:])
-        if apart is not None:
-            cells = [
-                *(number(round(apart[name], DECIMALS), 3) for name in ("place_m", "boresight_deg")),
-                f"{_signed(apart['horizontal_deg'])} x {_signed(apart['vertical_deg'])}",
-                *(_signed(apart[name], 3) for name in ("gate_start_m", "gate_end_m", "weight")),
-            ]
-        lines.append([pair["a"] or "-", pair["b"] or "-", *cells])
+    lines = [
+        [
+            pair["a"],
+            pair["b"],
+            *(number(round(apart[name], DECIMALS), 3) for name in ("place_m", "boresight_deg")),
+            f"{_signed(apart['horizontal_deg'])} x {_signed(apart['vertical_deg'])}",
+            *(_signed(apart[name], 3) for name in ("gate_start_m", "gate_end_m", "weight")),
+        ]
+        for pair in document["sensors"]
+        if (apart := pair["difference"]) is not None
+    ]
     print_table("sensors: second minus first", SENSOR_COLUMNS, lines, rich, text=SENSOR_COLUMNS[:2])
+    for place, key, other in (("first", "a", "b"), ("second", "b", "a")):
+        alone = [pair[key] for pair in document["sensors"] if pair[other] is None]
+        if alone:
+            rich.print(f"only in the {place}: {', '.join(alone)}", soft_wrap=True)
     metric = document["metric"]
     if metric is None:
         return
     title = (
-        f"{metric['name']} [{metric['unit']}], {metric['better']} is better, over {document['scenes']} held-out scenes"
+        f"{metric['name']} [{metric['unit']}] on {document['scenes']} held-out scenes ({metric['better']} is better)"
     )
     rows = [
         [
             row["design"],
-            *(number(row[name]) for name in ("rays", "value")),
-            interval_text(row),
-            *(number(row[name]) for name in ("failures", "bandwidth_mbps")),
+            *(number(row[name], 3) for name in ("rays", "value")),
+            interval_text(row, digits=3),
+            *(number(row[name], 3) for name in ("failures", "bandwidth_mbps")),
         ]
         for row in document["rows"]
     ]
     print_table(title, SCORE_COLUMNS, rows, rich)
+    _show_verdicts(document, rich)
+
+
+def _show_verdicts(document: dict[str, Any], rich: RichConsole) -> None:
     for pair in document["paired"]:
-        rich.print(_verdict(pair, metric), soft_wrap=True)
+        rich.print(_verdict(pair, document["metric"]), soft_wrap=True)
 
 
 def _signed(value: float, decimals: int = 2) -> str:
@@ -235,5 +244,4 @@ def _verdict(pair: dict[str, Any], metric: dict[str, Any]) -> str:
     from lidardesign.evaluate.results import Paired
 
     found = Paired(**{name: value for name, value in pair.items() if name != "half_width"})
-    numbers = f"{found.rays}" if found.rays_b in (None, found.rays) else f"{found.rays} and {found.rays_b}"
-    return difference_text(found, metric["better"], metric["unit"], f"with {numbers} rays")
+    return difference_text(found, metric["better"], metric["unit"])

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from lidardesign.design.layouts.rays import certificates_of
 from lidardesign.design.sensor import DesignSpec
+from lidardesign.evaluate.gates import difference_text
 from lidardesign.evaluate.report.markup import folded, paragraphs
 from lidardesign.evaluate.report.tables import counted, held_out_scenes, interval, table
 from lidardesign.evaluate.results import Evaluation, Paired, Row, verdict
@@ -59,16 +60,8 @@ def headline_pairs(evaluation: Evaluation) -> dict[str, Paired]:
 
 def headline(evaluation: Evaluation, pair: Paired) -> str:
     """A pair in a sentence: who is better and by how much, or that no difference was found."""
-    word, unit = verdict(evaluation, pair), evaluation.metric.unit
-    size, ends = f"{_digits(abs(pair.difference))} {unit}", [pair.ci_low, pair.ci_high]
-    known = [end for end in ends if end is not None]
-    if word != "open":
-        low, high = sorted(map(abs, known))
-        return f"{pair.a} is {word} than {pair.b} by {size} ({_digits(low)} to {_digits(high)}) at {pair.rays} rays."
-    lower = evaluation.metric.better == "lower"
-    side = "better" if (pair.difference < 0) == lower else "worse"
-    between = f", {_digits(known[0])} to {_digits(known[1])}" if known else ""
-    return f"No difference between {pair.a} and {pair.b} was found at {pair.rays} rays ({size} {side}{between})."
+    text = difference_text(pair, evaluation.metric.better, evaluation.metric.unit)
+    return f"{text.replace('no difference', 'No difference', 1) if text.startswith('no difference') else text}."
 
 
 def _table(evaluation: Evaluation, rows: dict[str, Row], pairs: dict[str, Paired]) -> str:
