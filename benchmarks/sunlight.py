@@ -155,7 +155,7 @@ def main() -> None:
 def measure(run_folder: Path, options: Any) -> None:
     """Fit, simulate and print."""
     from lidardesign import open_run
-    from lidardesign.evaluate.score import entries_of
+    from lidardesign.evaluate.entries import entries_of
 
     run = open_run(run_folder)
     designs = [fitted(run_folder, f"sunlight-{n}", sensors=n, layout="grid").specification for n in options.sensors]

@@ -47,7 +47,7 @@ def choices_look_at_few_scenes():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lidardesign.selection.information.FEW_SCENES", 5)
         patch.setattr("lidardesign.selection.information.MOST_SCENES", 10)
-        patch.setattr("lidardesign.evaluate.score.USUAL_SCENES", 10)
+        patch.setattr("lidardesign.evaluate.entries.USUAL_SCENES", 10)
         patch.setattr("lidardesign.workflow.fit.COUNTS", (1, 2))
         yield
 

@@ -7,13 +7,13 @@ is found on scenes that no rival's rays were chosen on.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from lidardesign.evaluate.baselines.candidates import RaysPerCondition
+from lidardesign.evaluate.entries import Entry
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scene_scores import score_here
 from lidardesign.run.clock import phase
@@ -52,25 +52,25 @@ class StrongestRival:
 
 
 @phase("strongest rival")
-def strongest_rival(
-    request: EvaluationRequest, rivals: Mapping[str, Callable[[int], RaysPerCondition]], rays: int, fired: int
-) -> StrongestRival | None:
+def strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: int) -> StrongestRival | None:
     """The best of all baselines at a number of rays, under the effects of the evaluation; None without baselines.
 
     Arguments:
         request: The evaluation.
-        rivals: By name the rays that each baseline fires in a scene.
-        rays: Their number.
-        fired: All rays that the evaluation fires, over its rows and scenes.
+        entries: All its rows to be.
+        rays: The number of rays.
     """
+    rivals = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
     if not rivals or not request.train:
         return None
+    fired = sum(entry.rays for entry in entries) * len(request.test)
     affordable = int(LARGEST_SHARE * fired / (rays * len(rivals)))
     scenes = held_back_scenes(request, min(max(affordable, FEWEST_SCENES), MOST_SCENES))
-    scene_pass = request.scene_pass(lambda number: [drawn(number) for drawn in rivals.values()], request.planner)
+    scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in rivals], request.planner)
     found = score_here(replace(scene_pass, scenes=scenes), None)
     means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
-    return StrongestRival.best_of(dict(zip(rivals, means, strict=True)), request.metric.better, rays, len(scenes))
+    values = dict(zip((entry.name for entry in rivals), means, strict=True))
+    return StrongestRival.best_of(values, request.metric.better, rays, len(scenes))
 
 
 def held_back_scenes(request: EvaluationRequest, count: int) -> list[Scene]:

@@ -9,39 +9,24 @@ same rays are scored once. All rows of a scene meet the same effects: those that
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.compare import outside_notes
-from lidardesign.design.layouts.rays import gates_of, layout_of
-from lidardesign.design.layouts.track import travels
-from lidardesign.design.sensor import CERTIFICATES, DesignSpec
-from lidardesign.errors import BackgroundNote, ConfigError
-from lidardesign.evaluate.baselines.candidates import Candidate, RaysPerCondition, mean_mbps
+from lidardesign.errors import BackgroundNote
+from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.baselines.catalog import part_notes
-from lidardesign.evaluate.baselines.greedy import GREEDY, USUAL_SCENES, Fired, GreedyCandidate, greedy_rays
-from lidardesign.evaluate.baselines.simple import CMA, Baselines, Option, TwinCandidate
-from lidardesign.evaluate.baselines.views import TrainingViews
-from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
-from lidardesign.evaluate.cma.search import TrainingObjective
+from lidardesign.evaluate.baselines.greedy import GREEDY, greedy_rays
 from lidardesign.evaluate.effects import effect_notes, effect_summaries
+from lidardesign.evaluate.entries import Entry, entries_of
 from lidardesign.evaluate.mounting import MountError
-from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out
-from lidardesign.evaluate.results import (
-    Audit,
-    Evaluation,
-    Mounting,
-    Paired,
-    Row,
-    audit_rows,
-    middle_rays,
-)
-from lidardesign.evaluate.rivals import StrongestRival, strongest_rival
+from lidardesign.evaluate.request import EvaluationRequest, left_out
+from lidardesign.evaluate.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
+from lidardesign.evaluate.rivals import strongest_rival
 from lidardesign.evaluate.scene_scores import Progress, silent_notes
 from lidardesign.evaluate.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.geometry.triangles import SecondCasts
@@ -49,210 +34,8 @@ from lidardesign.numerics import ROUNDING
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene, group_numbers
-from lidardesign.selection.candidates import CANDIDATES_PER_RAY
 from lidardesign.simulate.plan import EffectPlan, Planner
-from lidardesign.task import Metric, Score, conditions_of, notes_of
-
-# Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
-# at a fraction of the held-out scenes' cost.
-JUDGED_SCENES = 8
-
-
-@dataclass(frozen=True, eq=False)
-class Entry:
-    """One row to be.
-
-    Arguments:
-        name: The design's or baseline's.
-        positions: The rays per condition value.
-        baseline: Whether it is a baseline.
-        redraw: Rays of a scene, for what is drawn anew in each.
-        matched_to, matched_rays: The design and its number of rays whose bandwidth this baseline was given.
-        search: How a direct search found its rays.
-    """
-
-    name: str
-    positions: RaysPerCondition
-    baseline: bool
-    redraw: Callable[[int], RaysPerCondition] | None = None
-    matched_to: str | None = None
-    matched_rays: int | None = None
-    search: SearchRecord | None = None
-
-    @property
-    def rays(self) -> int:
-        """Rays per condition value."""
-        return len(self.positions[0])
-
-    def mbps(self, bandwidth: Bandwidth) -> float:
-        """What its rays cost to read out, averaged over condition values [Mbit/s]."""
-        return mean_mbps(self.positions, bandwidth)
-
-    def drawn(self, scene: int) -> RaysPerCondition:
-        """The rays that it fires in a held-out scene."""
-        return self.positions if self.redraw is None else self.redraw(scene)
-
-    @cached_property
-    def key(self) -> tuple[Any, ...]:
-        """Equal for entries that fire the same rays."""
-        if not self.baseline:
-            return ("design", self.name, self.rays)
-        arrays = (array for rays in self.positions for array in (rays.origin_m, rays.direction, rays.gate_m))
-        return (self.name, *(array.tobytes() for array in arrays))
-
-
-@phase("rays")
-def entries_of(request: EvaluationRequest) -> list[Entry]:
-    """All rows to be: designs at the numbers of rays that they can fire, baselines, then those at each one's bandwidth.
-
-    Raises:
-        ConfigError: No design can fire any of the numbers of rays, or a track ends before where it is evaluated.
-    """
-    conditions = _conditions(request)
-    _check_tracks(request, conditions)
-    counts = fired_numbers(request.designs, request.rays)
-    designs = [
-        Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
-        for design in request.designs
-        for count in counts
-        if can_fire(design, count)
-    ]
-    choosable = [] if request.greedy is None else greedy_rays(request.task, len(conditions), counts)[0]
-    baselines = Baselines(
-        request.space,
-        request.train,
-        request.seed,
-        partial(_judge, request),
-        conditions=conditions,
-        gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
-        without_visibility=partial(_twin, request, conditions) if request.without_visibility else None,
-        density=request.density,
-        optimised=partial(_optimised, request, conditions) if request.designs else None,
-        chosen=partial(_chosen, request, conditions, designs, max(choosable, default=0)),
-    )
-    wanted: list[tuple[str, list[Option], Entry | None]] = [
-        (name, baselines.options(name, count), None)
-        for name in request.baselines
-        for count in counts
-        if name != GREEDY or count in choosable
-    ]
-    if request.equal_bandwidth:
-        wanted += [
-            (name, baselines.options_within(name, entry.mbps(request.bandwidth), request.bandwidth), entry)
-            for entry in designs
-            for name in request.baselines
-            if name != CMA or entry.name == request.designs[0].name
-            if name != GREEDY or entry.rays in choosable
-        ]
-    chosen = baselines.best([(name, options) for name, options, _ in wanted])
-    return designs + [
-        _entry(baselines, name, option, matched) for (name, _, matched), option in zip(wanted, chosen, strict=True)
-    ]
-
-
-def has_gates_per_ray(design: DesignSpec) -> bool:
-    """Whether a design's rays have gates of their own, be it that each is a sensor."""
-    return gates_of(design) == "ray" or layout_of(design).one_sensor_per_ray
-
-
-def _check_tracks(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> None:
-    for design in request.designs:
-        if design.track is None:
-            continue
-        name, (first, last) = design.track.dimension, travels(design.track)
-        if any(name not in one for one in conditions):
-            raise ConfigError(
-                f"its rays follow {name}, which the task {request.task.name} does not have as a condition",
-                where=f"design {design.name}",
-                hint="fit a design at one value: lidardesign fit RUN --at",
-            )
-        beyond = [one[name] for one in conditions if not first <= one[name] <= last]
-        if beyond:
-            raise ConfigError(
-                f"its track goes from {name}={first:g} to {last:g}, but designs are evaluated at {beyond[0]:g} too",
-                where=f"design {design.name}",
-                hint="fit a track of the whole way: lidardesign fit RUN",
-            )
-
-
-def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | None) -> Entry:
-    candidate, count = option.candidate, len(option.positions[0])
-    return Entry(
-        name,
-        option.positions,
-        baseline=True,
-        redraw=partial(candidate.positions, baselines.spaces, count) if candidate.drawn_anew else None,
-        matched_to=None if matched is None else matched.name,
-        matched_rays=None if matched is None else matched.rays,
-        search=candidate.record_of(option.positions) if isinstance(candidate, CmaCandidate) else None,
-    )
-
-
-def _conditions(request: EvaluationRequest) -> list[dict[str, float]]:
-    with plugin_guard(request.task.name):
-        return conditions_of(request.task, request.config, request.space)
-
-
-def ordered_conditions(request: EvaluationRequest) -> list[dict[str, float]]:
-    """The condition values that are evaluated at, ascending; one empty entry without conditions."""
-    return sorted(_conditions(request), key=lambda condition: tuple(condition.values()))
-
-
-def _laid_out(
-    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], design: DesignSpec, count: int
-) -> RaysPerCondition:
-    samples = request.samples.get(design.name)
-    return tuple(request.lay_out(design, count, samples, at=condition) for condition in conditions)
-
-
-def _twin(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> Candidate:
-    return TwinCandidate(*request.without_visibility(), conditions, request.lay_out)
-
-
-def _optimised(
-    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], views: TrainingViews
-) -> Candidate:
-    return CmaCandidate(
-        followed=request.designs[0],
-        space=request.space,
-        conditions=conditions,
-        views=views,
-        objective=TrainingObjective(request.task, request.metric, request.train, request.planner, request.seed),
-        settings=request.cma,
-        seed=request.seed,
-    )
-
-
-def _chosen(
-    request: EvaluationRequest,
-    conditions: Sequence[Mapping[str, float]],
-    designs: Sequence[Entry],
-    most: int,
-    views: TrainingViews,
-) -> Candidate:
-    numbers = [one["scenes"] for design in request.designs for one in design.provenance.get(CERTIFICATES, ())]
-    return GreedyCandidate(
-        task=request.task,
-        views=views,
-        spaces=[request.space.at(condition) for condition in conditions],
-        source=request.greedy,
-        scenes=max(numbers, default=USUAL_SCENES),
-        gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
-        candidates=CANDIDATES_PER_RAY * most,
-        fired=[Fired(entry.rays, entry.mbps(request.bandwidth)) for entry in designs],
-        bandwidth=request.bandwidth,
-    )
-
-
-def _judge(request: EvaluationRequest, lists: Sequence[RaysPerCondition]) -> list[float]:
-    """The mean score of sets of rays on a few training scenes, turned so that lower is better."""
-    scenes = request.train[:JUDGED_SCENES]
-    objective = TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed)
-    if not objective.scenes:
-        return [0.0] * len(lists)
-    # one row per scene, whose rows are added one after the other
-    return np.array(objective.values(lists, range(len(objective.scenes))).T, order="C").mean(axis=0).tolist()
-
+from lidardesign.task import Metric, Score, notes_of
 
 # A second cast from beside also finds what a ray just passes: of rays in all directions, 2 in a million (measured).
 OUTLINE_SHARE = 1e-5
@@ -314,14 +97,8 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         audit=audit,
         mounting=mounting,
         searches=searches,
-        strongest_rival=_strongest_rival(request, entries, middle_rays(plain)),
+        strongest_rival=strongest_rival(request, entries, middle_rays(plain)),
     )
-
-
-def _strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: int) -> StrongestRival | None:
-    rivals = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
-    fired = sum(entry.rays for entry in entries) * len(request.test)
-    return strongest_rival(request, {entry.name: entry.drawn for entry in rivals}, rays, fired)
 
 
 def _part(progress: Progress | None, number: int, passes: int) -> Progress | None:

@@ -12,7 +12,8 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Coupling, DesignSpec, Sensor
 from lidardesign.errors import ConfigError, PluginError
-from lidardesign.evaluate.score import entries_of, evaluate
+from lidardesign.evaluate.entries import entries_of
+from lidardesign.evaluate.score import evaluate
 from lidardesign.geometry.rays import Rays
 from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Capsule, Scene, Sphere, rigid

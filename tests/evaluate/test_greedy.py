@@ -18,7 +18,8 @@ from lidardesign.evaluate.baselines import greedy as greedy_module
 from lidardesign.evaluate.baselines.candidates import mean_mbps, whole_range
 from lidardesign.evaluate.baselines.greedy import Fired, GreedyCandidate, GreedySource, greedy_rays
 from lidardesign.evaluate.baselines.views import TrainingViews
-from lidardesign.evaluate.score import entries_of, evaluate
+from lidardesign.evaluate.entries import entries_of
+from lidardesign.evaluate.score import evaluate
 from lidardesign.selection import information
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, angles

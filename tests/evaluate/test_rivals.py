@@ -11,9 +11,10 @@ from support.scoring import HitTask, MissTask, design, make_request, scenes
 from support.tables import each_row
 
 from lidardesign.evaluate.baselines.greedy import GreedySource
+from lidardesign.evaluate.entries import entries_of
 from lidardesign.evaluate.results import middle_rays
 from lidardesign.evaluate.rivals import FEWEST_SCENES, LARGEST_SHARE, MOST_SCENES, mean_rival
-from lidardesign.evaluate.score import entries_of, evaluate
+from lidardesign.evaluate.score import evaluate
 from lidardesign.evaluate.seeds import over_seeds
 from lidardesign.geometry.raycast import SceneCaster
 

@@ -18,10 +18,10 @@ from lidardesign.design.constraints.slack import SPACE_MARK, ConstraintSlack, co
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
+from lidardesign.evaluate.entries import ordered_conditions
 from lidardesign.evaluate.figures.density_views import DensityView, density_view
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, pattern_size
 from lidardesign.evaluate.results import Evaluation
-from lidardesign.evaluate.score import ordered_conditions
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scene import Scene
