@@ -10,7 +10,8 @@ from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
 # How the tests treat a block: readers of the page do not see it.
-REMARK = re.compile(r"^<!-- (?:run|instead|exits|columns|file|before):(?:(?!-->).)*-->\n", re.MULTILINE | re.DOTALL)
+REMARK = re.compile(r"^<!-- (?:run|instead|exits|columns|before):(?:(?!-->).)*-->\n", re.MULTILINE | re.DOTALL)
+FILE = re.compile(r"^<!-- file: (\S+) -->\n```(\w+)$", re.MULTILINE)
 OUTSIDE = re.compile(r"\[([^\]]+)\]\((?:\.\./)+(?!README\.md)([^)#]+)[^)]*\)")
 
 
@@ -23,8 +24,9 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Leave remarks for the tests out, and name files of the repository that are no pages."""
-    named = OUTSIDE.sub(lambda link: _named(*link.groups()), REMARK.sub("", markdown))
+    """Leave remarks for the tests out, show names of files, and name what lies in the repository and is no page."""
+    titled = FILE.sub(r'```\2 title="\1"', REMARK.sub("", markdown))
+    named = OUTSIDE.sub(lambda link: _named(*link.groups()), titled)
     return named.replace("](../README.md", "](index.md")
 
 
