@@ -25,15 +25,18 @@ from lidardesign.simulate.simulate import simulate
 from lidardesign.task import Task, conditions_of
 
 ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-CONSTRAINTS = (ROOT / "docs" / "constraints.md").read_text(encoding="utf-8")
-SHELL = (ROOT / "docs" / "shell.md").read_text(encoding="utf-8")
-FIRST_TASK = (ROOT / "docs" / "first-task.md").read_text(encoding="utf-8")
-WRITING_TASKS = (ROOT / "docs" / "writing-tasks.md").read_text(encoding="utf-8")
+CONSTRAINTS = (DOCS / "constraints.md").read_text(encoding="utf-8")
+SHELL = (DOCS / "shell.md").read_text(encoding="utf-8")
+FIRST_TASK = (DOCS / "first-task.md").read_text(encoding="utf-8")
+WRITING_TASKS = (DOCS / "writing-tasks.md").read_text(encoding="utf-8")
 # The README's pictures are downloaded by everyone who clones it.
 LARGEST_PICTURE_BYTES = 250_000
 # A first page is read to its end; what else there is to say has pages of its own.
 MOST_LINES = 130
+# All pages together: what nobody reads helps nobody.
+MOST_WORDS = 35_000
 
 
 def blocks(language: str, text: str = README) -> list[str]:
@@ -87,7 +90,7 @@ def test_every_constraint_key_that_is_shown_is_accepted_and_none_is_left_out():
 
 def test_the_configuration_file_is_accepted(tmp_path):
     path = tmp_path / "scans.yaml"
-    path.write_text(yaml_of((ROOT / "docs" / "run-folder.md").read_text(encoding="utf-8"), "scans.yaml"))
+    path.write_text(yaml_of((DOCS / "run-folder.md").read_text(encoding="utf-8"), "scans.yaml"))
     with pytest.raises(LidardesignError, match=r"scans: is not a folder") as caught:
         resolve(load_task("meshes"), config_file=path)
     assert caught.value.exit_code == 3
@@ -104,7 +107,7 @@ def test_every_exit_code_of_the_error_tree_is_listed():
 
 
 def test_every_command_is_shown():
-    shown = README + (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    shown = README + (DOCS / "commands.md").read_text(encoding="utf-8")
     for command in app.registered_commands:
         assert f"lidardesign {command.name or command.callback.__name__}" in shown
 
@@ -113,9 +116,13 @@ def test_the_readme_is_short():
     assert len(README.splitlines()) <= MOST_LINES
 
 
+def test_the_documentation_is_short():
+    assert len(README.split()) + sum(len(page.read_text("utf-8").split()) for page in DOCS.rglob("*.md")) <= MOST_WORDS
+
+
 def test_every_page_is_in_the_navigation():
     listed = re.findall(r": ([\w-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
-    assert {page.name for page in (ROOT / "docs").glob("*.md")} | {"index.md"} == set(listed)
+    assert {page.name for page in DOCS.glob("*.md")} | {"index.md"} == set(listed)
 
 
 def test_the_example_task_keeps_the_contract_and_scores_a_ray():
@@ -194,7 +201,7 @@ def test_the_drive_of_the_guide_is_scored_over_its_positions():
     assert task.score(scene, [*simulate(scene, away), *returns[1:]]).value == 25.0
 
 
-@each_row("page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda p: p.name)
+@each_row("page", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda p: p.name)
 def test_links_lead_somewhere_and_pictures_are_small(page):
     targets = re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))
     for target in targets:
