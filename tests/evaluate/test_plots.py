@@ -265,7 +265,7 @@ def test_many_differences_are_thinned_and_the_picture_says_so():
     assert len(many) <= MOST_ROWS
     assert {pair.rays for pair in many} == {576}
     assert {pair.b for pair in many} == {"uniform"}
-    assert "against baselines" in told
+    assert "against rivals" in told
 
 
 def test_phases_add_up_to_the_time_of_the_command():

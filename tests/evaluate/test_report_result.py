@@ -57,7 +57,7 @@ def test_only_pairs_at_the_rivals_number_of_rays_are_told():
     assert headline_pairs(evaluation) == {"f": told}
     text = result_section(evaluation, [])
     assert text.count('class="verdict"') == 1
-    assert "the best of 2 rivals on 20 training scenes" in text
+    assert "The strongest rival is greedy, the best of 2 on 20 training scenes." in text
 
 
 def test_a_design_without_the_middle_number_of_rays_is_shown_at_the_closest():

@@ -150,7 +150,7 @@ def drawn_pairs(evaluation: Evaluation) -> tuple[list[Paired], str]:
         return pairs, title
     baselines = {row.design for row in evaluation.rows if row.baseline}
     pairs = [pair for pair in pairs if pair.b in baselines]
-    return pairs[:MOST_ROWS], f"{title}, against baselines" + (f"; the first {MOST_ROWS}" * (len(pairs) > MOST_ROWS))
+    return pairs[:MOST_ROWS], f"{title}, against rivals" + (f"; the first {MOST_ROWS}" * (len(pairs) > MOST_ROWS))
 
 
 PHASE_ROW_INCHES, PANEL_MARGIN_INCHES = 0.17, 0.62

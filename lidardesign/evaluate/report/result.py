@@ -90,8 +90,8 @@ def _about(evaluation: Evaluation) -> list[str]:
     )
     if rival is None:
         return [about]
-    against = f"the best of {len(rival.values)} rivals" if len(rival.values) > 1 else "the only rival"
-    return [f"{about} {rival.name} is {against} on {counted(rival.scenes, 'training scene')}."]
+    best = f"the best of {len(rival.values)}" if len(rival.values) > 1 else "the only one"
+    return [f"{about} The strongest rival is {rival.name}, {best} on {counted(rival.scenes, 'training scene')}."]
 
 
 def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list[str]:

@@ -10,6 +10,7 @@ const PIECE_PX = 4; // lines are hidden in pieces of this length
 const AT_ONCE = 64; // solid lines per stroke: more make strokes slow
 const SHIFT = 0.618; // of the dashes from line to line, so that those of lines from one place make no rings
 const [AMBIENT, LAMP] = [0.5, [-0.35, 0.45, 0.82]]; // the lamp is left of, above and behind the eye: right, up, back
+const ABOVE = 0.995; // of a direction along an axis, from where it counts as such
 const DASHES = { solid: [], dash: [6, 3], dashdot: [7, 3, 2, 3], dot: [2, 2.5], longdash: [10, 4] };
 const MARK_PX = 3.2;
 const MARKS = {
@@ -244,7 +245,8 @@ function paintBox(pen, [low, high], lens, scale) {
     const [u, v] = [0, 1, 2].filter((other) => other !== axis);
     const at = (a, b) => Object.assign([...far], { [u]: a, [v]: b });
     const rim = [at(low[u], low[v]), at(high[u], low[v]), at(high[u], high[v]), at(low[u], high[v])];
-    if (!inFront(...rim)) continue;
+    // from straight above the walls say nothing
+    if (!inFront(...rim) || (axis < 2 && Math.abs(lens.back[2]) > ABOVE)) continue;
     pen.beginPath();
     line([...rim, rim[0]]);
     pen.fill();
@@ -254,7 +256,7 @@ function paintBox(pen, [low, high], lens, scale) {
   }
   // along the outline of the box: below for x and y, on the left for z
   return [0, 1, 2].flatMap((axis) => {
-    if (!ticks[axis].length || Math.abs(lens.back[axis]) > 0.995) return [];
+    if (!ticks[axis].length || Math.abs(lens.back[axis]) > ABOVE) return [];
     const [u, v] = [0, 1, 2].filter((other) => other !== axis);
     const [one, two] = [{ [u]: near[u], [v]: far[v] }, { [u]: far[u], [v]: near[v] }].map((place) => (value) => Object.assign([...far], place, { [axis]: value }));
     const lower = (place) => lens.seen(...place(middle[axis]))[axis === 2 ? 0 : 1] * (axis === 2 ? -1 : 1);

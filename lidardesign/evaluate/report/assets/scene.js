@@ -3,7 +3,7 @@
 
 const SHELL_STEPS = 8; // along each side of a gate's shell, as in drawing.py
 const TURN_STEPS = 24; // round an ellipse of origins
-const DENSE_RAYS = 100; // of more, lines are thinner
+const DENSE_RAYS = 100; // more of them are thin and pale, so that what is behind them is seen
 const CONE = 25; // numbers per sensor: origin 3, frame 9, field of view 2, gate 2, axes of origins 9
 
 function bytesOf(text) {
@@ -150,10 +150,11 @@ function rayPaths(view, state) {
 function rayItems(view, state, paths) {
   const shown = view.outcomes.filter(({ code }) => state.outcomes[code] !== false && paths.get(code).count).reverse();
   const total = shown.reduce((sum, { code }) => sum + paths.get(code).count, 0);
-  const width = Math.max(1.4 * Math.sqrt(Math.min(DENSE_RAYS / total, 1)), 0.4);
+  const share = Math.min(DENSE_RAYS / total, 1);
+  const [width, opacity] = [Math.max(1.4 * Math.sqrt(share), 0.4), 0.3 + 0.45 * share];
   const lines = shown.map(({ code, colour, dash, symbol }) => {
     const { lines: path, count } = paths.get(code);
-    return { kind: "lines", path, colour, dash, width, opacity: symbol === null && count > view.many ? view.faint : 0.7 };
+    return { kind: "lines", path, colour, dash, width, opacity: symbol === null && count > view.many ? view.faint : opacity };
   });
   const marks = shown.filter(({ symbol }) => symbol).map(({ code, colour, symbol }) => ({ kind: "marks", path: paths.get(code).ends, colour, symbol }));
   return [...lines, ...marks];
