@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-# Between two lines away from a terminal: so long, or such a share of all the time that it takes.
-LEAST_S = 10.0
-SHARE = 0.1
+# Between two lines away from a terminal: such a share of all the time that it takes, but so long at least and at most.
+SHARE = 0.2
+LEAST_S, MOST_S = 10.0, 600.0
 
 
 class ProgressDisplay:
@@ -76,6 +76,6 @@ class ProgressDisplay:
             if line not in self.lines:
                 self.lines[line] = self.bar.add_task(label, total=None, detail="")
             self.bar.update(self.lines[line], description=label, completed=done, total=total or None, detail=text)
-        elif now_s - self.said_s >= max(LEAST_S, SHARE * (passed_s + (left_s or 0.0))):
+        elif now_s - self.said_s >= min(max(LEAST_S, SHARE * (passed_s + (left_s or 0.0))), MOST_S):
             self.said_s = now_s
             self.say(f"{label}: {text}" if text else f"{label} ...")

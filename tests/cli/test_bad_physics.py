@@ -100,9 +100,16 @@ CASES = [
     *(
         (f"learn flatland --set {key}={value}", 2, f"--set {key}={value}")
         for key, value in [
-            ("illuminance_lux", "-1"), ("illuminance_lux", "1e9"), ("light", "moon"), ("visibility_m", "0"),
-            ("visibility_m", "1e-300"), ("visibility_m", ".inf"), ("reflectance", "-0.1"), ("reflectance", "1.1"),
-            ("gloss", ".nan"), ("gloss", "2"),
+            ("illuminance_lux", "-1"),
+            ("illuminance_lux", "1e9"),
+            ("light", "moon"),
+            ("visibility_m", "0"),
+            ("visibility_m", "1e-300"),
+            ("visibility_m", ".inf"),
+            ("reflectance", "-0.1"),
+            ("reflectance", "1.1"),
+            ("gloss", ".nan"),
+            ("gloss", "2"),
         ]
     ),
     ("learn face --set speed_m_s=1e9", 2, "--set speed_m_s=1e9"),

@@ -29,7 +29,7 @@ def run(tmp_path):
 def test_every_layout_can_be_fitted_at_a_value(lidardesign, run, layout):
     sensors = () if layout == "scan" else ("--sensors", 2)
     result = lidardesign(
-        "fit", run, "--at", "x_m=0.37", "--layout", layout, "--rays", 6, *sensors, "--name", "here", "--json"
+        "fit", run, "--at", "x_m=0.37", "--layout", layout, "--rays", 6, *sensors, "--name", "here", "--json", "-v"
     )
     assert result.code == 0, result.err
     design = load_design(run / "designs" / "here.yaml")

@@ -30,9 +30,7 @@ def test_importing_the_package_imports_nothing_heavy():
     assert not modules_after("import lidardesign") & {*HEAVY, *NUMERIC}
 
 
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["--version"], ["learn", "--help"], ["constrain", "--help"]]
-)
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["learn", "--help"], ["constrain", "--help"]])
 def test_help_imports_nothing_heavy(arguments):
     assert not modules_after(run_program(*arguments)) & {*HEAVY, *NUMERIC}
 
@@ -52,7 +50,5 @@ def test_the_modules_that_constrain_needs_import_no_torch():
 def test_threads_are_limited_before_torch_can_be_imported():
     code = "import os\nos.environ.pop('OMP_NUM_THREADS', None)\nos.environ['OPENBLAS_NUM_THREADS'] = '3'\n"
     code += run_program("--version") + "\nassert os.environ['OMP_NUM_THREADS'] == '1', os.environ\n"
-    code += (
-        "assert os.environ['OMP_WAIT_POLICY'] == 'PASSIVE'\nassert os.environ['OPENBLAS_NUM_THREADS'] == '3'"
-    )
+    code += "assert os.environ['OMP_WAIT_POLICY'] == 'PASSIVE'\nassert os.environ['OPENBLAS_NUM_THREADS'] == '3'"
     modules_after(code)

@@ -388,7 +388,9 @@ def test_boxes_are_given_by_option_and_by_file(call, tmp_path):
     assert result.code == 0, result.err
     rows = [row for row in json.loads(result.out)["constraints"] if "exclude" in row["name"]]
     assert rows[0]["bound"]["high_m"] == [0.6, 9, 9]
-    shown = call("constrain", "run", "--layout", "grid", "--constraints", "rules.yaml", "--set", "sensors.count=1")
+    shown = call(
+        "constrain", "run", "--layout", "grid", "--constraints", "rules.yaml", "--set", "sensors.count=1", "-v"
+    )
     assert "s0.origin.exclude[0]" in shown.out
     assert "low_m [-9, -9, -9], high_m [0.5, 9, 9]" in shown.out
     again = call("constrain", "run/designs/right.yaml", "--json")

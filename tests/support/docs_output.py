@@ -8,7 +8,8 @@ BOXES = re.compile(r"[\u2500-\u257f]+")
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?|\d+")
 LEFT_OUT = "..."
 NOTE = "note: "
-# Every command that computes ends with this table; pages that are not about it leave it out.
+# Every command that computes says its time in a line, or with -v in a table; pages that are not about it leave it out.
+TOOK = re.compile(r"took [\w. ]+ s")
 TIMES = "where the time went"
 # What a comparison of numbers may turn out to be.
 VERDICTS = re.compile(r"\b(?:better|worse|not told apart|yes, tight|yes|no)\b")
@@ -35,6 +36,8 @@ def difference(expected: list[str], out: str, err: str, *, small: bool) -> str |
     if not any(line.startswith(TIMES) for line in shown):
         out = out.partition(TIMES)[0]
     printed = [line for line in out.splitlines() if not (line.startswith(NOTE) and (small or line in expected))]
+    if not any(TOOK.fullmatch(line) for line in shown):
+        printed = [line for line in printed if not TOOK.fullmatch(line)]
     # a note that the page shows is no longer among what is compared in order
     printed = [line for line in printed if not line.startswith(NOTE) or masked(line) not in map(masked, expected)]
     return _mismatch(_pieces(shown), masked("\n".join(printed)))

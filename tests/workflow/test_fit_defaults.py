@@ -196,7 +196,7 @@ class TestTheBestNumber:
 
 class TestTheCommand:
     def test_says_what_was_tried_and_writes_the_bytes_that_the_number_gives_by_itself(self, lidardesign, flat):
-        done = lidardesign("fit", flat, "--rays", 9, "--json")
+        done = lidardesign("fit", flat, "--rays", 9, "--json", "-v")
         assert done.code == 0, done.err
         said, count = " ".join(done.err.split()), len(done.json["sensors"])
         assert f"sensors: {count}; Chamfer distance [mm] on 5 training scenes in " in said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -133,7 +134,7 @@ class TestDesignsWithChosenRays:
 class TestTheCommand:
     def test_says_how_far_from_the_best_they_are(self, lidardesign, run):
         printed = lidardesign("fit", run, "--layout", "selected", "--sensors", 2, "--rays", 9, "--name", "a")
-        assert "rays chosen on training scenes" in printed.out
+        assert re.search(r"^chosen among \d+ rays on \d+ training scenes; any other choice", printed.out, re.MULTILINE)
         fitted = lidardesign("fit", run, "--layout", "selected", "--sensors", 2, "--rays", 9, "--name", "a", "--json")
         shown = lidardesign("show", run / "designs" / "a.yaml", "--json")
         assert json.loads(fitted.out)["certificates"] == json.loads(shown.out)["provenance"]["certificates"]

@@ -194,7 +194,7 @@ def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:
 
     counts = [str(entry["rays"]) for entry in certificates_of(design)] or [str(design.rays)] * bool(design.rays)
     several = f"{', '.join(counts[:-1])} or " if counts[:-1] else ""
-    rays = f"{several}{counts[-1]} rays per frame" if counts else "any number of rays"
+    rays = f"{several}{counts[-1]} rays {_frames(design)}" if counts else "any number of rays"
     sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
     rich.print(f"{design.name}: {sensors}, {rays} (layout {design.layout}){_condition(design)}", soft_wrap=True)
     columns: dict[str, Callable[[Sensor], str]] = {
@@ -207,12 +207,24 @@ def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:
     }
     if len(set(map(_place, design.sensors))) == 1:
         del columns["origin [m]"]
+    if all(sensor.rays is None for sensor in design.sensors):
+        columns.pop("rays", None)
     shown = design.sensors[:MOST_ROWS]
     names = [sensor.name if sensor.part is None else f"{sensor.name} {sensor.part}" for sensor in shown]
     lines = [[name, *(cell(sensor) for cell in columns.values())] for name, sensor in zip(names, shown, strict=True)]
     print_table(None, ("sensor", *columns), lines, rich, text=("sensor",))
     if len(shown) < len(design.sensors):
         rich.print(f"... and {len(design.sensors) - MOST_ROWS} more sensors; --json lists all")
+
+
+def _frames(design: DesignSpec) -> str:
+    """Where so many rays are fired: in every frame, or at every value of a condition."""
+    if design.track is None:
+        return "per frame"
+    from lidardesign.design.layouts.track import travels
+
+    first, last = travels(design.track)
+    return f"at every {design.track.dimension} from {first:g} to {last:g}"
 
 
 def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
@@ -246,5 +258,5 @@ def _tight(checks: Sequence[ConstraintCheck], sensors: Sequence[str]) -> str:
         return f" ({', '.join(names[:MOST_NAMED])}{more})" if names else ""
 
     if not tight:
-        return "no constraint limits it"
+        return "no constraint is tight"
     return f"tight: {', '.join(f'{key}{owners(names)}' for key, names in tight.items())}"

@@ -12,7 +12,7 @@ from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.accuracy.settings import Accuracy, Measurement, Sweep
-    from lidardesign.evaluate.results import Evaluation
+    from lidardesign.evaluate.results import Evaluation, Paired
 
 
 Entry = dict[str, Any]
@@ -37,37 +37,34 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
     """Every design at one number of rays, against the strongest rival there; what else was asked for in a line each."""
-    metric, rival, count = document["metric"], document["strongest_rival"], evaluation.middle_rays
-    names = list(dict.fromkeys(row.design for row in evaluation.rows if not row.baseline))
-    nearest = [
-        min((row for row in document["rows"] if row["design"] == name), key=lambda row: abs(row["rays"] - count))
-        for name in names
-    ]
+    from lidardesign.evaluate.report.result import headline_pairs, headline_rows
+
+    rows, pairs, count = headline_rows(evaluation), headline_pairs(evaluation), evaluation.middle_rays
+    shown = [row.as_dict() for row in rows.values()]
     columns = {
-        "rays": [str(row["rays"]) for row in nearest],
-        "value": [number(row["value"], 3) for row in nearest],
-        "95 % interval": [interval_text(row, digits=3) for row in nearest],
-        "failures": [str(row["failures"]) for row in nearest],
-        "Mbit/s": [number(row["bandwidth_mbps"], 3) for row in nearest],
+        "rays": [str(row["rays"]) for row in shown],
+        "value": [number(row["value"], 3) for row in shown],
+        "95 % interval": [interval_text(row, digits=3) for row in shown],
+        "failures": [str(row["failures"]) for row in shown],
+        "Mbit/s": [number(row["bandwidth_mbps"], 3) for row in shown],
     }
-    if all(row["rays"] == count for row in nearest):
+    if all(row["rays"] == count for row in shown):
         del columns["rays"]
-    if not any(row["failures"] for row in nearest):
+    if not any(row["failures"] for row in shown):
         del columns["failures"]
-    pairs = [] if rival is None else [
-        pair for pair in document["paired"] if (pair["b"], pair["rays"]) == (rival["name"], count)
-    ]  # fmt: skip
-    if pairs:
-        apart = {pair["a"]: f"{pair['difference']:+.3g} ({interval_text(pair, ' to ', 3)})" for pair in pairs}
-        columns[f"difference to {rival['name']}"] = [apart.get(name, "-") for name in names]
-    title = f"{metric['name']} [{metric['unit']}] at {count} rays, {_scenes(document)} ({metric['better']} is better)"
+    if pairs and evaluation.strongest_rival is not None:
+        apart = {
+            name: f"{pair.difference:+.3g} ({interval_text(pair.as_dict(), ' to ', 3)})" for name, pair in pairs.items()
+        }
+        columns[f"difference to {evaluation.strongest_rival.name}"] = [apart.get(name, "-") for name in rows]
+    metric = evaluation.metric
+    title = f"{metric.name} [{metric.unit}] at {count} rays, {_scenes(document)} ({metric.better} is better)"
     rich.print(title, soft_wrap=True)
-    print_table(None, ("design", *columns), list(zip(names, *columns.values(), strict=True)), rich)
-    if pairs and None not in [pair["ci_low"] for pair in pairs]:
-        rich.print(_sentence(pairs, metric), soft_wrap=True)
+    print_table(None, ("design", *columns), list(zip(rows, *columns.values(), strict=True)), rich)
+    if pairs:
+        rich.print(sentence(evaluation, list(pairs.values())), soft_wrap=True)
     if "mounting" in document:
-        shown = [any(row is one for one in nearest) for row in document["rows"]]
-        _show_mounting(document, rich, shown)
+        _show_mounting(document, rich, [row in rows.values() for row in evaluation.rows])
     if "audit" in document:
         rich.print(_audit_title(document["audit"], document["effects"]), soft_wrap=True)
     simulated = [_words(effect["name"]) for effect in document["effects"] if effect["on"]]
@@ -75,40 +72,28 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
         rich.print(f"effects with the detector {document['detector']}: {', '.join(simulated)}", soft_wrap=True)
 
 
+def sentence(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
+    """What designs are against the strongest rival, in one sentence."""
+    from lidardesign.evaluate.gates import difference_text
+    from lidardesign.evaluate.results import verdict
+
+    metric, rival = evaluation.metric, pairs[0].b
+    if len(pairs) == 1:
+        apart = difference_text(pairs[0], metric.better, metric.unit)
+        return f"{apart}; {rival} is the strongest rival on training scenes"
+    parts = []
+    for word in ("better", "worse", "open"):
+        names = [pair.a for pair in pairs if verdict(evaluation, pair) == word]
+        listed = " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+        is_word = f"{listed} {'are' if len(names) > 1 else 'is'} {word}"
+        parts += [f"no difference was found for {listed}" if word == "open" else is_word] * bool(names)
+    return f"against {rival}, the strongest rival on training scenes: {'; '.join(parts)}"
+
+
 def _scenes(document: Entry) -> str:
     seeds = document.get("seeds", [])
     scenes = f"{document['scenes']} held-out scenes" + (f" and {len(seeds)} seeds" if seeds else "")
     return ", ".join([scenes, *document.get("set", [])])
-
-
-def _sentence(pairs: Sequence[Entry], metric: Entry) -> str:
-    """What designs are against the strongest rival."""
-    sign, rival = (
-        1.0 if metric["better"] == "lower" else -1.0,
-        f"{pairs[0]['b']}, the strongest rival on training scenes",
-    )
-    groups: dict[str, list[Entry]] = {}
-    for pair in pairs:
-        low, high = sorted(sign * pair[end] for end in ("ci_low", "ci_high"))
-        groups.setdefault("better" if high < 0 else "worse" if low > 0 else "", []).append(pair)
-    if len(pairs) == 1:
-        ((word, (pair,)),) = groups.items()
-        if not word:
-            return f"no difference between {pair['a']} and {rival}, was found"
-        low, high = sorted(abs(pair[end]) for end in ("ci_low", "ci_high"))
-        by = f"{number(abs(pair['difference']), 3)} {metric['unit']} ({number(low, 3)} to {number(high, 3)})"
-        return f"{pair['a']} is {word} than {rival}, by {by}"
-    parts = []
-    for word in ("better", "worse", ""):
-        names = [pair["a"] for pair in groups.get(word, [])]
-        listed = " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
-        if names:
-            parts.append(
-                f"{listed} {'is' if len(names) == 1 else 'are'} {word}"
-                if word
-                else f"no difference was found for {listed}"
-            )
-    return f"against {rival}: {'; '.join(parts)}"
 
 
 def _show_all(document: Entry, rich: RichConsole) -> None:

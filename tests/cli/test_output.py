@@ -1,0 +1,129 @@
+"""What people are told: a few lines, all tables with --verbose, the path of the result alone with --quiet."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from types import SimpleNamespace
+
+import pytest
+from support.command_line import caller, make_run
+from support.tables import each_row
+
+from lidardesign.cli import progress
+from lidardesign.cli.output import Output
+from lidardesign.cli.progress import ProgressDisplay
+from lidardesign.cli.tables.scores import sentence
+from lidardesign.errors import BackgroundNote
+from lidardesign.evaluate.results import Paired
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    """Run the program in this process, in an empty folder."""
+    program = caller(capsys, tmp_path, monkeypatch)
+    return lambda line, *more: program(*line.split(), *more)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("made") / "run")
+
+
+@pytest.fixture
+def flat(made, tmp_path):
+    return shutil.copytree(made, tmp_path / "run")
+
+
+@each_row(
+    ("quiet", "verbose", "said"),
+    [(False, False, ["note: act"]), (False, True, ["note: act", "note: decided"]), (True, False, [])],
+)
+def test_what_nobody_can_act_on_is_said_to_those_who_ask(quiet, verbose, said, capsys):
+    output = Output(quiet=quiet, verbose=verbose)
+    for note in ("act", BackgroundNote("decided")):
+        output.remark(note)
+    assert capsys.readouterr().err.splitlines() == said
+
+
+def test_a_fit_prints_a_line_per_sensor_and_what_limits_it(lidardesign, flat):
+    fit = f"constrain {flat} --layout grid --sensors 3 --rays 30 --set gate.width_m.max=0.2 --name thin"
+    lines = lidardesign(fit).out.splitlines()
+    assert lines[0] == "thin: 3 sensors, 30 rays per frame (layout grid)"
+    assert lines[1].split()[0] == "sensor"
+    assert [line.split()[0] for line in lines[2:5]] == ["s0", "s1", "s2"]
+    assert any(line.startswith("tight: gate.width_m.max") for line in lines[5:])
+    assert lines[-2].startswith("took ")
+    assert lines[-1] == f"design: {flat}/designs/thin.yaml"
+    assert len(lines) <= 6 + 3
+    assert lidardesign(f"{fit} --quiet").out == f"{flat}/designs/thin.yaml\n"
+    loud = lidardesign(f"{fit} -v").out
+    assert all(words in loud for words in ("bound", "log-likelihood", "where the time went"))
+    assert json.loads(lidardesign(f"{fit} --json").out)["design"] == f"{flat}/designs/thin.yaml"
+
+
+def test_an_evaluation_prints_a_line_per_design_against_the_strongest_rival(lidardesign, flat):
+    for name, sensors in (("one", 1), ("two", 2)):
+        lidardesign(f"fit {flat} --layout grid --sensors {sensors} --name {name}")
+    evaluate = f"evaluate {flat} --rays 12 --rays 20 --set test=6 --set train=2"
+    document = json.loads(lidardesign(f"{evaluate} --json").out)
+    rival = document["strongest_rival"]
+    lines = lidardesign(f"{evaluate} --csv scores.csv").out.splitlines()
+    assert f"at {rival['rays']} rays, 6 held-out scenes" in lines[0]
+    assert lines[1].endswith(f"difference to {rival['name']}")
+    assert [line.split()[0] for line in lines[2:4]] == ["one", "two"]
+    assert lines[4].startswith(f"against {rival['name']}, the strongest rival on training scenes")
+    assert lines[-1] == "csv: scores.csv"
+    assert len(lines) <= 5 + 2
+    assert lidardesign(f"{evaluate} --csv scores.csv --quiet").out == "scores.csv\n"
+    assert lidardesign(f"{evaluate} --quiet").out == ""
+    loud = lidardesign(f"{evaluate} -v").out
+    assert all(words in loud for words in ("difference to each baseline", "as much bandwidth", "where the time went"))
+
+
+def pair(name, low, high):
+    return Paired(name, "greedy", 20, (low + high) / 2, low, high)
+
+
+END = "; greedy is the strongest rival on training scenes"
+
+
+@each_row(
+    ("pairs", "better", "said"),
+    [
+        ([pair("fit", -3, -1)], "lower", f"fit is better than greedy by 2 mm (1 to 3) at 20 rays{END}"),
+        ([pair("fit", -3, -1)], "higher", f"fit is worse than greedy by 2 mm (1 to 3) at 20 rays{END}"),
+        ([pair("fit", 1, 3)], "lower", f"fit is worse than greedy by 2 mm (1 to 3) at 20 rays{END}"),
+        ([pair("fit", -1, 3)], "lower", f"no difference between fit and greedy was found at 20 rays (1 mm worse, -1 to 3){END}"),
+        ([pair("a", -3, -1), pair("b", -2, -1), pair("c", -1, 1)], "lower",
+         "against greedy, the strongest rival on training scenes: a and b are better; no difference was found for c"),
+    ],
+)  # fmt: skip
+def test_a_sentence_says_what_designs_are_against_the_strongest_rival(pairs, better, said):
+    evaluation = SimpleNamespace(metric=SimpleNamespace(unit="mm", better=better))
+    assert sentence(evaluation, pairs) == said
+
+
+def lines_of_work(monkeypatch, seconds, steps=5000):
+    """What is said of work of so many seconds away from a terminal."""
+    clock, said = SimpleNamespace(now_s=0.0), []
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    with ProgressDisplay("working", said.append, None) as display:
+        for step in range(steps):
+            clock.now_s = seconds * step / steps
+            display.show(step, steps)
+    return said
+
+
+@each_row(("seconds", "least", "most"), [(9, 0, 0), (35, 2, 3), (3600, 4, 6), (86400, 100, 150)])
+def test_away_from_a_terminal_a_line_comes_now_and_then_with_the_time_that_remains(seconds, least, most, monkeypatch):
+    said = lines_of_work(monkeypatch, seconds)
+    assert least <= len(said) <= most
+    assert all(line.startswith("working: ") and line.endswith(" left") for line in said)
+
+
+def test_quiet_work_says_nothing(capsys):
+    with Output(quiet=True).progress("working") as display:
+        display.said_s -= 1e6
+        display.show(1, 2)
+    assert capsys.readouterr().err == ""
