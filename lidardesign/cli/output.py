@@ -340,6 +340,21 @@ def keep_times(
         output.note(f"note: the times of {name} are not kept in {run}: {message}")
 
 
+def _forecast_lines(found: Mapping[str, Any]) -> list[str]:
+    """How long it will take and how much memory, and what is not known of that."""
+    seconds, longest = found["seconds"], found["longest_seconds"]
+    length = duration(seconds) if longest == seconds else f"{duration(seconds)} to {duration(longest)}"
+    each = f"{1e3 * found['pathwise_s']:.0f} and {1e3 * found['balancing_s']:.0f} ms"
+    lines = [
+        f"time   about {length}: preparing {duration(found['preparing_s'])}, {found['steps']:,} steps of {each}, "
+        f"measuring {duration(found['finishing_s'])}"
+    ]
+    for name, held in (("memory", found["peak_memory_bytes"]), ("memory on the GPU", found["gpu_memory_bytes"])):
+        if held is not None:
+            lines.append(f"{name} about {held / BYTES_PER_MEGABYTE:,.0f} MB")
+    return lines + [f"not known: {what}" for what in found["unknown"]]
+
+
 def show_plan(plan: RequestPlan, output: Output) -> None:
     """Give what `--dry-run` says as the result of a command: what it would do, read and write.
 
@@ -351,9 +366,10 @@ def show_plan(plan: RequestPlan, output: Output) -> None:
     lines = [f"{document['command']} would", *(f"  {step}" for step in document["steps"])]
     for entry in document["reads"]:
         size = entry["bytes"] or 0
-        text = f" ({size / BYTES_PER_MEGABYTE:.1f} MB)" if size >= BYTES_PER_MEGABYTE else f" ({size:,} bytes)"
+        text = f"{size / BYTES_PER_MEGABYTE:.1f} MB" if size >= BYTES_PER_MEGABYTE else f"{size:,} bytes"
+        text = f"{entry['files']} files, {text}" if "files" in entry else text
         place = "standard input" if entry["path"] == STDIO else entry["path"]
-        lines.append(f"read   {place}{'' if entry['bytes'] is None else text}")
+        lines.append(f"read   {place}{'' if entry['bytes'] is None else f' ({text})'}")
     for entry in document["writes"]:
         place = "standard output" if entry["path"] == STDIO else entry["path"]
         lines.append(f"write  {place}{' (replaced)' if entry['replaces'] else ''}")
@@ -361,6 +377,8 @@ def show_plan(plan: RequestPlan, output: Output) -> None:
         lines.append("write  nothing")
     if document["before"]:
         lines.append(f"time   {document['before']['of']} took {document['before']['seconds']:.1f} s")
+    if document["forecast"]:
+        lines += _forecast_lines(document["forecast"])
     lines.append("nothing was done: leave out --dry-run to do it")
 
     output.result(document, lambda rich: rich.print("\n".join(lines), soft_wrap=True), show_costs=False)

@@ -29,6 +29,7 @@ from lidardesign.workflow.run_folder import (
     EarlierRun,
     Notes,
     RequestPlan,
+    files_of,
     input_hashes,
     input_paths,
     last_time,
@@ -192,7 +193,8 @@ class LearnRequest:
         if self.replaces:
             designs = ", ".join(sorted(path.stem for path in (self.folder / DESIGN_FOLDER).glob("*.yaml")))
             steps.append(f"replace the run {self.folder}" + (f", with its designs ({designs})" if designs else ""))
-        reads = [path for path in (self.config_file, *input_paths(settings.task)) if path is not None]
+        reads = [] if self.config_file is None else [self.config_file]
+        reads += [file for path in input_paths(settings.task) for file in ([path] if path.is_dir() else files_of(path))]
         if self.begun:
             reads += sorted(path for path in self.place.iterdir() if path.is_file() and not path.name.startswith("."))
         # as other runs' files have it
@@ -205,6 +207,33 @@ class LearnRequest:
             document,
             None if self.begun else _time_of_twin(self.folder, {name: document[name] for name in TIME_SECTIONS}),
         )
+
+    def forecast(self, remark: Notes | None = None) -> dict[str, Any]:
+        """How long learning will take here and how much memory, from its preparation and a few steps.
+
+        Arguments:
+            remark: Called with what is wrong with lengths.
+
+        Raises:
+            ConfigError, DataError: Unusable settings or scenes.
+        """
+        with phase("libraries"):
+            from lidardesign.density.learn import prepare_training_data
+            from lidardesign.density.training.forecast import forecast
+
+        clock, goal = outermost_clock() or Clock(), self.goal
+        data = prepare_training_data(self.task, self.settings, remark)
+        found = forecast(
+            data,
+            self.settings,
+            self.place,
+            self.device,
+            lambda: clock.seconds,
+            resume=self.has_checkpoint,
+            tolerance=goal.tolerance,
+            time_budget_s=goal.time_budget_s,
+        )
+        return found.as_dict()
 
     def run(self, progress: Callable[[LearnProgress], None] | None = None, remark: Notes | None = None) -> LearnResult:
         """Learn into the folder; what failed before anything was learned is taken away again.

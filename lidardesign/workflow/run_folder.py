@@ -145,11 +145,12 @@ def input_paths(config: BaseModel) -> list[Path]:
 
 def input_hashes(config: BaseModel) -> dict[str, str]:
     """SHA-256 of the files that a task's configuration names, of those in its folders, and of its robots, by path."""
-    files = [file for path in input_paths(config) for file in _files_of(path)]
+    files = [file for path in input_paths(config) for file in files_of(path)]
     return {str(file): sha256_file(file) for file in files if file.is_file() and file.stat().st_size <= MESH.most_bytes}
 
 
-def _files_of(path: Path) -> list[Path]:
+def files_of(path: Path) -> list[Path]:
+    """The files of a folder, or those that a robot's model names, or the one file."""
     if path.suffix.lower() in (".xml", ".urdf"):
         from lidardesign.mujoco_model import model_files
 
@@ -300,6 +301,7 @@ class RequestPlan:
         writes: Files and folders that it would write; a folder's name ends in a stroke.
         settings: What it would do it with, as plain values.
         before: How long that took before, where that is known.
+        forecast: How long it will take and how much memory, as plain values, where that was measured.
     """
 
     command: str
@@ -308,6 +310,7 @@ class RequestPlan:
     writes: Sequence[Path | str] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     before: EarlierRun | None = None
+    forecast: Mapping[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The document of `--dry-run --json`."""
@@ -315,12 +318,11 @@ class RequestPlan:
             "dry_run": True,
             "command": self.command,
             "steps": list(self.steps),
-            "reads": [
-                {"path": str(path), "bytes": (os.path.getsize(path) if _is_file(path) else None)} for path in self.reads
-            ],
+            "reads": [_read_entry(path) for path in self.reads],
             "writes": [{"path": str(path), "replaces": _is_file(path)} for path in self.writes],
             "settings": dict(self.settings),
             "before": None if self.before is None else {"seconds": self.before.seconds, "of": self.before.name},
+            "forecast": None if self.forecast is None else dict(self.forecast),
         }
 
     def check_writable(self) -> None:
@@ -332,6 +334,16 @@ class RequestPlan:
         for path in map(str, self.writes):
             if path != STDIO:
                 check_writable(Path(path), is_folder=path.endswith("/"))
+
+
+def _read_entry(path: Path | str) -> dict[str, Any]:
+    """A file that is read and its size, or a folder with the number of its files and the size of all."""
+    if _is_file(path):
+        return {"path": str(path), "bytes": os.path.getsize(path)}
+    if str(path) != STDIO and os.path.isdir(path):
+        sizes = [entry.stat().st_size for entry in os.scandir(path) if entry.is_file()]
+        return {"path": str(path), "bytes": sum(sizes), "files": len(sizes)}
+    return {"path": str(path), "bytes": None}
 
 
 def _is_file(path: Path | str) -> bool:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
+import time
 from pathlib import Path
 
 import pytest
 from support.command_line import caller, files_under, make_run
 from support.tables import each_row
 
+from lidardesign.density.training.training import Trainer
 from lidardesign.run.manifest import read_manifest, write_manifest
 
 TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverage_proposals=256", "hidden=4")
@@ -200,3 +203,74 @@ def test_what_would_be_refused_is_refused_at_once(lidardesign, flat, given_files
     result = lidardesign(*line.replace("flat/", f"{flat}/").replace("flat ", f"{flat} ").split(), "--dry-run")
     assert result.code in (2, 3), result.out
     assert words in result.err
+
+
+SLOW_S = 0.02
+FORECASTS = {
+    "steps": (["--set", "learning.steps=40"], [40]),
+    "a tolerance": (["--set", "learning.steps=40", "--tolerance", 0.5], [5, 10, 20, 40, 80, 160]),
+    "steps that all balance": (["--set", "learning.steps=40", "--set", "learning.balance=1"], [40]),
+    "steps of which none balances": (["--set", "learning.steps=40", "--set", "learning.balance=0"], [40]),
+}
+
+
+@pytest.fixture
+def foreseen(lidardesign, monkeypatch):
+    """What `learn --dry-run` foresees on a machine whose steps take SLOW_S longer."""
+    whole = Trainer.find_gradient
+
+    def slowly(self):
+        time.sleep(SLOW_S)
+        return whole(self)
+
+    monkeypatch.setattr(Trainer, "find_gradient", slowly)
+    settings = [word for value in TINY[1:] for word in ("--set", f"learning.{value}")]
+
+    def call(*arguments):
+        return lidardesign("learn", "flatland", "--set", "train=1", *settings, *arguments, "--dry-run", "--json")
+
+    return call
+
+
+@each_row("name", FORECASTS)
+def test_learning_foresees_its_time_from_real_steps(foreseen, name):
+    arguments, stages = FORECASTS[name]
+    plan = foreseen(*arguments).json
+    found, balance = plan["forecast"], plan["settings"]["learning"]["balance"]
+    pathwise, balancing = found["pathwise_s"], found["balancing_s"]
+    assert pathwise > SLOW_S or balance == 1
+    assert balancing > SLOW_S or balance == 0
+    taken = [steps * ((1 - balance) * pathwise + balance * balancing) + found["finishing_s"] for steps in stages]
+    assert found["steps"] == stages[0]
+    assert found["seconds"] == pytest.approx(found["preparing_s"] + taken[0], abs=0.1)
+    assert found["longest_seconds"] == pytest.approx(found["preparing_s"] + sum(taken), abs=0.1)
+    assert found["peak_memory_bytes"] > 0
+    assert any("stages" in what for what in found["unknown"]) == (len(stages) > 1)
+    assert any("balancing" in what for what in found["unknown"]) == (balance > 0)
+
+
+def test_a_time_budget_is_foreseen_to_be_kept_or_refused_as_learning_would(foreseen):
+    found = foreseen("--time-budget", 60).json["forecast"]
+    assert found["steps"] * SLOW_S < found["seconds"] <= 60
+    refused = foreseen("--time-budget", 3)
+    assert (refused.code, refused.json["error"]["where"]) == (2, "--time-budget")
+
+
+def test_of_a_run_that_is_resumed_only_the_rest_is_foreseen(foreseen, lidardesign, tmp_path, monkeypatch):
+    settings = [word for value in ("train=1", *(f"learning.{one}" for one in TINY)) for word in ("--set", value)]
+    lidardesign("learn", "flatland", *settings, "--out", "run")
+    before = files_under(tmp_path)
+    assert foreseen("--set", "learning.steps=2", "--out", "run", "--resume").json["forecast"]["steps"] == 0
+    assert files_under(tmp_path) == before
+
+
+def test_people_are_told_how_long_it_takes_and_what_is_read(lidardesign, tmp_path):
+    (tmp_path / "flat.yaml").write_text("task_name: flatland\n")
+    settings = [word for value in TINY for word in ("--set", f"learning.{value}")]
+    shown = lidardesign("learn", "--config", "flat.yaml", "--set", "train=1", *settings, "--dry-run").out
+    assert "read   flat.yaml (20 bytes)" in shown
+    assert re.search(
+        r"^time   about .* s: preparing .*, 2 steps of [0-9]+ and [0-9]+ ms, measuring", shown, re.MULTILINE
+    )
+    assert re.search(r"^memory about [0-9,]+ MB$", shown, re.MULTILINE)
+    assert "not known: balancing steps" in shown

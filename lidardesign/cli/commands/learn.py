@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -114,9 +115,11 @@ def learn(
         for note in request.task_notes():
             remark(note)
         if dry_run:
-            for note in request.scale_notes():
-                remark(note)
-            return show_plan(request.plan(), output)
+            plan = request.plan()
+            plan.check_writable()
+            with output.progress("timing a few steps"):
+                plan = replace(plan, forecast=request.forecast(remark))
+            return show_plan(plan, output)
         output.when_interrupted = request.resume_hint
         with output.progress("learning") as progress:
             result = request.run(partial(_show_progress, progress), remark)

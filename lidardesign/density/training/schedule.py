@@ -245,6 +245,40 @@ class TimedProbes:
     seconds: float
 
 
+@dataclass(frozen=True, eq=False)
+class StepTimes:
+    """What steps take here, measured on the untrained flow.
+
+    Arguments:
+        pathwise_s, balancing_s: One step of each phase.
+        finishing_s: Measuring and writing at the end.
+        probes: Those that the measurement was timed with.
+    """
+
+    pathwise_s: float
+    balancing_s: float
+    finishing_s: float
+    probes: TimedProbes
+
+    @classmethod
+    def measured(cls, data: TrainingData, config: RunConfig, run: Path, device: torch.device) -> StepTimes:
+        """Take a few steps of each phase, draw a few samples; nothing is written."""
+        trainer = make_trainer(data, config, run, device)
+        last = trainer.pathwise_steps - 1
+        pathwise = max(_seconds_per_step(trainer, 0), _seconds_per_step(trainer, last)) if last >= 0 else 0
+        balancing = _seconds_per_step(trainer, trainer.pathwise_steps) if config.learning.balance > 0 else 0.0
+        probes = _timed_probes(data.target, config)
+        return cls(pathwise, balancing, _finishing_s(trainer, probes, config), probes)
+
+    def per_step(self, balance: float) -> float:
+        """A step in the mean, where a share of them balances [s]."""
+        return (1 - balance) * self.pathwise_s + balance * self.balancing_s
+
+    def of(self, steps: int, balance: float) -> float:
+        """So many steps, measured and written [s]."""
+        return steps * self.per_step(balance) + self.finishing_s
+
+
 @dataclass(eq=False)
 class Timekeeper:
     """Plans the steps of one command.
@@ -269,22 +303,26 @@ class Timekeeper:
         return (self.time_budget_s - self.elapsed_s()) * (1 - RESERVE)
 
     def plan(self, data: TrainingData, device: torch.device) -> RunConfig:
-        """The configuration with as many steps as fit.
+        """The configuration with as many steps as fit, which the run's folder then has.
 
         Raises:
             ConfigError: Not even `LEAST_STEPS` fit; it says what would be enough.
         """
-        trainer = make_trainer(data, self.config, self.run, device)
-        last = trainer.pathwise_steps - 1
-        pathwise = max(_seconds_per_step(trainer, 0), _seconds_per_step(trainer, last)) if last >= 0 else 0
-        share = self.config.learning.balance
-        balancing = _seconds_per_step(trainer, trainer.pathwise_steps) if share > 0 else 0.0
-        self.probes = _timed_probes(data.target, self.config)
-        finishing, left = _finishing_s(trainer, self.probes, self.config), self.left_s
-        per_step = (1 - share) * pathwise + share * balancing
-        steps = math.floor((left - finishing) / per_step)
+        times = StepTimes.measured(data, self.config, self.run, device)
+        self.probes = times.probes
+        self.planned = self.fitting(times)
+        return self._apply()
+
+    def fitting(self, times: StepTimes) -> TimePlan:
+        """How the time that is left would be spent.
+
+        Raises:
+            ConfigError: Not even `LEAST_STEPS` fit; it says what would be enough.
+        """
+        share, left = self.config.learning.balance, self.left_s
+        steps = math.floor((left - times.finishing_s) / times.per_step(share))
         if steps < LEAST_STEPS:
-            least = self.elapsed_s() + (LEAST_STEPS * per_step + finishing) / (1 - RESERVE)
+            least = self.elapsed_s() + times.of(LEAST_STEPS, share) / (1 - RESERVE)
             raise ConfigError(
                 f"{self.time_budget_s:g} s are over before anything worth having is learned",
                 where=WHERE,
@@ -292,10 +330,10 @@ class Timekeeper:
                 hint="a smaller learning.samples, or fewer training scenes, also leave more time for steps",
             )
         before = round((1 - share) * steps)
-        self.planned = TimePlan(
-            self.time_budget_s, pathwise, balancing, finishing, before, steps - before, settled=share == 0
-        )
-        return self._apply()
+        return TimePlan(
+            self.time_budget_s, times.pathwise_s, times.balancing_s, times.finishing_s, before, steps - before,
+            settled=share == 0,
+        )  # fmt: skip
 
     def replan(self, trainer: Trainer) -> LearningSettings:
         """The settings with as many balancing steps as fit now that the flow is trained; config.yaml follows."""

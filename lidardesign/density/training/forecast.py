@@ -1,0 +1,104 @@
+"""How long learning will take and how much memory: from its real preparation and a few real steps, without a trace."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lidardesign.config import RunConfig
+from lidardesign.density.learn import TrainingData, choose_device
+from lidardesign.density.training.checkpoint import load_arrays
+from lidardesign.density.training.schedule import StepTimes, Timekeeper, stage_steps
+from lidardesign.density.training.training import CHECKPOINT
+from lidardesign.run.clock import peak_memory_bytes, phase
+
+UNTRAINED = "balancing steps and the measurement at the end, which were timed before anything was learned"
+STAGES = "how many stages the tolerance takes, and whether it asks for finer distance fields"
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What learning will take on this machine, as far as a few steps tell.
+
+    Arguments:
+        seconds: The whole command [s]; with a tolerance its first stage.
+        longest_seconds: With a tolerance all of its stages, else the same [s].
+        preparing_s: Scenes, fields and proposals [s].
+        pathwise_s, balancing_s: One step of each phase [s].
+        finishing_s: Measuring and writing [s].
+        steps: Of both phases; with a tolerance those of its first stage.
+        peak_memory_bytes: The most that was held until then; None where the system does not tell.
+        gpu_memory_bytes: The most that was held on the GPU; None without one.
+        unknown: What a few steps do not tell.
+    """
+
+    seconds: float
+    longest_seconds: float
+    preparing_s: float
+    pathwise_s: float
+    balancing_s: float
+    finishing_s: float
+    steps: int
+    peak_memory_bytes: int | None
+    gpu_memory_bytes: int | None
+    unknown: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--dry-run --json`."""
+        values = {key: round(value, 4) if isinstance(value, float) else value for key, value in asdict(self).items()}
+        return {**values, "unknown": list(self.unknown)}
+
+
+@phase("planning")
+def forecast(
+    data: TrainingData,
+    config: RunConfig,
+    run: Path,
+    device: str,
+    elapsed_s: Callable[[], float],
+    *,
+    resume: bool = False,
+    tolerance: float | None = None,
+    time_budget_s: float | None = None,
+) -> Forecast:
+    """What learning will take.
+
+    Arguments:
+        data: What was prepared for it.
+        config: The configuration.
+        run: The folder that it would be learned in.
+        device: auto, cpu or cuda.
+        elapsed_s: How long the command has been running.
+        resume: Whether it goes on from the checkpoint there.
+        tolerance, time_budget_s: What decides the number of steps, where the configuration does not.
+
+    Raises:
+        ConfigError: The time is over before anything worth having is learned.
+    """
+    prepared, place, share = elapsed_s(), choose_device(device), config.learning.balance
+    times = StepTimes.measured(data, config, run, place)
+    stages = [config.learning.steps]
+    if resume:
+        _, state = load_arrays(run, CHECKPOINT)
+        stages = [max(config.learning.steps - int(state["step"]), 0)]
+    elif tolerance is not None:
+        stages = list(stage_steps(config.learning.steps))
+    elif time_budget_s is not None:
+        stages = [Timekeeper(time_budget_s, lambda: prepared, config, run).fitting(times).steps]
+    taken = [times.of(steps, share) for steps in stages]
+    return Forecast(
+        prepared + taken[0],
+        prepared + sum(taken),
+        prepared,
+        times.pathwise_s,
+        times.balancing_s,
+        times.finishing_s,
+        stages[0],
+        peak_memory_bytes(),
+        torch.cuda.max_memory_allocated(place) if place.type == "cuda" else None,
+        (*([UNTRAINED] if share > 0 else []), *([STAGES] if tolerance is not None and not resume else [])),
+    )
