@@ -143,16 +143,14 @@ MASKED_KEYS = re.compile(
     r"(.*_)?seconds(_.*)?|when|created|timings|phases|versions|lidardesign_version|peak_memory_bytes|peak_bytes"
     r"|(Config|space|scenes|score)_s"
 )
-# In text: durations, with the padding of their cell, memory, dates, and the table of what took how long.
+# In text: durations, memory, dates, and lines of progress, which come when they come.
 MASKED_TEXT = (
-    (re.compile(r"where the time went.*?└[^\n]*┘\n", re.DOTALL), ""),
-    (re.compile(r"(?<![\w.])\d+(\.\d+)?(e-\d+)? (s|ms|min|MiB)\b *"), "# "),
+    (re.compile(r"^[^\n]*(: .* left| \.\.\.)\n", re.MULTILINE), ""),
+    (re.compile(r"(?<![\w.])(\d+ (h|min) )?\d+(\.\d+)?(e-\d+)? (s|ms|min|MiB)\b *"), "# "),
     (re.compile(r"\d{4}-\d\d-\d\dT?[ ]?\d\d:\d\d(:\d\d)?(\.\d+)?([+-]\d\d:\d\d|Z)?"), "#"),
     (re.compile(r'<table>(?:(?!</table>).)*class="bar(?:(?!</table>).)*</table>', re.DOTALL), ""),
     (re.compile(r"^provenance:\n(?:[ -].*\n)*", re.MULTILINE), ""),
 )
-TABLE = re.compile(r"┏[^\n]*\n(?:[┃│├┡└][^\n]*\n)+")
-EDGES = re.compile(r"([┏┳┓┃┡╇┩│└┴┘├┼┤])")
 HTML_TABLE = re.compile(r'<th scope="col">seconds</th></tr>.*?</table>')
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 # Files that hold times beside what others hold; their sums in the manifest do so too.
@@ -365,19 +363,7 @@ def _masked_text(text: str) -> str:
     text = text.replace(str(Path.cwd().resolve()), "WORK").replace(str(ROOT), "REPOSITORY")
     for pattern, instead in MASKED_TEXT:
         text = pattern.sub(instead, text)
-    text = HTML_TABLE.sub(lambda table: re.sub(r"<td>[^<]*</td></tr>", "<td>#</td></tr>", table[0]), text)
-    return TABLE.sub(lambda table: _masked_table(table[0]), text)
-
-
-def _masked_table(table: str) -> str:
-    """A printed table with its column of seconds blank, borders too, as they are as wide as its figures."""
-    rows = [EDGES.split(line) for line in table.splitlines()]
-    headings = [(place, cell.strip()) for row in rows if row[1] == "┃" for place, cell in enumerate(row)]
-    timed = {place for place, heading in headings if heading in ("seconds", "s")}
-    for row in rows:
-        for place in timed & set(range(len(row))):
-            row[place] = "#"
-    return "".join("".join(row) + "\n" for row in rows)
+    return HTML_TABLE.sub(lambda table: re.sub(r"<td>[^<]*</td></tr>", "<td>#</td></tr>", table[0]), text)
 
 
 def _masked_csv(text: str) -> str:
