@@ -77,14 +77,15 @@ class LearningSettings(BaseModel):
     hidden: int = Field(96, ge=4, le=8_192, description="hidden width of each layer's network")
     bins: int = Field(16, ge=2, le=1_024, description="spline bins per dimension")
     dtype: Literal["float64", "float32"] = Field(
-        "float32", description="arithmetic of training steps, while it can invert the flow; samples are always float64"
+        "float32",
+        description="precision of training steps, as long as it can invert the flow; samples are always float64",
     )
-    entropy: float = Field(0.0, ge=0, le=1e3, description="eta of the paper; annealed to 0")
+    entropy: float = Field(0.0, ge=0, le=1e3, description="weight of the entropy, eta of the paper; annealed to 0")
     sigma_start_m: float | None = Field(
         None, ge=SHORTEST_M, le=FARTHEST_M, description="where sigma's annealing starts; default 6 sigma"
     )
     anneal: float = Field(0.7, ge=0, le=1, description="share of the path-wise steps over which sigma falls")
-    balance: float = Field(0.5, ge=0, le=1, description="share of the steps, the last ones, that balance by values")
+    balance: float = Field(0.5, ge=0, le=1, description="share of the steps, at the end, that balance by values")
     balance_proposals: int = Field(
         32768, ge=256, le=10_000_000, description="independent proposals that balancing draws from"
     )
@@ -130,7 +131,9 @@ def parse_override(text: str, option: str = "--set") -> Override:
     where = f"{option} {text}"
     parts = key.strip().split(".")
     if not equals or not all(parts):
-        raise ConfigError("is not of the form KEY=VALUE", where=where, allowed="a dotted key, as density.sigma_m=0.005")
+        raise ConfigError(
+            "is not of the form KEY=VALUE", where=where, allowed="a dotted key, such as density.sigma_m=0.005"
+        )
     if len(parts) > MAX_DEPTH:
         raise ConfigError(f"the key has {len(parts)} parts", where=where, allowed=f"at most {MAX_DEPTH}")
     value = value.strip()

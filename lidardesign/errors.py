@@ -19,7 +19,7 @@ Text = TypeVar("Text", str, None)
 # The largest root of random streams.
 MAX_SEED = 2**63 - 1
 # What to do where an option or a key has nothing behind it.
-UNSET_HINT = "a shell variable that is not set leaves nothing: give a value, or leave it out"
+UNSET_HINT = "a shell variable that is not set expands to nothing: give a value, or leave it out"
 # Where the documentation is: in a checkout, or where an installation puts it (pyproject.toml, data-files).
 _ROOT = Path(__file__).parents[1]
 _SHARED = Path("share", "doc", "lidardesign")

@@ -159,10 +159,10 @@ def painted_weights(part: trimesh.Trimesh, painted: Painted, where: str) -> np.n
     wrong = ~((weights >= 1 / LARGEST_WEIGHT) & (weights <= LARGEST_WEIGHT))
     if wrong.any():
         raise DataError(
-            f"{painted.attribute} of {int(wrong.sum())} vertices is not a usable weight, as {weights[wrong][0]:g}",
+            f"{painted.attribute} of {int(wrong.sum())} vertices is not a usable weight, such as {weights[wrong][0]:g}",
             where=where,
             allowed=f"{1 / LARGEST_WEIGHT:g} to {LARGEST_WEIGHT:g}",
-            hint="a part that hardly matters has a small weight, not 0",
+            hint="give a part that hardly matters a small weight, not 0",
         )
     return weights
 
@@ -234,7 +234,7 @@ def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, pain
     """
     path = Path(path)
     if not (np.isfinite(scale) and scale > 0):
-        raise DataError(f"the scale {scale} is no factor to metres", where=str(path), allowed="a positive number")
+        raise DataError(f"the scale {scale} is not a factor to metres", where=str(path), allowed="a positive number")
     vertices, faces, importance = _read(path, painted)
     with np.errstate(over="ignore", invalid="ignore"):  # what is too large is refused below
         vertices = vertices * scale
@@ -345,10 +345,10 @@ def _oriented(
         faces, turned = turned_to_agree(faces, _double_areas(vertices, faces))
         mixed_edges = edge_defects(faces)[1]
         if turned:
-            notes.append(BackgroundNote(f"turned {turned} faces that ran against their neighbours"))
+            notes.append(BackgroundNote(f"flipped {turned} faces that were wound against their neighbours"))
     if not open_edges and not mixed_edges and signed_volume_m3(vertices, faces) < 0:
         faces = faces[:, ::-1]
-        notes.append(BackgroundNote("the mesh was inside out: all faces were turned"))
+        notes.append(BackgroundNote("the mesh was inside out: all faces were flipped"))
     defects = [f"{open_edges} open edges"] * bool(open_edges)
     defects += [f"{mixed_edges} edges between faces of opposite winding"] * bool(mixed_edges)
     found = " and ".join(defects)
@@ -400,7 +400,7 @@ def _read(path: Path, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, 
 def _reason(error: Exception) -> str:
     """One line for people; trimesh asks an optional package about text that is not UTF-8."""
     if isinstance(error, ModuleNotFoundError):
-        return "its bytes are not UTF-8 text" if error.name == "charset_normalizer" else f"needs {error.name}"
+        return "it is not UTF-8 text" if error.name == "charset_normalizer" else f"needs {error.name}"
     return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
 
 

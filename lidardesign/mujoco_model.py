@@ -151,7 +151,7 @@ def load_model(
             raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from error
     _check_places(model, path)
     if root.find("mujoco/compiler[@discardvisual='true']") is not None:
-        collected.append("visual shapes are discarded, those that collide are seen")
+        collected.append("visual shapes are discarded, so rays meet the collision shapes")
     lines = dict.fromkeys(" ".join(str(line).split()) for line in (*collected, *(one.message for one in caught)))
     return model, tuple(f"{path.name}: MuJoCo warns: {line}" for line in lines)
 
@@ -274,7 +274,7 @@ def seen_geoms(model: mujoco.MjModel, groups: Sequence[int] | None = None) -> tu
         double = collides & (bodies > 0) & np.isin(bodies, bodies[~collides]) & ~np.isin(places, places[~collides])
         chosen = chosen[~double]
         if double.any():
-            left_out = f"shapes that collide are left out where their body has others to be seen: {double.sum()}"
+            left_out = f"collision shapes are left out where their body has visual ones: {double.sum()}"
             notes.append(BackgroundNote(left_out))
     if not len(chosen):
         used = ", ".join(str(group) for group in np.unique(model.geom_group)) or "none"
@@ -361,7 +361,7 @@ def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], 
     own, allowed_folder = path.resolve().parent, (folder or path.parent).resolve()
     documents, assets, directories, roots = [path.resolve()], [], {""}, []
     if folder is not None and not os.path.isdir(allowed_folder):
-        raise DataError("is no folder", where=str(folder), hint="name the folder that holds all files of the model")
+        raise DataError("is not a folder", where=str(folder), hint="name the folder that holds all files of the model")
 
     def inside(directory: str, name: str) -> Path:
         """The file that the model names, links followed."""

@@ -113,7 +113,7 @@ class PluginProcess:
         except subprocess.TimeoutExpired:
             return None
         if code == UNANSWERED:
-            return f"closes files that are not its own {when}"
+            return f"closes files that it did not open {when}"
         if code < 0:
             return f"crashes {when} ({signal.strsignal(-code)})"
         return f"ends the program {when} (exit code {code})"
@@ -189,7 +189,7 @@ def answer(result: Any, document: dict[str, Any]) -> None:
 
 GROUP = "lidardesign.tasks"
 IMPORT_SECONDS = 30.0
-AUTHOR_HINT = "tell its author"
+AUTHOR_HINT = "report it to its author"
 # Plugins that are imported elsewhere at the same time.
 SIDE_BY_SIDE = 8
 
@@ -433,9 +433,9 @@ def check_interface(name: str, task: Any) -> None:
         if not isinstance(getattr(task, member, None), kind):
             raise PluginError(f"its {member} is no {kind.__name__}", where=f"task {name}", hint=AUTHOR_HINT)
     if not (isinstance(getattr(task, "Config", None), type) and issubclass(task.Config, TaskConfig)):
-        raise PluginError("its Config is no subclass of TaskConfig", where=f"task {name}", hint=AUTHOR_HINT)
+        raise PluginError("its Config is not a subclass of TaskConfig", where=f"task {name}", hint=AUTHOR_HINT)
     for member in ("space", "scenes", "score"):
         if not callable(getattr(task, member, None)):
             raise PluginError(f"it has no method {member}()", where=f"task {name}", hint=AUTHOR_HINT)
     if task.name != name:
-        raise PluginError(f"it calls itself {task.name!r}", where=f"task {name}", hint=AUTHOR_HINT)
+        raise PluginError(f"its name is {task.name!r}", where=f"task {name}", hint=AUTHOR_HINT)

@@ -132,7 +132,7 @@ def load_samples(run: Path, expected: DesignSpace | None = None) -> Samples:
     if expected is not None and space != expected:
         own, theirs = space.as_dict(), expected.as_dict()
         name = next(name for name in own if own[name] != theirs[name])
-        found = f"are samples of another design space: {name} {own[name]}"
+        found = f"belong to another design space: {name} {own[name]}"
         raise DataError(found, where=str(path), allowed=f"{name} {theirs[name]}, as the run", hint=DAMAGED_HINT)
     outside = int((~space.contains(points)).sum())
     if outside:

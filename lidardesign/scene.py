@@ -43,7 +43,7 @@ def _check_weights(what: str, weights: np.ndarray, shape: tuple[int, ...] = ()) 
         raise DataError(
             f"{what}: importance is {weights[wrong].flat[0]:g}",
             allowed=f"{1 / LARGEST_WEIGHT:g} to {LARGEST_WEIGHT:g}",
-            hint="what does not count at all is a body with the role occluder, or no part of the mesh",
+            hint="give what does not count at all the role occluder, or leave it out of the mesh",
         )
 
 
@@ -191,7 +191,7 @@ def _check_shares(what: str, **shares: float) -> None:
             raise DataError(f"{what}: {name} is {value}", allowed="0 to 1")
     if sum(shares.values()) > 1 + SHARE_ROUNDING:
         named = " + ".join(shares)
-        raise DataError(f"{what}: {named} is {sum(shares.values()):g}", allowed="at most 1: no light is made")
+        raise DataError(f"{what}: {named} is {sum(shares.values()):g}", allowed="at most 1 in all")
 
 
 @dataclass(frozen=True)
@@ -385,7 +385,7 @@ class Scene:
                 found = repr(getattr(self, name))
                 raise DataError(f"scene {self.name!r}: {name} is {found}", allowed=f"{kind.__name__}(...) or None")
         if not isinstance(self.group, str | None):
-            raise DataError(f"scene {self.name!r}: group is {self.group!r}", allowed="a text or None")
+            raise DataError(f"scene {self.name!r}: group is {self.group!r}", allowed="text or None")
         if not (math.isfinite(self.frame_rate_hz) and self.frame_rate_hz > 0):
             raise DataError(f"scene {self.name!r}: frame_rate_hz is {self.frame_rate_hz}", allowed="finite, above 0")
 

@@ -226,7 +226,7 @@ class DesignSpace:
         for name, value in condition.items():
             if name not in self.condition:
                 raise ConfigError(
-                    f"{name!r} is no condition of the density",
+                    f"{name!r} is not a condition of the density",
                     where="--at",
                     allowed=", ".join(self.condition) or "none: the density has no conditions",
                 )

@@ -203,7 +203,9 @@ def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpa
     for scene in scenes:
         if not isinstance(scene, Scene):
             raise PluginError(
-                f"scenes gave one {type(scene).__name__}", where=f"task {task.name}", allowed="lidardesign.scene.Scene"
+                f"scenes() returned a {type(scene).__name__}",
+                where=f"task {task.name}",
+                allowed="lidardesign.scene.Scene",
             )
     return scenes
 
@@ -219,10 +221,12 @@ def metric_of(task: Task, config: Any) -> Metric:
     found = task.metric_of(config)
     where = f"task {task.name}, metric_of"
     if not isinstance(found, Metric):
-        raise PluginError(f"it gave {type(found).__name__}", where=where, allowed="lidardesign.task.Metric")
+        raise PluginError(f"it returned {type(found).__name__}", where=where, allowed="lidardesign.task.Metric")
     usual = [_quantity(metric) for metric in (task.metric, *getattr(task, "metrics", ()))]
     if _quantity(found) not in usual:
-        raise PluginError(f"it gave {_quantity(found)}", where=where, allowed=f"{' or '.join(usual)}, as in its metric")
+        raise PluginError(
+            f"it returned {_quantity(found)}", where=where, allowed=f"{' or '.join(usual)}, as in its metric"
+        )
     return found
 
 
@@ -234,7 +238,7 @@ def mount_of(task: Task, config: Any) -> str | None:
     """
     found = task.mount_of(config) if hasattr(task, "mount_of") else None
     if not isinstance(found, str | None) or found == "":
-        raise PluginError(f"it gave {found!r}", where=f"task {task.name}, mount_of", allowed="a name or None")
+        raise PluginError(f"it returned {found!r}", where=f"task {task.name}, mount_of", allowed="a name or None")
     return found
 
 
@@ -278,7 +282,7 @@ def conditions_of(task: Task, config: Any, space: DesignSpace) -> list[dict[str,
         named = [{name: float(value) for name, value in one.items()} for one in task.conditions(config)]
         where = f"task {task.name}, conditions"
         if not named:
-            raise PluginError("no condition value is named", where=where, allowed="1 or more")
+            raise PluginError("no condition value is given", where=where, allowed="1 or more")
         for one in named:
             try:
                 space.at(one)

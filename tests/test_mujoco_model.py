@@ -211,7 +211,7 @@ def test_a_urdf_finds_the_meshes_of_its_package_and_shows_its_visual_shapes(tmp_
 
 BAD = {
     "a missing file": (None, "cannot be read"),
-    "no XML": ("hello", "is no XML"),
+    "no XML": ("hello", "is not XML"),
     "another format": ("<sdf/>", "its root element is <sdf>"),
     "a file outside": ('<mujoco><asset><mesh file="../m.obj"/></asset></mujoco>', "outside the model's folder"),
     "a folder outside": ('<mujoco><compiler meshdir="/etc"/></mujoco>', "outside the model's folder"),

@@ -60,7 +60,9 @@ def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
         staged = Path(folder) / f"stdout{suffix}"
         yield staged
         if staged.is_dir():
-            raise DataError("is no folder, and this is a folder of files", where=str(path), hint="give a folder's name")
+            raise DataError(
+                "is not a folder, and this is a folder of files", where=str(path), hint="give a folder's name"
+            )
         content = staged.read_bytes()
     if is_output(path):
         put_on_stdout(content)
@@ -108,7 +110,7 @@ def claim_outputs(
     is_page = report is not None and (report.is_file() or not report.exists())
     if is_page and report.suffix.lower() not in ("", *PAGE_SUFFIXES):
         raise ConfigError(
-            f"{report.name} is no name of an HTML page",
+            f"{report.name} is not a name of an HTML page",
             where="--report",
             allowed=", ".join(PAGE_SUFFIXES),
             hint=f"--report {quote(str(report.with_suffix('.html')))}; a browser prints it as PDF",
@@ -124,4 +126,4 @@ def note_new_folders(paths: Iterable[Path], output: Output) -> None:
         if missing and not is_output(path):
             new.setdefault(missing[-1], path)
     for folder, path in new.items():
-        output.note(f"note: there is no folder {folder} yet; it is made for {path}")
+        output.note(f"note: there is not a folder {folder} yet; it is made for {path}")

@@ -36,8 +36,8 @@ from lidardesign.task import Task, notes_of, random_generator
 
 FLOW = "flow.safetensors"
 ON_PROCESSOR = (
-    "the target is evaluated on the processor, a round trip a step: on the GPU stay only meshes at rest, with "
-    "density.visibility=quadrature or off"
+    "the target is evaluated on the CPU, with a round trip at every step: only meshes at rest with "
+    "density.visibility=quadrature or off stay on the GPU"
 )
 DEVICES = ("auto", "cpu", "cuda")
 
@@ -100,7 +100,7 @@ def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str],
     """
     if not set(config.space.free) - set(config.space.conditioned):
         raise ConfigError(
-            "every dimension of the design space is fixed: it is one design point, with nothing to learn",
+            "every dimension of the design space is fixed, so there is nothing to learn",
             where="space",
             hint="free at least one, or write the point as a design file",
         )
@@ -137,7 +137,7 @@ def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
     receiver = common_receiver(scenes)
     if receiver is not None and not in_view(receiver, observed_point(points)).any():
         raise DataError(
-            "its field of view and range hold no surface that a ray of the design space reaches",
+            "no surface that a ray of the design space reaches lies in its field of view and range",
             where="receiver",
             hint="turn it, widen its field of view or its range, or move it",
         )
@@ -213,9 +213,9 @@ def learn(
 def _notes(trainer: Trainer, place: torch.device) -> list[str]:
     notes = [] if stays_on(trainer.target, place) else [ON_PROCESSOR]
     if trainer.skipped:
-        notes.append(f"{trainer.skipped} steps were not finite and skipped")
+        notes.append(f"{trainer.skipped} steps were skipped: their loss or gradient was not finite")
     if trainer.doubled_at is not None:
-        splines = f"float32 could not invert the flow's splines: from step {trainer.doubled_at} on float64"
+        splines = f"float32 could not invert the flow's splines: float64 was used from step {trainer.doubled_at} on"
         notes.append(BackgroundNote(splines))
     return notes
 

@@ -123,7 +123,9 @@ def load_flow(run: Path, name: str, config: RunConfig, target: Target | FlatTarg
         flow.load_state_dict({key: torch.as_tensor(value) for key, value in arrays.items()})
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
-        raise DataError(f"is of another flow: {reason}", where=str(run / name), hint="learn the run again") from None
+        raise DataError(
+            f"belongs to another flow: {reason}", where=str(run / name), hint="learn the run again"
+        ) from None
     return LearnedFlow(flow, target, Coordinates(config.space), generator.manual_seed(seed))
 
 
@@ -139,9 +141,11 @@ def seconds_at(run: Path, steps: list[int]) -> dict[int, float]:
         done = np.array([0.0, *(float(row["step"]) for row in rows)])
         taken = np.array([0.0, *(float(row["seconds"]) for row in rows)])
         if not (np.isfinite(done).all() and np.isfinite(taken).all() and (np.diff(done) > 0).all()):
-            raise ValueError("steps do not ascend, or a number is none")
+            raise ValueError("steps do not ascend, or a value is not a number")
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-        raise DataError("is no progress of learning", where=str(run / PROGRESS), hint="learn the run again") from None
+        raise DataError(
+            "does not hold the progress of learning", where=str(run / PROGRESS), hint="learn the run again"
+        ) from None
     return {step: float(np.interp(step, done, taken)) for step in steps}
 
 

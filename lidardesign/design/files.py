@@ -235,7 +235,7 @@ def design_from_document(
     root = Node(document, (), locate or (lambda _path: where))
     if not isinstance(root.value, dict) or "sensors" not in root.value:
         raise ConfigError(
-            "this is no design: it has no key `sensors`",
+            "this is not a design: it has no key `sensors`",
             where=root.locate(()),
             hint=f"{page('design-file.md')} shows a design written by hand",
         )

@@ -253,7 +253,7 @@ def refitted(
         constraints = Constraints.from_mapping(document, where=f"constraints of {design.name}")
         if any(pin is not None for group in sensor_groups(constraints.rules, samples.space, 1) for pin in group.pins):
             raise ConfigError(
-                f"a scan from a pinned origin cannot be fitted anew to {count} rays without its target density",
+                f"a scan from a pinned origin cannot be refitted to {count} rays without its target density",
                 where=design.name,
                 allowed=f"{own_count(design)} rays",
                 hint=f"lidardesign constrain RUN --layout scan --rays {count} with the same constraints",

@@ -266,7 +266,7 @@ def visible_surface(
         draw = int(1.5 * (count - found) * len(seen) / max(int(seen.sum()), 1)) + 1
     if not found:
         raise DataError(
-            "no admissible ray sees any part of a target",
+            "no ray of the design space sees any part of a target",
             where=f"scene {scene.name!r}",
             hint="move the sensors, or widen angles and range of the design space, to reach the targets",
         )

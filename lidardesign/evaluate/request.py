@@ -116,7 +116,7 @@ class EvaluationRequest:
         for name in names:
             if names.count(name) > 1 or is_baseline(name):
                 other = "a baseline" if is_baseline(name) else "another design"
-                raise ConfigError(f"a design has the name of {other}: {name!r}", hint="rename its file")
+                raise ConfigError(f"a design has the same name as {other}: {name!r}", hint="rename its file")
         for name in self.baselines:
             baseline_of(name, where="--baseline")
         if any(count < 1 for count in self.rays):

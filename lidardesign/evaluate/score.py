@@ -256,7 +256,7 @@ def group_notes(scenes: Sequence[Scene]) -> list[str]:
     """What intervals are over, where that are not just the held-out scenes."""
     groups = int(group_numbers(scenes).max()) + 1
     if len(scenes) == 1:
-        return ["one held-out scene: it says nothing about others, so there are no intervals"]
+        return ["only one held-out scene, so there are no intervals"]
     if groups == 1:
         return [f"all {len(scenes)} held-out scenes are of one group, {scenes[0].group!r}: there are no intervals"]
     if groups == len(scenes):

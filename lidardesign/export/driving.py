@@ -221,8 +221,8 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
     }
     write_atomic(path, json.dumps(whole, indent=1) + "\n")
     notes = [
-        "gates are not held: `range` is the end of the last one",
-        "names are not held: sensor_id counts the configurations, in the order of the sensors",
+        "gates are lost: `range` is the end of the last one",
+        "names are lost: sensor_id numbers the configurations, in the order of the sensors",
     ]
     if len(found) > len(mounted):
         notes.append(f"rays of {len(mounted)} sensors start at {len(found)} places: each is a configuration of its own")

@@ -251,7 +251,7 @@ def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
 
 
 def galvo_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose: gates open outward to whole picoseconds; firing times are not held."""
+    """What the written numbers lose: gates open outward to whole picoseconds; firing times are lost."""
     return rays_rounding(rays, read_galvo(path), path, times=False)
 
 
@@ -296,7 +296,7 @@ def read_galvo(path: Path) -> Rays:
     count = len(table["ray"])
     if sorted(table["ray"].tolist()) != list(range(count)) or sorted(table["step"].tolist()) != list(range(count)):
         raise DataError(
-            "rays or steps are missing or there twice", where=str(path), allowed=f"each of 0 to {count - 1}"
+            "rays or steps are missing or given twice", where=str(path), allowed=f"each of 0 to {count - 1}"
         )
     directions = np.empty((count, 3))
     boresights = np.stack([table["boresight_azimuth_deg"], table["boresight_elevation_deg"]], axis=1)
@@ -329,7 +329,7 @@ def _refuse_far_rays(design: DesignSpec, rays: Rays, positions: list[Position]) 
     x, y = angles_deg[worst]
     sensor = design.sensors[int(rays.sensor[ray[worst]])].name
     raise ConfigError(
-        f"{int(beyond.sum())} of {len(ray)} rays are out of the mirrors' reach, the furthest at x = {x:.2f}, "
+        f"{int(beyond.sum())} of {len(ray)} rays are beyond the mirrors' reach, the farthest at x = {x:.2f}, "
         f"y = {y:.2f} degrees from the middle of the rays (ray {ray[worst]}, sensor {sensor!r})",
         where=design.name,
         allowed=f"+-{LIMIT_DEG:g} degrees of optical scan angle per axis",
@@ -360,7 +360,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     where = str(path)
     (_, header), *rows = csv_rows(path, RAY_TABLE) or [(1, [])]
     if tuple(header) != COLUMNS:
-        raise DataError("is no ray list of the galvo format", where=where, allowed=",".join(COLUMNS))
+        raise DataError("is not a ray list of the galvo format", where=where, allowed=",".join(COLUMNS))
     values = np.empty((len(rows), len(COLUMNS)))
     for index, (line, row) in enumerate(rows):
         values[index] = _numbers(row, f"{where}:{line}")

@@ -93,7 +93,7 @@ def isaac_losses(design: DesignSpec, mounted: Sequence[Mount], rate_hz: float) -
     """Notes of what Isaac's profiles cannot hold."""
     notes = [*design_losses(design, mounted), *origin_losses(mounted)]
     if whole_rate_hz(rate_hz) != rate_hz:
-        notes.append(f"frame rates are whole numbers there: {rate_hz:g} Hz is {whole_rate_hz(rate_hz)} Hz")
+        notes.append(f"frame rates there are whole numbers: {rate_hz:g} Hz is {whole_rate_hz(rate_hz)} Hz")
     near = sum(one.gate_m[0] < LEAST_START_M for one in mounted)
     if near:
         notes.append(

@@ -59,7 +59,7 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     files = {RAYS: _file(comments, vertex=_ray_points(rays)), BEAMS: _beams(rays, comments)}
     if seen:
         files[FRUSTA] = _frusta(seen, comments)
-    notes = [*write_folder(path, files), "weights, spreads and origin covariances of the sensors are not held"]
+    notes = [*write_folder(path, files), "weights, spreads and origin covariances of the sensors are lost"]
     if len(seen) < len(design.sensors):
         notes.append(f"{len(design.sensors) - len(seen)} of {len(design.sensors)} sensors have no width, so no frustum")
     moving = [length for length, _ in (sensor.travel_m for _, sensor in seen) if length > 0]
@@ -180,7 +180,7 @@ def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     write_atomic(path, "".join(_solid(index, sensor) for index, sensor in enumerate(design.sensors)))
     notes = [
         "numbers are millimetres: STL has no units, and CAD programs take that one",
-        "sensors only: rays, fields of view, gates, weights and spreads are not held",
+        "sensors only: rays, fields of view, gates, weights and spreads are lost",
     ]
     moving = [length for length, _ in (sensor.travel_m for sensor in design.sensors) if length > 0]
     if moving:

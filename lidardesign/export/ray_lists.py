@@ -62,7 +62,7 @@ def rays_of_columns(columns: Mapping[str, np.ndarray], path: Path) -> Rays:
             if values.dtype.kind not in "iuf" or not (np.abs(values.astype(np.float64)) <= most).all():
                 raise ValueError(f"a number of {name} is none, or beyond {most:g}")
         if (sensor % 1 != 0).any() or (sensor < 0).any():
-            raise ValueError("a sensor is no whole number of 0 or more")
+            raise ValueError("a sensor is not a whole number of 0 or more")
         return Rays(origin, ray, gate, sensor, time)
     except (KeyError, ValueError, ConfigError) as error:
         raise DataError(f"holds no ray list: {error}", where=str(path)) from error
@@ -70,7 +70,7 @@ def rays_of_columns(columns: Mapping[str, np.ndarray], path: Path) -> Rays:
 
 def ray_list_losses(design: DesignSpec) -> list[str]:
     """What a ray list says nothing of."""
-    notes = ["sensors appear by index only: their weights, spreads and origin covariances are not held"]
+    notes = ["sensors are numbered: their names, weights, spreads and origin covariances are lost"]
     return notes + constraint_losses(design)
 
 
@@ -129,7 +129,7 @@ def npz_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estima
 def write_sensors_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the sensors, not the rays; returns notes of what the format cannot hold."""
     notes = write_sensor_csv(design, path)
-    return [*notes, f"the {len(rays)} rays are not held"] if len(rays) else notes
+    return [*notes, f"the {len(rays)} rays are lost"] if len(rays) else notes
 
 
 def sensors_csv_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:

@@ -123,7 +123,7 @@ def write_helios(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> 
         f"the surveys name the scene {SCENE}: put yours beside them, and give the folder to helios as --assets",
         f"HELIOS++ drops returns up to {MM_PER_M * lost_m:.1f} mm behind a gate's start: the rise of a pulse of "
         f"{PULSE_NS} ns must begin inside",
-        "all rays of a frame fire at once: their times within the frame are not held",
+        "all rays of a frame fire at once: their times within the frame are lost",
     ]
     if near:
         notes.append(
@@ -131,7 +131,7 @@ def write_helios(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> 
             "sends no power through a gate from 0"
         )
     if pulse_hz != rate_hz:
-        notes.append(f"{rate_hz:g} frames per second became {pulse_hz}: HELIOS++ knows whole numbers only")
+        notes.append(f"{rate_hz:g} frames per second became {pulse_hz}: HELIOS++ takes whole numbers only")
     return [*notes, *design_losses(design, mounted)]
 
 
@@ -214,7 +214,7 @@ def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     notes += [
         "scenes hold no shapes: include one of them in yours, or yours in it; each sensor is a scene of its own",
         f"the light is one flash for all rays: only light straight there and back (max_depth {DEPTH}) is the ray's own",
-        f"gates end on whole bins of {MM_PER_M * Bandwidth().bin_m:.1f} mm; times within the frame are not held",
+        f"gates end on whole bins of {MM_PER_M * Bandwidth().bin_m:.1f} mm; times within the frame are lost",
     ]
     largest = max(len(one.ray) * _bins(rays, one) for one in found)
     if largest > MOST_NUMBERS:

@@ -71,7 +71,7 @@ class Exporter:
         write = getattr(import_module(self.module), self.functions[0])
         self.check_rate(rate_hz)
         if robot is not None and not self.robotic:
-            raise ConfigError(f"{self.name} holds no robot", where="--robot", allowed="with mjcf")
+            raise ConfigError(f"{self.name} cannot hold a robot", where="--robot", allowed="with mjcf")
         options: dict[str, Any] = {} if robot is None else {"robot": robot}
         if self.rated:
             options["rate_hz"] = Bandwidth().rate_hz if rate_hz is None else rate_hz
@@ -92,7 +92,7 @@ class Exporter:
         if rate_hz is not None and not self.rated:
             rated = ", ".join(name for name, exporter in EXPORTERS.items() if exporter.rated)
             raise ConfigError(
-                f"{self.name} holds no frame rate", where="--rate-hz", allowed=f"with {rated}" if rated else "none"
+                f"{self.name} cannot hold a frame rate", where="--rate-hz", allowed=f"with {rated}" if rated else "none"
             )
 
     def rounding(self, design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
@@ -151,7 +151,7 @@ EXPORTERS: dict[str, Exporter] = {
             ("write_mjcf", "mjcf_rounding"),
             robotic=True,
             reader="MuJoCo",
-            checked="loaded and run in MuJoCo: its distances are ours",
+            checked="loaded and run in MuJoCo: its distances agree with ours",
         ),
         Exporter(
             "sdf",

@@ -90,7 +90,9 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | No
     if robot is not None:
         model, place, sensors = _robot_with(design.mount, robot, path)
         taken += [body.get("name", "") for body in model.iter("body")]
-        notes.append("geoms of the robot that are not shown are transparent, for MuJoCo's rays pass no others")
+        notes.append(
+            "geoms of the robot that are not shown are transparent, since MuJoCo's rays pass through no others"
+        )
     bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
     site = np.empty(len(rays), dtype=object)
     for mount, name in zip(mounted, bodies, strict=True):
@@ -157,7 +159,7 @@ def read_mjcf(path: Path, count: int | None = None) -> Rays:
         looking = np.array([frames[one.attrib["site"]][1] for one in found]).reshape(-1, 3)
         return Rays(origin, unit_vectors(looking), user[:, :2], user[:, 2].astype(np.int64), user[:, 3])
     except (KeyError, ValueError, IndexError) as error:
-        raise DataError(f"is no model of rangefinders: {error!r}", where=str(path)) from error
+        raise DataError(f"is not a model of rangefinders: {error!r}", where=str(path)) from error
 
 
 def mjcf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
@@ -341,7 +343,7 @@ def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Band
     mounted = mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
     write_xml(path, element("robot", {"name": identifier(design.name)}, [*_base(), *parts]))
-    mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave the sensors out"
+    mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave out the sensors"
     return [*urdf_losses(design, mounted, rays), mass]
 
 

@@ -78,7 +78,7 @@ def read_obj(data: bytes, where: str) -> TextMesh:
     corners = _column_counts(faces, 3, where)
     references = _references(faces, where)
     vertices = np.zeros(len(references), dtype=np.int64)
-    for column, (what, rows) in enumerate((("vertex", points), ("texture place", places), ("normal", normals))):
+    for column, (what, rows) in enumerate((("vertex", points), ("texture coordinate", places), ("normal", normals))):
         named = references[:, column]
         index = _resolved(named, rows, faces, corners) if (named < 0).any() else named - 1
         wrong = ((index < 0) | (index >= len(rows.texts))) & ((column == 0) | (named != ABSENT))
@@ -113,7 +113,7 @@ def read_off(data: bytes, where: str) -> TextMesh:
     rows = Rows(data, rb"^[ \t]*([^\s#][^\n#]*)")
     word, _, rest = (rows.texts[0] if rows.texts else b"").partition(b" ")
     if not re.fullmatch(rb"C?N?OFF", word.strip().upper()) or rest.strip().upper() == b"BINARY":
-        raise DataError("is no OFF file in text", where=where, allowed="a first line OFF, COFF, NOFF or CNOFF")
+        raise DataError("is not an OFF text file", where=where, allowed="a first line OFF, COFF, NOFF or CNOFF")
     begin = 0 if rest.strip() else 1
     counts = (rest if rest.strip() else b" ".join(rows.texts[1:2])).split()
     if len(counts) < 2 or not all(count.isdigit() and len(count) < 19 for count in counts[:2]):
@@ -174,7 +174,7 @@ def read_stl(data: bytes, where: str) -> TextMesh:
         raise DataError(
             f"promises {promised} triangles in {STL_HEADER + promised * STL_FACET.itemsize} bytes, and has {len(data)}",
             where=where,
-            hint="it may be cut short, or no STL file",
+            hint="it may be cut short, or not an STL file",
         )
     data = _plain(data, where)
     corners, words = (
@@ -187,7 +187,7 @@ def read_stl(data: bytes, where: str) -> TextMesh:
     assert fitting is not None, "nothing fits as well"
     if fitting.end() < len(letters.rstrip(b"x")):
         line = words.lines()[fitting.end()]
-        raise DataError("a facet has not 3 corners", where=f"{where}:{line}", allowed="3 in each")
+        raise DataError("a facet does not have 3 corners", where=f"{where}:{line}", allowed="3 in each")
     if not letters.endswith(b"d"):
         raise DataError("ends early: the last solid is not closed", where=where, hint="it may be cut short")
     _column_counts(corners, 3, where, most=3)
@@ -211,7 +211,7 @@ def _plain(data: bytes, where: str) -> bytes:
     longest = int(np.argmax(np.diff(ends, prepend=-1)))
     length = int(np.diff(ends, prepend=-1)[longest])
     if length > LONGEST_LINE:
-        raise DataError(f"has a line of {length} letters", where=f"{where}:{longest + 1}", allowed=f"{LONGEST_LINE}")
+        raise DataError(f"has a line of {length} characters", where=f"{where}:{longest + 1}", allowed=f"{LONGEST_LINE}")
     data = data.replace(b"\t", b" ")
     # patterns would look at every blank several times
     return re.sub(rb" {2,}", b" ", data) if 8 * data.count(b" " * 4) > len(data) else data
@@ -252,7 +252,7 @@ def _parsed(text: bytes, kind: type) -> np.ndarray | None:
             return None
 
 
-# No index: of texture places and normals that a face does not name.
+# No index: of texture coordinates and normals that a face does not name.
 ABSENT = np.iinfo(np.int64).min
 WHOLE_NUMBER = re.compile(rb"[-+]?\d{1,18}")
 # Faces whose corners are taken apart at once; bounds memory.
@@ -261,7 +261,7 @@ BLANKS = b" \t\v\f"
 
 
 def _references(faces: Rows, where: str) -> np.ndarray:
-    """The indices of vertex, texture place and normal of every corner as they stand there, shape (N, 3)."""
+    """The indices of vertex, texture coordinate and normal of every corner as they stand there, shape (N, 3)."""
     found = [np.zeros((0, 3), dtype=np.int64)]
     for begin in range(0, len(faces.texts), ROWS_AT_ONCE):
         texts = faces.texts[begin : begin + ROWS_AT_ONCE]
@@ -311,13 +311,13 @@ def check_ply(data: bytes, where: str) -> None:
     if not data.startswith(b"ply") or not found:
         raise DataError("has no header from `ply` to `end_header`", where=where, hint=AGAIN_HINT)
     if len(header) > LONGEST_HEADER or (body.count(b"\n") > MOST_ROWS and b"ascii" in header):
-        allowed = f"{LONGEST_HEADER} letters of header, and {MOST_ROWS} lines of text"
+        allowed = f"{LONGEST_HEADER} characters of header, and {MOST_ROWS} lines of text"
         raise DataError("has too long a header or too many lines", where=where, allowed=allowed, hint=BINARY_HINT)
     is_text, name, least, total = b"ascii" in header.partition(b"element")[0], "", 0, 0
     for line, words in enumerate((text.split() for text in header.decode(errors="replace").splitlines()), 1):
         if words[:1] == ["element"]:
             if len(words) != 3 or not words[2].isdigit() or len(words[2]) > 18:
-                raise DataError("is no count of elements", where=f"{where}:{line}", allowed="element NAME COUNT")
+                raise DataError("is not a count of elements", where=f"{where}:{line}", allowed="element NAME COUNT")
             name, count = words[1], int(words[2])
             total += count
         elif words[:1] == ["property"] and name:
@@ -358,7 +358,7 @@ def check_gltf(data: bytes, where: str) -> None:
     except ValueError as error:
         raise DataError(f"its JSON cannot be read: {error}", where=where, hint=AGAIN_HINT) from None
     if not isinstance(document, dict):
-        raise DataError("is no glTF file: its JSON is no object", where=where, hint=AGAIN_HINT)
+        raise DataError("is not a glTF file: its JSON is not an object", where=where, hint=AGAIN_HINT)
     needed = [name for name in document.get("extensionsRequired") or () if not str(name).startswith(READ_EXTENSIONS)]
     if needed:
         raise DataError(f"needs {needed[0]}", where=where, allowed="glTF that is not packed", hint="export it unpacked")

@@ -84,12 +84,12 @@ def _check_list(file: BinaryIO, where: str, hint: str) -> None:
         DataError: So it is.
     """
     if not zipfile.is_zipfile(file):
-        raise DataError("is no .npz file, or one cut short", where=where, hint=hint)
+        raise DataError("is not an .npz file, or is cut short", where=where, hint=hint)
     file.seek(-min(file.seek(0, io.SEEK_END), END_BYTES), io.SEEK_END)
     end = file.read()
     size = int.from_bytes(end[end.rfind(END_MARK) + 12 :][:4], "little")
     if size > LARGEST_LIST_BYTES or END_MARK_64 in end:
-        raise DataError("lists too many arrays", where=where, allowed="some thousand arrays", hint=hint)
+        raise DataError("lists too many arrays", where=where, allowed="a few thousand arrays", hint=hint)
 
 
 def check_kind(dtype: np.dtype, name: str, where: str, kinds: str = NUMERIC_KINDS) -> None:
@@ -110,7 +110,9 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, kinds: str, where:
     """One array, once its header is found to tell the truth about its data."""
     name = member.filename.removesuffix(".npy")
     if name == member.filename:
-        raise DataError(f"holds {member.filename!r}, which is no array", where=where, allowed="arrays of numpy.savez")
+        raise DataError(
+            f"holds {member.filename!r}, which is not an array", where=where, allowed="arrays of numpy.savez"
+        )
     with archive.open(member) as file:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -145,5 +147,5 @@ def csv_rows(path: Path, kind: Kind) -> list[tuple[int, list[str]]]:
     except UnicodeDecodeError:
         raise DataError("is not UTF-8 text", where=str(path)) from None
     except csv.Error as error:
-        raise DataError(f"is no CSV: {error}", where=f"{path}:{reader.line_num}") from None
+        raise DataError(f"is not CSV: {error}", where=f"{path}:{reader.line_num}") from None
     return rows

@@ -186,7 +186,7 @@ def sha256_file(path: Path) -> str:
 
 # What stands for standard input where a file is read, and for standard output where one is written.
 STDIO = "-"
-HINT = "give one of them as a file; a file that is called - is given by its whole path"
+HINT = "give one of them as a file; give a file called - by its full path"
 
 
 class Input:
@@ -249,7 +249,7 @@ def read_input(kind: str, most_bytes: int) -> bytes:
     """
     offered = _OFFERED.get()
     if offered is None:
-        raise ConfigError("stands for standard input in commands only", where=STDIO, hint="give a file")
+        raise ConfigError("means standard input in commands only", where=STDIO, hint="give a file")
     return offered.read(kind, most_bytes)
 
 
@@ -289,7 +289,7 @@ def check_lock(run: Path) -> None:
     """
     path = Path(run) / FILE_NAME
     if os.path.lexists(path) and (path.is_symlink() or not path.is_file()):
-        raise DataError("is no regular file, as a lock is", where=str(path), hint="remove it")
+        raise DataError("is not a regular file, as a lock must be", where=str(path), hint="remove it")
 
 
 @contextlib.contextmanager

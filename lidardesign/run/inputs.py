@@ -75,7 +75,7 @@ def check_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint
     if stat.S_ISDIR(status.st_mode):
         raise kind.error("cannot be read: it is a folder", where=str(path), allowed=allowed or "a file", hint=hint)
     if not stat.S_ISREG(status.st_mode):
-        raise kind.error("is no regular file", where=str(path), allowed=allowed, hint=hint or STDIN_HINT)
+        raise kind.error("is not a regular file", where=str(path), allowed=allowed, hint=hint or STDIN_HINT)
     check_bytes(status.st_size, kind, str(path))
     return status.st_size
 
@@ -88,7 +88,7 @@ def check_bytes(size: int, kind: Kind, where: str, *, unpacked: bool = False) ->
     """
     most = (kind.unpacked_bytes or 0) if unpacked else kind.most_bytes
     if size > most:
-        what = "its data unpacked take" if unpacked else "the file is too large:"
+        what = "its unpacked data take" if unpacked else "the file is too large:"
         raise kind.error(f"{what} {size_text(size)}", where=where, allowed=f"at most {size_text(most)} ({kind.name})")
 
 

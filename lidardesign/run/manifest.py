@@ -64,7 +64,7 @@ def read_manifest(run: Path) -> dict[str, Any]:
     if not run.exists():
         raise DataError("no such run", where=str(run), hint=LEARN_HINT)
     if not path.exists():
-        raise DataError(f"is no run folder: it has no {FILE_NAME}", where=str(run), hint=LEARN_HINT)
+        raise DataError(f"is not a run folder: it has no {FILE_NAME}", where=str(run), hint=LEARN_HINT)
     try:
         manifest = parse_json(read_file(path, RECORD))
     except ValueError as error:
@@ -164,7 +164,7 @@ def changed_since_recorded(run: Path, name: str) -> str | None:
     size = (run / name).stat().st_size
     if size < entry["bytes"]:
         return f"is truncated: {size} of {entry['bytes']} bytes"
-    return "was changed since it was written (its SHA-256 is not the manifest's)"
+    return "was changed after it was written (its SHA-256 differs from the manifest's)"
 
 
 def _hashes(entry: dict[str, Any]) -> list[str]:

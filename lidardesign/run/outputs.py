@@ -104,7 +104,7 @@ def check_writable(path: Path, *, is_folder: bool = False) -> None:
         place = Path(os.path.realpath(path))
         there = next(folder for folder in ([place] if is_folder else []) + [*place.parents] if _look_up(folder))
         if not there.is_dir():
-            raise DataError(f"cannot be made: {there} is a file", where=str(path), hint=ELSEWHERE)
+            raise DataError(f"cannot be created: {there} is a file", where=str(path), hint=ELSEWHERE)
         for part in place.relative_to(there).parts:
             _look_up(there / part)  # a name may be too long
         with tempfile.TemporaryFile(dir=there) as trial:  # it has no name: no kill leaves it behind

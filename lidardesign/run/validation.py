@@ -157,7 +157,7 @@ def _explain(
 
 def _allowed(kind: str, text: str) -> str:
     if kind == "model_type":
-        return "keys and values, as `{key: value}`"
+        return "keys and values, such as `{key: value}`"
     words = text.removeprefix("Input should be ")
     return words[:1].lower() + words[1:]
 

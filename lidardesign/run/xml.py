@@ -41,7 +41,7 @@ def read_xml(path: Path, allowed: str, *, kind: Kind = XML, most_elements: int =
     """The root element of a file.
 
     Raises:
-        DataError: The file cannot be read, is too large, is no XML, has a document type, or is nested too deep.
+        DataError: The file cannot be read, is too large, is not XML, has a document type, or is nested too deep.
     """
     content = read_file(path, kind, allowed=allowed)
     builder = _Builder(path, most_elements)
@@ -51,9 +51,9 @@ def read_xml(path: Path, allowed: str, *, kind: Kind = XML, most_elements: int =
         position = f"{path}:{error.lineno}:{error.offset + 1}"
         if error.code in CUT_SHORT:
             raise DataError(builder.unfinished, where=position, allowed=allowed, hint="it may be cut short") from None
-        raise DataError(f"is no XML: {expat.ErrorString(error.code)}", where=position, allowed=allowed) from None
+        raise DataError(f"is not XML: {expat.ErrorString(error.code)}", where=position, allowed=allowed) from None
     except (LookupError, ValueError) as error:
-        raise DataError(f"is no XML: {error}", where=str(path), allowed=allowed) from None
+        raise DataError(f"is not XML: {error}", where=str(path), allowed=allowed) from None
 
 
 class _Builder:
@@ -78,7 +78,7 @@ class _Builder:
     def unfinished(self) -> str:
         """What is missing of a file that ends too early."""
         if not self._open:
-            return "is no XML, or ends early: it has no element"
+            return "is not XML, or ends early: it has no element"
         last = self._open[-1]
         return f"ends early: <{last.tag[:LONGEST_QUOTE]}> of line {last.line} is not closed"
 

@@ -27,7 +27,7 @@ MAX_NODES = 500_000
 MAX_DIGITS = 100
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _BaseDumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-QUOTE_HINT = 'text that begins with a sign, or has a colon in it, stands in quotes, as "*hand"'
+QUOTE_HINT = 'quote text that begins with a sign or has a colon in it, such as "*hand"'
 # What libyaml and its Python twin say of text without them.
 UNQUOTED = ("found character", "mapping values", "did not find expected alphabetic")
 
@@ -83,7 +83,7 @@ class Document:
             raise ConfigError(
                 f"found one {type(self.value).__name__}",
                 where=f"{self.where}:1:1",
-                allowed="keys and values, as `key: value`",
+                allowed="keys and values, such as `key: value`",
             )
         return self.value
 
@@ -162,7 +162,7 @@ def plain_number(text: str) -> float:
     """
     number = float(text) if _FLOAT.fullmatch(text.strip()) else math.nan
     if not math.isfinite(number):
-        raise ValueError(f"{text!r} is no finite number")
+        raise ValueError(f"{text!r} is not a finite number")
     return number
 
 

@@ -29,7 +29,7 @@ ROUNDS = 80
 PRICE_BISECTIONS = 12
 PATIENCE = 5  # rounds without a lower bound after which steps are halved
 PROGRESS = 0.02  # of what the bound exceeds the value by: a bound that is lower by less is not lower
-PROXY = "mean over items of what the returns of the chosen rays leave unknown, by informs of the task"
+PROXY = "mean over items of what the returns of the chosen rays leave unknown, by the task's informs"
 MEMORY = 0.7  # how much of its last direction a step keeps
 
 

@@ -75,12 +75,12 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
     harm = np.zeros((frames, rays)) if information.harm is None else np.asarray(information.harm)
     seen_in = np.zeros(0, dtype=int) if information.seen_in is None else information.seen_in
     faults = {
-        "ray, item and worth of other lengths": not len(information.item) == len(information.worth) == pairs,
-        "seen_in of another length than item": information.seen_in is not None and len(seen_in) != pairs,
-        "weight of another length than frame": weight.shape != (items,),
+        "ray, item and worth of different lengths": not len(information.item) == len(information.worth) == pairs,
+        "seen_in and item of different lengths": information.seen_in is not None and len(seen_in) != pairs,
+        "weight and frame of different lengths": weight.shape != (items,),
         f"harm of shape {harm.shape}, not {(frames, rays)}": harm.shape != (frames, rays),
-        "unit that is no text": not isinstance(information.unit, str),
-        "weights that do not count": not weight.sum() > 0,
+        "a unit that is not text": not isinstance(information.unit, str),
+        "weights that are all zero": not weight.sum() > 0,
     }
     for name, index, count in (
         ("ray", information.ray, rays),
@@ -90,7 +90,7 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
     ):
         faults[f"{name} outside 0 to {count - 1}"] = bool(((index < 0) | (index >= count)).any())
     for name, values in (("worth", information.worth), ("weight", weight), ("harm", harm)):
-        faults[f"{name} that is negative or no number"] = not (np.isfinite(values) & (values >= 0)).all()
+        faults[f"{name} that is negative or not a number"] = not (np.isfinite(values) & (values >= 0)).all()
     for fault, found in faults.items():
         if found:
             raise PluginError(f"informs gave {fault}", where=where, allowed="see lidardesign.task.Information")

@@ -81,21 +81,24 @@ def choose_parts(
     started, space, wanted = perf_counter(), samples.space, constraints.parts
     if space.conditioned:
         raise ConfigError(
-            "the density has conditions", where="--parts", allowed="tasks whose sensors rest", hint="fit without parts"
+            "the density has conditions",
+            where="--parts",
+            allowed="tasks whose sensors do not move",
+            hint="fit without parts",
         )
     every = named_parts(wanted.names, wanted.each)
     nearest = [part.name for part in every if part.value("near_m") is None]
     if nearest:
         left_out = "left out" if wanted.names == "catalog" else "taken as 0"
-        notes(f"no source says from where {', '.join(nearest)} measure: {left_out}")
+        notes(f"no source gives the shortest range of {', '.join(nearest)}: {left_out}")
     power = [] if wanted.power_w is None else [part.name for part in every if part.value("power_w") is None]
     if power:
-        notes(f"no source says what {', '.join(power)} consume: left out, as parts.power_w is bounded")
+        notes(f"no source gives the power of {', '.join(power)}: left out, since parts.power_w is bounded")
     unknown = {*power, *(nearest if wanted.names == "catalog" else ())}
     every = [part for part in every if part.name not in unknown]
     if not every:
         raise InfeasibleError(
-            "no source says what any of the parts consumes",
+            "no source gives the power of any of the parts",
             conflicts=["parts.power_w"],
             hint="leave parts.power_w out, or name parts whose power is known",
         )
@@ -114,7 +117,7 @@ def choose_parts(
     bundle = PartBundle(placed, most, next(scenes("choice")).frames)
     chosen, coverage, held_back_loss, trained = _chosen_set(bundle, limits, informs, scenes, seed)
     if len(chosen.members) < count:
-        notes(f"{len(chosen.members)} of {count} parts: no other tells more, or fits the bounds")
+        notes(f"{len(chosen.members)} of {count} parts: no further part tells more or fits the bounds")
     design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays)
     certificate = certificate_document(
         rays=design.rays or 0,
@@ -201,13 +204,15 @@ def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, 
     places, axes = _places(rules, samples, generator), Axes.of(space)
     kept = [ways for part in parts if (ways := shapes_of(part, space))]
     if not kept:
-        raise InfeasibleError("no part measures in the range of the design space", conflicts=["space.range_m", "parts"])
+        raise InfeasibleError(
+            "no part measures within the range of the design space", conflicts=["space.range_m", "parts"]
+        )
     broken = [broken_keys(ways[0], rules) for ways in kept]
     kept = [ways for ways, keys in zip(kept, broken, strict=True) if not keys]
     if not kept or not len(places):
         keys = sorted(set().union(*broken)) if len(places) else ["origin"]
         raise InfeasibleError(
-            f"no part keeps {', '.join(keys)}",
+            f"no part satisfies {', '.join(keys)}",
             conflicts=[*keys, "parts"],
             hint="loosen one of them, or name other parts",
         )

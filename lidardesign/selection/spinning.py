@@ -187,7 +187,7 @@ def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -
     even = np.unique(np.linspace(space.low[4], space.high[4], CANDIDATES_PER_RAY * max(channels, 1)))
     most = min(len(even), MOST_TABLE_RAYS // count)
     faults = {
-        ("the density has conditions", "--layout spinning", "tasks whose sensors rest"): space.conditioned,
+        ("the density has conditions", "--layout spinning", "tasks whose sensors do not move"): space.conditioned,
         (f"{channels} channels", "--channels", f"1 to {most}, of as many elevations and rays as there are"): not (
             1 <= channels <= most
         ),

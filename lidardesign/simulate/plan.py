@@ -276,10 +276,12 @@ def parse_effects(text: str) -> Choice:
     if names[0] in CHOICES and len(names) == 1:
         return names[0]  # type: ignore[return-value]
     if not all(names):
-        raise ConfigError(f"{text!r} leaves an effect unnamed", where="--effects", allowed=allowed)
+        raise ConfigError(f"{text!r} has an empty name of an effect", where="--effects", allowed=allowed)
     for name in names:
         if name in WORDS:
-            raise ConfigError(f"{name!r} stands among effects", where="--effects", allowed=f"{name} alone, or names")
+            raise ConfigError(
+                f"{name!r} cannot be combined with effects", where="--effects", allowed=f"{name} alone, or names"
+            )
         if name not in EFFECTS:
             raise ConfigError(
                 f"unknown effect {name!r}",

@@ -42,9 +42,9 @@ def new_task(name: str, folder: Path | None = None) -> list[Path]:
         ConfigError: The name cannot be one, or is taken.
         DataError: The folder holds something, or cannot be written.
     """
-    allowed = f"small letters, digits and single underscores, up to {LONGEST_NAME}, as landmark or drone_landing"
+    allowed = f"small letters, digits and single underscores, up to {LONGEST_NAME}, such as landmark or drone_landing"
     if not NAME.fullmatch(name) or len(name) > LONGEST_NAME:
-        raise ConfigError(f"{name!r} is no name for a task", where="NAME", allowed=allowed)
+        raise ConfigError(f"{name!r} is not a name for a task", where="NAME", allowed=allowed)
     if name in registry.task_names():
         raise ConfigError(f"a task {name!r} is installed already", where="NAME", hint="choose another name")
     if find_spec(f"lidardesign_{name}") is not None:

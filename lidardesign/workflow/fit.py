@@ -88,7 +88,7 @@ class FitOptions:
     def __post_init__(self) -> None:
         if self.name is not None and not NAME_PATTERN.fullmatch(self.name):
             allowed = "letters, digits, _, -, + and . (not in front), at most 100"
-            raise ConfigError(f"{self.name!r} is no name for a design", where="--name", allowed=allowed)
+            raise ConfigError(f"{self.name!r} is not a name for a design", where="--name", allowed=allowed)
         if self.layout is not None:
             check_choice(self.layout, "--layout", FITTED_LAYOUTS)
         if self.gates is not None:
@@ -225,7 +225,7 @@ class FitRequest:
         """What the fit would do.
 
         Raises:
-            ConfigError: A name that is no condition of the density.
+            ConfigError: A name that is not a condition of the density.
             DataError: The run has no samples yet, or they are not those that were recorded.
             InfeasibleError: The constraints contradict each other.
         """
@@ -274,7 +274,7 @@ class FitRequest:
         counted = {
             None: "as many sensors as follow",
             BEST: "as many sensors as score best on training scenes",
-            "auto": "as many sensors as held-out likelihood says",
+            "auto": "as many sensors as the held-out likelihood favours",
         }
         sensors = counted.get(choices["sensors"], f"{choices['sensors']} sensors")
         sensors = "one sensor per ray" if LAYOUTS[choices["layout"]].one_sensor_per_ray else sensors

@@ -52,7 +52,7 @@ class Fitter:
     """Fits the designs of requests that differ in choices and constraints, to samples weighted by settings of the task.
 
     Raises:
-        ConfigError: A setting that cannot be, or a name that is no condition of the density.
+        ConfigError: A setting that cannot be, or a name that is not a condition of the density.
         DataError: The density is too rough, with or without the settings.
     """
 

@@ -34,7 +34,7 @@ class MovingTruth(LazyTruth):
         found = [self._surface(frame) for frame in range(self.scene.frames)]
         if all(surface is None for surface in found):
             raise DataError(
-                "no admissible ray sees any part of a target in any frame",
+                "no ray of the design space sees any part of a target in any frame",
                 where=f"scene {self.scene.name!r}",
                 hint="move the sensors, or the poses of the bodies",
             )

@@ -63,19 +63,19 @@ CASES = [
             LONG: "there is no detector",
             "garbage": "is not UTF-8 text",
             "run": "it is a folder",
-            "empty.yaml": "says nothing about a detector",
-            "comment.yaml": "says nothing about a detector",
-            "null.yaml": "says nothing about a detector",
+            "empty.yaml": "does not describe a detector",
+            "comment.yaml": "does not describe a detector",
+            "null.yaml": "does not describe a detector",
             "list.yaml": "list.yaml:1:1",
             "laughs.yaml": "expands to too many values",
             "code.yaml": "code.yaml:1:1",
-            "unit.yaml": "unit.yaml:1:1: unknown key 'bin_m': 'm' is no unit of 'bin'",
-            "no_unit.yaml": "'bin' needs its unit",
+            "unit.yaml": "unit.yaml:1:1: unknown key 'bin_m': 'm' is not a unit of 'bin'",
+            "no_unit.yaml": "'bin' needs a unit",
             "nan.yaml": "nan.yaml:1:9",
             "negative.yaml": "negative.yaml:1:17",
             "huge.yaml": "huge.yaml:1:9",
             "text.yaml": "text.yaml:1:9",
-            "photons.yaml": "counts photons, but does not say energy_fj",
+            "photons.yaml": "counts photons, but does not give energy_fj",
             "line.yaml": "line.yaml:1:17: footprint_rays: 7 rays in a beam of divergence 0",
             "short.yaml": "is longer than the histogram",
             "pulse.yaml": "outside the histogram, which starts with the pulse",
@@ -85,9 +85,9 @@ CASES = [
     ("evaluate run --effects dew", 2, "unknown effect 'dew'"),
     ("evaluate run --effects Jitter", 2, "did you mean 'jitter'"),
     ("evaluate run --effects ALL", 2, "did you mean 'all'"),
-    ("evaluate run --effects audit,all", 2, "'audit' stands among effects"),
-    ("evaluate run --effects jitter,none", 2, "'none' stands among effects"),
-    ("evaluate run --effects jitter,", 2, "leaves an effect unnamed"),
+    ("evaluate run --effects audit,all", 2, "'audit' cannot be combined with effects"),
+    ("evaluate run --effects jitter,none", 2, "'none' cannot be combined with effects"),
+    ("evaluate run --effects jitter,", 2, "has an empty name of an effect"),
     *(
         (f"evaluate run {option} {value}", 2, f"{option}: ")
         for option in ("--range-tolerance-mm", "--return-tolerance")
@@ -126,7 +126,7 @@ CASES = [
     ("constrain run --constraints key.yaml", 2, "did you mean 'low_m'"),
     ("constrain run --constraints all.yaml", 4, "origin.exclude[0]"),
     ("constrain run --constraints fixed.yaml", 4, "origin.fixed_m"),
-    ("export wide.yaml --format galvo", 2, "out of the mirrors' reach"),
+    ("export wide.yaml --format galvo", 2, "beyond the mirrors' reach"),
     ("export far.yaml --format galvo", 2, "a number from 0 to 1e+09"),
     ("export open.yaml --format galvo", 2, "give --rays N"),
     ("export good.yaml --format galvo --out run", 3, "is a folder"),
@@ -207,7 +207,7 @@ def test_a_scanner_file_that_a_spreadsheet_saved_is_read(ready):
 # what a plugin may do to a scene, and the words of the message
 SCENES = {
     "a negative reflectance": (lambda scene: Body(Sphere(1.0), reflectance=-0.1), "reflectance is -0.1"),
-    "more light than comes": (lambda scene: Body(Sphere(1.0), reflectance=0.9, specular=0.2), "no light is made"),
+    "more light than comes": (lambda scene: Body(Sphere(1.0), reflectance=0.9, specular=0.2), "at most 1 in all"),
     "faster than light": (lambda scene: Body(Sphere(1.0), velocity_m_s=(3e8, 0, 0)), "slower than light"),
     "air of lead": (lambda scene: Medium(1e300, 0.0), "extinction_per_m is 1e+300"),
     "light by name": (lambda scene: Scene(scene.bodies, ambient="sun"), "ambient is 'sun'"),
@@ -250,7 +250,7 @@ def test_a_library_that_cannot_be_is_named_where_it_comes_from(monkeypatch, tmp_
     monkeypatch.setattr(light_transport_process, "PACKAGES", {})
     for wrong in (tmp_path, tmp_path / "absent.so"):
         monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(wrong))
-        assert light_transport_process.missing().startswith(f"DRJIT_LIBLLVM_PATH names {wrong}, which is no LLVM")
+        assert light_transport_process.missing().startswith(f"DRJIT_LIBLLVM_PATH names {wrong}, which is not an LLVM")
 
 
 def interrupted_kernel():

@@ -158,7 +158,7 @@ def test_no_visibility_needs_a_design_whose_run_is_there(lidardesign, flat):
     (flat / "designs" / "fit.yaml").unlink()
     result = lidardesign("evaluate", flat, away, "--rays", 12, "--baseline", "no-visibility")
     assert result.code == 2
-    assert "no design to fit anew" in result.err
+    assert "no design to refit" in result.err
 
 
 def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, monkeypatch):

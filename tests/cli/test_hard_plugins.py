@@ -27,7 +27,7 @@ CONDITIONS = {
     "open": (lambda: [{}], 6, "x_m open"),
     "outside": (lambda: [{"x_m": 99.0}], 2, "task flatland, conditions: x_m=99 is outside"),
     "nan": (lambda: [{"x_m": float("nan")}], 2, "task flatland, conditions: x_m=nan is outside"),
-    "another dimension": (lambda: [{"x_m": 0.5, "z_m": 0.0}], 2, "'z_m' is no condition"),
+    "another dimension": (lambda: [{"x_m": 0.5, "z_m": 0.0}], 2, "'z_m' is not a condition"),
 }
 
 

@@ -82,7 +82,7 @@ def test_too_little_time_is_refused_with_the_least_that_would_do(tmp_path, steps
     steps_take(0.1, 0.1, 0.3)
     keeper = keeper_for(tmp_path, 10.0)
     data = prepare_training_data(BallTask(), keeper.config)
-    with pytest.raises(ConfigError, match=r"--time-budget.*over before.*\n.*at least 26 s") as caught:
+    with pytest.raises(ConfigError, match=r"--time-budget.*too short to learn.*\n.*at least 26 s") as caught:
         keeper.plan(data, CPU)
     assert caught.value.exit_code == 2
     steps_take(0.1, 0.1, 0.3)

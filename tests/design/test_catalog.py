@@ -472,7 +472,7 @@ def test_two_own_parts_of_one_name_are_refused(tmp_path):
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "same.yaml").write_text(OWN)
-    with pytest.raises(ConfigError, match="is a second part 'same'"):
+    with pytest.raises(ConfigError, match="is a second part called 'same'"):
         load_library([tmp_path / "a", tmp_path / "b"])
 
 
@@ -485,7 +485,7 @@ def test_two_own_parts_of_one_name_are_refused(tmp_path):
         ("vl53l5cx:", "vl53l5cx has no mode ''"),
         ("", "there is no part ''"),
         ("nowhere/part.yaml", "cannot be read"),
-        ("no such.yaml", "'no such' is no name of a part"),
+        ("no such.yaml", "'no such' is not a name of a part"),
     ],
 )
 def test_names_that_lead_nowhere_are_refused(name, message):

@@ -221,7 +221,7 @@ def test_rays_of_a_sensor_that_start_at_many_places_are_refused(tmp_path):
 
 def test_rays_out_of_reach_are_refused_with_their_number_and_the_worst(tmp_path):
     wide = design(sensor("a", 2.6, 0.0), sensor("b", 3.6, 0.0))
-    with pytest.raises(ConfigError, match=r"\d+ of 60 rays are out of the mirrors' reach, the furthest at x = -?3\d\."):
+    with pytest.raises(ConfigError, match=r"\d+ of 60 rays are beyond the mirrors' reach, the farthest at x = -?3\d\."):
         write_galvo(wide, lay_out(wide), tmp_path / "f.csv")
     assert not list(tmp_path.iterdir())
 
@@ -235,10 +235,10 @@ def test_rays_exactly_at_the_limit_are_within_reach(tmp_path):
 
 
 BROKEN = {
-    "another table": (lambda text: "a,b\n1,2\n", "no ray list of the galvo format"),
-    "an empty file": (lambda text: "", "no ray list"),
-    "a unit of another kind": (lambda text: text.replace("x_deg", "x_rad"), "no ray list"),
-    "a ray twice": (lambda text: text + text.splitlines()[1] + "\n", "there twice"),
+    "another table": (lambda text: "a,b\n1,2\n", "not a ray list of the galvo format"),
+    "an empty file": (lambda text: "", "not a ray list"),
+    "a unit of another kind": (lambda text: text.replace("x_deg", "x_rad"), "not a ray list"),
+    "a ray twice": (lambda text: text + text.splitlines()[1] + "\n", "given twice"),
     "a row cut short": (lambda text: text[:-9], ":61: "),
     "no number": (lambda text: text.replace(",0.4,", ",wide,", 1), ":2: .*wide"),
     "NaN": (lambda text: text.replace(",0.4,", ",nan,", 1), ":2: "),
@@ -281,5 +281,5 @@ def test_the_program_exports_and_says_what_the_mirrors_travel(call, tmp_path):
     save_design(design(sensor("a", 2.0, 0.0), sensor("b", 4.0, 0.0)), tmp_path / "wide.yaml")
     done = call("export", "wide.yaml", "--format", "galvo")
     assert done.code == 2
-    assert "out of the mirrors' reach" in done.err
+    assert "beyond the mirrors' reach" in done.err
     assert not (tmp_path / "wide.galvo.csv").exists()

@@ -133,7 +133,7 @@ def test_the_same_directions_in_radians_degrees_and_vectors_are_the_same_rays(tm
 
 def test_what_a_ray_list_leaves_out_is_told_and_not_made_up(tmp_path):
     path = write_rays(tmp_path / "r.csv", {"azimuth_deg": [0, 10], "elevation_deg": [0, 5]})
-    with pytest.raises(DataError, match="does not say how far 2 of its 2 rays are heard") as refused:
+    with pytest.raises(DataError, match="does not say how far 2 of its 2 rays reach") as refused:
         load_design(path)
     assert "gate_end_m" in str(refused.value)
     design = load_design(path, reach_m=1.5)
@@ -177,7 +177,7 @@ def test_uneven_firing_times_are_told(tmp_path):
 
 GOOD = "azimuth_rad,elevation_rad,gate_end_m"
 BAD_LISTS = {
-    "no direction": ("gate_end_m,sensor\n1,0\n", "rays.csv:1", "no column says where rays look"),
+    "no direction": ("gate_end_m,sensor\n1,0\n", "rays.csv:1", "no column says where rays point"),
     "half a direction": ("azimuth_rad,gate_end_m\n0,1\n", "rays.csv:1", "without elevation_rad"),
     "half a place": (f"{GOOD},origin_x_m\n0,0,1,2\n", "rays.csv:1", "without origin_y_m, origin_z_m"),
     "an unknown column": (f"{GOOD},colour\n0,0,1,2\n", "rays.csv:1", "'colour'"),
@@ -190,7 +190,7 @@ BAD_LISTS = {
     "a gate that ends before it starts": (f"{GOOD},gate_start_m\n0,0,1,2\n", "rays.csv:2:3", "before the gate's start"),
     "a negative start": (f"{GOOD},gate_start_m\n0,0,1,-2\n", "rays.csv:2:4", "negative"),
     "no vector": ("direction_x,direction_y,direction_z,gate_end_m\n0,0,0,1\n", "rays.csv:2:1", "without length"),
-    "two directions": (f"{GOOD},azimuth_deg,elevation_deg\n0,0,1,9,0\n", "rays.csv:2:4", "another direction"),
+    "two directions": (f"{GOOD},azimuth_deg,elevation_deg\n0,0,1,9,0\n", "rays.csv:2:4", "a different direction"),
     "far away": (f"{GOOD},origin_x_m,origin_y_m,origin_z_m\n0,0,1,1e12,0,0\n", "rays.csv", "a place"),
     "a sensor without a name": (f"{GOOD},sensor\n0,0,1,\n", "rays.csv:2:4", "sensor is empty"),
 }
@@ -328,7 +328,7 @@ BAD_XML = {
     "cut short": (model_of("")[:-9], "ends early"),
     "no rangefinder": (model_of(""), "has no rangefinder"),
     "an unknown site": (model_of('<rangefinder site="b" cutoff="1"/>'), "MuJoCo cannot read it"),
-    "a camera": (model_of('<rangefinder camera="c"/>', '<camera name="c"/>'), "of a camera"),
+    "a camera": (model_of('<rangefinder camera="c"/>', '<camera name="c"/>'), "on a camera"),
     "too many copies": (
         model_of("", '<replicate count="999"><replicate count="99"><site/></replicate></replicate>'),
         "replicates too much",
@@ -336,7 +336,7 @@ BAD_XML = {
     "too many sites": (model_of("", "<site/>" * 120_001), "too many bodies, sites and sensors"),
     "no number of copies": (model_of("", '<replicate count="many"><site/></replicate>'), "count is 'many'"),
     "another model": (model_of("", '<attach model="x"/>'), "attaches another model"),
-    "no end": (model_of('<rangefinder site="a"/>'), "does not say how far 1 of its 1 rays are heard"),
+    "no end": (model_of('<rangefinder site="a"/>'), "does not say how far 1 of its 1 rays reach"),
     "a URDF": ("<robot name='r'/>", "root element is '<robot>'"),
     "a page": ("<html></html>", "root element is '<html>'"),
     "nesting": ("<mujoco>" + "<body>" * 300 + "</body>" * 300 + "</mujoco>", "nested too deep"),
@@ -525,7 +525,7 @@ def test_what_an_sdf_file_says_beyond_a_design_is_told(tmp_path):
     text = f'<model name="m"><link name="a">{extra}</link><link name="b">{two}</link></model>'
     design = load_sdf(tmp_path, text, reach_m=3.0)
     notes = "\n".join(design.provenance["notes"])
-    for said in ("noise is not held", "resolution is not held", "min_angle, as in Gazebo", "gates start", "3 m"):
+    for said in ("noise is ignored", "resolution is ignored", "min_angle, as in Gazebo", "gates start", "3 m"):
         assert said in notes
     # one ray along min_angle, and names that say where each is
     assert [sensor.name for sensor in design.sensors] == ["m::a::eye", "m::b::eye"]
@@ -537,7 +537,7 @@ BAD_SDF = {
     "a circle": (
         '<model name="m"><link name="a"><pose relative_to="b">0 0 0 0 0 0</pose>{lidar}</link>'
         '<frame name="b" attached_to="a"/></model>',
-        "counts from itself",
+        "is relative to itself",
     ),
     "an unknown frame": (
         '<model name="m"><link name="a"><pose relative_to="z">0 0 0 0 0 0</pose>{lidar}</link></model>', "'z'",
@@ -560,7 +560,7 @@ BAD_SDF = {
     ),
     "a chain of frames": (
         f'<model name="m">{CHAIN}<link name="a"><pose relative_to="f0">0 0 0 0 0 0</pose>{{lidar}}</link></model>',
-        "counts from too many others",
+        "is relative to too many others",
     ),
 }  # fmt: skip
 
@@ -662,7 +662,7 @@ def test_a_rig_scores_as_the_design_that_fires_its_rays(call, run, tmp_path):
     by = {(row["design"], row["rays"]): row["value"] for row in rows}
     for count in (8, 16):
         assert by["fans", count] == by["same", count]
-    assert "how far 16 of 16 rays are heard is not said; 1.2 m" in result.err
+    assert "the file does not say how far 16 of 16 rays reach; 1.2 m" in result.err
     assert any(note.startswith("fans fires 16 rays") for note in result.json["notes"])
     assert any(note.startswith("no design fires") for note in result.json["notes"])
 
@@ -670,7 +670,7 @@ def test_a_rig_scores_as_the_design_that_fires_its_rays(call, run, tmp_path):
 def test_what_is_no_file_is_refused_before_it_is_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (type(tmp_path)("/dev/zero"), tmp_path / "pipe"):
-        with pytest.raises(DataError, match="no regular file"):
+        with pytest.raises(DataError, match="not a regular file"):
             load_design(path)
 
 

@@ -88,7 +88,7 @@ def test_a_fit_like_a_rig_keeps_its_names_and_its_place_where_that_was_rounded(c
     path = rays_file(tmp_path, 4e-4)
     result = call("fit", run, "--like", path, "--name", "alike", "--json")
     assert result.code == 0, result.err
-    note = "left, it's right: 0.4 mm from where the run's sensors stand: taken to stand there"
+    note = "left, it's right: 0.4 mm from where the run's sensors stand: treated as standing there"
     assert note in result.err
     assert note in call("fit", run, "--like", path, "--dry-run").err
     assert [sensor["name"] for sensor in result.json["sensors"]] == ["left", "it's right"]
@@ -115,6 +115,6 @@ def test_an_origin_that_is_set_counts_as_the_place_next_to_it(call, run):
     for further in ([], ["--dry-run"]):
         result = call("constrain", run, *setting, "--name", "set", "--json", *further)
         assert result.code == 0, result.err
-        assert "origin.fixed_m is 0.8 mm from where the run's sensors stand: taken to be there" in result.err
+        assert "origin.fixed_m is 0.8 mm from where the run's sensors stand: treated as being there" in result.err
     refused = call("constrain", run, "--set", "origin.fixed_m=[0.5, 0.002, 0]", "--sensors", 1)
     assert refused.code == 4

@@ -124,9 +124,9 @@ def test_a_quarter_turn_of_roll_swaps_the_spreads_and_is_noted(tmp_path):
 def test_another_level_is_noted(tmp_path):
     sensor = Sensor("r", 1.0, np.zeros(3), np.zeros((3, 3)), 0.5, 0.0, 0.0, 0.2, 0.1, 1.0, 0.1, level=0.9)
     design = DesignSpec("d", (sensor,), level=0.9)
-    assert any("0.9 is not held" in note for note in write_sensor_csv(design, tmp_path / "d.csv"))
+    assert any("0.9 is lost" in note for note in write_sensor_csv(design, tmp_path / "d.csv"))
     plain = replace(design, level=0.95)
-    assert not any("is not held: intervals" in note for note in write_sensor_csv(plain, tmp_path / "d.csv"))
+    assert not any("is lost: intervals" in note for note in write_sensor_csv(plain, tmp_path / "d.csv"))
 
 
 @each_row(

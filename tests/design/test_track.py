@@ -335,7 +335,7 @@ def test_only_origins_move():
     np.testing.assert_array_equal(lay_out(turned, at={"azimuth_rad": 0.3}).direction, lay_out(bolted()).direction)
     with pytest.raises(ConfigError, match=r"azimuth_rad=0\.3"):
         lay_out(turned, at={"azimuth_rad": 1.0})
-    with pytest.raises(ConfigError, match="no dimension"):
+    with pytest.raises(ConfigError, match="not a dimension"):
         lay_out(bolted(), at={"speed": 1.0})
     with pytest.raises(ConfigError, match="finite"):
         lay_out(bolted(), at={"x_m": math.inf})

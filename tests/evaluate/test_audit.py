@@ -144,7 +144,7 @@ def test_the_report_shows_effects_and_audit_and_escapes_names():
     assert "100,000 lux (sun)" in page
     assert "<b>x</b>" not in page
     calm = evaluate(make_request())
-    assert "No scene calls for any effect" in effects_section(calm)
+    assert "No effect is needed in any scene" in effects_section(calm)
 
 
 def test_failed_rows_are_those_beyond_the_tolerance_on_either_side():

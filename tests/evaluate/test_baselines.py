@@ -200,11 +200,11 @@ def test_what_follows_the_colon_reaches_the_family_and_keeps_its_layouts_apart(o
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("axis", "lacks what it is to be of"),
-        ("axis:", "lacks what it is to be of"),
+        ("axis", "needs a value after its name"),
+        ("axis:", "needs a value after its name"),
         ("axis:z", "no axis 'z'"),
-        ("uniform:3", "takes nothing after its name"),
-        ("uniform:", "takes nothing after its name"),
+        ("uniform:3", "takes no value after its name"),
+        ("uniform:", "takes no value after its name"),
         ("axes:x", "axis:AXIS"),
         ("", "axis:AXIS"),
     ],

@@ -267,11 +267,11 @@ def test_a_reader_that_crashes_or_does_not_end_is_a_damaged_file(tmp_path, monke
     path = tmp_path / "s.mat"
     save_matlab_5(path, make_capture(3))
     monkeypatch.setattr(matlab, "PATIENCE_SECONDS", 0.01)
-    with pytest.raises(DataError, match="no MATLAB file, or a damaged one"):
+    with pytest.raises(DataError, match="not a MATLAB file, or is damaged"):
         load_capture(path)
     monkeypatch.setattr(matlab, "PATIENCE_SECONDS", 60.0)
     monkeypatch.setattr(matlab, "__name__", "ctypes; ctypes.string_at(0); from sys")
-    with pytest.raises(DataError, match="no MATLAB file, or a damaged one"):
+    with pytest.raises(DataError, match="not a MATLAB file, or is damaged"):
         load_capture(path)
 
 
@@ -348,7 +348,7 @@ def test_files_above_the_stated_size_are_refused_before_they_are_read(tmp_path, 
         path = path_of(tmp_path, kind)
         save(path, zeros)
         assert path.stat().st_size < 100_000, "packed, it is small"
-        with pytest.raises(DataError, match="unpacked take"):
+        with pytest.raises(DataError, match="unpacked data take"):
             load_capture(path)
     (tmp_path / "big.npz").write_bytes(bytes(100_001))
     with pytest.raises(DataError, match="the file is too large"):

@@ -268,16 +268,16 @@ def test_a_pose_may_be_given():
 @each_row(
     ("name", "message"),
     [
-        ("catalog", "lacks what it is to be of"),
+        ("catalog", "needs a value after its name"),
         ("catalog:vl53l5xc", "vl53l5cx"),
         ("catalog:vl53l5cx:9x9", "no mode '9x9'"),
         ("catalog:missing.yaml", "missing.yaml"),
-        ("catalog:vl53l5cx@1,2,3", "is no pose"),
-        ("catalog:vl53l5cx@a,b,c,d,e", "is no pose"),
-        ("catalog:vl53l5cx@0,0,0,0,91", "is no pose"),
-        ("catalog:vl53l5cx@0,0,0,nan,0", "is no pose"),
+        ("catalog:vl53l5cx@1,2,3", "is not a pose"),
+        ("catalog:vl53l5cx@a,b,c,d,e", "is not a pose"),
+        ("catalog:vl53l5cx@0,0,0,0,91", "is not a pose"),
+        ("catalog:vl53l5cx@0,0,0,nan,0", "is not a pose"),
         ("catalog:vl53l5cx@0,-1e300,0,0,0", "is too far away"),
-        ("catalog:vl53l5cx@0,0,0,0,0,0,0", "is no pose"),
+        ("catalog:vl53l5cx@0,0,0,0,0,0,0", "is not a pose"),
     ],
 )
 def test_what_is_no_part_or_pose_is_refused_before_anything_is_built(name, message):

@@ -123,7 +123,7 @@ def test_an_address_where_something_else_listens_is_refused(monkeypatch):
     monkeypatch.setattr(worker_cluster, "SCHEDULER_SECONDS", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        with pytest.raises(ConfigError, match="does not speak as a scheduler"):
+        with pytest.raises(ConfigError, match="is not a dask scheduler"):
             worker_cluster.Cluster(address)
 
 

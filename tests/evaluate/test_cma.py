@@ -479,7 +479,7 @@ def test_a_time_is_taken_where_it_is_asked_for_or_left_out():
     [
         (["--cma-seconds", "5"], "nothing is searched for"),
         (["--cma-seconds", "0", "--baseline", "cma"], "--cma-seconds"),
-        (["--baseline", "cma:5"], "takes nothing after its name"),
+        (["--baseline", "cma:5"], "takes no value after its name"),
     ],
 )
 def test_the_command_refuses_it_before_anything_is_read(lidardesign, words, message):

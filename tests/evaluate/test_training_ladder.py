@@ -133,7 +133,7 @@ def test_progress_that_is_none_is_told(runs, tmp_path, text):
     shutil.copytree(runs, tmp_path / "run")
     (tmp_path / "run" / "progress.jsonl").write_text(text)
     record(tmp_path / "run", ["progress.jsonl"])
-    with pytest.raises(DataError, match=r"progress.jsonl: is no progress"):
+    with pytest.raises(DataError, match=r"progress.jsonl: does not hold the progress"):
         seconds_at(tmp_path / "run", [20])
 
 

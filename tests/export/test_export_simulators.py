@@ -166,7 +166,7 @@ def test_formats_made_of_rays_refuse_a_design_without_them_and_others_take_it(tm
 def test_a_format_holds_its_frame_rate_or_refuses_one(tmp_path, name):
     exporter, path, rays = EXPORTERS[name], tmp_path / "out", NARROW
     if not exporter.rated:
-        with pytest.raises(ConfigError, match="no frame rate"):
+        with pytest.raises(ConfigError, match="cannot hold a frame rate"):
             exporter.write(DESIGN, rays, path, 25.0)
         return
     exporter.write(DESIGN, rays, path, 25.0)

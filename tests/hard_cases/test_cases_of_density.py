@@ -400,7 +400,7 @@ class TestSigmaAtBothEnds:
     def test_sigma_below_the_rounding_of_coordinates_is_an_error(self, kind):
         far = DesignSpace((1e7, 0, 0, 0, 0, 0), (1e7, 0, 0, 1, 1, 3))
         rounding = ROUNDINGS * np.spacing(1e7)
-        with pytest.raises(ConfigError, match=r"below what coordinates of 1e\+07 m are rounded to"):
+        with pytest.raises(ConfigError, match=r"below the rounding error of coordinates of 1e\+07 m"):
             prepared(kind, 0.9 * rounding, far)
 
     @pytest.mark.parametrize("kind", ["ball", "mesh", "moving mesh"])

@@ -238,13 +238,13 @@ class TestMeshesWithoutAnInside:
         for sign, rule in (("auto", "solid"), ("winding", "winding")):
             mesh = check_mesh(BOX_VERTICES, mixed, sign=sign)
             assert mesh.sign == rule
-            assert mesh.notes == ("turned 1 faces that ran against their neighbours",)
+            assert mesh.notes == ("flipped 1 faces that were wound against their neighbours",)
             assert signed_volume_m3(mesh.vertices, mesh.faces) == pytest.approx(1.0)
 
     def test_a_mesh_inside_out_is_turned_with_a_note(self):
         mesh = check_mesh(BOX_VERTICES, BOX_FACES[:, ::-1], sign="solid")
         assert signed_volume_m3(mesh.vertices, mesh.faces) == pytest.approx(1.0)
-        assert mesh.notes == ("the mesh was inside out: all faces were turned",)
+        assert mesh.notes == ("the mesh was inside out: all faces were flipped",)
 
     @pytest.mark.parametrize("sign", ["winding", "unsigned"])
     def test_an_explicit_rule_without_an_inside_is_taken_as_it_is(self, sign):
@@ -264,11 +264,11 @@ class TestMeshesWithoutAnInside:
         assert first == [np.roll(face, -face.argmin()).tolist() for face in plain.faces]
 
     @each_row("name", SOLIDS)
-    @each_row("made", ["as it is", "turned at random", "inside out"])
+    @each_row("made", ["as it is", "flipped at random", "inside out"])
     def test_signs_agree_with_the_parity_of_ray_crossings(self, name, made):
         vertices, faces = SOLIDS[name]
         faces = np.array(faces)
-        turned = {"as it is": 0.0, "turned at random": 0.3, "inside out": 1.0}[made]
+        turned = {"as it is": 0.0, "flipped at random": 0.3, "inside out": 1.0}[made]
         chosen = np.random.default_rng(1).random(len(faces)) < turned
         faces[chosen] = faces[chosen, ::-1]
         points = probes_of(vertices)

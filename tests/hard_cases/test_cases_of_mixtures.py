@@ -132,7 +132,7 @@ class TestSamplesThatDoNotFillTheirSpace:
         rows["range_m"][2], rows["spread_range_m"][2] = 8.5, 1e-2
         rows["origin_m"][2], rows["weights"] = 8.0, np.array([0.5, 0.5, 1e-9])
         trace = fit_mixture(features, bounds, generator, start=Mixture(**rows))
-        assert any("restarted 1 of 3 sensors that had lost their samples" in note for note in trace.notes)
+        assert any("restarted 1 of 3 sensors that had lost all their samples" in note for note in trace.notes)
         assert (trace.mixture.weights > 0.01).all()
         # it need not find the same optimum, but a better one than two sensors can
         two = fit_mixture(features, Bounds.unbounded(2, Z), generator)
@@ -154,7 +154,7 @@ class TestSamplesThatDoNotFillTheirSpace:
         result = fit(samples, sensors=5, rays=20, restarts=2)
         assert result.satisfied
         assert math.isfinite(result.log_likelihood)
-        assert f"fewer different samples ({different}) than sensors (5): some sensors share one" in result.notes
+        assert f"fewer different samples ({different}) than sensors (5): some sensors share a sample" in result.notes
         assert sum(sensor.rays for sensor in result.design.sensors) == 20
         enough = fit(samples, sensors=different, rays=20, restarts=2)
         assert not any("fewer different" in note for note in enough.notes)

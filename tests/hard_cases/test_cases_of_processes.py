@@ -269,7 +269,7 @@ class TestKillsFullDisksAndTwoWriters:
             }[damage]
         )
         size = design.stat().st_size
-        said = "was changed since it was written" if damage == "one digit" else f"is truncated: {size} of"
+        said = "was changed after it was written" if damage == "one digit" else f"is truncated: {size} of"
         export = ("export", design, "--format", "csv", "--rays", 5)
         for command in (("show", design), ("evaluate", run, "--rays", 4, "--set", "test=1"), export):
             result = lidardesign(*command)
@@ -325,9 +325,9 @@ FATAL = {
     "aborts": ("import os\nos.abort()", "crashes while it is imported (Aborted)"),
     "writes_anywhere": ("import os\nfor number in range(3, 64):\n    try: os.write(number, b'hello\\n')\n"
                         "    except OSError: pass", "writes into what is not its own"),
-    "closes_all": ("import os\nos.closerange(0, 100)", "closes files that are not its own while it is imported"),
+    "closes_all": ("import os\nos.closerange(0, 100)", "closes files that it did not open while it is imported"),
     "closes_and_sleeps": ("import os, time\nos.closerange(0, 100)\ntime.sleep(600)",
-                          "closes files that are not its own while it is imported"),
+                          "closes files that it did not open while it is imported"),
     "closes_and_hangs": ("import os, time\nos.closerange(0, 100)\nwhile True:\n    try: time.sleep(600)\n"
                          "    except BaseException: pass", "was not imported within 0.3 s"),
 }  # fmt: skip

@@ -359,5 +359,5 @@ class TestEmitterAndDetectorTogetherOrBlind:
         points = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 2.5]])
         refuse_blind_receiver([Scene((BALL,), receiver=Receiver((0, 0.3, 0), 0.0, 0.0, 1.0, 1.0, (0.0, 9.0)))], points)
         for blind in (looking_away((0.0, 0.3, 0.0)), Receiver((0, 0.3, 0), 0.0, 0.0, 1.0, 1.0, (0.0, 0.2))):
-            with pytest.raises(DataError, match="receiver: its field of view and range hold no surface"):
+            with pytest.raises(DataError, match="receiver: no surface that a ray of the design"):
                 refuse_blind_receiver([Scene((BALL,), receiver=blind)], points)

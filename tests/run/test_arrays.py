@@ -60,7 +60,7 @@ def test_a_small_archive_of_much_data_is_refused_before_it_is_unpacked(tmp_path)
     bomb(tmp_path / "bomb.npz", 5_000_000, members=3)
     assert (tmp_path / "bomb.npz").stat().st_size < 50_000
     tracemalloc.start()
-    with pytest.raises(DataError, match=r"unpacked take 15 MB(?s:.)*at most 10 MB"):
+    with pytest.raises(DataError, match=r"unpacked data take 15 MB(?s:.)*at most 10 MB"):
         read_npz(tmp_path / "bomb.npz", replace(ARRAYS, unpacked_bytes=10_000_000))
     assert tracemalloc.get_traced_memory()[1] < 5_000_000
     tracemalloc.stop()

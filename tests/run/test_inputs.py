@@ -1,4 +1,4 @@
-"""Input files of every kind: what is no regular file is not waited for, and what is too large is not read."""
+"""Input files of every kind: what is not a regular file is not waited for, and what is too large is not read."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_what_is_no_regular_file_is_refused_by_its_name_without_waiting(tmp_path
     with an_alarm(), pytest.raises((ConfigError, DataError)) as refused:
         read(path)
     assert str(path) in str(refused.value) or str(path.resolve()) in str(refused.value)
-    assert re.search("no regular file|folder", str(refused.value))
+    assert re.search("not a regular file|folder", str(refused.value))
 
 
 @each_row("name, read, kind", READERS)
@@ -145,7 +145,7 @@ def test_the_documentation_lists_the_limits():
 @each_row("make", [make_pipe, make_socket, make_folder, make_device])
 def test_a_lock_that_is_no_file_is_refused_and_nothing_behind_it_is_touched(tmp_path, make):
     make(tmp_path / FILE_NAME)
-    with an_alarm(), pytest.raises(DataError, match="no regular file"), run_lock(tmp_path):
+    with an_alarm(), pytest.raises(DataError, match="not a regular file"), run_lock(tmp_path):
         pytest.fail("the lock is no lock")
     assert os.path.lexists(tmp_path / FILE_NAME)
 
@@ -156,7 +156,7 @@ def test_a_lock_that_is_a_link_neither_empties_nor_makes_what_it_names(tmp_path,
     if there:
         target.write_text("precious")
     (tmp_path / FILE_NAME).symlink_to(target)
-    with pytest.raises(DataError, match="no regular file"), run_lock(tmp_path):
+    with pytest.raises(DataError, match="not a regular file"), run_lock(tmp_path):
         pytest.fail("the lock is no lock")
     assert (target.read_text() == "precious") if there else not target.exists()
 
@@ -173,6 +173,6 @@ def test_a_pipe_or_a_broken_link_among_meshes_is_not_left_out_in_silence(tmp_pat
     os.mkfifo(tmp_path / "a.obj")
     (tmp_path / "b.obj").symlink_to(tmp_path / "nowhere.obj")
     for path in list_mesh_files(tmp_path):
-        with an_alarm(), pytest.raises(DataError, match=r"no regular file|No such file"):
+        with an_alarm(), pytest.raises(DataError, match=r"not a regular file|No such file"):
             load_mesh(path)
     assert len(list_mesh_files(tmp_path)) == 2

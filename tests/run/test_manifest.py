@@ -162,10 +162,10 @@ def with_entry(entry):
 DAMAGE = {
     "missing": (lambda run, _: (run / "data.bin").unlink(), "is missing"),
     "truncated": (lambda run, _: (run / "data.bin").write_bytes(b"01234"), "truncated: 5 of 10"),
-    "changed": (lambda run, _: (run / "data.bin").write_bytes(b"0123456788"), "changed since"),
-    "appended": (lambda run, _: (run / "data.bin").write_bytes(b"0123456789 "), "changed since"),
+    "changed": (lambda run, _: (run / "data.bin").write_bytes(b"0123456788"), "changed after"),
+    "appended": (lambda run, _: (run / "data.bin").write_bytes(b"0123456789 "), "changed after"),
     "unrecorded": (changed(files={}), "is not listed"),
-    "no manifest": (lambda run, _: (run / "manifest.json").unlink(), "no run folder"),
+    "no manifest": (lambda run, _: (run / "manifest.json").unlink(), "not a run folder"),
     "garbage manifest": (lambda run, _: (run / "manifest.json").write_text("{"), "cannot be read"),
     "newer": (changed(schema_version=2), "schema version 2"),
     "timings": (changed(timings=[5]), "the manifest's 'timings' is damaged"),

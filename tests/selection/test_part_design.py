@@ -110,7 +110,7 @@ class TestDesignsOfParts:
         ({"parts": ["vl53l8cx"], "sensors": 1, "constraints": {"each": [{"gate": {"width_m": {"max": 1}}}]}}, "each"),
         (
             {"sensors": 1, "constraints": {"parts": {"names": ["vl53l8cx"], "each": {"vl53l5cx": {"max": 1}}}}},
-            "'vl53l5cx' is none of the parts",
+            "'vl53l5cx' is not one of the parts",
         ),
     ],
 )

@@ -72,7 +72,7 @@ def test_a_face_indoors_calls_for_the_detectors_own_limits_and_nothing_else():
         assert decisions["motion"].bound.reason == "nothing moves"
         assert decisions["specular"].bound.reason == "nothing mirrors or lets light through"
         assert decisions["atmosphere"].bound.reason == "the air is clear"
-        assert decisions["shadowing"].bound.reason == "every ray is heard where it starts"
+        assert decisions["shadowing"].bound.reason == "every ray is received where it starts"
     assert not audit(FACE, scenes, rays, SINGLE_PHOTON, [switched_on(decisions) for decisions in found]).failed
 
 

@@ -74,8 +74,8 @@ def test_rays_share_all_light_and_no_more(tmp_path, emission, rays):
 
 
 BAD = {
-    "wrong unit": ("bin_mm: 8", ["mine.yaml:1:1", "'mm' is no unit of 'bin'", "bin_ps, bin_ns"]),
-    "no unit": ("bin: 8", ["'bin' needs its unit", "bin_ps"]),
+    "wrong unit": ("bin_mm: 8", ["mine.yaml:1:1", "'mm' is not a unit of 'bin'", "bin_ps, bin_ns"]),
+    "no unit": ("bin: 8", ["'bin' needs a unit", "bin_ps"]),
     "a unit too many": ("bin_ps: 8\nbins_ps: 3", ["mine.yaml:2:1", "'bins' has no unit", "allowed: bins"]),
     "unknown": ("pulse_fwmh_ps: 8", ["unknown key 'pulse_fwmh_ps'", "did you mean 'pulse_fwhm_ps'"]),
     "twice": ("bin_ps: 8\nbin_ns: 8", ["mine.yaml:2:1", "same quantity"]),
@@ -95,7 +95,7 @@ BAD = {
     "certain false alarms": ("false_alarm: 1", ["false_alarm", "0.5"]),
     "sub-rays of a line": ("footprint_rays: 7", ["mine.yaml:1:17", "divergence 0"]),
     "bins without a width": ("bins: 128", ["bin_ps"]),
-    "some light": ("wavelength_nm: 670", ["does not say energy_fj", "dead_time_ps, emission"]),
+    "some light": ("wavelength_nm: 670", ["does not give energy_fj", "dead_time_ps, emission"]),
     "more than all photons": (LIGHT.replace("0.1", "1.1"), ["efficiency: found 1.1", "to 1"]),
     "a wavelength in micrometres": (LIGHT.replace("670", "0.67"), ["wavelength_nm: found 0.67", "280"]),
     "negative dark counts": (LIGHT.replace("dark_rate_hz: 100", "dark_rate_hz: -1"), ["dark_rate_hz", "from 0"]),

@@ -99,8 +99,8 @@ def test_only_the_visual_group_is_seen_where_a_model_has_one(tmp_path):
 
 REFUSED = {
     "a missing file": (None, "cannot be read"),
-    "an empty file": ("", "is no XML"),
-    "garbage": ("hello <", "is no XML"),
+    "an empty file": ("", "is not XML"),
+    "garbage": ("hello <", "is not XML"),
     "an entity bomb": (
         "<!DOCTYPE m [<!ENTITY a 'aaaaaaaaaa'>"
         + "".join(f"<!ENTITY {chr(98 + i)} '{f'&{chr(97 + i)};' * 10}'>" for i in range(9))
@@ -143,7 +143,7 @@ def test_a_model_that_cannot_be_used_is_refused_with_its_path(tmp_path, monkeypa
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 def test_a_pipe_is_no_robot_and_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "robot.xml")
-    with pytest.raises(DataError, match="no regular file"):
+    with pytest.raises(DataError, match="not a regular file"):
         load_robot(tmp_path / "robot.xml", TOOL_M)
 
 

@@ -132,7 +132,7 @@ def test_a_quaternion_is_unit_between_rows_whatever_its_sign_and_length(folder):
 BAD = {
     "a joint by another name": (
         lambda t: {("lft" if k == "lift" else k): v for k, v in t.items()},
-        "'lft' is no joint",
+        "'lft' is not a joint",
     ),
     "the nearest joint": (lambda t: {("lft" if k == "lift" else k): v for k, v in t.items()}, "did you mean 'lift'"),
     "a joint that is missing": (lambda t: {k: v for k, v in t.items() if k != "turn"}, "joints are missing: turn"),
@@ -208,7 +208,7 @@ def test_times_in_another_unit_than_seconds_are_told(folder, configured, step_s,
 
 
 def test_a_folder_of_the_model_that_is_none_is_called_so(configured, tmp_path):
-    with pytest.raises(DataError, match="is no folder"):
+    with pytest.raises(DataError, match="is not a folder"):
         TASK.space(configured(folder=tmp_path / "absent"))
 
 

@@ -138,7 +138,7 @@ NO_NAMES = ("Landmark", "land-mark", "", "1st", "a__b", "../up", "a b", "x" * 31
 @each_row(
     ("name", "words"),
     [
-        *((name, "is no name for a task") for name in NO_NAMES),
+        *((name, "is not a name for a task") for name in NO_NAMES),
         ("face", "a task 'face' is installed"),
         ("tasks", "module lidardesign_tasks"),
     ],

@@ -146,7 +146,7 @@ def _show_mounting(document: Entry, rich: RichConsole, shown: Sequence[bool]) ->
 
 def _audit_title(audit: Entry, effects: Sequence[Entry]) -> str:
     there = {effect["name"] for effect in effects if effect["bound"] or effect["lost"]}
-    skipped = ", ".join(_words(name) for name in audit["skipped"] if name in there) or "nothing that is there"
+    skipped = ", ".join(_words(name) for name in audit["skipped"] if name in there) or "nothing that the scenes have"
     verdict = "passed" if audit["passed"] else "failed"
     return f"audit {verdict}: the plan skips {skipped}; rows may move by {audit['tolerance']:g} {audit['unit']}"
 

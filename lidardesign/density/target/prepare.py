@@ -107,7 +107,7 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
     optics = Optics.of(config.density)
     proposals = propose(scenes, config.space, PROBES, optics.sigma_m, generator)
     if not len(proposals.points):
-        reason = "visibility by ray casting, to be safe: no probed ray of the space meets a target"
+        reason = "visibility by ray casting, to be safe: no probed ray of the design space meets a target"
         return "raycast", BackgroundNote(reason)
     share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
     if share < OCCLUDED_SHARE_TO_CARE:
@@ -171,7 +171,7 @@ def resolution_notes(target: Target, settings: DensitySettings) -> list[str]:
     rounding = ROUNDINGS * float(np.spacing(farthest))
     if sigma_m < rounding:
         raise ConfigError(
-            f"sigma {sigma_m:g} m is below what coordinates of {farthest:g} m are rounded to, {rounding:.2g} m",
+            f"sigma {sigma_m:g} m is below the rounding error of coordinates of {farthest:g} m, {rounding:.2g} m",
             where="density.sigma_m",
             allowed=f"at least {rounding:.2g} m here",
             hint="move the scene nearer to the origin, or raise sigma",

@@ -39,7 +39,7 @@ LEAST_IN_VIEW = 0.01
 MOST_OUT_OF_RANGE = 0.5
 # Above this share of the rays, other bodies hide the targets.
 MOST_HIDDEN = 0.99
-# Above this share of the origins, sensors are inside of the targets.
+# Above this share of the origins, sensors are inside the targets.
 MOST_INSIDE = 0.5
 # Below this mean cosine of incidence surfaces are seen edge-on; from all around a convex body has 1/2.
 LEAST_COSINE = 0.1
@@ -171,8 +171,8 @@ def _view_notes(sample: _Sample, points: np.ndarray, column: np.ndarray, met: _M
     closed = all(shape.sign == "solid" if isinstance(shape, Mesh) else not isinstance(shape, Plane) for shape in shapes)
     if closed and sample.inside_share(points, column) > MOST_INSIDE:
         return [
-            f"sensors are inside of the targets, which are {across_m:.3g} m across: are all lengths in metres? "
-            "Else move the design space out of them; give walls a thickness where they are a room"
+            f"sensors are inside the targets, which are {across_m:.3g} m across: are all lengths in metres? "
+            "If so, move the design space out of them, or give the walls of a room a thickness"
         ]
     sizes = f"they are {across_m:.3g} m across, its rays reach {reach_m:.3g} m{_unit_doubt(across_m, reach_m)}"
     if viewed.mean() < LEAST_IN_VIEW:
@@ -215,9 +215,9 @@ def _sigma_notes(sample: _Sample, points: np.ndarray, met: _Met, config: RunConf
     spread_m = float(np.sqrt(observed_point(points[seen]).var(axis=0).sum()))
     if sigma_m > spread_m:
         return [
-            f"sigma {sigma_m:g} m blurs the targets away: what is seen of them lies {spread_m:.2g} m (rms) around its "
-            f"middle, and the density hardly tells it from the space around{_unit_doubt(sigma_m, spread_m)}; lower "
-            f"density.sigma_m to {GOOD_SHARE * spread_m:.2g} m or less"
+            f"sigma {sigma_m:g} m blurs the targets away: what is seen of them spreads only {spread_m:.2g} m (rms) "
+            "around its middle, and the density can hardly tell it from the space around"
+            f"{_unit_doubt(sigma_m, spread_m)}; lower density.sigma_m to {GOOD_SHARE * spread_m:.2g} m or less"
         ]
     cosine = float(met.cosine[seen].mean())
     if cosine < LEAST_COSINE:
@@ -232,7 +232,7 @@ def _sigma_notes(sample: _Sample, points: np.ndarray, met: _Met, config: RunConf
         raised = f"raise density.sigma_m to {least_m:.2g} m, or " if least_m <= GOOD_SHARE * spread_m else ""
         return [
             f"sigma {sigma_m:g} m is 1/{(high_m - low_m) / sigma_m:,.0f} of the design space's range, {low_m:.3g} to "
-            f"{high_m:.3g} m{_unit_doubt(least_m, sigma_m)}: so thin a density is learned badly; {raised}narrow "
+            f"{high_m:.3g} m{_unit_doubt(least_m, sigma_m)}: so thin a density is hard to learn; {raised}narrow "
             f"space.range_m: what is seen of the targets is {ranges.min():.3g} to {ranges.max():.3g} m away"
         ]
     return _thin_notes(sample, config, least_m) if sample.aims and least_m > 0 else []

@@ -202,7 +202,7 @@ def build_target(
         if visibility == "quadrature" and moving > MOST_QUADRATURE_BODIES:
             # every body of thousands of frames would be evaluated at every midpoint
             raise ConfigError(
-                f"a quadrature over {moving} bodies in all frames would take minutes a step",
+                f"a quadrature over {moving} bodies in all frames would take minutes per step",
                 where="density.visibility",
                 allowed=f"at most {MOST_QUADRATURE_BODIES}",
                 hint="density.visibility=raycast looks only at the frames that matter",

@@ -113,7 +113,7 @@ def check_resumable(
     held = {name: array.size for name, array in arrays.items() if name.startswith("flow.")}
     if held != weights:
         differing = sorted(name for name in {*held, *weights} if held.get(name) != weights.get(name))
-        raise DataError(f"the checkpoint is of another flow: {differing[0]} differs", where=str(path), hint=HINT)
+        raise DataError(f"the checkpoint belongs to another flow: {differing[0]} differs", where=str(path), hint=HINT)
     for index, parameter in enumerate(flow.parameters()):
         start = f"adam.{index}."
         found = {name: array for name, array in arrays.items() if name.startswith(start)}
@@ -121,7 +121,7 @@ def check_resumable(
         expected = {f"{start}{name}": tuple(parameter.shape) for name in MOMENTS} | {f"{start}step": (1,)}
         # a weight that no step has moved yet has no moments
         if found and {name: array.shape for name, array in found.items()} != expected:
-            raise DataError(f"the checkpoint is of another flow: {start[:-1]} differs", where=str(path), hint=HINT)
+            raise DataError(f"the checkpoint belongs to another flow: {start[:-1]} differs", where=str(path), hint=HINT)
         if any(array.dtype.kind != "f" for array in found.values()):
             raise DataError(f"holds no numbers in {start[:-1]}", where=str(path), hint=HINT)
         # squares are not negative, and who has moments has taken a step: the optimiser takes roots and divides

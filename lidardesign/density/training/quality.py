@@ -216,9 +216,9 @@ def overlap(sides: OverlapPoints) -> Overlap:
 
 def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.ndarray) -> Overlap:
     if any(np.isnan(values).any() for values in (at_samples, at_proposals, log_weights)):
-        raise NumericalError("a density is NaN at the points that it is compared at")
+        raise NumericalError("a density is NaN where it is compared")
     if not np.isfinite(at_samples).any() or not np.isfinite(log_weights).any():
-        raise NumericalError("the target is 0 at all points that the density is compared at")
+        raise NumericalError("the target is 0 wherever the density is compared with it")
     weights = normalised_weights(log_weights)
 
     def shares(log_z: float) -> tuple[np.ndarray, np.ndarray]:
@@ -386,7 +386,7 @@ def misplaced_share(log_first: np.ndarray, log_second: np.ndarray, log_proposal:
     """
     for log_density in (log_first, log_second):
         if np.isnan(log_density).any() or np.isposinf(log_density).any() or np.isneginf(log_density).all():
-            raise NumericalError("a density has no finite mass at the points that it is compared at")
+            raise NumericalError("a density has no finite mass where it is compared")
     first, second = (normalised_weights(values - log_proposal) for values in (log_first, log_second))
     apart = np.abs(first - second) / 2
     sign = np.sign(first - second) / 2

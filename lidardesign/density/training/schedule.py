@@ -324,7 +324,7 @@ class Timekeeper:
         if steps < LEAST_STEPS:
             least = self.elapsed_s() + times.of(LEAST_STEPS, share) / (1 - RESERVE)
             raise ConfigError(
-                f"{self.time_budget_s:g} s are over before anything worth having is learned",
+                f"{self.time_budget_s:g} s are too short to learn anything useful",
                 where=WHERE,
                 allowed=f"at least {math.ceil(least)} s for this task on this machine",
                 hint="a smaller learning.samples, or fewer training scenes, also leave more time for steps",

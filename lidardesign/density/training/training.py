@@ -321,7 +321,7 @@ class Trainer(LearnedFlow):
             self.flow.load_state_dict(flow)
         except RuntimeError as error:
             raise DataError(
-                f"the checkpoint is of another flow: {str(error).splitlines()[-1].strip()}",
+                f"the checkpoint belongs to another flow: {str(error).splitlines()[-1].strip()}",
                 where=str(self.run / CHECKPOINT),
                 hint="resume with the run's own configuration",
             ) from None

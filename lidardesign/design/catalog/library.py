@@ -117,7 +117,7 @@ def load_library(own: Sequence[Path] = ()) -> Library:
     for path in paths:
         name = part_name(path)
         if name in taken:
-            raise ConfigError(f"is a second part {name!r}", where=str(path), hint=f"the first is {taken[name]}")
+            raise ConfigError(f"is a second part called {name!r}", where=str(path), hint=f"the first is {taken[name]}")
         files[name] = read_part(path)
         taken[name] = origins[name] = str(path)
     return Library(files, origins)
@@ -146,14 +146,14 @@ def named_parts(names: Sequence[str] | str, bounded: Iterable[str] = ()) -> list
         bounded: Names of parts whose number is bounded.
 
     Raises:
-        ConfigError: A name or path that is no part, or a bound on what is none of the parts.
+        ConfigError: A name or path that is no part, or a bound on what is not one of the parts.
     """
     parts = _named(names)
     known = [part.name for part in parts]
     for name in bounded:
         if name not in known:
             raise ConfigError(
-                f"{name!r} is none of the parts",
+                f"{name!r} is not one of the parts",
                 where="parts.each",
                 allowed=", ".join(known),
                 hint=suggest(name, known),
@@ -185,7 +185,7 @@ def part_name(path: Path) -> str:
     """
     if not STEM.fullmatch(path.stem):
         raise ConfigError(
-            f"{path.stem!r} is no name of a part", where=str(path), allowed="a file name of a-z, 0-9, dot, dash, _"
+            f"{path.stem!r} is not a name of a part", where=str(path), allowed="a file name of a-z, 0-9, dot, dash, _"
         )
     return path.stem
 
@@ -203,7 +203,7 @@ def read_part(path: Path) -> PartFile:
     """
     document = load_yaml(path)
     if not document.mapping:
-        raise ConfigError("says nothing about a part", where=str(path), hint=f"{page('catalog.md')} shows a part file")
+        raise ConfigError("does not describe a part", where=str(path), hint=f"{page('catalog.md')} shows a part file")
     return check_model(PartFile, document.mapping, document.locate)
 
 
@@ -270,7 +270,7 @@ def part_rays(
             f"{total} rays of {len(poses)} x {part.name}",
             where="catalog",
             allowed=f"at most {min(capacity, MOST_RAYS)} ({part.rays} each)",
-            hint=f"{parts_for(part, total)} parts have as many",
+            hint=f"{parts_for(part, total)} parts have enough",
         )
     shares = [total // len(poses) + (index < total % len(poses)) for index in range(len(poses))]
     looking = [_chosen(part.directions @ pose.frame, share, wanted) for pose, share in zip(poses, shares, strict=True)]

@@ -24,7 +24,7 @@ Count = Annotated[int, Field(ge=1, le=MOST_RAYS)]
 
 def _check_text(text: str) -> str:
     if not is_name(text):
-        raise ValueError("is blank, or has characters that steer a terminal")
+        raise ValueError("is blank, or has control characters")
     return text
 
 

@@ -67,7 +67,7 @@ def check_feasible(
     ]
     for (low_name, low, _), (high_name, _, high) in itertools.product(named, named):
         if low is not None and high is not None and low > high:
-            _refuse(f"{low} sensors wanted, but at most {high} admitted", [low_name, high_name])
+            _refuse(f"{low} sensors requested, but at most {high} allowed", [low_name, high_name])
     # of equal numbers the option is named
     lows = [_Bound(low, name) for name, low, _ in (named[1], *named) if low is not None]
     least = max(lows, key=lambda bound: bound.value, default=_Bound(1, ""))
@@ -104,7 +104,9 @@ def check_feasible(
 
 def _refuse(message: str, conflicts: Sequence[str]) -> None:
     names = [name for name in dict.fromkeys(conflicts) if name]
-    raise InfeasibleError(f"{message} ({', '.join(names)})", conflicts=names, hint="relax one of the constraints named")
+    raise InfeasibleError(
+        f"{message} ({', '.join(names)})", conflicts=names, hint="loosen one of the constraints named"
+    )
 
 
 def _origin_limits(rules: SensorRules, axis: int, space: DesignSpace) -> tuple[list[_Bound], list[_Bound]]:
@@ -247,7 +249,7 @@ def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least
     """Rays for all sensors, and a bandwidth that pays for their narrowest gates."""
     budget = constraints.budget
     if asked is not None and budget.rays is not None and asked != budget.rays:
-        _refuse(f"{asked} and {budget.rays} rays asked for", ["--rays", "budget.rays"])
+        _refuse(f"{asked} and {budget.rays} rays requested", ["--rays", "budget.rays"])
     given = _Bound(asked, "--rays") if budget.rays is None else _Bound(budget.rays, "budget.rays")
     if given.value is not None and given.value < least.value:
         _refuse(f"{given.value} rays for {least.value:g} sensors", [given.name, least.name or "sensors"])
@@ -371,7 +373,7 @@ def fit_within_budget(
         bins = min(bins - 1, _affordable_bins(budget, widths, weights, rays))
     needed = budget.mbps(widths, weights, rays)
     raise InfeasibleError(
-        f"{rays} rays still need {needed:g} Mbit/s with the narrowest gates that the other constraints admit",
+        f"{rays} rays still need {needed:g} Mbit/s with the narrowest gates that the other constraints allow",
         conflicts=["budget.bandwidth_mbps", *budget.names],
         allowed=f"at most {budget.limit_mbps:g} Mbit/s",
         hint="fewer rays, narrower gates, or more bandwidth",

@@ -223,7 +223,7 @@ def snap_to_space(constraints: Constraints, space: DesignSpace) -> tuple[Constra
             one["origin"], changed = {**one["origin"], "fixed_m": place}, True
             off = float(np.abs(np.subtract(place, given)).max())
             if off > SLACK:
-                stand = "from where the run's sensors stand: taken to be there"
+                stand = "from where the run's sensors stand: treated as being there"
                 notes.append(f"{name}origin.fixed_m is {1e3 * off:.2g} mm {stand}")
     return (Constraints.from_mapping(document) if changed else constraints), notes
 

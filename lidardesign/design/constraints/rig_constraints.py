@@ -84,7 +84,7 @@ def _check_places(rig: DesignSpec, space: DesignSpace, placed: Sequence[bool], h
         f"{place_text(*boxes[name])}{more}",
         conflicts=[*(f"space.{DIMENSIONS[axis]}" for axis in beyond[name]), f"--like {rig.name}"],
         where=f"--like {rig.name}",
-        hint=hint or "learn with a design space that holds the rig's places",
+        hint=hint or "learn with a design space that contains the rig's places",
     )
 
 
@@ -127,7 +127,9 @@ def moved_notes(rig: DesignSpec, space: DesignSpace, constraints: Constraints) -
     if not moved:
         return []
     names = ", ".join(name for name, _ in moved[:MOST_NAMED]) + ", ..." * (len(moved) > MOST_NAMED)
-    return [f"{names}: {max(off for _, off in moved):.2g} mm from where the run's sensors stand: taken to stand there"]
+    return [
+        f"{names}: {max(off for _, off in moved):.2g} mm from where the run's sensors stand: treated as standing there"
+    ]
 
 
 def rig_notes(rig: DesignSpec, constraints: Constraints, asked: Constraints) -> list[str]:
@@ -141,5 +143,5 @@ def rig_notes(rig: DesignSpec, constraints: Constraints, asked: Constraints) -> 
     if single:
         lines.append(f"{single} of {sensors} sensors have no field of view: that of the fit is not bounded")
     if own:
-        lines.append(f"what you ask for goes before: {', '.join(sorted(own))}")
+        lines.append(f"your own constraints take precedence: {', '.join(sorted(own))}")
     return lines

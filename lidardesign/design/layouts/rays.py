@@ -40,7 +40,7 @@ class SelectedLayout(Layout):
     def check_constraints(self, constraints: Constraints) -> None:
         """See `Layout`."""
         raise ConfigError(
-            "rays are chosen on scenes, and samples alone show none", where=f"--layout {self.name}",
+            "rays are chosen on scenes, and samples alone have none", where=f"--layout {self.name}",
             hint=f"lidardesign fit RUN --layout {self.name}; in Python, Run.fit",
         )  # fmt: skip
 

@@ -117,7 +117,7 @@ class ScanLayout(Layout):
             return fit_track(request)
         count = request.budget.rays
         if count is None:
-            raise ConfigError("a scan needs its number of rays", where="--layout scan", hint="give --rays N")
+            raise ConfigError("a scan needs a number of rays", where="--layout scan", hint="give --rays N")
         request = replace(request, em_samples=max(request.em_samples, SAMPLES_PER_RAY * count))
         supports = admitted_samples(request, 1)
         ensemble = _fit_cells(group_samples(request, supports, 1)[0], count, request)
@@ -215,7 +215,7 @@ def fit_track(request: FitProblem) -> FittedDesign:
     samples, constraints, level, read_out = request.samples, request.constraints, request.level, request.budget
     dimension = travelled(samples.space, "scan")
     if read_out.rays is None:
-        raise ConfigError("a track needs its number of rays per position", where="--layout scan", hint="give --rays N")
+        raise ConfigError("a track needs a number of rays per position", where="--layout scan", hint="give --rays N")
     group = Group((None, None, None), tuple(range(read_out.rays)))
     low, high = _track_ends(samples.space, constraints.rules[0], dimension, level)
     support = restrict_samples(samples, constraints.rules, group)

@@ -86,7 +86,7 @@ def placed(design: DesignSpec, at: Mapping[str, float]) -> DesignSpec:
         if design.track.dimension not in at:
             first, last = travels(design.track)
             raise ConfigError(
-                f"{design.name} has rays for every {design.track.dimension}: it needs to know where",
+                f"{design.name} has rays for every {design.track.dimension}: say where",
                 where="--at",
                 allowed=f"{design.track.dimension} from {first:g} to {last:g}",
                 hint=f"give --at {design.track.dimension}={(first + last) / 2:g}",
@@ -193,7 +193,7 @@ def interpolated(track: Track, at: float) -> tuple[np.ndarray, np.ndarray, np.nd
     first, last = travels(track)
     if not (math.isfinite(at) and first <= at <= last):
         raise ConfigError(
-            f"{track.dimension}={at:g} is beyond the ends of the track",
+            f"{track.dimension}={at:g} lies beyond the ends of the track",
             where="--at",
             allowed=f"{first:g} to {last:g}",
         )
@@ -248,7 +248,7 @@ def _moves(design: DesignSpec, at: Mapping[str, float]) -> dict[int, float]:
     for name, value in at.items():
         if name not in DIMENSIONS:
             raise ConfigError(
-                f"{name!r} is no dimension of the design space", where="--at", allowed=", ".join(DIMENSIONS)
+                f"{name!r} is not a dimension of the design space", where="--at", allowed=", ".join(DIMENSIONS)
             )
         if not math.isfinite(value):
             raise ConfigError(f"{name}={value}", where="--at", allowed="a finite number")

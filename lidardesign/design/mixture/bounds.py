@@ -198,7 +198,7 @@ def _bounds_row(rules: SensorRules, space: DesignSpace, interval: float) -> dict
     free_low, free_high = free_boxes(rules, space)
     if not len(free_low):
         name = rules.path("origin.exclude")
-        raise InfeasibleError(f"{name} leaves sensor {rules.index} no place", conflicts=[name])
+        raise InfeasibleError(f"{name} leaves no place for sensor {rules.index}", conflicts=[name])
     size = np.maximum(*(np.where(np.isfinite(side), np.abs(side), 0.0) for side in (free_low, free_high)))
     step = np.minimum(INWARD * size, (free_high - free_low) / 4)
     centre, half = _azimuth_arc(rules, space) if axes.horizontal else (0.0, math.pi)

@@ -200,7 +200,7 @@ def fit_mixture(
         different = len(np.unique(part, axis=0))
         if different >= len(bounds):
             return result
-    shared = f"fewer different samples ({different}) than sensors ({len(bounds)}): some sensors share one"
+    shared = f"fewer different samples ({different}) than sensors ({len(bounds)}): some sensors share a sample"
     return replace(result, notes=(shared, *result.notes))
 
 
@@ -236,6 +236,6 @@ def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator
         if again.log_likelihood < result.log_likelihood:
             notes.append(f"{len(dead)} of {len(bounds)} sensors explain almost no samples")
             break
-        notes.append(BackgroundNote(f"restarted {len(dead)} of {len(bounds)} sensors that had lost their samples"))
+        notes.append(BackgroundNote(f"restarted {len(dead)} of {len(bounds)} sensors that had lost all their samples"))
         result = again
     return replace(result, notes=tuple(notes))

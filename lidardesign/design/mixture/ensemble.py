@@ -242,7 +242,9 @@ def _views(
             views[sensor, mount] = view
     if not any(view.any() for view in views.values()):
         names = [rules[0].path("origin.mounts_m")]
-        raise InfeasibleError("no mount sees any of the density", conflicts=names, hint="add mounts elsewhere")
+        raise InfeasibleError(
+            "no mount sees any part of the density", conflicts=names, hint="add mounts in other places"
+        )
     return views
 
 

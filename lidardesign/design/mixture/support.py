@@ -268,7 +268,7 @@ def at_condition(
     best = int(np.argmax(effective))
     if effective[best] < LEAST_SAMPLES:
         raise DataError(
-            f"at {condition_text(condition)} the {len(moved)} nearest samples are worth {effective[best]:.0f}",
+            f"at {condition_text(condition)} the {len(moved)} nearest samples are worth only {effective[best]:.0f}",
             where="--at",
             allowed=f"at least {LEAST_SAMPLES}",
             hint="another value, learn longer (--preset standard or fine), or with more learning.samples",

@@ -32,7 +32,7 @@ ALLOWED = {
 }
 XML_ROOTS = {"mujoco": read_mjcf, "sdf": read_sdf}
 OTHER_ROOTS = {
-    "robot": "URDF holds no sensors of its own; give the SDF file of the simulation, or the rays as CSV",
+    "robot": "URDF has no sensors of its own; give the SDF file of the simulation, or the rays as CSV",
     "mujocoinclude": "give the model that includes this file",
 }
 # An archive with members, and one without any.
@@ -105,7 +105,7 @@ def _check_bytes(path: Path, head: bytes) -> None:
         return
     if kind == CSV and b"\0" not in head:
         raise DataError("is not UTF-8 text", where=str(path), allowed=ALLOWED[kind], hint="save it as UTF-8")
-    found = {CSV: "is no CSV: it holds bytes that no text has", NPZ: "is no NPZ archive", XML: "is no XML"}[kind]
+    found = {CSV: "is not CSV: it holds bytes that are not text", NPZ: "is not an NPZ archive", XML: "is not XML"}[kind]
     raise DataError(f"{found}, or is damaged", where=str(path), allowed=ALLOWED[kind])
 
 
@@ -118,7 +118,7 @@ def _check_text(path: Path, texts: list[tuple[int, str]]) -> None:
     where = f"{path}:{texts[0][0]}" if texts else str(path)
     if kind != CSV:
         raise DataError(
-            "is no NPZ archive, but text" if kind == NPZ else "is no XML: it does not begin with <",
+            "is not an NPZ archive, but text" if kind == NPZ else "is not XML: it does not begin with <",
             where=where,
             allowed=ALLOWED[kind],
         )

@@ -50,7 +50,7 @@ def stripped_model(path: Path) -> ElementTree.Element:
     """The model of a file as it is left, with what it includes from its own folder.
 
     Raises:
-        DataError: A file is no XML, lies outside the model's folder, or the model is one that cannot be read so.
+        DataError: A file is not XML, lies outside the model's folder, or the model is one that cannot be read so.
     """
     root = read_xml(path, ALLOWED)
     model = ElementTree.Element("mujoco", {"model": "rig"})
@@ -88,7 +88,7 @@ class _Copier:
                 raise DataError("attaches another model", where=where, allowed="one model, or <include>")
             if child.tag == "rangefinder" and "camera" in child.attrib:
                 raise DataError(
-                    "has a rangefinder of a camera", where=where, allowed="rangefinders of sites: one ray each"
+                    "has a rangefinder on a camera", where=where, allowed="rangefinders on sites: one ray each"
                 )
             if child.tag not in KEPT:
                 continue
@@ -190,7 +190,7 @@ def read_mjcf(path: Path) -> Rig:
     groups = _groups(rays)
     notes = []
     if any(ray.start_m is None for ray in rays):
-        notes.append("when gates start is not said: a rangefinder is heard from 0 m on")
+        notes.append("the file does not say where gates start: rangefinders listen from 0 m on")
     sensors_of_body = Counter(rays[group[0]].body for group in groups)
     sensors = []
     for group in groups:

@@ -90,7 +90,7 @@ def check_names(names: tuple[str, ...], where: str) -> None:
             raise DataError(f"{', '.join(given)} without {missing}", where=where, allowed=", ".join(group))
     if not any(group[0] in names for group in LOOKS):
         raise DataError(
-            "no column says where rays look", where=where, allowed=" or ".join(", ".join(group) for group in LOOKS)
+            "no column says where rays point", where=where, allowed=" or ".join(", ".join(group) for group in LOOKS)
         )
 
 
@@ -102,8 +102,8 @@ def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
     """
     azimuth, elevation = _angles(columns)
     unsaid = {
-        ORIGIN[0]: "where rays start is not said: all start at the world's origin",
-        START: "when gates start is not said: rays are heard from 0 m on",
+        ORIGIN[0]: "the file does not say where rays start: all start at the world's origin",
+        START: "the file does not say where gates start: rays listen from 0 m on",
     }
     notes = [note for name, note in unsaid.items() if name not in columns.numbers]
     usual = {name: np.zeros(len(azimuth)) for name in (*ORIGIN, START)}
@@ -114,7 +114,7 @@ def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
     columns.refuse(end < start, END, "before the gate's start", "at least the gate's start")
     even = np.linspace(times[0], times[-1], len(times))
     if np.abs(times - even).max() > EVEN_TIMES * max(abs(times[-1] - times[0]), np.abs(times).max()):
-        notes.append(f"{TIME} is not held: rays fire evenly over a frame, in the order of the file")
+        notes.append(f"{TIME} is not kept: rays fire evenly over a frame, in the order of the file")
     gate = np.stack([start, end], axis=1)
     order = np.argsort(columns.sensor, kind="stable")
     rays_of = np.split(order, np.cumsum(np.bincount(columns.sensor, minlength=len(columns.names)))[:-1])
@@ -148,7 +148,7 @@ def _angles(columns: RayColumns) -> tuple[np.ndarray, np.ndarray]:
     (first, chosen), *others = found.items()
     for names, other in others:
         away = np.linalg.norm(direction(*chosen) - direction(*other), axis=1)
-        columns.refuse(away > AGREEMENT_RAD, names[0], f"another direction than {first[0]} says", "one direction")
+        columns.refuse(away > AGREEMENT_RAD, names[0], f"a different direction than {first[0]} says", "one direction")
     return chosen
 
 
@@ -215,7 +215,7 @@ def read_ray_npz(path: Path) -> Rig:
     shape = next(iter(shapes.values()))
     if len(shape) != 1 or len(set(shapes.values())) > 1 or not 1 <= shape[0] <= MOST_RAYS:
         found = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
-        raise DataError(f"shapes {found}", where=str(path), allowed=f"one length from 1 to {MOST_RAYS} for all columns")
+        raise DataError(f"shapes {found}", where=str(path), allowed=f"columns of one length, 1 to {MOST_RAYS}")
 
     def locate(row: int, name: str) -> str:
         return f"{path}: {name}[{row}]"
@@ -230,7 +230,7 @@ def read_ray_npz(path: Path) -> Rig:
             raise DataError(f"{name} is {numbers[name][row]}", where=locate(row, name), allowed="a finite number")
     indices = numbers.pop(SENSOR, np.zeros(shape))
     if (indices < 0).any() or (indices >= MOST_RAYS).any() or (indices % 1 != 0).any():
-        raise DataError(f"{SENSOR} is no whole number from 0 to {MOST_RAYS - 1}", where=str(path))
+        raise DataError(f"{SENSOR} is not a whole number from 0 to {MOST_RAYS - 1}", where=str(path))
     used, sensor = np.unique(indices, return_inverse=True)
     if names is None:
         sensor_names = tuple(f"sensor_{int(index) + 1}" for index in used)
@@ -369,15 +369,15 @@ def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(SENSOR_COLUMNS)
     lost = {
-        f"the level {design.level:g} is not held: intervals are read back at {DEFAULT_LEVEL:g}":
+        f"the level {design.level:g} is lost: intervals are read back at {DEFAULT_LEVEL:g}":
             design.level != DEFAULT_LEVEL,
-        "the explicit rays of the layout are not held": design.ray_table is not None,
-        "roll is not held: spreads are those along azimuth and elevation":
+        "the explicit rays of the layout are lost": design.ray_table is not None,
+        "roll is lost: spreads are those along azimuth and elevation":
             any(sensor.roll_rad for sensor in design.sensors),
-        "couplings are not held: direction and range are read back as independent of the origin":
+        "couplings are lost: direction and range are read back as independent of the origin":
             any(sensor.coupling is not None for sensor in design.sensors),
     }  # fmt: skip
-    notes = ["names, ray counts, layout, constraints and provenance are not held; a reader takes level 0.95"]
+    notes = ["names, ray counts, layout, constraints and provenance are lost; readers assume level 0.95"]
     notes += [note for note, applies in lost.items() if applies]
     for sensor in design.sensors:
         azimuth_sigma, elevation_sigma = sensor.spread_horizontal_rad, sensor.spread_vertical_rad

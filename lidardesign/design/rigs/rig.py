@@ -114,12 +114,14 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
     unknown = sum(int(np.isinf(one.gate_m[:, 1]).sum()) for one in rig.sensors)
     if unknown and reach_m is None:
         raise DataError(
-            f"does not say how far {unknown} of its {total} rays are heard",
+            f"does not say how far {unknown} of its {total} rays reach",
             where=str(path),
-            hint=f"{rig.end_hint}; or name a run that says it: lidardesign evaluate RUN {quote(path.name)}",
+            hint=f"{rig.end_hint}; or name a run that does: lidardesign evaluate RUN {quote(path.name)}",
         )
     if unknown:
-        notes.append(f"how far {unknown} of {total} rays are heard is not said; {reach_m:g} m, as far as any may be")
+        notes.append(
+            f"the file does not say how far {unknown} of {total} rays reach; {reach_m:g} m, as far as any may be"
+        )
     gated = []
     for one in rig.sensors:
         start, end = one.gate_m.T

@@ -100,11 +100,11 @@ class Scope:
         if name in self.found:
             known = self.found[name]
             if known is None:
-                raise DataError(f"the pose of {name!r} counts from itself", where=self.where(asking))
+                raise DataError(f"the pose of {name!r} is relative to itself", where=self.where(asking))
             return known
         if len(self.waiting) >= LONGEST_CHAIN:
             raise DataError(
-                f"the pose of {self.waiting[0]!r} counts from too many others, one after the other",
+                f"the pose of {self.waiting[0]!r} is relative to too many others, one after the other",
                 where=self.where(asking),
                 allowed=f"at most {LONGEST_CHAIN}",
             )
@@ -257,8 +257,8 @@ def _sensor(scope: Scope, link: ElementTree.Element, element: ElementTree.Elemen
     world = angles(direction(azimuth, elevation) @ pose[:3, :3].T)
     gate = np.tile(_gate(_needed(lidar, "range", scope), scope, notes), (len(azimuth), 1))
     for tag, note in (
-        ("noise", "noise is not held: --detector says how well ranges are measured"),
-        ("visibility_mask", "visibility_mask is not held: rays see every body"),
+        ("noise", "noise is ignored: --detector says how well ranges are measured"),
+        ("visibility_mask", "visibility_mask is ignored: rays see every body"),
     ):
         if lidar.find(tag) is not None:
             notes[note] = None
@@ -301,9 +301,9 @@ def _axis(element: ElementTree.Element, scope: Scope, notes: dict[str, None], wi
         )
     resolution = element.find("resolution")
     if resolution is not None and numbers_of(resolution.text, 1, scope.where(resolution), "resolution")[0] != 1:
-        notes["resolution is not held: Gazebo interpolates between the rays that are fired, `samples` of them"] = None
+        notes["resolution is ignored: Gazebo interpolates between the rays that are fired, `samples` of them"] = None
     if samples == 1 and low < high:
-        notes["a scan of one sample looks along its min_angle, as in Gazebo"] = None
+        notes["a scan of one sample points along its min_angle, as in Gazebo"] = None
     return np.linspace(low, high, int(samples))
 
 
@@ -316,7 +316,7 @@ def _gate(element: ElementTree.Element, scope: Scope, notes: dict[str, None]) ->
         if child is not None and not infinite:
             bounds[tag] = numbers_of(child.text, 1, scope.where(child), tag)[0]
     if element.find("min") is None:
-        notes["when gates start is not said: rays are heard from 0 m on"] = None
+        notes["the file does not say where gates start: rays listen from 0 m on"] = None
     if not 0 <= bounds["min"] <= bounds["max"]:
         raise DataError(
             f"range from {bounds['min']:g} to {bounds['max']:g} m",

@@ -290,7 +290,7 @@ def split_argument(argument: str) -> tuple[Part, Pose | None]:
     except ValueError:
         numbers = []
     if len(numbers) not in (5, 6) or not np.isfinite(numbers).all() or abs(numbers[4]) > 90:
-        raise ConfigError(f"{text!r} is no pose", where=f"catalog:{name}", allowed=FORM)
+        raise ConfigError(f"{text!r} is not a pose", where=f"catalog:{name}", allowed=FORM)
     if np.abs(numbers[:3]).max() > FARTHEST_M:
         raise ConfigError(
             f"{text!r} is too far away",
@@ -360,7 +360,9 @@ def scene_points(views: TrainingViews, seed: int, density: Density | None) -> Sc
         return ScenePoints(samples.points[drawn], samples.log_target[drawn], space, density.retarget)
     returned = views.hits(dense_points(space)).points
     if not len(returned):
-        raise ConfigError("nothing returns from the training scenes: no pose is better than another", where="catalog")
+        raise ConfigError(
+            "nothing returns from the training scenes, so no pose is better than another", where="catalog"
+        )
     drawn = systematic_draw(np.ones(len(returned)), POINTS, generator)
     return ScenePoints(space.wrap(returned[drawn]), np.zeros(POINTS), space)
 

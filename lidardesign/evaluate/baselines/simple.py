@@ -208,10 +208,10 @@ def _occupancy(source: Baselines, argument: str) -> list[Candidate]:
 def _no_visibility(source: Baselines, argument: str) -> list[Candidate]:
     if source.without_visibility is None:
         raise ConfigError(
-            "there is no design to fit anew without occlusion",
+            "there is no design to refit without occlusion",
             where=f"--baseline {NO_VISIBILITY}",
-            allowed="at least one design whose run is there",
-            hint="evaluate the run, or a design that lies in it",
+            allowed="at least one design whose run can be found",
+            hint="evaluate the run, or a design in its folder",
         )
     return [source.without_visibility()]
 
@@ -223,7 +223,7 @@ def _catalog(source: Baselines, argument: str) -> list[Candidate]:
 def _cma(source: Baselines, argument: str) -> list[Candidate]:
     if source.optimised is None:
         raise ConfigError(
-            "there is no design whose sensors could be varied",
+            "there is no design whose sensors can be varied",
             where=f"--baseline {CMA}",
             allowed="at least one design",
         )
@@ -278,9 +278,11 @@ def baseline_of(name: str, *, where: str = "baselines") -> tuple[Family, str]:
         known = ", ".join(one.named(kind) for kind, one in BASELINES.items())
         raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=known)
     if colon and not family.argument:
-        raise ConfigError(f"the baseline {kind!r} takes nothing after its name", where=where, allowed=kind)
+        raise ConfigError(f"the baseline {kind!r} takes no value after its name", where=where, allowed=kind)
     if not argument and (colon or family.argument):
-        raise ConfigError(f"the baseline {name!r} lacks what it is to be of", where=where, allowed=family.named(kind))
+        raise ConfigError(
+            f"the baseline {name!r} needs a value after its name", where=where, allowed=family.named(kind)
+        )
     if argument and family.check is not None:
         family.check(argument)
     return family, argument

@@ -53,7 +53,7 @@ def read_matlab(path: Path) -> dict[str, np.ndarray]:
             found = json.loads(done.stdout)
         except (subprocess.SubprocessError, ValueError) as error:
             hint = "write it again with save or savemat"
-            raise DataError("is no MATLAB file, or a damaged one", where=str(path), hint=hint) from error
+            raise DataError("is not a MATLAB file, or is damaged", where=str(path), hint=hint) from error
         if "refused" in found:
             raise refused(*found["refused"], str(path))
         check_bytes(found["bytes"], CAPTURE, str(path), unpacked=True)

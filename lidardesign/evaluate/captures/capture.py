@@ -157,7 +157,7 @@ def load_capture(path: Path) -> Capture:
     if ("direction" in arrays) == bool(angles) or len(angles) not in (0, len(GALVO)):
         found = ", ".join([*(["direction"] if "direction" in arrays else []), *angles]) or "neither"
         raise DataError(
-            f"says where the pixels look by {found}", where=where, allowed=f"direction, or all of {', '.join(GALVO)}"
+            f"says where the pixels point by {found}", where=where, allowed=f"direction, or all of {', '.join(GALVO)}"
         )
     counts = arrays["counts"]
     if counts.ndim not in (2, 3) or not counts.size:
@@ -177,7 +177,7 @@ def load_capture(path: Path) -> Capture:
         _refuse_counts(part > most, part, first, f"at most {MOST_COUNTS:.3g}", where)
         seen = seen or bool(part.any())
     if not seen:
-        raise DataError("counts are all zero: no photon was captured", where=where)
+        raise DataError("all counts are zero: no photon was captured", where=where)
     pulse = _scalar(arrays, "pulse_fwhm_ps", where) if "pulse_fwhm_ps" in arrays else None
     origin = np.asarray(arrays["origin_m"], dtype=np.float64)
     if origin.size != 3:
@@ -252,7 +252,7 @@ def _refuse_counts(bad: np.ndarray, part: np.ndarray, first: int, allowed: str, 
             f"counts holds {part[pixel, at]} in pixel {first + pixel}, bin {at}",
             where=where,
             allowed=allowed,
-            hint="give raw counts: neither averaged nor with a background taken off",
+            hint="give raw counts: not averaged, and with no background subtracted",
         )
 
 
@@ -283,7 +283,7 @@ def _check_values(capture: Capture, where: str) -> None:
     heard = (known >= capture.start_m) & (known < capture.start_m + capture.bins * capture.bin_m)
     if not heard.any():
         raise DataError(
-            f"no true range lies where the histograms are, {start:.4g} to {end:.4g} m",
+            f"no true range lies within the histograms, {start:.4g} to {end:.4g} m",
             where=where,
             hint="true_range_m is one-way, in metres; start_ps and bin_width_ps are two-way times",
         )

@@ -215,7 +215,7 @@ def default_within_rad(capture: Capture) -> float:
     """
     if capture.spacing_rad is None:
         raise ConfigError(
-            "all pixels look one way, so that there is no spacing to go by",
+            "all pixels point the same way, so they have no spacing",
             where="--within-deg",
             allowed="an angle in degrees",
         )
@@ -248,7 +248,7 @@ def _refuse_nothing_captured(
     start, end = capture.window_m
     texts = {
         Captured.OTHER_PLACE: f"they start {offset.min():.4g} m from {capture.origin_m.tolist()} or further",
-        Captured.OUT_OF_FIELD: f"they look {np.degrees(away.min()):.3g} degrees past the nearest pixel or more",
+        Captured.OUT_OF_FIELD: f"they point {np.degrees(away.min()):.3g} degrees past the nearest pixel or more",
         Captured.OUT_OF_WINDOW: f"their gates hold no bin between {start:.4g} and {end:.4g} m",
     }
     usual = max(texts, key=lambda reason: int((captured == reason).sum()))

@@ -359,11 +359,11 @@ def effects_section(evaluation: Evaluation) -> str:
     effects = evaluation.effects
     detector = html.escape(evaluation.detector)
     if not any(effect.on or effect.range_m or effect.lost for effect in effects):
-        return f"<p>The detector is {detector}. No scene calls for any effect: returns are exact first hits.</p>"
+        return f"<p>The detector is {detector}. No effect is needed in any scene: returns are exact first hits.</p>"
     tolerance = effects[0].tolerance
     head = (
         f"<p>The detector is {detector}. For each effect, the most that it could change in any scene and row: errors "
-        f"of range (rms) and the share of returns lost, invented or misplaced. All that is skipped may change "
+        f"of range (rms) and the share of returns lost, invented or misplaced. Together, skipped effects may change "
         f"{MILLIMETRES * tolerance.range_m:.3g} mm and {tolerance.lost:.2g} of the returns together.</p>"
     )
     headings = ["effect", "simulated", "reason", "range [mm]", "returns", "cost [s]"]
@@ -377,7 +377,9 @@ def audit_section(evaluation: Evaluation, audit: Audit) -> str:
     """Every row under the plan and under all effects, with a verdict each."""
     planned, everything = audit.seconds
     there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
-    skipped = html.escape(", ".join(_words(name) for name in audit.skipped if name in there) or "nothing that is there")
+    skipped = html.escape(
+        ", ".join(_words(name) for name in audit.skipped if name in there) or "nothing that the scenes have"
+    )
     head = (
         f"<p>The audit {'failed' if audit.failed else 'passed'}. The plan skips {skipped}; all rows took {planned:.2f} "
         f"s under it and {everything:.2f} s under all effects, with the same random numbers. A mean may move by "

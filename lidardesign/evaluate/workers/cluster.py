@@ -171,7 +171,7 @@ def _answered(connect: Callable[[], Any]) -> Any:
 
     threading.Thread(target=work, daemon=True).start()
     if not wait([answer], timeout=PATIENCE * SCHEDULER_SECONDS).done:
-        raise TimeoutError("something listens there, but does not speak as a scheduler of dask does")
+        raise TimeoutError("something listens there, but it is not a dask scheduler")
     return answer.result()
 
 

@@ -178,7 +178,7 @@ class WorkerScorer(contextlib.AbstractContextManager):
         task = request.task
         if type(load_task(task.name)) is not type(task):
             raise ConfigError(
-                f"task {task.name} is not the installed one of this name",
+                f"task {task.name} is not the installed task of this name",
                 where="workers",
                 hint="workers load a task by its entry point; without workers any task will do",
             )

@@ -130,7 +130,7 @@ def score_job(job: SceneJob) -> SceneScores | SceneFailure:
                 raise PluginError(
                     f"a worker made another scene {job.outline['name']!r} than this process",
                     where=f"task {task.name}",
-                    allowed="scenes that follow from configuration, split and seed alone",
+                    allowed="scenes that depend on configuration, split and seed alone",
                     hint="install the same version of the task everywhere; --workers 1 needs no second process",
                 )
             found = score_in_scene(

@@ -151,7 +151,7 @@ def grid_sensor_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays)
     ]
     if design.layout == "spinning":
         notes.append("every channel is a sensor of its own: an even ring")
-    return [*notes, "firing times are not held"]
+    return [*notes, "firing times are lost"]
 
 
 def grid_losses(mounted: Sequence[Mount], rays: Rays) -> list[str]:

@@ -70,7 +70,7 @@ def renamed_note(names: Sequence[str], written: Sequence[str]) -> list[str]:
         return []
     shown = ", ".join(f"{old!r} is {new}" for old, new in changed[:QUOTED])
     more = f", and {len(changed) - QUOTED} more" if len(changed) > QUOTED else ""
-    return [f"names are letters, digits and underscores there: {shown}{more}"]
+    return [f"names there are letters, digits and underscores: {shown}{more}"]
 
 
 def xml_text(text: str) -> str:
@@ -163,5 +163,5 @@ def read_xml(path: Path, tag: str) -> Element:
     """
     root = xml.read_xml(path, f"a <{tag}> document", kind=EXPORT, most_elements=EXPORT.most_bytes)
     if root.tag != tag:
-        raise DataError(f"is no <{tag}> document but a <{root.tag[:40]}>", where=str(path))
+        raise DataError(f"is not a <{tag}> document but a <{root.tag[:40]}>", where=str(path))
     return root

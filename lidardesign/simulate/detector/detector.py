@@ -293,13 +293,13 @@ def ends_of_bins(path_m: np.ndarray, windows_m: np.ndarray, detector: Detector) 
 EFFECTS = {
     "footprint": "beams have a width: mixed pixels, several returns",
     "motion": "things move within a frame",
-    "specular": "mirrors and glass lead light elsewhere",
-    "multipath": "light comes back by way of other surfaces",
+    "specular": "mirrors and glass send light elsewhere",
+    "multipath": "light comes back by other surfaces",
     "shadowing": "the receiver may not see what the emitter lights",
-    "atmosphere": "the air weakens light and sends some of it back",
+    "atmosphere": "air weakens light and scatters some of it back",
     "photon_noise": "light comes in photons",
     "jitter": "photons are timed with an error",
-    "ambient": "light of the surroundings and dark counts",
+    "ambient": "ambient light and dark counts",
     "pile_up": "a detector is blind after a count",
     "quantisation": "times are rounded to bins",
 }

@@ -110,7 +110,7 @@ def load_detector(name_or_path: str | Path) -> Detector:
         )
     document = load_yaml(path)
     if not document.mapping:
-        raise ConfigError("says nothing about a detector", where=str(path), hint="--detector ideal needs no file")
+        raise ConfigError("does not describe a detector", where=str(path), hint="--detector ideal needs no file")
     return _detector(document, path.stem)
 
 
@@ -160,7 +160,7 @@ def _unknown(key: str, where: str, allowed: list[str]) -> ConfigError:
     for name in (stem, key):
         if name in QUANTITIES:
             units = QUANTITIES[name].keys(name)
-            found = f"{unit!r} is no unit of {name!r}" if name == stem else f"{name!r} needs its unit"
+            found = f"{unit!r} is not a unit of {name!r}" if name == stem else f"{name!r} needs a unit"
             if units == [name]:
                 found = f"{name!r} has no unit"
             return ConfigError(f"unknown key {key!r}: {found}", where=where, allowed=", ".join(units))
@@ -206,9 +206,9 @@ def _photons(document: Document, found: Mapping[str, float | None], emission: An
         return None
     if missing:
         raise ConfigError(
-            f"counts photons, but does not say {', '.join(missing)}",
+            f"counts photons, but does not give {', '.join(missing)}",
             where=document.where,
-            hint="give them all, or none for a detector that any light is enough for",
+            hint="give all of them, or none for a detector that any light triggers",
         )
     return Photons(
         wavelength_m=found["wavelength"],
@@ -229,7 +229,7 @@ def _check_together(document: Document, detector: Detector) -> None:
     """What single values cannot show."""
     if detector.footprint_rays > 1 and detector.divergence_rad == 0:
         raise ConfigError(
-            f"footprint_rays: {detector.footprint_rays} rays in a beam of divergence 0 are all the same one",
+            f"footprint_rays: {detector.footprint_rays} rays in a beam of divergence 0 are all the same ray",
             where=document.locate(("footprint_rays",)),
             hint="give divergence_mrad, or footprint_rays: 1",
         )

@@ -164,7 +164,7 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
     """Why the air does not matter, if so."""
     if scene.medium is None or scene.medium.extinction_per_m == scene.medium.backscatter_per_m_sr == 0:
         return "the air is clear"
-    return None if detector.photons is not None else "the detector hears an echo however weak"
+    return None if detector.photons is not None else "the detector registers any echo, however weak"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:

@@ -91,7 +91,7 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
     """Why beams are lines, if so."""
     if detector.divergence_rad == 0:
         return "beams are thin lines"
-    return None if detector.footprint_rays > 1 else "the detector gives beams one sub-ray each"
+    return None if detector.footprint_rays > 1 else "each beam has a single sub-ray"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:

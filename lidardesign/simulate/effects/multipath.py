@@ -270,7 +270,7 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
     if len(scene.bodies) == 1 and _convex_from(scene.bodies[0], lists):
         return "one convex body lights nothing else"
     if not detector.bin_s and not detector.pulse_sigma_s:
-        return "later light is told apart from the first echo"
+        return "later light is separate from the first echo"
     return None if any(body.reflectance > 0 for body in scene.bodies) else "nothing reflects"
 
 
@@ -288,7 +288,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     reason = (
         f"other surfaces fill {100 * found.seen.mean():.2g} % of what a surface sees; "
         + (f"late light is at most {late:.2g} %" if late >= TINY_PERCENT else f"late light is below {TINY_PERCENT} %")
-        + (f", and all there is of {100 * alone.mean():.3g} % of returns" if alone.any() else "")
+        + (f", and the only light of {100 * alone.mean():.3g} % of returns" if alone.any() else "")
     )
     if by_spots_m2 > squared_m2:
         reason = f"the spots of a flood light each other, {reason}"

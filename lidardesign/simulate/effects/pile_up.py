@@ -82,7 +82,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     )
     typical = float(np.median(blind.per_pulse[first_hits.returned] if first_hits.returned.any() else blind.per_pulse))
     dead_ns = 1e9 * first_hits.detector.photons.dead_s
-    return EffectBound(squared, lost, f"{count_text(typical)} counts a pulse, {dead_ns:.3g} ns blind after each")
+    return EffectBound(squared, lost, f"{count_text(typical)} counts per pulse, {dead_ns:.3g} ns blind after each")
 
 
 def _invented(counts: Counts, blind: Blindness) -> np.ndarray:

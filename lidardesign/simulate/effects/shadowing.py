@@ -120,7 +120,7 @@ def visible_echoes(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, trace
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
     """Why all that is lit is seen, if so."""
-    return None if scene.receiver is not None else "every ray is heard where it starts"
+    return None if scene.receiver is not None else "every ray is received where it starts"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:

@@ -65,7 +65,7 @@ def missing() -> str | None:
     if llvm_library() is None:
         named = os.environ.get(LLVM_VARIABLE)
         if named:
-            return f"{LLVM_VARIABLE} names {named}, which is no LLVM library of version {OLDEST_LLVM} or newer"
+            return f"{LLVM_VARIABLE} names {named}, which is not an LLVM library of version {OLDEST_LLVM} or newer"
         return f"no LLVM library of version {OLDEST_LLVM} or newer was found"
     return None
 

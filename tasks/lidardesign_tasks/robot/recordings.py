@@ -101,7 +101,7 @@ def _checked(model: mujoco.MjModel, path: Path) -> Recording:
     unknown, missing = [name for name in table if name not in names], [name for name in names if name not in table]
     if unknown:
         hint = suggest(unknown[0], missing or names)
-        raise DataError(f"{unknown[0]!r} is no joint", where=str(path), allowed=listed([TIME, *names]), hint=hint)
+        raise DataError(f"{unknown[0]!r} is not a joint", where=str(path), allowed=listed([TIME, *names]), hint=hint)
     if missing:
         raise DataError(
             f"joints are missing: {listed(missing)}", where=str(path), allowed=f"a column each of {listed(names)}"
@@ -160,7 +160,7 @@ def _read(path: Path, changed_ns: int, size: int) -> Mapping[str, np.ndarray]:
         raise DataError("a column is given twice", where=str(path))
     wide = next((line for line, cells in rows if len(cells) != len(names)), None)
     if wide is not None:
-        raise DataError(f"has not {len(names)} columns, as the header", where=f"{path}:{wide}")
+        raise DataError(f"does not have {len(names)} columns like the header", where=f"{path}:{wide}")
     return {name: np.array([_number(path, name, line, cells[i]) for line, cells in rows])
             for i, name in enumerate(names)}  # fmt: skip
 
