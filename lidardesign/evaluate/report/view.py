@@ -226,7 +226,8 @@ def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndar
         f'<button type="button" data-camera="{how}">{word}</button>' for how, word in CAMERA if how not in left_out
     )
     stage = (
-        f'<div class="stage"><div id="view-scene" tabindex="0" role="application" aria-label="3D view of the scene. '
+        '<div class="stage"><div id="view-scene" tabindex="0" role="application" '
+        'title="Drag to turn, with Shift to move. Click, then scroll to go closer." aria-label="3D view of the scene. '
         'Arrow keys turn it, plus and minus go closer and farther, Home shows the first view."><canvas></canvas></div>'
         '<img id="view-printed" alt="The 3D view as it stood when the page was printed">'
         f'<div class="buttons" role="group" aria-label="Camera">{buttons}'
