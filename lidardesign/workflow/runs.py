@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.errors import DataError, LidardesignError
+from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
 from lidardesign.workflow.designs import Design, html_table
 from lidardesign.workflow.fit import FitOptions, FitRequest
@@ -182,7 +183,7 @@ class Run(RunFolder):
         Raises:
             DataError: The manifest is damaged.
         """
-        manifest, config = read_manifest(self.folder), self.config
+        manifest, config, at_work = read_manifest(self.folder), self.config, writer(self.folder)
         learned = manifest.get("learn")
         quality = None if learned is None else self.quality
         designs = [_design_entry(path, manifest) for path in self.design_paths()]
@@ -198,7 +199,8 @@ class Run(RunFolder):
             "seconds": learned.get("seconds") if learned else None,
             "steps": learned.get("steps") if learned else None,
             "designs": designs,
-            "next": self._next_commands(designs, finished=learned is not None),
+            "writer": at_work,
+            "next": [] if learned is None and at_work else self._next_commands(designs, finished=learned is not None),
         }
 
     def _next_commands(self, designs: Sequence[Mapping[str, Any]], *, finished: bool) -> list[str]:
@@ -207,15 +209,16 @@ class Run(RunFolder):
         if not finished:
             return [f"lidardesign learn {self.config.task_name} --out {run} --resume"]
         scored = [entry for entry in designs if entry["score"] is not None]
-        if not scored:
-            return [f"lidardesign evaluate {run} --report report.html" if designs else f"lidardesign fit {run}"]
-        best = (min if self.metric.better == "lower" else max)(scored, key=lambda entry: entry["score"]["value"])
         unscored = [entry for entry in designs if entry["score"] is None and "error" not in entry]
+        evaluating = [f"lidardesign evaluate {run} --report report.html"] if unscored else []
+        if not scored:
+            return evaluating or [f"lidardesign fit {run}"]
+        best = (min if self.metric.better == "lower" else max)(scored, key=lambda entry: entry["score"]["value"])
+        rays = best["score"]["rays"]
         return [
-            *([f"lidardesign evaluate {run} --report report.html"] if unscored else []),
-            f"lidardesign show {quote(best['path'])}",
-            f"lidardesign constrain {run} --set gate.width_m.max=0.1 --name narrow",
-            f"lidardesign export {quote(best['path'])} --format csv --out rays.csv",
+            *evaluating,
+            f"lidardesign constrain {run} --set budget.rays={max(rays // 2, 1)} --name fewer",
+            f"lidardesign export {quote(best['path'])} --format csv --rays {rays} --out rays.csv",
         ]
 
     def evaluate(

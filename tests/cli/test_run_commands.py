@@ -10,6 +10,7 @@ from support.command_line import files_under, make_run
 from support.plugins import GOOD, install_plugins
 
 from lidardesign.errors import DataError
+from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import note, read_manifest, verify
 from lidardesign.workflow import learn as learn_module
 
@@ -175,6 +176,10 @@ def test_a_run_that_is_not_finished_is_gone_on_with(lidardesign, flat):
     shown = lidardesign("show", flat)
     assert (shown.code, "learning was not finished" in shown.out) == (0, True)
     assert follow(lidardesign, shown.out) == ["learn"]
+    with run_lock(flat):  # somebody is at work
+        shown = lidardesign("show", flat).out
+    assert "is learning it" in shown
+    assert "next:" not in shown
 
 
 def test_a_run_says_what_it_has_and_what_can_be_done_next(lidardesign, finished):
@@ -188,7 +193,7 @@ def test_a_run_says_what_it_has_and_what_can_be_done_next(lidardesign, finished)
     assert follow(lidardesign, shown) == ["evaluate"]
     scores = lidardesign("evaluate", finished, "--rays", 9, "--json").json
     shown = lidardesign("show", finished).out
-    assert follow(lidardesign, shown) == ["show", "constrain", "export"]
+    assert follow(lidardesign, shown) == ["constrain", "export"]
     (row,) = [row for row in scores["rows"] if row["design"] == "fit"]
     rival = scores["strongest_rival"]["name"]
     (pair,) = [pair for pair in scores["paired"] if (pair["a"], pair["b"]) == ("fit", rival)]

@@ -100,7 +100,7 @@ def _show_summary(document: dict[str, Any], rich: RichConsole) -> None:
     quality, designs, metric = document["quality"], document["designs"], document["metric"]
     rich.print("run: {run}\ntask {task}, preset {preset}, seed {seed}".format_map(document), soft_wrap=True)
     if quality is None:
-        rich.print("learning was not finished")
+        rich.print(f"{document['writer']} is learning it" if document["writer"] else "learning was not finished")
     else:
         misplaced, kl, ess = 100 * quality["misplaced"], quality["kl_nats"], quality["ess"]
         rich.print(
@@ -113,7 +113,7 @@ def _show_summary(document: dict[str, Any], rich: RichConsole) -> None:
     fine = [entry for entry in designs if "error" not in entry]
     scored = any(entry["score"] for entry in fine)
     if fine:
-        title = f"{metric['name']} [{metric['unit']}] the last time, {metric['better']} is better"
+        title = f"last scores: {metric['name']} [{metric['unit']}], {metric['better']} is better"
         columns = DESIGN_COLUMNS + VALUE_COLUMNS * scored
         rows = [_design_row(entry)[: len(columns)] for entry in fine]
         print_table(title if scored else None, columns, rows, rich, text=("design", "layout"))
@@ -121,7 +121,8 @@ def _show_summary(document: dict[str, Any], rich: RichConsole) -> None:
         rich.print(f"{entry['name']} cannot be read: {entry['error']}", soft_wrap=True)
     if quality is not None and not scored:
         rich.print("no scores are kept yet" if fine else "no designs yet")
-    rich.print("\n".join(["next:", *(f"  {line}" for line in document["next"])]), soft_wrap=True)
+    if document["next"]:
+        rich.print("\n".join(["next:", *(f"  {line}" for line in document["next"])]), soft_wrap=True)
 
 
 def _design_row(entry: dict[str, Any]) -> list[str]:
