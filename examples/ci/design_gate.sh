@@ -4,18 +4,19 @@
 #   design_gate.sh RUN LIMIT [DESIGN...]
 #
 # RUN is learned from lidar.yaml where it is not there yet. Without a DESIGN, one is fitted to it under constraints.yaml.
-# LIMIT is in the task's own unit. Exit codes are those of lidardesign: 0 good enough, 1 worse than LIMIT, above that
-# something went wrong. What can be looked at goes to gate/: rows.csv, result.json, report.html.
+# LIMIT is in the task's own unit. With RIVAL in the environment, a baseline or another design, every design must also be
+# better than it by the interval of the difference. Exit codes are those of lidardesign: 0 good enough, 1 not good enough,
+# above that something went wrong. What can be looked at goes to gate/: rows.csv, result.json, report.html.
 set -eu
 run=$1 limit=$2
 shift 2
 rays=${RAYS:-196}
+rival=${RIVAL:-}
 out=${OUT:-gate}
 mkdir -p "$out"
 
 if [ ! -e "$run/samples.npz" ]; then
-    task=$(sed -n 's/^task_name: *//p' lidar.yaml)
-    lidardesign learn "$task" --config lidar.yaml --out "$run" --quiet
+    lidardesign learn --config lidar.yaml --out "$run" --quiet
 fi
 if [ $# -eq 0 ]; then
     lidardesign constrain "$run" --constraints constraints.yaml --rays "$rays" --name gate --quiet
@@ -23,11 +24,11 @@ if [ $# -eq 0 ]; then
 fi
 
 code=0
-lidardesign evaluate "$@" --rays "$rays" --fail-above "$limit" \
+lidardesign evaluate "$@" --rays "$rays" --fail-above "$limit" ${rival:+--fail-unless-better "$rival"} \
     --csv "$out/rows.csv" --report "$out/report.html" --json >"$out/result.json" || code=$?
 case $code in
-    0) echo "good enough: at most $limit with $rays rays" ;;
-    1) echo "worse than $limit with $rays rays: see $out/report.html" ;;
+    0) echo "good enough: at most $limit${rival:+ and better than $rival} with $rays rays" ;;
+    1) echo "worse than $limit${rival:+ or not better than $rival} with $rays rays: see $out/report.html" ;;
     *) echo "not scored: exit code $code" ;;
 esac
 exit "$code"

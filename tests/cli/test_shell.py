@@ -344,9 +344,9 @@ def test_the_workflow_passes_with_a_good_design_and_keeps_what_can_be_looked_at(
     assert [step["name"] for step in steps if "pip install" in step["run"]] == ["Install"]
     for step in steps:
         if step["name"] != "Install":
-            done = gate(step["run"], RAYS="9", LIMIT="1e6")
+            done = gate(step["run"], **{**workflow["env"], "RAYS": "9", "LIMIT": "1e6"})
             assert done.returncode == 0, done.stderr + done.stdout
-    assert "good enough" in done.stdout
+    assert "good enough: at most 1e6 and better than uniform with 9 rays" in done.stdout
     (kept,) = [step["with"]["path"] for step in job["steps"] if "upload-artifact" in step.get("uses", "")]
     assert {path.name for path in (tmp_path / kept).iterdir()} == {"rows.csv", "result.json", "report.html"}
     assert json.loads((tmp_path / kept / "result.json").read_text())["rows"]
@@ -357,6 +357,11 @@ def test_the_shell_script_fails_with_a_bad_design_and_says_why(gate, tmp_path):
     assert done.returncode == 1
     assert "worse than 1e-6 with 9 rays" in done.stdout
     assert (tmp_path / "gate" / "rows.csv").is_file()
+    # the design is no better than itself
+    done = gate("sh design_gate.sh runs/gate 1e6 runs/gate/designs/fit.yaml", RAYS="9", RIVAL="fit")
+    assert done.returncode == 2
+    assert "no other design to compare fit with" in done.stderr
+    assert "not scored: exit code 2" in done.stdout
 
 
 def test_the_files_of_the_gate_are_what_the_program_takes(lidardesign, flat):
