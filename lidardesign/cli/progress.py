@@ -31,6 +31,8 @@ class ProgressDisplay:
         self.began_s = self.said_s = time.monotonic()
         self.bar: Progress | None = None
         self.lines: dict[str, Any] = {}
+        # when counted work began, and with how much done
+        self.firsts: dict[str, tuple[float, float]] = {}
 
     def __enter__(self) -> Self:
         if self.console is not None:
@@ -39,6 +41,7 @@ class ProgressDisplay:
             columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[detail]}"))
             self.bar = Progress(*columns, console=self.console, transient=True)
             self.bar.start()
+            self.show()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -66,9 +69,9 @@ class ProgressDisplay:
             line: The name of the line, where there are several.
         """
         now_s, label = time.monotonic(), self.label if label is None else label
-        passed_s = now_s - self.began_s
-        if left_s is None and 0 < done <= total:
-            left_s = passed_s * (total / done - 1)
+        began_s, first = self.firsts.setdefault(line, (now_s, done)) if total else (now_s, done)
+        if left_s is None and first < done <= total:
+            left_s = (now_s - began_s) * (total - done) / (done - first)
         share = f"{100 * done / total:.0f} %" if done and total else ""
         left = f"{duration(left_s)} left" if left_s is not None else ""
         text = ", ".join(filter(None, [share, detail, left]))
@@ -76,6 +79,6 @@ class ProgressDisplay:
             if line not in self.lines:
                 self.lines[line] = self.bar.add_task(label, total=None, detail="")
             self.bar.update(self.lines[line], description=label, completed=done, total=total or None, detail=text)
-        elif now_s - self.said_s >= min(max(LEAST_S, SHARE * (passed_s + (left_s or 0.0))), MOST_S):
+        elif now_s - self.said_s >= min(max(LEAST_S, SHARE * (now_s - self.began_s + (left_s or 0.0))), MOST_S):
             self.said_s = now_s
             self.say(f"{label}: {text}" if text else f"{label} ...")
