@@ -13,7 +13,6 @@ from lidardesign.config import (
     DensitySettings,
     LearningSettings,
     load_run_config,
-    parse_override,
     resolve,
     save_run_config,
     with_task_settings,
@@ -23,6 +22,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.registry import list_tasks, load_task
 from lidardesign.run.manifest import start_manifest
+from lidardesign.run.overrides import parse_override
 from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig
 

@@ -19,13 +19,13 @@ from lidardesign.config import (
     SECTIONS,
     DensitySettings,
     LearningSettings,
-    parse_override,
     resolve,
 )
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import SCHEMA_FILE
 from lidardesign.errors import MAX_SEED, ConfigError, check_choice
 from lidardesign.registry import plugin_guard
+from lidardesign.run.overrides import parse_override
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.space import DIMENSIONS
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from lidardesign.config import apply_override, parse_override, with_task_settings
+from lidardesign.config import with_task_settings
 from lidardesign.design.catalog.library import named_parts
 from lidardesign.design.constraints.document import MOST_FITTED, Constraints
 from lidardesign.design.constraints.feasibility import check_feasible
@@ -20,6 +20,7 @@ from lidardesign.design.layouts.rays import LAYOUTS, gates_of, layout_of
 from lidardesign.design.sensor import FITTED_LAYOUTS, LEVELS, MOST_RAYS, DesignSpec, Gates
 from lidardesign.errors import MAX_SEED, ConfigError, check_choice, check_number
 from lidardesign.run.manifest import verify
+from lidardesign.run.overrides import apply_override, parse_override
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
 from lidardesign.selection.information import MOST_SELECTED, informs_rays
 from lidardesign.task import Task
