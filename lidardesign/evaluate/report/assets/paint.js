@@ -12,7 +12,8 @@ const SHIFT = 0.618; // of the dashes from line to line, so that those of lines 
 const [AMBIENT, LAMP] = [0.5, [-0.35, 0.45, 0.82]]; // the lamp is left of, above and behind the eye: right, up, back
 const ABOVE = 0.995; // of a direction along an axis, from where it counts as such
 const DASHES = { solid: [], dash: [6, 3], dashdot: [7, 3, 2, 3], dot: [2, 2.5], longdash: [10, 4] };
-const MARK_PX = 3.2;
+const MARK_PX = 3.6;
+const [WIDE_PX, THINNEST] = [600, 0.6]; // narrower pictures have thinner lines and smaller marks
 const MARKS = {
   plus: [[[-1, 0], [1, 0]], [[0, -1], [0, 1]]],
   x: [[[-0.9, -0.9], [0.9, 0.9]], [[-0.9, 0.9], [0.9, -0.9]]],
@@ -78,10 +79,11 @@ function paint(canvas, view, items, camera, scale, family) {
     const nearness = sheet.nearness[Math.floor(y) * sheet.width + Math.floor(x)];
     return nearness > 0 && depth > 1 / nearness + lens.slack;
   };
+  const thick = scale * Math.min(Math.max(width / WIDE_PX, THINNEST), 1);
   for (const item of items) {
-    if (item.kind === "lines") paintLines(pen, item, lens, hidden, scale);
-    if (item.kind === "marks") paintMarks(pen, item, lens, hidden, scale);
-    if (item.kind === "dots") paintDots(pen, item, lens, hidden, scale);
+    if (item.kind === "lines") paintLines(pen, item, lens, hidden, thick);
+    if (item.kind === "marks") paintMarks(pen, item, lens, hidden, thick);
+    if (item.kind === "dots") paintDots(pen, item, lens, hidden, thick);
   }
   paintLabels(pen, labels, scale, family);
 }
@@ -200,9 +202,9 @@ function addSegment(pen, a, b, lens, hidden, scale) {
   }
 }
 
-function paintMarks(pen, { path, colour, symbol }, lens, hidden, scale) {
+function paintMarks(pen, { path, colour, symbol, size: share }, lens, hidden, scale) {
   Object.assign(pen, { strokeStyle: colour, lineWidth: 1.2 * scale });
-  const size = MARK_PX * scale;
+  const size = MARK_PX * share * scale;
   for (let n = 0; n < path.x.length; n++) {
     const [x, y, depth] = lens.seen(path.x[n], path.y[n], path.z[n]);
     if (depth <= lens.near || hidden([x, y, depth])) continue;

@@ -156,7 +156,7 @@ function rayItems(view, state, paths) {
     const { lines: path, count } = paths.get(code);
     return { kind: "lines", path, colour, dash, width, opacity: symbol === null && count > view.many ? view.faint : opacity };
   });
-  const marks = shown.filter(({ symbol }) => symbol).map(({ code, colour, symbol }) => ({ kind: "marks", path: paths.get(code).ends, colour, symbol }));
+  const marks = shown.filter(({ symbol }) => symbol).map(({ code, colour, symbol }) => ({ kind: "marks", path: paths.get(code).ends, colour, symbol, size: Math.max(Math.sqrt(share), 0.5) }));
   return [...lines, ...marks];
 }
 
