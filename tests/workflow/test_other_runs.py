@@ -117,15 +117,11 @@ def test_a_design_of_another_task_is_scored_where_it_can_be(runs, tmp_path):
     own, _ = runs
     aisle = package.open_run(make_run(tmp_path / "aisle", task="warehouse", seed=3))
     notes = []
-    scores = aisle.evaluate(
-        [own / "designs" / "selected.yaml"],
-        rays=[8],
-        settings={"test": 2},
-        notes=notes.append,
-    )
-    assert scores.rows[0].design == "selected"
-    assert notes[0].startswith("selected of ")
-    assert notes[0].endswith("; 8 of 8 rays start, point or listen outside its design space")
+    design = own / "designs" / "grid.yaml"
+    scores = aisle.evaluate([design], rays=[4], settings={"test": 2, "train": 4}, notes=notes.append)
+    assert scores.rows[0].design == "grid"
+    assert notes[0].startswith("grid of ")
+    assert notes[0].endswith("; 2 of 2 sensors start, point or listen outside its design space")
 
 
 def test_a_track_is_refused_where_nothing_is_followed(runs, tmp_path):
