@@ -39,12 +39,12 @@ MANUALS: dict[str, Manual] = {
         {
             "lidardesign learn face --preset draft --out runs/face": "half a minute, for trials",
             "lidardesign learn meshes --set folder=scans --set scale=0.001 --out runs/scans": "meshes in mm",
-            "lidardesign learn face --config - < face.yaml": "a configuration from standard input",
+            "lidardesign learn --config - < face.yaml": "a configuration from standard input",
             "lidardesign learn face --tolerance 0.15 --out runs/good_enough": "until it is good enough",
             "lidardesign learn face --time-budget 60 --out runs/minute": "as well as a minute allows",
             "lidardesign learn face --out runs/face --resume": "go on after Ctrl-C, to the same bytes",
             "lidardesign learn face --out runs/face --overwrite": "anew; the old run stays until the new one is there",
-            "lidardesign learn face --out runs/face --dry-run": "what would be learned, and where to",
+            "lidardesign learn face --out runs/face --dry-run": "what would be learned, where to, and how long it takes",
         },
         about="Learns which rays are worth firing. All that follows (fit, constrain, evaluate, export) works on the "
         "run folder that this makes, and learns nothing again.",

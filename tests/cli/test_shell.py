@@ -291,7 +291,7 @@ def planned_examples():
 def test_an_example_can_be_done_where_its_files_are(lidardesign, place, monkeypatch, words):
     monkeypatch.chdir(place)
     before = sorted(place.rglob("*"))
-    text = "budget: {rays: 196}\n" if "--constraints" in words else "preset: draft\n"
+    text = "budget: {rays: 196}\n" if "--constraints" in words else "{task_name: face, preset: draft}\n"
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text.encode())))
     if words[0] == "learn":  # the runs that other examples work on are there already
         words = [*words, "--out", "runs/new"]
