@@ -277,6 +277,22 @@ def test_what_stands_before_something_hides_it_also_where_it_reaches_behind_the_
     assert (through[..., 1] > 0).any()
 
 
+def test_what_is_tinted_lets_what_is_behind_it_through_by_its_share(page):
+    alpha, red, blue = page.evaluate("""() => {
+      const sheet = {width: 1, height: 1, pixels: new Uint32Array(1), nearness: new Float32Array(1)};
+      const fill = (colour, opacity, depth) => fillTriangle(
+        sheet, [-5, -5, depth, 1], [9, -5, depth, 1], [-5, 9, depth, 1], colour, opacity);
+      fill([200, 0, 0], 0.5, 3);
+      fill([0, 0, 200], 0.25, 2);
+      const pixel = sheet.pixels[0];
+      return [pixel >>> 24, pixel & 255, (pixel >> 16) & 255];
+    }""")
+    # over an empty ground: what each adds to what is seen
+    assert alpha / 255 == pytest.approx(1 - 0.5 * 0.75, abs=0.01)
+    assert alpha / 255 * red == pytest.approx(200 * 0.5 * 0.75, abs=2)
+    assert alpha / 255 * blue == pytest.approx(200 * 0.25, abs=2)
+
+
 def test_the_keyboard_reaches_every_control_and_shows_where_it_is(page):
     wanted = page.evaluate(
         "() => { window.reached = new Set(); const seen = all('a[href], button, input, summary, [tabindex]')"

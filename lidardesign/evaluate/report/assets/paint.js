@@ -63,16 +63,19 @@ function firstCamera(view, width, height) {
 function paint(canvas, view, items, camera, scale, family) {
   const { width, height } = canvas.getBoundingClientRect();
   [canvas.width, canvas.height] = [Math.round(width * scale), Math.round(height * scale)];
-  const pen = canvas.getContext("2d", { willReadFrequently: true });
+  const pen = canvas.getContext("2d");
   const lens = lensOf(camera, canvas.width, canvas.height);
   pen.fillStyle = "#ffffff";
   pen.fillRect(0, 0, canvas.width, canvas.height);
   const labels = paintBox(pen, view.bounds, lens, scale);
-  const image = pen.getImageData(0, 0, canvas.width, canvas.height);
+  // nothing is read back from a canvas: browsers that guard against fingerprints would give noise
+  const image = new ImageData(canvas.width, canvas.height);
   const sheet = { width: image.width, height: image.height, pixels: new Uint32Array(image.data.buffer), nearness: new Float32Array(image.width * image.height) };
   const meshes = items.filter((item) => item.kind === "mesh");
   for (const item of [...meshes.filter((one) => one.opacity === 1), ...meshes.filter((one) => one.opacity < 1)]) paintMesh(sheet, item, lens);
-  pen.putImageData(image, 0, 0);
+  const layer = Object.assign(document.createElement("canvas"), { width: image.width, height: image.height });
+  layer.getContext("2d").putImageData(image, 0, 0);
+  pen.drawImage(layer, 0, 0);
   pen.lineJoin = "round";
   const hidden = ([x, y, depth]) => {
     if (x < 0 || y < 0 || x >= sheet.width || y >= sheet.height) return false;
@@ -154,9 +157,11 @@ function fillTriangle({ width, height, pixels, nearness }, a, b, c, [red, green,
       const near = na + shareB * (nb - na) + shareC * (nc - na);
       if (near <= nearness[at]) continue;
       const light = a[3] + shareB * (b[3] - a[3]) + shareC * (c[3] - a[3]);
-      const [under, own, rest] = [pixels[at], opacity * light, 1 - opacity];
+      const under = pixels[at];
+      const below = ((1 - opacity) * (under >>> 24)) / 255;
+      const [own, rest] = [(opacity * light) / (opacity + below), below / (opacity + below)];
       const mixed = [own * blue + rest * ((under >> 16) & 255), own * green + rest * ((under >> 8) & 255), own * red + rest * (under & 255)];
-      pixels[at] = 0xff000000 | (mixed[0] << 16) | (mixed[1] << 8) | mixed[2];
+      pixels[at] = (Math.round(255 * (opacity + below)) << 24) | (mixed[0] << 16) | (mixed[1] << 8) | mixed[2];
       if (opacity === 1) nearness[at] = near;
     }
   }
