@@ -246,7 +246,9 @@ def with_task_settings(task: Task, config: RunConfig, overrides: Sequence[str], 
     layers.merge("task", config.task.model_dump(mode="json"), FILE_NAME)
     for text in overrides:
         override = parse_override(text, option)
-        if override.path[0] in SECTIONS[1:] and len(override.path) > 1:
+        first = str(override.path[0])
+        learned = [name for name in SECTIONS[1:] if first in _models(task)[name].model_fields]
+        if (first in SECTIONS[1:] and len(override.path) > 1) or (learned and first not in task.Config.model_fields):
             raise ConfigError(
                 "what was learned cannot be changed", where=override.where, allowed=f"keys of the task {task.name}"
             )

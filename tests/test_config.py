@@ -291,6 +291,7 @@ def test_a_run_is_judged_by_other_values_of_its_task_and_keeps_the_rest():
     [
         ("count=4", "design space"),
         ("density.sigma_m=0.03", "what was learned cannot be changed"),
+        ("sigma_m=0.03", "what was learned cannot be changed"),
         ("space.x_m=0", "what was learned cannot be changed"),
         ("lable=b", "unknown key"),
         ("jitter.angle_rad=-1", "jitter.angle_rad"),
