@@ -150,7 +150,7 @@ def _read(line: bytes) -> Probe:
         found = json.loads(line)
         return Probe(summary=str(found.get("summary", "")), error=found.get("error"))
     except (ValueError, AttributeError):
-        return Probe(error="writes into what is not its own while it is imported", contained=True)
+        return Probe(error="writes to a stream that is not its own while it is imported", contained=True)
 
 
 def probed(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:
@@ -323,7 +323,7 @@ def _load(name: str, offers: list[EntryPoint]) -> Task:
 def _only(name: str, offers: list[EntryPoint]) -> EntryPoint:
     if len(offers) > 1:
         packages = " and ".join(f"{_distribution(offer)} ({offer.value})" for offer in offers)
-        raise PluginError(f"is offered by {packages}", where=f"task {name}", hint="uninstall one of them")
+        raise PluginError(f"is offered by {packages}", where=f"task {name}", hint="uninstall only one of them")
     return offers[0]
 
 

@@ -318,7 +318,9 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
     for axis in ("horizontal", "vertical"):
         spread, field = spreads.get(f"{axis}_rad"), fields.get(axis)
         if spread is None and field is None:
-            raise node.error(f"has neither field_of_view_rad.{axis} nor spread.{axis}_rad", hint="give one of them")
+            raise node.error(
+                f"has neither field_of_view_rad.{axis} nor spread.{axis}_rad", hint="give only one of them"
+            )
         widest = FULL_TURN * (1 + AGREEMENT) / full
         spread_rad.append(field.number(0, FULL_TURN) / full if spread is None else spread.number(0, widest))
         if spread is not None and field is not None:

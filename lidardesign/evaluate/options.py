@@ -87,7 +87,7 @@ class ScoreOptions:
             check_number(count, "--rays", 1, MOST_RAYS, whole=True)
         if self.cma_seconds is not None and CMA not in self.baselines:
             raise ConfigError(
-                "nothing is searched for", where="--cma-seconds", hint=f"add --baseline {CMA}, or leave it out"
+                "there is no search", where="--cma-seconds", hint=f"add --baseline {CMA}, or leave it out"
             )
 
     def misplacement(self) -> MountError | None:

@@ -75,14 +75,14 @@ def check_memory(subject: Subject) -> LawHolds | NotApplicable:
     """The process holds no more memory than the limit."""
     peak = peak_memory_bytes()
     if peak is None:
-        return NotApplicable("this system does not tell what a process holds")
+        return NotApplicable("this system does not say how much memory a process holds")
     if peak > subject.limits.memory_bytes:
         raise BrokenLawError(
-            f"the process held {peak / GIBIBYTE:.2f} GiB",
+            f"the process used {peak / GIBIBYTE:.2f} GiB",
             allowed=f"{subject.limits.memory_bytes / GIBIBYTE:.2f} GiB",
             hint="check fewer or smaller scenes (--set), or allow more (--memory-mb)",
         )
-    return LawHolds(f"the process held {peak / MEBIBYTE:.0f} MiB at most", {"peak_bytes": peak})
+    return LawHolds(f"the process used {peak / MEBIBYTE:.0f} MiB at most", {"peak_bytes": peak})
 
 
 _AFTER = ("scores are numbers", "returns inform")
@@ -218,4 +218,4 @@ def refuse_broken(name: str, findings: Sequence[Finding]) -> None:
     broken = [finding for finding in findings if finding.outcome == "fail"]
     if broken:
         listed = "; ".join(f"{finding.law}: {finding.detail}" for finding in broken)
-        raise BrokenLawError(f"{len(broken)} of {len(findings)} laws do not hold: {listed}", where=f"task {name}")
+        raise BrokenLawError(f"{len(broken)} of {len(findings)} laws are broken: {listed}", where=f"task {name}")

@@ -25,7 +25,7 @@ def check_config(subject: Subject) -> LawHolds:
     if taken:
         raise BrokenLawError(f"takes NaN for {taken[0]!r}", hint="keep allow_inf_nan=False of TaskConfig")
     if again.model_dump() != config.model_dump():
-        raise BrokenLawError("values are others after a way through JSON, which runs are kept in")
+        raise BrokenLawError("values change on the way through JSON, in which runs are kept")
     mute = [name for name, info in kind.model_fields.items() if not info.description]
     if mute:
         raise BrokenLawError(
@@ -110,9 +110,9 @@ def check_space(subject: Subject) -> LawHolds:
     for space in (first, again):
         if not isinstance(space, DesignSpace):
             found = type(space).__name__
-            raise BrokenLawError(f"space gave {found}", allowed="lidardesign.space.DesignSpace")
+            raise BrokenLawError(f"space() returned {found}", allowed="lidardesign.space.DesignSpace")
     if first.as_dict() != again.as_dict():
-        raise BrokenLawError("space gave another one the second time", allowed="the same every time")
+        raise BrokenLawError("space() returned a different one the second time", allowed="the same every time")
     designed = len(set(subject.config.space.free) - set(subject.config.space.conditioned))
     if not designed:
         raise BrokenLawError("every dimension of the design space is fixed", hint="free at least one")

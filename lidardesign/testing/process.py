@@ -126,7 +126,7 @@ def _next_finding(child: PluginProcess, seconds: float, *, loading: bool) -> dic
         found = _read(line) if line else None
         if found is None:
             if line:
-                return "writes into what is not its own while this is tried"
+                return "writes to a stream that is not its own while this is tried"
             died_of = None if line is None else child.died_of(deadline, "while this is tried")
             return died_of or f"{called} did not end within {allowed:g} s".lstrip()
         if CALLED not in found:

@@ -37,8 +37,8 @@ def check_repeatable(subject: Subject) -> LawHolds:
         for number, (one, other) in enumerate(zip(first, again, strict=True)):
             if fingerprint(one) != fingerprint(other):
                 raise BrokenLawError(
-                    f"the second time the split {split} has another scene {number} ({one.name!r})",
-                    hint="draw all chance from lidardesign.task.random_generator(seed, ...)",
+                    f"the second time the split {split} has a different scene {number} ({one.name!r})",
+                    hint="draw all random numbers from lidardesign.task.random_generator(seed, ...)",
                 )
     return LawHolds("made twice, the same to the bit")
 
@@ -52,7 +52,7 @@ def check_seeds(subject: Subject) -> LawHolds | NotApplicable:
         same = "another seed gives the same training scenes"
         if not informs_rays(subject.task):
             return NotApplicable(f"{same}; without informs, no further ones are drawn")
-        raise BrokenLawError(f"{same}, but rays are chosen on further ones", hint="draw chance from the seed")
+        raise BrokenLawError(f"{same}, but rays are chosen on further ones", hint="draw random numbers from the seed")
     return LawHolds(f"{shared} of {len(first)} training scenes are the same with another seed", {"shared": shared})
 
 
@@ -66,9 +66,9 @@ def check_disjoint(subject: Subject) -> LawHolds:
             if name is not None:
                 raise BrokenLawError(
                     f"the training scene {scene.name!r} of seed {seed} is the held-out scene {name!r}",
-                    hint="name the split where chance is drawn: random_generator(seed, self.name, split, index)",
+                    hint="name the split where random numbers are drawn: random_generator(seed, name, split, ...)",
                 )
-    return LawHolds(f"{len(held_out)} held out, none met with {len(seeds)} seeds", {"seeds": len(seeds)})
+    return LawHolds(f"{len(held_out)} held out, none trained on with {len(seeds)} seeds", {"seeds": len(seeds)})
 
 
 def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
@@ -82,7 +82,7 @@ def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
         if found[split] != mine:
             number = next((i for i, (a, b) in enumerate(zip(mine, found[split], strict=False)) if a != b), len(mine))
             raise BrokenLawError(
-                f"another process makes another scene {number} of the split {split}",
+                f"another process makes a different scene {number} of the split {split}",
                 hint="do not use hash(), the order of sets, the time or the process in scenes",
             )
     return LawHolds("another process makes them the same to the bit")
@@ -101,7 +101,7 @@ def check_picklable(subject: Subject) -> LawHolds:
             what = getattr(scene, "name", "the configuration")
             raise BrokenLawError(f"{what!r} cannot be pickled: {type(error).__name__}: {error}") from error
         if fingerprint(again) != fingerprint(scene):
-            raise BrokenLawError(f"{scene!r:.80} is another one after pickling")
+            raise BrokenLawError(f"{scene!r:.80} is different after pickling")
         size = max(size, len(content))
     return LawHolds(f"{size / 1000:.3g} kB at most", {"bytes": size})
 

@@ -63,7 +63,7 @@ def check_nothing(subject: Subject) -> LawHolds:
                 raise BrokenLawError(
                     f"scene {scene.name!r}: {what} score {score.value:.4g}, better than {dense.value:.4g} of "
                     f"{DENSE} returns from targets",
-                    hint="where there is too little to compute anything, return Score(metric.worst, failed=True)",
+                    hint="where there are too few returns to compute anything, return Score(metric.worst, failed=True)",
                 )
             found.append(score.failed)
     return LawHolds(
@@ -108,7 +108,7 @@ def check_noise(subject: Subject) -> LawHolds:
     if min(losses) < -metric.tolerance:
         raise BrokenLawError(f"noise on the ranges makes the score better: {said}")
     figures = {"exact": value, "noisy": float(found[-1])}
-    return LawHolds(said if max(losses) > 0 else f"{said}: ranges do not enter", figures)
+    return LawHolds(said if max(losses) > 0 else f"{said}: ranges do not matter", figures)
 
 
 def check_order(subject: Subject) -> LawHolds:
@@ -153,7 +153,7 @@ def check_untouched(subject: Subject) -> LawHolds:
 def check_information(subject: Subject) -> LawHolds | NotApplicable:
     """Rays tell about items by their own returns alone: once, alike in any order, and nothing without a return."""
     if not informs_rays(subject.task):
-        return NotApplicable("the task does not say what returns tell: rays of its designs cannot be chosen")
+        return NotApplicable("the task has no method informs, so rays of its designs cannot be chosen")
     pairs, rays = 0, 0
     for number, scene in _scenes(subject):
         dense = _dense(subject, number)
@@ -166,19 +166,19 @@ def check_information(subject: Subject) -> LawHolds | NotApplicable:
             )
         said = f"informs in scene {scene.name!r}"
         if len(silent.ray) or (silent.harm is not None and np.any(silent.harm)):
-            raise BrokenLawError(f"{said}: rays without a return tell or spoil something")
+            raise BrokenLawError(f"{said}: rays without a return have worth or harm")
         if not np.stack([one.returned for one in first])[found.source, found.ray].all():
-            raise BrokenLawError(f"{said}: a ray tells something by a frame in which it has no return")
+            raise BrokenLawError(f"{said}: a ray has worth by a frame in which it has no return")
         one, two = _pairs(found, np.sort(order)), _pairs(reordered, order)
         if len(np.unique(one[:, :3], axis=0)) < len(one):
-            raise BrokenLawError(f"{said}: a pair of an item and a ray comes twice")
+            raise BrokenLawError(f"{said}: a pair of an item and a ray is given twice")
         if one.shape != two.shape or not np.allclose(one, two, rtol=SLACK, atol=0):
-            raise BrokenLawError(f"{said}: rays in another order tell something else")
+            raise BrokenLawError(f"{said}: rays in another order are worth something else")
         pairs, rays = pairs + len(one), rays + len(order)
     if not rays:
         return NotApplicable("no candidate rays see a target under every condition")
     if not pairs:
-        raise BrokenLawError(f"informs: {rays} rays at targets tell nothing")
+        raise BrokenLawError(f"informs: {rays} rays at targets are worth nothing")
     return LawHolds(f"{rays} rays and their items are {pairs} pairs", {"pairs": pairs})
 
 
@@ -197,7 +197,7 @@ LAWS = (
         needs=("metric is defined", "targets are in reach"),
     ),
     Law(
-        "nothing heard is scored",
+        "no returns are scored",
         "score",
         "no rays and no returns are scored, no better than returns",
         check_nothing,

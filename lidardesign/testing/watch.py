@@ -201,4 +201,4 @@ class _Surroundings:
         for number in changed:
             with contextlib.suppress(ValueError, TypeError):  # not in this thread, or not from Python
                 signal.signal(number, self._heard[number])
-        return [f"who hears {number.name}" for number in changed]
+        return [f"who handles {number.name}" for number in changed]

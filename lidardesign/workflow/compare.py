@@ -45,7 +45,9 @@ def compare_designs(
     """
     designs, run = _read(files, run_folder, notes)
     if run is None and rays:
-        raise ConfigError("no run says what the designs see", where="--rays", hint="--in RUN")
+        raise ConfigError(
+            "no run is known in whose scenes the designs could be scored", where="--rays", hint="--in RUN"
+        )
     specifications = [design.specification for design in designs]
     entries = [
         {
@@ -75,7 +77,7 @@ def _read(files: tuple[Path, Path], run_folder: Path | None, notes: Notes) -> tu
         for design, place in zip(designs, ("first", "second"), strict=True):
             design.specification = replace(design.specification, name=f"{design.specification.name} ({place})")
     if not given and all(design.run is None for design in designs):
-        notes("no run says what the designs see, so there are no scores; --in RUN has scenes")
+        notes("no run is known, so there are no scores; --in RUN names one whose scenes are used")
         return designs, None
     return designs, judging_run(designs, given, notes)
 
@@ -129,5 +131,5 @@ def _usual_counts(designs: Sequence[DesignSpec], own: Sequence[int | None], run:
     if not fixed or min(fixed.values()) >= usual[-1]:
         return usual
     name = min(fixed, key=lambda name: fixed[name])
-    notes(f"{name} fires {fixed[name]} rays: at equal rays no more are compared; --rays has other numbers")
+    notes(f"{name} fires {fixed[name]} rays: no others are compared; --rays sets other numbers")
     return sorted({*(count for count in usual if count <= fixed[name]), fixed[name]})

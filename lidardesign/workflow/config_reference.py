@@ -178,7 +178,7 @@ def config_text(
         name=task.name, summary=task.summary, metric=metric.name, unit=metric.unit, better=metric.better, off=OFF
     )
     lines = [*_comment(head), _entry("schema_version", 1, on=True), _entry("task_name", task.name, on=True)]
-    lines += ["", *_comment("root of every random stream; whole number from 0")]
+    lines += ["", *_comment("seed of all random numbers; whole number from 0")]
     lines.append(_entry("seed", seed or 0, on=seed is not None))
     lines += _comment("effort of learning: draft, standard or fine")
     lines.append(_entry("preset", preset, on=("", "preset") in chosen))

@@ -300,7 +300,7 @@ def judging_run(designs: Sequence[Design], runs: Sequence[RunFolder], notes: Not
     candidates = runs or [design.run for design in designs if design.run is not None]
     if not candidates:
         raise ConfigError(
-            "no design names a run that is there, so the task is unknown",
+            "no design comes from a run that can be found, so the task is unknown",
             hint="give the run folder too: lidardesign evaluate RUN DESIGN",
         )
     judge = candidates[0]
@@ -308,7 +308,7 @@ def judging_run(designs: Sequence[Design], runs: Sequence[RunFolder], notes: Not
     if other is not None:
         raise ConfigError(
             f"{judge.folder} and {other.folder} differ in task, configuration or design space",
-            hint="name the one run whose scenes judge: lidardesign evaluate RUN DESIGN ..., or compare A B --in RUN",
+            hint="name the run whose scenes are used: lidardesign evaluate RUN DESIGN ..., or compare A B --in RUN",
         )
     if not designs:
         hint = f"lidardesign fit {quote(str(judge.folder))}"

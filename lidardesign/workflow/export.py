@@ -214,7 +214,7 @@ class ExportRequest:
             "export",
             [
                 f"write {content}{place} as {exporter.name}: {exporter.summary}",
-                "read the file back, and say what its numbers lose",
+                "read the file back, and say what was lost",
             ],
             [design.name if source.path is None else source.path, *run, *([robot.path] if robot else [])],
             [f"{self.target}/" if exporter.folder else self.target],
@@ -277,10 +277,12 @@ def export_target(path: Path | None, out: Path | None, exporter: Exporter) -> Pa
     """
     if out is None and path is not None and is_input(path):
         raise ConfigError(
-            "a design from standard input stands beside nothing", where="DESIGN -", hint="give --out PATH"
+            "a design from standard input has no folder to write to", where="DESIGN -", hint="give --out PATH"
         )
     if out is None and path is None:
-        raise ConfigError("a design without a file stands beside nothing", hint="save it, or say where to export it")
+        raise ConfigError(
+            "a design without a file has no folder to write to", hint="save it, or say where to write the export"
+        )
     target = out if out is not None else path.with_suffix(exporter.suffix)
     if str(target) == STDIO and exporter.folder:
         raise ConfigError(f"{exporter.name} is a folder of files", where="--out -", hint="give --out FOLDER")

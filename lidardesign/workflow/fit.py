@@ -39,7 +39,7 @@ from lidardesign.workflow.run_folder import (
 )
 from lidardesign.workflow.run_samples import Weighting
 
-BEST = "best"  # as many sensors as score best on training scenes
+BEST = "best"  # the number of sensors that scores best on training scenes
 COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
 CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones would only leave candidates out
 # Of designs: names that a file may have everywhere.
@@ -178,14 +178,14 @@ class FitRequest:
         }
         if LAYOUTS[layout].chosen_on_scenes and any(beside.values()):
             raise ConfigError(
-                f"layout {layout} beside {next(name for name, given in beside.items() if given)}",
+                f"layout {layout} with {next(name for name, given in beside.items() if given)}",
                 where="--layout",
                 allowed=", ".join(name for name in FITTED_LAYOUTS if not LAYOUTS[name].chosen_on_scenes),
-                hint="chosen rays follow from what scenes show alone",
+                hint="rays are chosen by what scenes show alone",
             )
         if options.sensors is not None and LAYOUTS[layout].one_sensor_per_ray:
             raise ConfigError(
-                f"{options.sensors} sensors of a scan, whose every ray is a sensor of its own",
+                f"{options.sensors} sensors for a scan, in which every ray is its own sensor",
                 where="--sensors",
                 hint="give --rays N alone, or another --layout",
             )
@@ -274,8 +274,8 @@ class FitRequest:
         rays = "rays left open" if choices["rays"] is None else f"{choices['rays']} rays"
         counted = {
             None: "as many sensors as follow",
-            BEST: "as many sensors as score best on training scenes",
-            "auto": "as many sensors as the held-out likelihood favours",
+            BEST: "the number of sensors that scores best on training scenes",
+            "auto": "the number of sensors that the held-out likelihood favours",
         }
         sensors = counted.get(choices["sensors"], f"{choices['sensors']} sensors")
         sensors = "one sensor per ray" if LAYOUTS[choices["layout"]].one_sensor_per_ray else sensors
@@ -286,21 +286,21 @@ class FitRequest:
         how = f"layout {layout}, {rays}, level {choices['level']:g}{place}, seed {self.seed}"
         steps = [f"fit {sensors}, {how}"]
         if self.weighting.settings:
-            steps.append(f"weigh the density with {', '.join(self.weighting.settings)}")
+            steps.append(f"weight the density with {', '.join(self.weighting.settings)}")
         if constraints:
-            steps.append(f"keep to constraints of {', '.join(constraints)}; check them on the finished file")
+            steps.append(f"satisfy the constraints of {', '.join(constraints)}; check them on the finished file")
         return steps
 
 
 def check_chosen(task: Task, layout: str) -> None:
-    """Refuse layouts whose rays are chosen where a task does not say what returns tell.
+    """Refuse layouts whose rays are chosen where a task has no method informs.
 
     Raises:
         ConfigError: It does not.
     """
     if not informs_rays(task):
         raise ConfigError(
-            f"the task {task.name} does not say what returns tell",
+            f"the task {task.name} has no method informs",
             where=f"--layout {layout}",
             allowed="tasks with informs",
             hint="another --layout, or give the task a method informs(scene, returns)",
@@ -316,7 +316,7 @@ def _with_rig(
     layout = options.layout or "grid"
     if not LAYOUTS[layout].starts_at_sensors:
         allowed = [name for name in FITTED_LAYOUTS if LAYOUTS[name].starts_at_sensors]
-        raise ConfigError(f"{layout} beside --like", where="--layout", allowed=", ".join(allowed))
+        raise ConfigError(f"{layout} together with --like", where="--layout", allowed=", ".join(allowed))
     rig = read_design(Path(options.like), notes, reach_of([run]))
     own, space = Constraints() if asked is None else asked, run.config.space
     keys = " / ".join(key for key in PLACE_KEYS if key in type(run.config.task).model_fields)
@@ -337,12 +337,12 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
         return asked
     named_parts(asked.parts.names, asked.parts.each)
     lacking = {
-        "how many parts is not said": not isinstance(options.sensors, int) and asked.parts.count is None,
-        "parts beside --at or --weight": options.at or options.weights,
-        "parts beside each, which bounds single sensors": asked.each,
+        "the number of parts is missing": not isinstance(options.sensors, int) and asked.parts.count is None,
+        "parts together with --at or --weight": options.at or options.weights,
+        "parts together with each, which bounds single sensors": asked.each,
         f"parts in the layout {options.layout}": options.layout,
-        "parts beside --gates: their gates are what they are": options.gates,
-        f"the task {run.task.name} does not say what returns tell": not informs_rays(run.task),
+        "parts with --gates: parts have the gates that they have": options.gates,
+        f"the task {run.task.name} has no method informs": not informs_rays(run.task),
     }
     for fault, is_found in lacking.items():
         if is_found:

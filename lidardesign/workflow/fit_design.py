@@ -66,9 +66,9 @@ class Fitter:
             if request.weighting.settings:
                 before = self.samples.effective_sample_size
                 self.samples = self.samples.retargeted(self.target(self.samples.points))
-                self._check_effective_samples("a setting nearer to what was learned, or learn with it")
+                self._check_effective_samples("choose a setting nearer to the learned one, or learn with it")
                 now, settings = self.samples.effective_sample_size, ", ".join(request.weighting.settings)
-                notes(BackgroundNote(f"with {settings} the samples have ESS {now:.2f}, as learned {before:.2f}"))
+                notes(BackgroundNote(f"with {settings} the samples have ESS {now:.2f}, and {before:.2f} as learned"))
 
     def _check_effective_samples(self, hint: str) -> None:
         """Refuse samples of which too few are effective to fit anything to, whatever the constraints."""

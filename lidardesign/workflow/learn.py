@@ -133,14 +133,14 @@ class LearnRequest:
         replaces = options.overwrite and _holds_run(folder)
         place = next_to(folder, NEW) if replaces else folder
         if options.resume and not place.is_dir():
-            raise DataError("there is no run to resume", where=str(place), hint="leave out --resume to start it")
+            raise DataError("there is no run to resume", where=str(place), hint="leave out --resume to start one")
         begun = options.resume and not _was_killed_before_it_began(place)
         if begun:
             goal = resumed_goal(goal, place)
             plugin, settings = _resumed_settings(plugin, place, choices)
         else:
             if options.resume:
-                notes("nothing of the run was kept yet; it starts from the beginning")
+                notes("the run has nothing to resume from yet; it starts from the beginning")
             check_can_start(place)
             settings = resolve(plugin, **choices)
         request = cls(plugin, folder, settings, goal, options.device, begun, replaces, config_file, options.command)

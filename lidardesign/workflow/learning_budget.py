@@ -73,7 +73,9 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
         ConfigError: Both, a value that is none, or a number of steps beside a time.
     """
     if tolerance is not None and time_budget_s is not None:
-        raise ConfigError("both decide the number of steps", where=f"{TOLERANCE}, {TIME_BUDGET}", allowed="one of them")
+        raise ConfigError(
+            "both set the number of steps", where=f"{TOLERANCE}, {TIME_BUDGET}", allowed="only one of them"
+        )
     if tolerance is not None:
         check_number(tolerance, TOLERANCE, *TOLERANCES)
     keys, path = {text.partition("=")[0].strip() for text in given["overrides"]}, given["config_file"]
@@ -81,12 +83,12 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
         return Goal(tolerance, fixed_fields=path is not None or FIELDS_KEY in keys)
     check_number(time_budget_s, TIME_BUDGET, SHORTEST_S, LONGEST_S)
     if STEPS_KEY in keys:
-        raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
+        raise ConfigError(f"the time budget sets {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
     if path is not None:
         document, key = load_yaml(path, empty_sections=True), tuple(STEPS_KEY.split("."))
         if key in dict(leaves(document.value)):
             where = f"{TIME_BUDGET}, {document.locate(key)}"
-            raise ConfigError(f"the time decides {STEPS_KEY}", where=where, hint=f"leave out {STEPS_KEY} there")
+            raise ConfigError(f"the time budget sets {STEPS_KEY}", where=where, hint=f"leave out {STEPS_KEY} there")
     return Goal(None, time_budget_s)
 
 
@@ -170,7 +172,7 @@ class Learner:
         chosen = fields_within(scenes, config, goal.tolerance, fixed=goal.fixed_fields)
         if chosen.misplaced >= goal.tolerance:
             raise ConfigError(
-                f"{chosen.note}, which leaves nothing to learning",
+                f"{chosen.note}, which leaves nothing for learning",
                 where=TOLERANCE,
                 allowed=f"above {chosen.misplaced:.2g}",
                 hint=f"a larger {FIELDS_KEY}, or a larger tolerance",

@@ -105,7 +105,7 @@ class RunFolder:
         if not changed:
             return []
         more = "" if len(changed) == 1 else f" and {len(changed) - 1} more"
-        return [f"{changed[0]}{more} changed since {self.folder} was learned: its scenes are others now"]
+        return [f"{changed[0]}{more} changed since {self.folder} was learned: its scenes are different now"]
 
     def design_paths(self) -> list[Path]:
         """The files of this run's designs by name."""
@@ -180,7 +180,7 @@ def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = Non
     except (ConfigError, DataError) as error:
         if difference is None:
             raise
-        hint = f"the file {difference}; fit it again, or mend it"
+        hint = f"the file {difference}; fit it again, or correct it"
         raise type(error)(error.message, where=error.where, allowed=error.allowed, hint=hint) from None
     if difference is not None:
         notes(f"{path} {difference}")
@@ -239,7 +239,7 @@ def need_run(run: RunFolder | None, path: Path | str) -> RunFolder:
     """
     if run is None:
         raise DataError(
-            "the run of this design is not there",
+            "the run of this design cannot be found",
             where=str(path),
             hint="give the run folder (RUN --like FILE for a rig), or put the design back into its designs folder",
         )

@@ -106,13 +106,13 @@ class Run(RunFolder):
         """
         learned, where = read_manifest(self.folder).get("learn"), str(self.folder / MANIFEST)
         if learned is None:
-            raise DataError("the run was not learned to its end", where=where, hint="resume it")
+            raise DataError("learning of the run was not finished", where=where, hint="continue with --resume")
         try:
             estimates = learned.get("error_estimates") or {}
             errors = {name: estimates[name].get("error") for name in FIGURES if name in estimates}
             return LearnedQuality(*(float(learned[name]) for name in FIGURES), errors)
         except (KeyError, TypeError, ValueError, AttributeError):
-            raise DataError("the figures of learning are damaged", where=where, hint=DAMAGED_HINT) from None
+            raise DataError("the record of learning is damaged", where=where, hint=DAMAGED_HINT) from None
 
     @property
     def density(self) -> LearnedDensity:

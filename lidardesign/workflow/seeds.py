@@ -42,7 +42,7 @@ def differing_seeds(targets: Sequence[Path], notes: Notes = log_note) -> list[Ru
     seeds = {run.config.seed for run in runs}
     other = next((key for run in runs[1:] if (key := _other_setting(runs[0], run)) is not None), None)
     if other is not None and len(seeds) == len(runs):
-        notes(f"the runs differ in {other}, not in their seeds alone: their designs stand side by side")
+        notes(f"the runs differ in {other}, not only in their seeds: their designs are compared side by side")
     return runs if other is None and len(seeds) > 1 else []
 
 
@@ -177,14 +177,14 @@ def _check_runs(runs: Sequence[RunFolder]) -> None:
     seeds: dict[int, RunFolder] = {}
     for run in runs:
         if run.folder.resolve() in places:
-            raise ConfigError(f"{run.folder} is named twice", where="runs", allowed="every run once")
+            raise ConfigError(f"{run.folder} is named twice", where="runs", allowed="each run once")
         places[run.folder.resolve()] = run
         other = _other_setting(runs[0], run)
         if other is not None:
             raise ConfigError(
                 f"{runs[0].folder} and {run.folder} differ in {other}",
                 where="runs",
-                allowed="runs that differ in their seed alone",
+                allowed="runs that differ only in their seed",
                 hint="learn them with the same settings and another --seed",
             )
         twin = seeds.setdefault(run.config.seed, run)
@@ -192,7 +192,7 @@ def _check_runs(runs: Sequence[RunFolder]) -> None:
             raise ConfigError(
                 f"{twin.folder} and {run.folder} have the same seed, {run.config.seed}",
                 where="runs",
-                allowed="every seed once",
+                allowed="each seed once",
                 hint="learn one of them with another --seed",
             )
 
@@ -218,7 +218,7 @@ def _check_options(options: ScoreOptions) -> None:
         )
     for option, given in (("--accuracy", options.accuracy), ("--effects audit", options.effects.strip() == "audit")):
         if given:
-            raise ConfigError("it looks at one run", where=option, hint="give one run, or leave it out")
+            raise ConfigError("it works on one run", where=option, hint="give one run, or leave it out")
 
 
 def _common_names(runs: Sequence[RunFolder], wanted: Sequence[str]) -> list[str]:
@@ -232,7 +232,7 @@ def _common_names(runs: Sequence[RunFolder], wanted: Sequence[str]) -> list[str]
     common = sorted(reduce(set.intersection, sets))
     if not common:
         raise ConfigError(
-            "no design bears the same name in all runs",
+            "no design has the same name in all runs",
             where="runs",
             allowed="; ".join(
                 f"{run.folder}: {', '.join(sorted(names))}" for run, names in zip(runs, sets, strict=True)

@@ -34,7 +34,7 @@ class ArmConfig(MovingSurroundings):
     """The arm, how many trajectories of how many frames, how much they differ, its surroundings, and the sensors'."""
 
     size: Literal["full", "small"] = Field(
-        "full", description="small: 4 trajectories of 12 frames in each split unless told otherwise, for trials"
+        "full", description="small: 4 trajectories of 12 frames in each split unless set otherwise, for trials"
     )
     robot: Path | None = Field(
         None, description="MJCF file of an arm with 7 hinges; empty: the embedded arm of primitive links"
@@ -91,7 +91,7 @@ class ArmTask:
         """
         if config.jitter_m == 0:
             raise ConfigError(
-                "without jitter all trajectories are nearly the same, and held-out ones would be known",
+                "without jitter all trajectories are nearly the same, so held-out ones would be known",
                 where="task.jitter_m",
                 hint="set jitter_m above 0",
             )
@@ -140,7 +140,7 @@ def rejection_notes(motions: Sequence[Motion], split: str) -> tuple[str, ...]:
     if not rejected:
         return ()
     reasons = ", ".join(f"{count} {reason}" for reason, count in rejected.most_common())
-    return (f"{split}: motions that the arm cannot do were drawn again: {reasons}",)
+    return (f"{split}: motions that the arm cannot perform were drawn again: {reasons}",)
 
 
 def _scene(robot: Robot, motion: Motion, name: str, rate_hz: float, notes: tuple[str, ...]) -> Scene:

@@ -32,7 +32,7 @@ class EmitterConfig(HeadConfig):
 
     detector_m: Vector = Field((0.40, 0.0, 0.0), description="place of the detector [m]; the nose tip is at 0")
     detector_azimuth_deg: float = Field(180.0, ge=-360, le=360, description="where the detector looks [deg]")
-    detector_elevation_deg: float = Field(0.0, ge=-90, le=90, description="and how far upwards [deg]")
+    detector_elevation_deg: float = Field(0.0, ge=-90, le=90, description="and its elevation [deg]")
     field_of_view_deg: tuple[FieldAngle, FieldAngle] = Field(
         (60.0, 50.0), description="the detector's whole horizontal and vertical field of view [deg]"
     )

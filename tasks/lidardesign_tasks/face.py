@@ -47,7 +47,7 @@ class HeadConfig(Importance):
     )
     train: int = Field(50, ge=1, le=10_000, description="training heads")
     test: int = Field(50, ge=1, le=10_000, description="held-out heads")
-    modes: int = Field(100, ge=1, le=10_000, description="use at most so many modes of the model")
+    modes: int = Field(100, ge=1, le=10_000, description="use at most this many modes of the model")
     identity_scale: float = Field(
         1.0, ge=0, le=3, description="scale of the identity coefficients; 0: the mean head"
     )
@@ -56,7 +56,7 @@ class HeadConfig(Importance):
         0.008, ge=0, le=0.5, description="standard deviation of the place [m]"
     )
     truth_points: int = Field(
-        5000, ge=100, le=200_000, description="points of the visible surface to judge by"
+        5000, ge=100, le=200_000, description="points of the visible surface that scores compare with"
     )
     speed_m_s: float = Field(0.0, ge=0, le=100, description="how fast heads move within a frame, in any direction")
 
@@ -129,7 +129,7 @@ def head_scenes(
     """
     if config.identity_scale == 0 and config.jitter_rotation_deg == 0 and config.jitter_translation_m == 0:
         raise ConfigError(
-            "without identities and pose jitter all heads are the same, and held-out ones would be known",
+            "without identities and pose jitter all heads are the same, so held-out ones would be known",
             where="task.identity_scale",
             hint="set identity_scale, jitter_rotation_deg or jitter_translation_m above 0",
         )

@@ -58,7 +58,7 @@ class Importance(Surroundings):
     region_weight: float = Field(
         4.0, gt=1e-3, le=1e3, description="how many times as much the region counts as the rest"
     )
-    region_edge_m: float = Field(0.01, ge=0, le=1e6, description="over what distance around it this fades [m]")
+    region_edge_m: float = Field(0.01, ge=0, le=1e6, description="distance over which this fades around it [m]")
 
     @model_validator(mode="after")
     def _one_region(self) -> Importance:

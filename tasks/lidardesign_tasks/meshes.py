@@ -73,18 +73,20 @@ class MeshesConfig(Importance):
         le=30,
         description="objects per scene that are dropped until they rest; 0: one object alone, not dropped",
     )
-    background: Kind = Field("bin", description="what they are dropped into, any way up: bin; or onto, upright: table")
+    background: Kind = Field("bin", description="bin: they are dropped into one, any way up; table: onto one, upright")
     background_returns: Literal["removed", "stay"] = Field(
-        "removed", description="whether returns where bin or table are known to be are removed before scoring"
+        "removed", description="whether returns from the bin or table, whose place is known, are removed before scoring"
     )
     jitter_rotation_deg: float = Field(4.0, ge=0, le=180, description="standard deviation of the pose [deg]")
     jitter_translation_m: float | None = Field(
         None, ge=0, le=FARTHEST_M, description="of the place [m]; 2 % of the extent if empty"
     )
-    occluders: Path | None = Field(None, description="folder of meshes that stand in front, in world coordinates")
-    origin_m: Vector | None = Field(None, description="sensor place [m]; if empty: in front, at 2 extents")
+    occluders: Path | None = Field(None, description="folder of meshes that block the view, in world coordinates")
+    origin_m: Vector | None = Field(None, description="place of the sensor [m]; if empty: in front, 2 extents away")
     origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
-    truth_points: int = Field(5000, ge=100, le=200_000, description="points of the visible surface to judge by")
+    truth_points: int = Field(
+        5000, ge=100, le=200_000, description="points of the visible surface that scores compare with"
+    )
     motion: Path | None = Field(
         None,
         description="CSV of poses over time: columns time_s, body, x_m, y_m, z_m, and qw, qx, qy, qz or "

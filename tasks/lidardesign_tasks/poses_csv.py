@@ -175,7 +175,7 @@ def _checked_header(names: tuple[str, ...], where: str) -> tuple[str, ...]:
         told = {"missing columns": missing, "unknown or repeated": wrong}
         found = "; ".join(f"{what}: {', '.join(columns)}" for what, columns in told.items() if columns)
         if len(given) > 1:
-            found = "rotations are given in two ways"
+            found = "rotations are given twice, in two forms"
         either = " or ".join(", ".join(group) for group in ROTATIONS)
         raise DataError(found, where=where, allowed=f"{', '.join((TIME, BODY, *PLACE))}, and {either}")
     return given[0] if given else ()
@@ -187,7 +187,7 @@ def _path(poses: Sequence[tuple[float, np.ndarray, int]], name: str, path: Path)
             raise DataError(
                 f"body {name!r} is at {after:g} s after {before:g} s in line {first}",
                 where=f"{path}:{line}",
-                allowed="times of a body that ascend",
+                allowed="ascending times for each body",
             )
     return BodyPath(np.array([one[0] for one in poses]), np.stack([one[1] for one in poses]), poses[0][2])
 

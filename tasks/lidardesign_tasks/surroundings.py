@@ -31,13 +31,13 @@ class Surroundings(TaskConfig):
     """Surfaces, light and air, the same in all scenes of a task."""
 
     illuminance_lux: float = Field(
-        300.0, ge=0, le=200_000, description="light on the surfaces; sunlight has 100,000 [lux]"
+        300.0, ge=0, le=200_000, description="light on the surfaces [lux]; sunlight is 100,000"
     )
     light: Literal["indoor", "sun"] = Field("indoor", description="its spectrum: white LEDs, or the sun")
     visibility_m: float | None = Field(
-        None, ge=0.01, le=FARTHEST_M, description="how far one sees through fog [m]; empty: clear air"
+        None, ge=0.01, le=FARTHEST_M, description="visibility in fog [m]; empty: clear air"
     )
-    reflectance: float = Field(MATT_GREY, ge=0, le=1, description="share of the light that matt surfaces send back")
+    reflectance: float = Field(MATT_GREY, ge=0, le=1, description="share of the light that surfaces reflect diffusely")
     gloss: float = Field(0.0, ge=0, le=1, description="share of the light that surfaces mirror instead")
 
     def around(self, scene: Scene) -> Scene:

@@ -44,7 +44,7 @@ class WarehouseConfig(Surroundings):
     train: int | None = Field(None, ge=1, le=10_000, description="training shelves; default 100, small 6")
     test: int | None = Field(None, ge=1, le=10_000, description="held-out shelves; default 40, small 4")
     positions: int | None = Field(
-        None, ge=0, le=1000, description="robot positions besides 0, 1.2, 2.4, 3.6 m; default 20, small 4"
+        None, ge=0, le=1000, description="robot positions in addition to 0, 1.2, 2.4, 3.6 m; default 20, small 4"
     )
     bays: int | None = Field(None, ge=1, le=20, description="bays along the aisle; default 4, small 2")
     front_m: Interval = Field(
@@ -150,13 +150,13 @@ def _check_space(space: DesignSpace) -> None:
     for name in FIXED_DIMENSIONS:
         if DIMENSIONS.index(name) in space.free:
             raise ConfigError(
-                f"{name} is free, but the warehouse judges rays in one vertical plane per robot position",
+                f"{name} is free, but the warehouse scores rays in one vertical plane per robot position",
                 where=f"space.{name}",
                 hint="fix it to one number",
             )
     if X in space.free and X not in space.conditioned:
         raise ConfigError(
-            "x_m is free, but designs are judged at given robot positions", where="space.condition", allowed="x_m"
+            "x_m is free, but designs are scored at given robot positions", where="space.condition", allowed="x_m"
         )
     low, high = space.low[X], space.high[X]
     if (low, high) != AISLE_M and not (X not in space.free and AISLE_M[0] <= low <= AISLE_M[1]):

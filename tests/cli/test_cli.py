@@ -300,7 +300,7 @@ def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesi
     for arguments, words in (
         (("export", copied, "--format", "csv", "--rays", 20), "need samples of the learned density"),
         (("evaluate", copied), "give the run folder too"),
-        (("constrain", copied), "the run of this design is not there"),
+        (("constrain", copied), "the run of this design cannot be found"),
     ):
         result = lidardesign(*arguments)
         assert result.code in (2, 3)

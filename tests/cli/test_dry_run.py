@@ -156,11 +156,13 @@ def test_people_are_told_in_words(lidardesign, flat, tmp_path):
     lines = result.out.splitlines()
     assert lines[0] == "fit would"
     assert "  fit 2 sensors, layout grid, rays left open, level 0.95, seed 3" in lines
-    assert "  weigh the density with variation=1.5" in lines
+    assert "  weight the density with variation=1.5" in lines
     assert f"write  {flat}/designs/fit.yaml (replaced)" in lines
     assert any(line.startswith(f"time   the last fit of {flat} took") for line in lines)
     assert lines[-1] == "nothing was done: leave out --dry-run to do it"
-    chosen = "fit as many sensors as score best on training scenes, layout selected, rays left open, level 0.999"
+    chosen = (
+        "fit the number of sensors that scores best on training scenes, layout selected, rays left open, level 0.999"
+    )
     assert chosen in lidardesign("fit", flat, "--dry-run").out
     told = lidardesign("evaluate", flat, "--rays", 9, "--rays", 16, "--baseline", "occupancy", "--dry-run").out
     assert "beside uniform, random, bounding, silhouette, greedy, occupancy: 14 rows at equal rays" in told

@@ -477,7 +477,7 @@ def test_a_time_is_taken_where_it_is_asked_for_or_left_out():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--cma-seconds", "5"], "nothing is searched for"),
+        (["--cma-seconds", "5"], "there is no search"),
         (["--cma-seconds", "0", "--baseline", "cma"], "--cma-seconds"),
         (["--baseline", "cma:5"], "takes no value after its name"),
     ],

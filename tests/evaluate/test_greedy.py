@@ -198,7 +198,7 @@ def test_an_evaluation_has_it_at_each_number_of_rays_in_no_more_bandwidth_than_t
 @each_row(
     "changes, note",
     [
-        ({"task": MissTask()}, "greedy is left out: the task miss does not say what returns tell"),
+        ({"task": MissTask()}, "greedy is left out: the task miss has no method informs"),
         ({"rays": (5, 40)}, "greedy is left out above 30 rays: choosing them takes too long"),
         ({"greedy": None}, None),
     ],

@@ -200,14 +200,14 @@ def flatland(lidardesign, out, *options):
 @each_row(
     ("options", "message"),
     [
-        ("--tolerance 0.1 --time-budget 60", "both decide"),
+        ("--tolerance 0.1 --time-budget 60", "both set"),
         ("--tolerance 0", "from 0.0001 to 0.9999"),
         ("--tolerance nan", "a finite number"),
         ("--time-budget -3", "from 1 to 31622400"),
         ("--time-budget inf", "a finite number"),
         ("--time-budget 1e300", "from 1 to 31622400"),
-        ("--time-budget 60 --set learning.steps=7", "the time decides learning.steps"),
-        ("--time-budget 60 --config other.yaml", "other.yaml:2:10: the time decides learning.steps"),
+        ("--time-budget 60 --set learning.steps=7", "the time budget sets learning.steps"),
+        ("--time-budget 60 --config other.yaml", "other.yaml:2:10: the time budget sets learning.steps"),
     ],
 )
 def test_goals_that_make_no_sense_are_config_errors(lidardesign, options, message):

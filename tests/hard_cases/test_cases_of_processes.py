@@ -324,7 +324,7 @@ FATAL = {
     "crashes": ("import ctypes\nctypes.string_at(0)", "crashes while it is imported (Segmentation fault)"),
     "aborts": ("import os\nos.abort()", "crashes while it is imported (Aborted)"),
     "writes_anywhere": ("import os\nfor number in range(3, 64):\n    try: os.write(number, b'hello\\n')\n"
-                        "    except OSError: pass", "writes into what is not its own"),
+                        "    except OSError: pass", "writes to a stream that is not its own"),
     "closes_all": ("import os\nos.closerange(0, 100)", "closes files that it did not open while it is imported"),
     "closes_and_sleeps": ("import os, time\nos.closerange(0, 100)\ntime.sleep(600)",
                           "closes files that it did not open while it is imported"),

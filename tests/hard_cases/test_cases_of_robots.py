@@ -128,7 +128,7 @@ class TestUnstableRollouts:
         assert len(made) == 6
         assert counted.total() > 0
         (note,) = made[0].notes
-        assert note.startswith("train: motions that the arm cannot do were drawn again: ")
+        assert note.startswith("train: motions that the arm cannot perform were drawn again: ")
         assert all(f"{count} {reason}" in note for reason, count in counted.items())
         again = TASK.scenes(config, "train", 0)
         for first, second in zip(made, again, strict=True):  # the seed tells which ones were rejected

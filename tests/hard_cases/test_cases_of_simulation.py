@@ -172,7 +172,9 @@ class TestEmptyReturns:
     def broke():
         with np.errstate(invalid="ignore"):
             mean = np.divide(np.float64(0.0), np.float64(0.0))
-        return f"the mean distance of no points is {mean:g}, which a mean over scenes hands on to every one of them"
+        return (
+            f"the mean distance of no points is {mean:g}, which a mean over scenes hands on to every only one of them"
+        )
 
     @pytest.mark.parametrize("rays", [NO_RAYS, LOST, SHUT], ids=["no rays", "all miss", "gates without width"])
     def test_every_task_gives_the_worst_value_and_says_that_it_failed(self, one_scene, rays):

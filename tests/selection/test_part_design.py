@@ -105,7 +105,7 @@ class TestDesignsOfParts:
         ({"parts": ["vl53l8xc"], "sensors": 1}, "no part 'vl53l8xc'"),
         ({"parts": ["vl53l8cx"]}, "how many parts"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "grid"}, "parts in the layout grid"),
-        ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "ray"}, "beside --gates"),
+        ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "ray"}, "with --gates"),
         ({"parts": [str(Path(__file__).parent)], "sensors": 1}, "holds no file"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "constraints": {"each": [{"gate": {"width_m": {"max": 1}}}]}}, "each"),
         (

@@ -325,7 +325,7 @@ WRONG = {
     "a mount that is not there": ({"mount_body": "bse"}, "did you mean 'base'"),
     "a mount that is the world": ({"mount_body": "world"}, "no body is called 'world'"),
     "a target that carries the sensors": ({"mount_body": "hand", "targets": ("hand",)}, "is a target"),
-    "targets alone as known": ({"known": ("hand",), "targets": ("hand",)}, "all that is known is a target"),
+    "targets alone as known": ({"known": ("hand",), "targets": ("hand",)}, "all known pieces are targets"),
     "sensors inside geometry": ({"origin_m": (0, 0, 0.5)}, "inside 'base'"),
     "sensors inside the mount": ({"mount_body": "base", "origin_m": (0, 0, 0)}, "inside 'base'"),
 }

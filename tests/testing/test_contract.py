@@ -92,7 +92,7 @@ BROKEN = {
         (VALUE, "        return Score(float('inf'))\n", "score returned inf"),
         (VALUE, "        return Score(1.0, details={'seen': 'much'})\n", "the detail 'seen'"),
     ],
-    "nothing heard is scored": [
+    "no returns are scored": [
         ("Score(self.metric.worst, failed=True)", "Score(-5.0)", "no rays score -5, better than"),
     ],
     "best on the truth": [
@@ -121,8 +121,8 @@ BROKEN = {
         (SCORE, INFORMS.replace("returns[0].returned", "returns[0].range_m") + SCORE, "rays without a return tell"),
         (SCORE, INFORMS.replace("np.flatnonzero(", "np.repeat(*np.where(").replace("turned)", "turned), 2)") + SCORE,
          "comes twice"),
-        (SCORE, INFORMS.replace("np.ones(len(ray))", "1.0 + ray") + SCORE, "in another order tell something else"),
-        (SCORE, INFORMS.replace("returns[0].returned", "[]") + SCORE, "rays at targets tell nothing"),
+        (SCORE, INFORMS.replace("np.ones(len(ray))", "1.0 + ray") + SCORE, "in another order are worth something else"),
+        (SCORE, INFORMS.replace("returns[0].returned", "[]") + SCORE, "rays at targets are worth nothing"),
     ],
     "no global random state": [
         (VALUE, "        np.random.uniform()\n" + VALUE, "numpy's random in score"),
@@ -278,7 +278,7 @@ def test_scenes_that_hang_on_the_hashes_of_a_process_are_noticed(tmp_path, monke
 
     contract = contract_of(hashed_task.Task())
     assert contract.finding("scenes repeat").outcome == "pass"
-    assert "another process makes another scene 0" in contract.finding("scenes repeat elsewhere").detail
+    assert "another process makes a different scene 0" in contract.finding("scenes repeat elsewhere").detail
 
 
 def test_laws_that_need_a_broken_one_are_not_tried_and_say_so():
@@ -288,7 +288,7 @@ def test_laws_that_need_a_broken_one_are_not_tried_and_say_so():
 
 
 def test_check_task_returns_findings_or_raises_with_every_broken_law():
-    with pytest.raises(BrokenLawError, match=r"2 of \d+ laws do not hold: metric is defined") as caught:
+    with pytest.raises(BrokenLawError, match=r"2 of \d+ laws are broken: metric is defined") as caught:
         check_task(task_of(GOOD.replace(METRIC, METRIC.replace("radius error", " ")).replace("split, i)", "i)")))
     assert caught.value.exit_code == 6
     with pytest.raises(PluginError, match="version 9"):

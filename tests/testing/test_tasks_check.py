@@ -136,7 +136,9 @@ def test_every_call_of_a_law_has_its_own_time():
     waiting, calling = START_SECONDS + 8.0, 8.0
     assert child.waits == pytest.approx([waiting, calling, waiting, calling], abs=0.5)
     assert process._next_finding(Playing({"called": "score"}), 2.0, loading=False) == "score did not end within 6 s"
-    assert process._next_finding(Playing({"other": 1}), 2.0, loading=True).startswith("writes into what is not its own")
+    assert process._next_finding(Playing({"other": 1}), 2.0, loading=True).startswith(
+        "writes to a stream that is not its own"
+    )
 
 
 def test_none_of_them_is_imported_here_or_spoils_the_others(findings, place, tmp_path, monkeypatch, capsys):
@@ -146,7 +148,7 @@ def test_none_of_them_is_imported_here_or_spoils_the_others(findings, place, tmp
     assert result.code == 6
     assert result.json["keeps"] is False
     assert (result.json["fail"], result.json["task"]) == (1, "wrong_types")
-    assert f"1 of {len(LAWS) + 1} laws do not hold: scenes are made" in result.err
+    assert f"1 of {len(LAWS) + 1} laws are broken: scenes are made" in result.err
     (law,) = [law for law in result.json["laws"] if law["outcome"] == "fail"]
     assert law["group"] == "scenes"
 

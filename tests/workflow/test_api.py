@@ -145,7 +145,7 @@ def test_designs_work_without_a_run_and_find_their_own(run, tmp_path):
     assert len(alone.rays()) == 16
     assert alone.export(tmp_path / "rays.npz").rays == 16
     assert alone.as_dict()["design"] == str(path)
-    with pytest.raises(DataError, match="the run of this design is not there"):
+    with pytest.raises(DataError, match="the run of this design cannot be found"):
         alone.constrain(constraints={})
 
 

@@ -97,7 +97,7 @@ def test_names_choose_among_designs_of_one_run_too(lidardesign, runs):
         ("1 2 1", "flat-1 is named twice"),
         ("1 2 --designs one", "not every run has a design 'one'"),
         ("1 2 --seed 4", "--scenes-seed"),
-        ("1 2 --effects audit", "it looks at one run"),
+        ("1 2 --effects audit", "it works on one run"),
     ],
 )
 def test_bad_choices_are_refused(lidardesign, runs, arguments, message):
@@ -136,7 +136,7 @@ def test_runs_of_another_task_are_refused(runs, tmp_path):
 
 def test_designs_that_are_missing_are_named(runs):
     (runs[1] / "designs" / "two.yaml").rename(runs[1] / "designs" / "other.yaml")
-    with pytest.raises(ConfigError, match="no design bears the same name") as refused:
+    with pytest.raises(ConfigError, match="no design has the same name") as refused:
         package.evaluate_seeds(runs, **OPTIONS)
     assert "flat-2: other" in refused.value.allowed
     shutil.rmtree(runs[2] / "designs")

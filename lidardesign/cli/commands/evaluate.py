@@ -45,7 +45,7 @@ def evaluate(
             metavar="RUN|DESIGN",
             readable=False,
             help="Run folders (all their designs) and design files. Designs of other runs are scored in the scenes of "
-            "the run that is named. Of runs that differ in their seed alone, designs of one name are one row, with "
+            "the run that is named. Of runs that differ only in their seed, designs of one name are one row, with "
             "intervals over seeds and scenes.",
         ),
     ],

@@ -61,7 +61,7 @@ def greedy_rays(task: Task, positions: int, counts: Iterable[int]) -> tuple[list
     from lidardesign.selection.information import informs_rays
 
     if not informs_rays(task):
-        return [], [f"{GREEDY} is left out: the task {task.name} does not say what returns tell"]
+        return [], [f"{GREEDY} is left out: the task {task.name} has no method informs"]
     most = MOST_CHOSEN // positions
     beyond = any(count > most for count in counts)
     notes = [f"{GREEDY} is left out above {most} rays: choosing them takes too long"] if beyond else []

@@ -151,7 +151,9 @@ def _check_keys(document: Document, values: Mapping[str, Any]) -> None:
         if name is None:
             raise _unknown(key, where, [*spelled, "name", *CHOICES])
         if name in seen:
-            raise ConfigError(f"{key!r} and {seen[name]!r} are the same quantity", where=where, allowed="one of them")
+            raise ConfigError(
+                f"{key!r} and {seen[name]!r} are the same quantity", where=where, allowed="only one of them"
+            )
         seen[name] = key
 
 

@@ -126,7 +126,7 @@ class Arm:
                 rejected[str(reason)] += 1
         counts = ", ".join(f"{count} {reason}" for reason, count in rejected.most_common())
         raise DataError(
-            f"the arm can do none of {TRIES} drawn motions ({counts})",
+            f"the arm can perform none of {TRIES} drawn motions ({counts})",
             where=f"task.robot, trajectory {name}",
             hint="lower jitter_m, raise duration_s, or use an arm that reaches 0.4 to 0.75 m around its base",
         )

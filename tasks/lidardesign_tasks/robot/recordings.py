@@ -114,7 +114,7 @@ def _checked(model: mujoco.MjModel, path: Path) -> Recording:
     if not (np.isfinite(qpos).all() and np.isfinite(time_s).all()):
         raise DataError("values are NaN or infinite", where=str(path))
     if (np.diff(time_s) <= 0).any():
-        raise DataError(f"{TIME} does not ascend", where=str(path), allowed="times that ascend")
+        raise DataError(f"{TIME} does not ascend", where=str(path), allowed="ascending times")
     _check_limits(model, qpos, time_s, path)
     for start in turns(model):
         qpos[:, start : start + 4] = _continuous(qpos[:, start : start + 4], names[start], path)

@@ -144,7 +144,7 @@ def _read(path: Path, folder: Path | None, states: tuple[FileState, ...], target
                           hint="targets on other bodies, or another mount_body")  # fmt: skip
     told_apart = _named(pieces, known, "known")
     if known and not (told_apart & ~wanted).any() and not wanted.all():
-        raise ConfigError("all that is known is a target", where="task.known",
+        raise ConfigError("all known pieces are targets", where="task.known",
                           allowed="names of other bodies or geoms, [*] for all of them, [] for none")  # fmt: skip
     told_apart &= ~wanted
     return Model(model, pieces, tuple(found), told_apart, number, (*said, *notes))
@@ -166,7 +166,7 @@ def _named(pieces: Sequence[ModelGeom], patterns: Names, key: str) -> np.ndarray
 def _target(pieces: Sequence[ModelGeom], chosen: np.ndarray) -> Target:
     first = pieces[chosen[0]]
     if any(isinstance(pieces[piece].shape, Plane) for piece in chosen):
-        raise ConfigError(f"{first.body_name!r} is a plane without an end", where="task.targets", hint="ignore it")
+        raise ConfigError(f"{first.body_name!r} is an infinite plane", where="task.targets", hint="ignore it")
     points = np.concatenate([outline_m(pieces[piece]) for piece in chosen])
     box_m = np.array(list(itertools.product(*zip(points.min(axis=0), points.max(axis=0), strict=True))))
     return Target(first.body_name, first.body, chosen, box_m, mean_depth_m(points))
@@ -218,6 +218,6 @@ def refuse_sensors_inside(model: Model, poses: np.ndarray, origins_m: np.ndarray
         inside = (np.bincount(passed, minlength=len(own)) % 2 == 1).reshape(len(poses), -1).all(axis=1)
         if 2 * inside.sum() > len(inside):
             raise ConfigError(
-                f"all places where sensors may be are inside {piece.name!r} (frame {int(np.argmax(inside))})",
+                f"all places where sensors may stand are inside {piece.name!r} (frame {int(np.argmax(inside))})",
                 where="task.origin_m", hint="move origin_m, or widen origin_box_m",
             )  # fmt: skip

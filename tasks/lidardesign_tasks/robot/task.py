@@ -58,17 +58,21 @@ class MujocoConfig(MovingSurroundings):
         ".qw, .qx, .qy, .qz of free ones), a folder of them, keyframes of the model, or random"
     )  # fmt: skip
     known: Patterns = Field(
-        ("*",), description="bodies or geoms, none of targets, whose returns are told apart: by default all"
+        ("*",), description="bodies or geoms, other than targets, whose returns are recognised; by default all"
     )
-    ignored: Patterns = Field((), description="bodies or geoms that are left out")
+    ignored: Patterns = Field((), description="bodies or geoms to leave out")
     groups: tuple[Group, ...] | None = Field(None, description="groups of geoms that are seen; 0, 1 and 2 if empty")
     mount_body: str | None = Field(None, description="the body that sensors are on; in the world if empty")
     origin_m: Vector | None = Field(
-        None, description="sensor place, in the mount's frame [m]; if empty: in front at 2 extents, or on the mount"
+        None,
+        description="place of the sensor in the mount's frame [m]; if empty: in front, 2 extents away, or on the mount",
     )
     origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
     range_m: Interval | None = Field(None, description="shortest and longest range [m]; of targets if empty")
-    metric: Measure = Field("position", description="position of targets [m], their surface [mm], or seen at all [%]")
+    metric: Measure = Field(
+        "position",
+        description="what is scored: position of targets [m], their surface [mm], or whether they are seen [%]",
+    )
     frames: int = Field(20, ge=1, le=1000, description="time frames of a scene")
     frame_rate_hz: float = Field(10.0, gt=0, le=10_000, description="frames per second [Hz]")
     train: int = Field(40, ge=1, le=10_000, description="training scenes")
@@ -145,7 +149,7 @@ class MujocoTask:
         moved_m = np.ptp(_corners_m(config, model), axis=1).max(axis=(1, 2))
         resting = [target.name for target, way_m in zip(model.targets, moved_m, strict=True) if way_m < TOUCHING_M]
         if resting:
-            found.append(f"{', '.join(resting)}: at the same place in all scenes; free bodies move by recordings alone")
+            found.append(f"{', '.join(resting)}: at the same place in all scenes; free bodies move only in recordings")
         if len(recordings) > 1:
             found.append(f"{len(recordings)} recordings, half of them held out")
         elif recordings:
