@@ -59,5 +59,5 @@ def test_details_of_a_score_that_are_no_numbers_by_name_are_the_tasks_fault(lida
 def test_scenes_that_are_none_are_the_tasks_fault():
     task = FlatlandTask()
     task.scenes = lambda config, split, seed: [{"bodies": []}]
-    with pytest.raises(PluginError, match="scenes gave one dict"):
+    with pytest.raises(PluginError, match=r"scenes\(\) returned a dict"):
         scenes_of(task, None, "train", 0, DesignSpace((0.0,) * 6, (1.0,) * 6))

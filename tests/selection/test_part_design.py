@@ -103,7 +103,7 @@ class TestDesignsOfParts:
     "options, words",
     [
         ({"parts": ["vl53l8xc"], "sensors": 1}, "no part 'vl53l8xc'"),
-        ({"parts": ["vl53l8cx"]}, "how many parts"),
+        ({"parts": ["vl53l8cx"]}, "number of parts is missing"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "grid"}, "parts in the layout grid"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "ray"}, "with --gates"),
         ({"parts": [str(Path(__file__).parent)], "sensors": 1}, "holds no file"),

@@ -65,9 +65,9 @@ def test_scenes_at_any_scale_are_scored_up_to_their_own_worst_value(balls, moves
 @each_row(
     ("found", "said"),
     [
-        (1000.0, "it gave float"),
-        (Metric("error", "mm", "lower", 1.0, 0.1), "it gave error \\[mm\\], lower is better"),
-        (Metric("miss", "m", "lower", 1.0, 0.1), "it gave miss \\[m\\]"),
+        (1000.0, "it returned float"),
+        (Metric("error", "mm", "lower", 1.0, 0.1), "it returned error \\[mm\\], lower is better"),
+        (Metric("miss", "m", "lower", 1.0, 0.1), "it returned miss \\[m\\]"),
         (Metric("miss", "mm", "higher", 1.0, 0.1), "higher is better"),
     ],
 )

@@ -55,8 +55,8 @@ BROKEN = {
         (METRIC, METRIC.replace("lower", "smaller"), "metric.better is 'smaller'"),
         (METRIC, METRIC.replace("100.0", "10**400"), "OverflowError"),
         (SCORE, METRIC_OF + "replace(self.metric, worst=float('nan'))\n\n" + SCORE, "metric.worst is nan"),
-        (SCORE, METRIC_OF + "100.0\n\n" + SCORE, "metric_of failed: it gave float"),
-        (SCORE, METRIC_OF + "replace(self.metric, unit='m')\n\n" + SCORE, "it gave radius error [m]"),
+        (SCORE, METRIC_OF + "100.0\n\n" + SCORE, "metric_of failed: it returned float"),
+        (SCORE, METRIC_OF + "replace(self.metric, unit='m')\n\n" + SCORE, "it returned radius error [m]"),
     ],
     "defaults are accepted": [
         (DEFAULTS, "Defaults(rays=())", "defaults.rays is ()"),
@@ -66,7 +66,7 @@ BROKEN = {
         (DEFAULTS, "Defaults(learning={'fine': {'step': 3}})", "preset fine: unknown key 'learning.step'"),
     ],
     "space is fixed": [
-        (SPACE, "        self.asked = getattr(self, 'asked', 4) + 1\n" + SPACE, "another one the second time"),
+        (SPACE, "        self.asked = getattr(self, 'asked', 4) + 1\n" + SPACE, "a different one the second time"),
         ("4.0))", "4.0 + self.asked))", ""),
     ],
     "conditions lie in the space": [
@@ -78,7 +78,7 @@ BROKEN = {
         (SCENES, SCENES + "        1 / 0\n", "ZeroDivisionError: division by zero"),
     ],
     "scenes repeat": [
-        (CENTRE, CENTRE.replace("generator", "np.random.default_rng()"), "has another scene 0"),
+        (CENTRE, CENTRE.replace("generator", "np.random.default_rng()"), "has a different scene 0"),
     ],
     "seeds differ": [
         ("random_generator(seed,", "random_generator(0,", "the same training scenes"),
@@ -118,9 +118,9 @@ BROKEN = {
          "informs returned NoneType"),
         (SCORE, INFORMS.replace("0 * ray", "1 + ray") + SCORE, "informs gave item outside 0 to 0"),
         (SCORE, INFORMS.replace("np.ones", "-np.ones") + SCORE, "informs gave worth that is negative"),
-        (SCORE, INFORMS.replace("returns[0].returned", "returns[0].range_m") + SCORE, "rays without a return tell"),
+        (SCORE, INFORMS.replace("returns[0].returned", "returns[0].range_m") + SCORE, "rays without a return have worth"),
         (SCORE, INFORMS.replace("np.flatnonzero(", "np.repeat(*np.where(").replace("turned)", "turned), 2)") + SCORE,
-         "comes twice"),
+         "given twice"),
         (SCORE, INFORMS.replace("np.ones(len(ray))", "1.0 + ray") + SCORE, "in another order are worth something else"),
         (SCORE, INFORMS.replace("returns[0].returned", "[]") + SCORE, "rays at targets are worth nothing"),
     ],
@@ -134,7 +134,7 @@ BROKEN = {
     ],
     "nothing else is changed": [
         (VALUE, "        import os; os.environ['MINE'] = '1'\n" + VALUE, "the environment (MINE) in score"),
-        (VALUE, "        import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + VALUE, "who hears SIGINT"),
+        (VALUE, "        import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + VALUE, "who handles SIGINT"),
         (VALUE, "        import locale; locale.setlocale(locale.LC_ALL, 'C.UTF-8')\n" + VALUE, "the locale in score"),
         (VALUE, "        np.seterr(all='ignore')\n" + VALUE, "numpy's error settings in score"),
     ],

@@ -37,7 +37,7 @@ BROKEN = {
     "wrong_version": (GOOD.replace("api_version = 1", "api_version = 7"), "plugin loads", "version 7 of the task"),
     "duplicate": (GOOD, "plugin loads", "is offered by first 1.0 (first_duplicate:Task) and second 1.0"),
     "nan_metric": (GOOD.replace("50 / len(points)", "float('nan')"), "scores are numbers", "returned np.float64(nan)"),
-    "wrong_types": (in_scenes("return ['a scene', 'another']"), "scenes are made", "scenes gave one str"),
+    "wrong_types": (in_scenes("return ['a scene', 'another']"), "scenes are made", "scenes() returned a str"),
     "writes_outside": (
         in_scenes("try: open('OUTSIDE', 'w').write('x')\n        except OSError: pass"), "nothing is written", "mark"
     ),
