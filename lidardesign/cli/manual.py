@@ -44,7 +44,7 @@ MANUALS: dict[str, Manual] = {
             "lidardesign learn face --time-budget 60 --out runs/minute": "as well as a minute allows",
             "lidardesign learn face --out runs/face --resume": "go on after Ctrl-C, to the same bytes",
             "lidardesign learn face --out runs/face --overwrite": "anew; the old run stays until the new one is there",
-            "lidardesign learn face --out runs/face --dry-run": "what would be learned, where to, and how long it takes",
+            "lidardesign learn face --out runs/face --dry-run": "what would be learned, where to, and how long",
         },
         about="Learns which rays are worth firing. All that follows (fit, constrain, evaluate, export) works on the "
         "run folder that this makes, and learns nothing again.",

@@ -118,7 +118,7 @@ BROKEN = {
          "informs returned NoneType"),
         (SCORE, INFORMS.replace("0 * ray", "1 + ray") + SCORE, "informs gave item outside 0 to 0"),
         (SCORE, INFORMS.replace("np.ones", "-np.ones") + SCORE, "informs gave worth that is negative"),
-        (SCORE, INFORMS.replace("returns[0].returned", "returns[0].range_m") + SCORE, "rays without a return have worth"),
+        (SCORE, INFORMS.replace("returns[0].returned", "returns[0].range_m") + SCORE, "without a return have worth"),
         (SCORE, INFORMS.replace("np.flatnonzero(", "np.repeat(*np.where(").replace("turned)", "turned), 2)") + SCORE,
          "given twice"),
         (SCORE, INFORMS.replace("np.ones(len(ray))", "1.0 + ray") + SCORE, "in another order are worth something else"),
