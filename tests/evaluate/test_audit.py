@@ -176,16 +176,19 @@ def test_the_program_audits_and_exits_with_1_only_where_scores_move(lidardesign,
     failed = lidardesign("evaluate", fitted, *rough, "--range-tolerance-mm", 1e4)
     assert failed.code == 1
     assert "audit failed" in failed.out
-    assert "skipped effects move fit with 8 rays" in failed.err
+    assert "skipped effects move fit at 8 rays" in failed.err
     document = lidardesign("evaluate", fitted, *rough, "--range-tolerance-mm", 1e4, "--json")
     assert document.code == 1
     assert not document.json["audit"]["passed"]
 
 
 def test_the_program_shows_effects_with_their_reasons(lidardesign, fitted):
-    plain = lidardesign("evaluate", fitted, "--rays", 8)
+    plain = lidardesign("evaluate", fitted, "--rays", 8, "-v")
     assert "none called for with the detector ideal" in plain.out
-    noisy = lidardesign("evaluate", fitted, "--rays", 8, "--detector", "single-photon", "--return-tolerance", 0.002)
+    noise = ("--detector", "single-photon", "--return-tolerance", 0.002)
+    short = lidardesign("evaluate", fitted, "--rays", 8, *noise)
+    assert "effects with the detector single-photon: " in short.out
+    noisy = lidardesign("evaluate", fitted, "--rays", 8, *noise, "-v")
     assert "0.12 mm and 0.002 of returns together" in noisy.out
     assert "bins are 1.2 mm wide" in noisy.out
 
@@ -198,7 +201,7 @@ def test_tolerances_are_those_that_are_asked_for():
 def test_the_program_judges_by_other_surroundings_than_were_learned(lidardesign, fitted):
     options = ("evaluate", fitted, "--rays", 8, "--detector", "single-photon", "--effects", "auto")
     room = lidardesign(*options, "--json").json
-    sunny = lidardesign(*options, "--set", "illuminance_lux=100000", "--set", "light=sun")
+    sunny = lidardesign(*options, "--set", "illuminance_lux=100000", "--set", "light=sun", "-v")
     assert sunny.code == 0
     assert "illuminance_lux=100000, light=sun" in sunny.out
     assert "100,000 lux (sun)" in sunny.out

@@ -155,6 +155,6 @@ def test_the_command_shows_what_careless_mounting_costs(lidardesign, tmp_path):
     mounting = json.loads(found.out)["mounting"]
     assert (mounting["place_m"], mounting["angle_rad"]) == pytest.approx((0.005, 0.5 * DEGREE))
     assert mounting["rows"][0]["design"] == "two"
-    shown = lidardesign("evaluate", run, "--rays", 16, "--set", "test=2", "--mount-error", "5mm", "--quiet").out
+    shown = lidardesign("evaluate", run, "--rays", 16, "--set", "test=2", "--mount-error", "5mm").out
     assert "mounted carelessly: every sensor off by 5 mm and 0 degrees" in shown
     assert lidardesign("evaluate", run, "--mount-error", "5 miles").code == 2

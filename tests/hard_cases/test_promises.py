@@ -526,7 +526,7 @@ class TestEveryFigureHasItsError:
                 assert estimate["kind"] == "rounding"
 
     def test_tables_print_errors_and_units_beside_the_figures(self, lidardesign, flat):
-        assert "+-" in lidardesign("fit", flat, *GRID, "--name", "one").out
+        assert "+-" in lidardesign("fit", flat, *GRID, "--name", "one", "-v").out
         table = lidardesign("evaluate", flat, "--rays", 8, "--set", "test=4").out
         assert "mm" in table
         assert "95 %" in table

@@ -189,7 +189,7 @@ def test_weights_that_cannot_be_are_refused_by_the_options_name(lidardesign, run
 def test_a_density_is_weighted_towards_other_scenes(lidardesign, runs, tmp_path):
     run = shutil.copytree(runs["spots"], tmp_path / "run")
     result = lidardesign(
-        "fit", run, "--weight", "scene=discs", "--weight", "train=3", "--sensors", 2, "--name", "discs"
+        "fit", run, "--weight", "scene=discs", "--weight", "train=3", "--sensors", 2, "--name", "discs", "-v"
     )
     assert result.code == 0, result.err
     assert "note: with scene=discs, train=3 the samples have ESS 0." in result.err

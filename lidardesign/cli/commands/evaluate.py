@@ -269,11 +269,9 @@ def evaluate(
 
 def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
     with output.progress("evaluating") as progress:
-
-        def show(done: int, total: int, row: str = "") -> None:
-            progress.show(done, total, detail=row)
-
-        return request.score(show, search_display(request, progress))
+        return request.score(
+            lambda done, total, scene="": progress.show(done, total), search_display(request, progress)
+        )
 
 
 def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDisplay) -> Show:
