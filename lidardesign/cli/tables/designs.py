@@ -85,7 +85,7 @@ def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
         for entry in certificates_of(design)
     ]
     if rows:
-        rich.print(text_table(columns, rows, "rays chosen on training scenes", columns))
+        rich.print(text_table(columns, rows, "\nrays chosen on training scenes", columns))
 
 
 def _show_track(design: DesignSpec, track: Track, rich: RichConsole) -> None:
@@ -148,7 +148,7 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
             holds = ("yes, tight" if left.is_tight else "yes") if check.satisfied else Text("no", style="bold")
             rows.append((check.name, number(check.bound, 6), number(check.value, 6), _left(*left), holds))
     if rows:
-        table = text_table(("constraint", "bound", "value", "left", "holds"), rows, "constraints")
+        table = text_table(("constraint", "bound", "value", "left", "holds"), rows, "\nconstraints")
         table.columns[0].overflow = "fold"  # names are needed whole, to loosen what they name
         rich.print(table)
 
