@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 from lidardesign.config import RunConfig
 from lidardesign.density.learn import TrainingData, choose_device
 from lidardesign.density.training.checkpoint import load_arrays
-from lidardesign.density.training.schedule import StepTimes, Timekeeper, stage_steps
+from lidardesign.density.training.schedule import WRITING_S, StepTimes, Timekeeper, stage_steps
 from lidardesign.density.training.training import CHECKPOINT
 from lidardesign.run.clock import peak_memory_bytes, phase
 
@@ -29,7 +29,7 @@ class Forecast:
         longest_seconds: With a tolerance all of its stages, else the same [s].
         preparing_s: Scenes, fields and proposals [s].
         pathwise_s, balancing_s: One step of each phase [s].
-        finishing_s: Measuring and writing [s].
+        finishing_s: Measuring [s].
         steps: Of both phases; with a tolerance those of its first stage.
         peak_memory_bytes: The most that was held until then; None where the system does not tell.
         gpu_memory_bytes: The most that was held on the GPU; None without one.
@@ -89,6 +89,8 @@ def forecast(
         stages = list(stage_steps(config.learning.steps))
     elif time_budget_s is not None:
         stages = [Timekeeper(time_budget_s, lambda: prepared, config, run).fitting(times).steps]
+    # what a budget keeps in reserve for writing is more than writing takes
+    times = replace(times, finishing_s=times.finishing_s - WRITING_S)
     taken = [times.of(steps, share) for steps in stages]
     return Forecast(
         prepared + taken[0],
