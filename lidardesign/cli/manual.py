@@ -42,12 +42,12 @@ MANUALS: dict[str, Manual] = {
             "lidardesign learn --config - < face.yaml": "a configuration from standard input",
             "lidardesign learn face --tolerance 0.15 --out runs/good_enough": "until it is good enough",
             "lidardesign learn face --time-budget 60 --out runs/minute": "as well as a minute allows",
-            "lidardesign learn face --out runs/face --resume": "go on after Ctrl-C, to the same bytes",
+            "lidardesign learn face --out runs/face --resume": "continue after Ctrl-C, to the same result",
             "lidardesign learn face --out runs/face --overwrite": "anew; the old run stays until the new one is there",
             "lidardesign learn face --out runs/face --dry-run": "what would be learned, where to, and how long",
         },
-        about="Learns which rays are worth firing. All that follows (fit, constrain, evaluate, export) works on the "
-        "run folder that this makes, and learns nothing again.",
+        about="Learns which rays are worth firing. All other commands (fit, constrain, evaluate, export) work on the "
+        "run folder that this writes, and learn nothing again.",
         files=(
             "--config FILE: any of the sections task, space, density, learning (config init TASK writes one)",
             "RUN/: config.yaml, manifest.json, flow.safetensors, samples.npz, checkpoint.safetensors, progress.jsonl",
@@ -58,10 +58,10 @@ MANUALS: dict[str, Manual] = {
     "fit": Manual(
         {
             "lidardesign fit runs/face": "as many sensors as score best, their rays chosen",
-            "lidardesign fit runs/face --sensors 4 --layout grid --name even": "four sensors, rays even and left open",
+            "lidardesign fit runs/face --sensors 4 --layout grid --name even": "four sensors with even rays",
             "lidardesign fit runs/face --layout scan --rays 576 --name beams": "one steerable beam per ray",
             "lidardesign fit runs/face --parts vl53l8cx,tmf8828 --sensors 2 --name bought": "which parts, and where",
-            "lidardesign fit runs/face --like robot.sdf --name instead": "no more than a rig that there is",
+            "lidardesign fit runs/face --like robot.sdf --name instead": "no more than an existing rig",
             "lidardesign fit runs/warehouse --rays 12 --at x_m=0.37 --name here": "for one position of a robot",
         },
         about="Reads sensors off the learned density: a mixture is fitted to its samples, and its components are "
@@ -114,7 +114,7 @@ MANUALS: dict[str, Manual] = {
             "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out rays.csv": "explicit rays",
             "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out - | head -3": "to stdout",
         },
-        about="Says what the format cannot hold, and reads the file back to say what its numbers lose.",
+        about="Says what the format cannot hold, and reads the file back to say how exact its numbers are.",
         files=(
             "DESIGN: a design file or one of a rig (lidardesign show --help), - for standard input",
             "--out PATH: what is written, - for standard output",
@@ -128,7 +128,7 @@ MANUALS: dict[str, Manual] = {
             "lidardesign capture scan.mat free.galvo.csv --reference head.ply --csv points.csv": "what a scanner "
             "was given, against a reference surface",
         },
-        about="Scores designs on the histograms that a lab measured: with their gates, without, and beside even rays.",
+        about="Scores designs on histograms measured in a lab: with their gates, without them, and next to even rays.",
         files=("CAPTURE: .npz or .mat", "--csv FILE: every ray's range and point, - for standard output"),
         see=("captures.md",),
     ),
@@ -148,11 +148,11 @@ MANUALS: dict[str, Manual] = {
     "compare": Manual(
         {
             "lidardesign compare runs/face/designs/free.yaml runs/face/designs/beams.yaml": "two designs of a run",
-            "lidardesign compare robot.sdf runs/face/designs/free.yaml --rays 100": "a rig that there is, and a design",
+            "lidardesign compare robot.sdf runs/face/designs/free.yaml --rays 100": "an existing rig, and a design",
             "lidardesign compare rig.csv other.csv --in runs/face": "two rigs in the scenes of a run",
         },
         about="Shows what differs, sensor by sensor, and what that is worth: both are scored in the same held-out "
-        "scenes, and the differences scene by scene have the intervals that tell two designs apart.",
+        "scenes, and compared scene by scene.",
         exits=FROM_A_RUN,
         see=("rigs.md", "evaluate.md"),
     ),
@@ -170,7 +170,7 @@ MANUALS: dict[str, Manual] = {
         see=("catalog.md",),
     ),
     "tasks list": Manual(
-        {"lidardesign tasks list": "names, and why a broken one is broken"}, see=("writing-tasks.md",)
+        {"lidardesign tasks list": "names, and what is wrong with broken ones"}, see=("writing-tasks.md",)
     ),
     "tasks show": Manual({"lidardesign tasks show face": "its metric, its keys with units and defaults, its space"}),
     "tasks check": Manual(
@@ -199,7 +199,7 @@ MANUALS: dict[str, Manual] = {
         },
         about="Every key has its default, its bounds and what it is in a comment. Defaults are commented out, so that "
         "the file says only what was changed.",
-        files=("--out FILE: a new file; one that is there is kept",),
+        files=("--out FILE: a new file; an existing one is not overwritten",),
         see=("run-folder.md",),
     ),
     "config schema": Manual(

@@ -11,7 +11,7 @@ import typer
 
 from lidardesign.errors import MAX_SEED, ConfigError
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, errors too.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, for errors too.")]
 Seed = Annotated[
     int | None,
     typer.Option(
@@ -19,12 +19,12 @@ Seed = Annotated[
         metavar="N",
         min=0,
         max=MAX_SEED,
-        help="Root of every random stream.",
+        help="Seed of all random numbers.",
         show_default="the run's, or 0",
     ),
 ]
 Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="No notes and no progress; of a result in a file its path alone.")
+    bool, typer.Option("--quiet", "-q", help="Print no notes and no progress; of a result in a file, only its path.")
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print everything: all tables and notes.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
@@ -33,7 +33,7 @@ DryRun = Annotated[
     bool,
     typer.Option(
         "--dry-run",
-        help="Check everything that can be checked at once, say what would be done, read and written, and do nothing.",
+        help="Check what can be checked, say what would be done, read and written, and stop there.",
     ),
 ]
 Name = Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the design: RUN/designs/NAME.yaml.")]
@@ -42,8 +42,8 @@ Layout = Annotated[
     typer.Option(
         "--layout",
         metavar="grid|density|scan|distributed|selected|spinning",
-        help="Rays even in the field of view, by density, each its own sensor, starting across the origins, chosen, or "
-        "rings that are chosen.",
+        help="Where rays lie: evenly in the field of view, by density, each its own sensor, starting all over the "
+        "origins, chosen on training scenes, or on chosen rings.",
         show_default="the design's, else selected; grid or scan where rays cannot be chosen",
     ),
 ]
@@ -52,7 +52,7 @@ At = Annotated[
     typer.Option(
         "--at",
         metavar="NAME=VALUE",
-        help="Value of a condition, as the robot's position x_m=0.37; exact, no window. Repeatable.",
+        help="Value of a condition, such as the robot's position x_m=0.37; exact, no window. Repeatable.",
         show_default=False,
     ),
 ]
@@ -82,7 +82,7 @@ Level = Annotated[
     typer.Option(
         "--level",
         metavar="SHARE",
-        help="Share of rays and returns that fields of view and gates hold, as 0.99.",
+        help="Share of rays and returns that fields of view and gates contain, such as 0.99.",
         show_default="the design's, else 0.999 for chosen rays and the task's for others",
     ),
 ]
@@ -120,7 +120,7 @@ Weights = Annotated[
     typer.Option(
         "--weight",
         metavar="KEY=VALUE",
-        help="Weigh the learned density towards the task with another setting, as importance; nothing is learned "
+        help="Weight the learned density for another setting of the task, such as importance; nothing is learned "
         "again. Repeatable.",
         show_default=False,
     ),
@@ -140,8 +140,8 @@ Like = Annotated[
         "--like",
         metavar="RIG",
         readable=False,
-        help="Be as a rig that there is (a design, rays as CSV or NPZ, a MuJoCo model, an SDF file): as many sensors "
-        "at its places, fields of view and gates no wider, as many rays. Constraints of your own go before.",
+        help="Use no more than an existing rig (a design, rays as CSV or NPZ, a MuJoCo model, an SDF file): as many "
+        "sensors and rays, its places, fields of view and gates no wider. Your own constraints take precedence.",
         show_default=False,
     ),
 ]
@@ -159,7 +159,7 @@ Overrides = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Set one value, as density.sigma_m=0.002 (`tasks show TASK` lists keys); repeatable.",
+        help="Set one value, such as density.sigma_m=0.002 (`tasks show TASK` lists keys); repeatable.",
         show_default=False,
     ),
 ]
@@ -190,7 +190,7 @@ def parse_at(texts: list[str] | None) -> dict[str, float]:
         except ValueError:
             number = math.nan
         if not (name and equals and math.isfinite(number)):
-            raise ConfigError(f"{text!r}", where="--at", allowed="NAME=VALUE with a finite number, as x_m=0.37")
+            raise ConfigError(f"{text!r}", where="--at", allowed="NAME=VALUE with a finite number, such as x_m=0.37")
         if name in values:
             raise ConfigError(f"{name} is given twice: {values[name]:g} and {number:g}", where="--at")
         values[name] = number
@@ -210,5 +210,5 @@ def part_names(text: str | None) -> list[str] | str | None:
     """
     names = [] if text is None else [name.strip() for name in text.split(",")]
     if not all(names):
-        raise ConfigError(f"{text!r} leaves a part unnamed", where="--parts", allowed="NAME,NAME or catalog")
+        raise ConfigError(f"{text!r} has an empty part name", where="--parts", allowed="NAME,NAME or catalog")
     return text if text in (None, "catalog") else names

@@ -292,7 +292,7 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
         return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
     # torch says so by a name or by words of its own
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or NO_MEMORY in str(error):
-        text = "the computer has no memory left; a smaller batch, field_resolution or preset needs less"
+        text = "the computer ran out of memory; a smaller batch, field_resolution or preset needs less"
         return {"kind": "memory", "message": text}, EXIT_INTERNAL, f"memory error: {text}"
     if isinstance(error, OSError):
         name = f"{error.filename}: " if error.filename else ""
@@ -307,7 +307,7 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
         }
     else:
         text = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        hint = "this is a fault of lidardesign; --debug shows where, please report it"
+        hint = "this is a bug in lidardesign: please report it; --debug shows where"
         document = {"kind": "internal", "message": text, "hint": hint}
         return document, EXIT_INTERNAL, f"internal error: {text}\n  {hint}"
     attempt = f"\n  try: {document['hint']}" if "hint" in document else ""

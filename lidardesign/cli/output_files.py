@@ -77,7 +77,7 @@ def put_on_stdout(content: bytes) -> None:
         ConfigError: They are no text, and it is a terminal.
     """
     if sys.stdout.isatty() and b"\0" in content:
-        raise ConfigError("is no text; a terminal cannot show it", where=STDIO, hint="send it to a file: > FILE")
+        raise ConfigError("is not text, so a terminal cannot show it", where=STDIO, hint="send it to a file: > FILE")
     sys.stdout.flush()
     stream = getattr(sys.stdout, "buffer", None)
     if stream is None:
@@ -126,4 +126,4 @@ def note_new_folders(paths: Iterable[Path], output: Output) -> None:
         if missing and not is_output(path):
             new.setdefault(missing[-1], path)
     for folder, path in new.items():
-        output.note(f"note: there is not a folder {folder} yet; it is made for {path}")
+        output.note(f"note: the folder {folder} does not exist yet; it is created for {path}")

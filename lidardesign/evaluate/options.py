@@ -34,7 +34,7 @@ class ScoreOptions:
         effects: auto, all, none, audit, or names of effects between commas.
         detector: The name of a detector, or its file.
         range_tolerance_mm: What all skipped effects together may change of ranges.
-        return_tolerance: What all skipped effects together may change of returns.
+        return_tolerance: Share of returns that all skipped effects together may change.
         settings: Settings of the task to judge by other scenes than were learned.
         workers: Processes that score scenes, or the address of a scheduler.
         cma_seconds: Wall time of each search of the baseline cma [s].

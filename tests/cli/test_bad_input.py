@@ -175,7 +175,7 @@ CASES = [
     ("fit equal --layout grid --sensors 2", 3, "its 1000 samples are worth 1"),
     ("fit elsewhere --layout grid --sensors 2", 3, "belong to another design space: range_m"),
     ("fit millimetres --layout grid --sensors 2", 3, "1000 of 1000 points outside"),
-    ("fit run --parts , --sensors 1", 2, "leaves a part unnamed"),
+    ("fit run --parts , --sensors 1", 2, "has an empty part name"),
     ("learn mujoco --set model=robot.xml --set targets=[*hand]", 2, 'in it, such as "*hand"'),
     ("learn mujoco --config alias.yaml", 2, 'in it, such as "*hand"'),
     ("learn mujoco --config sign.yaml", 2, 'in it, such as "*hand"'),

@@ -70,10 +70,10 @@ def test_a_folder_that_is_made_for_a_file_is_told_once(call, work, arguments):
     name = "made" + arguments.split("{}")[1].replace("/", "").replace(" ", "") + arguments[:2]
     result = call(*arguments.format(name).split())
     assert result.code == 0, result.err
-    notes = [line for line in result.err.splitlines() if "there is not a folder" in line]
+    notes = [line for line in result.err.splitlines() if "does not exist yet" in line]
     assert len(notes) == 1
-    assert f"there is not a folder {name} yet" in notes[0]
+    assert f"the folder {name} does not exist yet" in notes[0]
     assert (work / name).exists() == ("--dry-run" not in arguments)
     if (work / name).exists():
         again = call(*arguments.replace("flat.yaml", "two.yaml").format(name).split())
-        assert "there is not a folder" not in again.err
+        assert "does not exist yet" not in again.err

@@ -184,7 +184,7 @@ def test_the_program_audits_and_exits_with_1_only_where_scores_move(lidardesign,
 
 def test_the_program_shows_effects_with_their_reasons(lidardesign, fitted):
     plain = lidardesign("evaluate", fitted, "--rays", 8, "-v")
-    assert "none called for with the detector ideal" in plain.out
+    assert "none needed with the detector ideal" in plain.out
     noise = ("--detector", "single-photon", "--return-tolerance", 0.002)
     short = lidardesign("evaluate", fitted, "--rays", 8, *noise)
     assert "effects with the detector single-photon: " in short.out

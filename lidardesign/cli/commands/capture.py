@@ -84,7 +84,7 @@ def capture(
     verbose: options.Verbose = False,
     debug: options.Debug = False,
 ) -> None:
-    """Score designs by a captured scan: with their gates, without, and beside even rays."""
+    """Score designs by a captured scan: with their gates, without them, and next to even rays."""
     with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
         claim_outputs(output, csv=csv)
         check_outputs({"--csv": csv}, [file, *designs, *([] if reference is None else [reference])])

@@ -34,14 +34,14 @@ Reflectance = Annotated[
     typer.Option(
         "--reflectance",
         metavar="PERCENT",
-        help="Ranges that sources vouch for on targets of this reflectance.",
+        help="Ranges that sources state for targets of this reflectance.",
         show_default=False,
     ),
 ]
 Klux = Annotated[
     float | None,
     typer.Option(
-        "--klux", metavar="KLUX", help="Ranges that sources vouch for in this ambient light.", show_default=False
+        "--klux", metavar="KLUX", help="Ranges that sources state for this ambient light.", show_default=False
     ),
 ]
 
@@ -66,7 +66,7 @@ def catalog(
     elif own or reflectance is not None or klux is not None:
         with command(json=json, quiet=quiet, debug=debug):
             raise ConfigError(
-                "options of a subcommand stand behind it", where="catalog", hint="lidardesign catalog list --help"
+                "options of a subcommand go after it", where="catalog", hint="lidardesign catalog list --help"
             )
 
 
@@ -137,7 +137,7 @@ def show(
         typer.Option(
             "--arrange",
             metavar="interleaved|beside",
-            help="Several parts see the same with rays between each other's, or fields side by side.",
+            help="Several parts see the same, with interleaved rays, or have fields of view side by side.",
             show_default="interleaved",
         ),
     ] = None,
@@ -219,7 +219,7 @@ def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> Des
     except ValueError:
         origin = np.zeros(0)
     if origin.shape != (3,) or not (np.abs(origin) <= FARTHEST_M).all():
-        allowed = f"three numbers, as 0.5,0,1.8 [m], each at most {FARTHEST_M:g}"
+        allowed = f"three numbers, such as 0.5,0,1.8 [m], each at most {FARTHEST_M:g}"
         raise ConfigError(f"found {text!r}", where="--at-origin", allowed=allowed)
     pose = Pose(origin, *(math.radians(value) for value in degrees.values()))
     poses = interleaved(part, pose, needed) if arrange == "interleaved" else side_by_side(part, pose, needed)

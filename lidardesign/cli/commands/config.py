@@ -17,7 +17,7 @@ from lidardesign.run.outputs import check_writable
 
 Out = Annotated[
     Path | None,
-    typer.Option("--out", metavar="FILE", help="File to write; one that is there is kept.", show_default="stdout"),
+    typer.Option("--out", metavar="FILE", help="New file to write; none is overwritten.", show_default="stdout"),
 ]
 
 config_app = typer.Typer(

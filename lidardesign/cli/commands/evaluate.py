@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from lidardesign.workflow.seeds import SeedsRequest
 
 BASELINE_HELP = (
-    "A further baseline beside uniform, random, bounding, silhouette and greedy: lloyd (as silhouette, denser where "
+    "A baseline in addition to uniform, random, bounding, silhouette and greedy: lloyd (like silhouette, denser where "
     "returns are frequent and surfaces large), occupancy (rays towards cells that targets occupy) or no-visibility "
-    "(the first design fitted anew to the density without its occlusion term, from samples drawn for it: some "
-    "seconds), catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres and "
+    "(the first design refitted to the density without its occlusion term; takes some seconds), "
+    "catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres and "
     "degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on "
     "training scenes, for --cma-seconds). Repeatable."
 )
@@ -60,7 +60,7 @@ def evaluate(
             metavar="N",
             min=1,
             max=1_000_000,
-            help="Rays per frame and position; repeatable. A fixed pattern is left out beyond its own number.",
+            help="Rays per frame and position; repeatable. A fixed pattern has no row above its own number.",
             show_default="the task's and those of smaller fixed patterns",
         ),
     ] = None,
@@ -82,9 +82,9 @@ def evaluate(
         typer.Option(
             "--effects",
             metavar="auto|all|none|audit|LIST",
-            help="Physical effects: those that each scene calls for, all, none, or names between commas; audit: as "
-            "auto, and every row under all effects too (exit 1 where a score moves by more than the metric's "
-            "tolerance).",
+            help="Physical effects: auto for those that matter in each scene, all, none, or names separated by "
+            "commas; audit: like auto, and every row under all effects too (exit 1 if a score moves by more than the "
+            "metric's tolerance).",
         ),
     ] = "auto",
     detector: Annotated[
@@ -92,7 +92,7 @@ def evaluate(
         typer.Option(
             "--detector",
             metavar="NAME|FILE",
-            help="What measures: ideal, single-photon, consumer-8x8, or a YAML file.",
+            help="The detector: ideal, single-photon, consumer-8x8, or a YAML file.",
         ),
     ] = "ideal",
     range_tolerance_mm: Annotated[
@@ -100,7 +100,7 @@ def evaluate(
         typer.Option(
             "--range-tolerance-mm",
             metavar="MM",
-            help="What all skipped effects together may change of ranges, rms.",
+            help="How much all skipped effects together may change ranges (rms).",
             show_default="a tenth of a bin, or 1, and at most the metric's tolerance where it is a length",
         ),
     ] = None,
@@ -109,7 +109,7 @@ def evaluate(
         typer.Option(
             "--return-tolerance",
             metavar="SHARE",
-            help="What all skipped effects together may change of returns.",
+            help="Share of returns that all skipped effects together may change.",
             show_default="0.001",
         ),
     ] = None,
@@ -118,8 +118,8 @@ def evaluate(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="Judge by other scenes than were learned: a key of the task, as illuminance_lux=100000 or test=10, "
-            "that leaves the design space as it is; repeatable.",
+            help="Score in scenes other than the learned ones: a key of the task, such as illuminance_lux=100000 or "
+            "test=10, that does not change the design space; repeatable.",
             show_default=False,
         ),
     ] = None,
@@ -166,15 +166,15 @@ def evaluate(
         typer.Option(
             "--workers",
             metavar="N|tcp://HOST:PORT",
-            help="What scores held-out scenes: so many processes of this machine, or the workers of a dask scheduler "
-            "(extra: cluster). The scores are the same.",
+            help="Score with this many processes on this machine, or with the workers of a dask scheduler (extra: "
+            "cluster). The scores are the same.",
         ),
     ] = "1",
     accuracy: Annotated[
         bool,
         typer.Option(
             "--accuracy",
-            help="Also measure what accuracy costs in time here: errors and seconds of every numerical choice, for "
+            help="Also measure what accuracy costs on this machine: errors and seconds of every numerical choice, for "
             "this task and run, and the cheapest setting that is good enough. Takes minutes.",
         ),
     ] = False,
@@ -183,8 +183,8 @@ def evaluate(
         typer.Option(
             "--mount-error",
             metavar="LENGTH,ANGLE",
-            help="Also score all rows with every sensor misplaced at random in every scene, as 5mm,0.5deg: standard "
-            "deviations along and about each axis.",
+            help="Also score all rows with every sensor misplaced at random in every scene, such as 5mm,0.5deg: "
+            "standard deviations along and about each axis.",
             show_default=False,
         ),
     ] = None,
@@ -197,7 +197,7 @@ def evaluate(
             metavar="N",
             min=0,
             max=MAX_SEED,
-            help="Root of the held-out scenes.",
+            help="Seed of the held-out scenes.",
             show_default="--seed, or the (first) run's",
         ),
     ] = None,

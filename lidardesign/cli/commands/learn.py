@@ -66,7 +66,7 @@ def learn(
             "--tolerance",
             metavar="SHARE",
             help="Learn until at most this share of the density's mass is in the wrong place, in stages of doubled "
-            "steps from an eighth to four times those of the preset; exit 1 when none is good enough.",
+            "steps from an eighth to four times those of the preset; exit 1 if none is good enough.",
             show_default=False,
         ),
     ] = None,

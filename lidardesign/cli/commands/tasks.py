@@ -16,7 +16,7 @@ from lidardesign.run.clock import phase
 
 OUTCOMES = {"pass": ("pass", "green"), "fail": ("FAIL", "bold red"), "skip": ("skip", "dim")}
 
-tasks_app = typer.Typer(help="List, show, check or begin tasks.", invoke_without_command=True)
+tasks_app = typer.Typer(help="List, show, check or start tasks.", invoke_without_command=True)
 
 
 @tasks_app.callback()
@@ -27,7 +27,7 @@ def tasks(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """List, show, check or begin tasks."""
+    """List, show, check or start tasks."""
     if context.invoked_subcommand is None:
         list_(seed=seed, json=json, quiet=quiet, debug=debug)
 
@@ -132,7 +132,7 @@ def check(
         typer.Option("--seconds", metavar="S", min=0.1, max=86_400, help="Longest time of one call of the task."),
     ] = 60.0,
     memory_mb: Annotated[
-        int, typer.Option("--memory-mb", metavar="MB", min=256, max=1_000_000, help="Most memory that it may hold.")
+        int, typer.Option("--memory-mb", metavar="MB", min=256, max=1_000_000, help="Most memory that it may use.")
     ] = 4096,
     seed: options.Seed = None,
     json: options.Json = False,

@@ -178,14 +178,14 @@ def show_fit(
         return
     show_design(design, rich)
     show_constraints(checks, rich)
-    figures = {"log-likelihood": "log_likelihood", "ESS": "ess", "admissible mass": "admissible_mass"}
+    figures = {"log-likelihood": "log_likelihood", "ESS": "ess", "density inside the constraints": "admissible_mass"}
     estimates = document["error_estimates"]
     known = [f"{name} {with_error(estimates[key])}" for name, key in figures.items() if key in estimates]
     known.append(f"{number(document['seconds'], 3)} s" + (" (+- are standard errors)" if known else ""))
     rich.print(", ".join(known))
     rays = estimates.get("rays")
     if rays is not None and rays["error"] > 0:
-        rich.print(f"whole rays: {number(rays['error'], 2)} of {rays['value']:.0f} are not where the weights say")
+        rich.print(f"whole rays: {number(rays['error'], 2)} of {rays['value']:.0f} are not where the weights put them")
 
 
 def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:

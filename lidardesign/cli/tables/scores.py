@@ -198,11 +198,11 @@ def _show_effects(document: Entry, rich: RichConsole) -> None:
 
     detector, effects = document["detector"], document["effects"]
     if not any(effect["on"] or effect["bound"] or effect["lost"] for effect in effects):
-        rich.print(f"effects: none called for with the detector {detector}", soft_wrap=True)
+        rich.print(f"effects: none needed with the detector {detector}", soft_wrap=True)
         return
     first = effects[0]
     allowed = f"{MILLIMETRES * first['tolerance']:.3g} mm and {first['lost_tolerance']:.2g} of returns"
-    title = f"effects with the detector {detector}; all that are skipped may change {allowed} together"
+    title = f"effects with the detector {detector}; those that are skipped may change {allowed} together"
     lines = []
     for effect in effects:
         bounds = [plain_number(MILLIMETRES * effect["bound"], 3), plain_number(effect["lost"], 2)]
