@@ -144,6 +144,8 @@ class LearnRequest:
             check_can_start(place)
             settings = resolve(plugin, **choices)
         request = cls(plugin, folder, settings, goal, options.device, begun, replaces, config_file, options.command)
+        if replaces:
+            notes(f"once it is learned it replaces the run {folder}{request._lost_designs()}")
         if begun and not request.has_checkpoint:
             notes("the run has no checkpoint yet; it starts from the beginning")
         return request
@@ -152,6 +154,11 @@ class LearnRequest:
     def place(self) -> Path:
         """The folder that is learned in: beside the run's own as long as that holds the run to be replaced."""
         return next_to(self.folder, NEW) if self.replaces else self.folder
+
+    def _lost_designs(self) -> str:
+        """The designs that go with the run that is replaced, in words."""
+        designs = ", ".join(sorted(path.stem for path in (self.folder / DESIGN_FOLDER).glob("*.yaml")))
+        return f", with its designs ({designs})" if designs else ""
 
     @property
     def has_checkpoint(self) -> bool:
@@ -191,8 +198,7 @@ class LearnRequest:
             f"draw {learning.samples:,} samples for fit and constrain, and measure how good they are",
         ]
         if self.replaces:
-            designs = ", ".join(sorted(path.stem for path in (self.folder / DESIGN_FOLDER).glob("*.yaml")))
-            steps.append(f"replace the run {self.folder}" + (f", with its designs ({designs})" if designs else ""))
+            steps.append(f"replace the run {self.folder}{self._lost_designs()}")
         reads = [] if self.config_file is None else [self.config_file]
         reads += [file for path in input_paths(settings.task) for file in ([path] if path.is_dir() else files_of(path))]
         if self.begun:

@@ -78,6 +78,7 @@ def test_a_run_is_replaced_only_where_that_is_asked_for(lidardesign, old, tmp_pa
 def test_a_replaced_run_is_the_one_that_another_folder_would_have_got(lidardesign, old, tmp_path):
     result = learned(lidardesign, "--seed", 1, "--overwrite", "--json")
     assert (result.code, result.json["run"]) == (0, "run")
+    assert "note: once it is learned it replaces the run run, with its designs (mine)" in result.err
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     assert not (tmp_path / "run" / "designs").exists()
     assert read_manifest(tmp_path / "run")["learn"]["run"] == "run"
