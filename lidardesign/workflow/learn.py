@@ -399,17 +399,22 @@ def put_in_place(folder: Path) -> None:
     """Put the run that was learned beside a folder into its place; the old one goes last.
 
     Raises:
-        ConfigError: Somebody is writing the old one; both are kept.
-        DataError: The folders cannot be renamed; both are kept.
+        DataError: Somebody is writing the old one, or the folders cannot be renamed; both are kept.
     """
     place, new, aside = (next_to(folder, suffix) for suffix in ("", NEW, OLD))
     try:
         with run_lock(place, wait_s=WAIT_S):
             place.rename(aside)
-            new.rename(place)
+            try:
+                new.rename(place)
+            except OSError:
+                aside.rename(place)
+                raise
         shutil.rmtree(aside)
-    except OSError as error:
-        raise DataError(f"cannot replace {folder}: {error.strerror or error}", where=str(new)) from error
+    except (ConfigError, OSError) as error:
+        reason = error.message if isinstance(error, ConfigError) else error.strerror or error
+        hint = "the new run is finished: use it where it is, or move it"
+        raise DataError(f"cannot replace {folder}: {reason}", where=str(new), hint=hint) from error
 
 
 def _was_killed_before_it_began(run: Path) -> bool:

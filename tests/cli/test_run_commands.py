@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import shlex
 import sys
+from pathlib import Path
 
 import pytest
 from support.command_line import files_under, make_run
 from support.plugins import GOOD, install_plugins
 
-from lidardesign.errors import DataError
 from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import note, read_manifest, verify
-from lidardesign.workflow import learn as learn_module
 
 TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverage_proposals=256", "hidden=4")
 LEARN_TINY = [word for value in ("train=1", *(f"learning.{one}" for one in TINY)) for word in ("--set", value)]
@@ -120,15 +120,32 @@ def test_the_old_run_stays_as_it_is_while_the_new_one_is_not_finished(
         assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_both_runs_are_kept_where_the_folders_cannot_be_renamed(lidardesign, old, tmp_path, monkeypatch):
-    def refuse(folder):
-        raise DataError("cannot be renamed", where=str(folder))
+REFUSED = {"the old one": "run", "the new one": "run.new"}
 
-    monkeypatch.setattr(learn_module, "put_in_place", refuse)
-    assert learned(lidardesign, "--seed", 1, "--overwrite").code == 3
+
+@pytest.mark.parametrize("which", REFUSED)
+def test_both_runs_are_kept_where_a_folder_cannot_be_renamed(lidardesign, old, tmp_path, monkeypatch, which):
+    rename = Path.rename
+
+    def refuse(self, target):
+        if self.name == REFUSED[which]:
+            raise OSError(errno.EACCES, "Permission denied")
+        return rename(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", refuse)
+        result = learned(lidardesign, "--seed", 1, "--overwrite")
+    assert result.code == 3
+    assert "run.new: cannot replace run: Permission denied" in result.err
     now = files_under(tmp_path)
     assert {name: now[name] for name in old} == old
     verify(tmp_path / "run.new", "samples.npz")
+
+
+def test_a_run_that_is_being_written_is_not_replaced(lidardesign, old, tmp_path):
+    with run_lock(tmp_path / "run"):
+        assert learned(lidardesign, "--seed", 1, "--overwrite").code == 2
+    assert files_under(tmp_path) == old
 
 
 def test_only_runs_are_replaced(lidardesign, tmp_path):
