@@ -128,3 +128,16 @@ def test_quiet_work_says_nothing(capsys):
         display.said_s -= 1e6
         display.show(1, 2)
     assert capsys.readouterr().err == ""
+
+
+def test_an_export_says_in_one_line_what_the_format_cannot_hold(lidardesign, flat):
+    lidardesign(f"fit {flat} --layout grid --sensors 2 --rays 12 --name one")
+    export = f"export {flat}/designs/one.yaml --format sdf --out one.sdf"
+    notes = json.loads(lidardesign(f"{export} --json").out)["notes"]
+    short, loud = lidardesign(export), lidardesign(f"{export} -v")
+    assert len(notes) > 2
+    assert [line.removeprefix("note: ") for line in loud.err.splitlines()] == notes
+    assert short.err.startswith("note: ")
+    assert short.err.count("\n") == short.out.count("\n") == 1
+    assert short.out.startswith("wrote one.sdf (12 rays")
+    assert lidardesign(f"{export} --quiet").out == "one.sdf\n"

@@ -16,8 +16,8 @@ from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
-# What a note says before it explains itself.
-HEAD = re.compile(r"[^:;]+")
+# Where a note begins to explain itself.
+EXPLANATION = re.compile(r"[:;] .*", re.DOTALL)
 # Below it rounding is told with --verbose alone, whether of metres, radians or seconds.
 LEAST_ERROR = 1e-4
 
@@ -100,7 +100,8 @@ def export(
             if output.verbose or note not in exported.notes:
                 output.remark(note)
         if exported.notes and not output.verbose:
-            output.remark(f"{'; '.join(HEAD.match(note)[0] for note in exported.notes)} (-v says more)")
+            heads = [EXPLANATION.sub("", note) for note in exported.notes]
+            output.remark("; ".join(heads) + (" (-v says more)" if heads != list(exported.notes) else ""))
         if source.folder is not None:
             keep_times(source.folder, "export", output)
 
