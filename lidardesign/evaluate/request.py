@@ -163,8 +163,12 @@ def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[
         hint = "a design of more parts: lidardesign catalog show NAME --rays N --out FILE"
         if chosen:
             why, hint = "rays were chosen at other numbers", "lidardesign fit RUN --layout selected --rays N"
+        who = "no design fires"
+        if len(designs) == 1:
+            who = f"{designs[0].name} does not fire"
+            why = "its rays were chosen at other numbers" if chosen else "it is a fixed pattern"
         raise ConfigError(
-            f"no design fires {_listed(asked, 'or')} rays: {why}",
+            f"{who} {_listed(asked, 'or')} rays: {why}",
             where="--rays",
             allowed=_listed(chosen, "or") if chosen else f"at most {max(sizes)}",
             hint=hint,

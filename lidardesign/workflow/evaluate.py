@@ -381,7 +381,7 @@ def _check_rival(name: str | None, designs: Sequence[str]) -> None:
     if is_baseline(name):
         baseline_of(name, where=where)
     elif name not in designs:
-        allowed = f"a baseline, or of the designs: {', '.join(designs)}"
+        allowed = f"a baseline, or a design: {', '.join(designs)}"
         raise ConfigError(f"no baseline or design {name!r}", where=where, allowed=allowed)
     elif len(designs) == 1:
         raise ConfigError(f"there is no other design to compare {name} with", where=where, hint="name a baseline")

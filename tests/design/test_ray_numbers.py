@@ -101,7 +101,7 @@ def test_numbers_that_no_design_fires_are_refused_alike_with_and_without_dry_run
     for further in ([], ["--dry-run"]):
         refused = call("evaluate", run / "designs" / "few.yaml", "--rays", 8, *further)
         assert refused.code == 2
-        assert "no design fires 8 rays: all are fixed patterns" in refused.err
+        assert "few does not fire 8 rays: it is a fixed pattern" in refused.err
         assert "at most 7" in refused.err
 
 
@@ -113,4 +113,4 @@ def test_a_comparison_says_where_one_of_the_two_has_no_row(call, run):
     assert [pair["rays"] for pair in result.json["paired"]] == [5]
     refused = call("compare", *paths, "--in", run, "--rays", 12)
     assert refused.code == 2
-    assert "no design fires 12 rays" in refused.err
+    assert "few does not fire 12 rays" in refused.err
