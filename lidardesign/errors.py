@@ -86,7 +86,7 @@ class DataError(LidardesignError):
 
 
 class InfeasibleError(LidardesignError):
-    """Constraints that no design can satisfy, or that hold too little of the density (exit 4).
+    """Constraints that no design can satisfy, or that leave too little of the density (exit 4).
 
     Arguments:
         conflicts: Names of the constraints that contradict each other.

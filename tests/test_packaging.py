@@ -162,7 +162,7 @@ def install_step(workflow: Path) -> str:
     [("gate", "path"), ("gate", "wheel"), ("gate", "index"), ("gate", "repository"), ("new task", "path")],
 )
 def test_a_workflow_installs_the_program_from_wherever_it_is(unpacked, wheel, tmp_path, workflow, source):
-    """What pip does offline: what the program needs is there already, and nothing is downloaded."""
+    """What pip does offline: what the program needs is there, and nothing is downloaded."""
     folder = tmp_path / "checkout"
     if workflow == "new task":
         new_task("landmark", folder)

@@ -43,7 +43,7 @@ MANUALS: dict[str, Manual] = {
             "lidardesign learn face --tolerance 0.15 --out runs/good_enough": "until it is good enough",
             "lidardesign learn face --time-budget 60 --out runs/minute": "as well as a minute allows",
             "lidardesign learn face --out runs/face --resume": "continue after Ctrl-C, to the same result",
-            "lidardesign learn face --out runs/face --overwrite": "anew; the old run stays until the new one is there",
+            "lidardesign learn face --out runs/face --overwrite": "again; the old run stays until then",
             "lidardesign learn face --out runs/face --dry-run": "what would be learned, where to, and how long",
         },
         about="Learns which rays are worth firing. All other commands (fit, constrain, evaluate, export) work on the "
@@ -99,7 +99,7 @@ MANUALS: dict[str, Manual] = {
             "lidardesign evaluate runs/face --workers 8": "eight processes",
             "lidardesign evaluate runs/face --accuracy --plots pictures": "what accuracy costs here, and pictures",
         },
-        about="Scores designs in scenes that nothing was learned from, beside what an engineer would build without "
+        about="Scores designs in scenes that nothing was learned from, next to what an engineer would build without "
         "learning, at equal rays and at equal bandwidth, with intervals and paired differences.",
         files=(
             "RUN or DESIGN: designs, and the task and scenes of their run",
@@ -214,7 +214,7 @@ MANUALS: dict[str, Manual] = {
         {
             'eval "$(lidardesign completion bash)"': "in this shell; in ~/.bashrc for all",
             "lidardesign completion zsh > ~/.zfunc/_lidardesign": "where ~/.zfunc is in fpath",
-            "lidardesign completion fish > ~/.config/fish/completions/lidardesign.fish": "for all shells to come",
+            "lidardesign completion fish > ~/.config/fish/completions/lidardesign.fish": "for all new shells",
         },
         about="Completes commands, options, tasks, keys of --set with their values, formats, presets, baselines, "
         "parts, effects, run folders and their designs. The shell asks the program, so plugins' tasks are there too.",

@@ -94,5 +94,5 @@ def effect_notes(effects: Sequence[EffectSummary], choice: Choice) -> list[str]:
     ]
     left_out = [effect.name for effect in effects if effect.exceeds and not effect.on and effect.missing is None]
     if left_out and choice != "auto":
-        notes.append(f"not simulated, as asked, though beyond the tolerance: {', '.join(left_out)}")
+        notes.append(f"not simulated, as requested, though beyond the tolerance: {', '.join(left_out)}")
     return notes

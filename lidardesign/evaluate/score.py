@@ -291,4 +291,8 @@ def slipped_notes(casts: SecondCasts) -> list[str]:
     if casts.found <= OUTLINE_SHARE * casts.rays:
         return []
     note = f"{casts.found:,} of {casts.rays:,} rays ({casts.found / casts.rays:.2%}) had slipped between triangles, as "
-    return [BackgroundNote(f"{note}happens at the vertices of a mesh; a second cast from beside found what they meet")]
+    return [
+        BackgroundNote(
+            f"{note}happens at the vertices of a mesh; a second cast, slightly shifted, found what they meet"
+        )
+    ]

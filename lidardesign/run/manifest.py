@@ -198,7 +198,7 @@ def verify(run: Path, name: str) -> None:
         at_work = writer(run)
         unfinished = "learning was not finished: continue with --resume"
         hint = f"{at_work} is still learning it: wait" if at_work else unfinished
-        raise DataError(f"the run holds no {name} yet", where=str(run), hint=hint)
+        raise DataError(f"the run has no {name} yet", where=str(run), hint=hint)
     if not path.is_file():
         raise DataError(
             "the manifest lists this file, but it is missing",

@@ -17,7 +17,7 @@ from lidardesign.run.yaml import plain_number
 DEEPEST = 200
 MOST_ELEMENTS = 500_000
 LONGEST_QUOTE = 80
-# The parser hands text over in pieces of so much, not line by line: each is joined to what is there already.
+# The parser hands text over in pieces of so much, not line by line: each is joined to what already exists.
 PIECE_BYTES = 1 << 20
 # What the parser says at the end of a file that goes on.
 CUT_SHORT = frozenset(

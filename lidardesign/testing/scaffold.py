@@ -59,7 +59,7 @@ def new_task(name: str, folder: Path | None = None) -> list[Path]:
     }
     folder = Path(tokens["package"]) if folder is None else folder
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DataError("is there already", where=str(folder), allowed="a new or an empty folder", hint="--out DIR")
+        raise DataError("already exists", where=str(folder), allowed="a new or an empty folder", hint="--out DIR")
     templates = files("lidardesign.testing") / "template"
     written = []
     for target, template in FILES.items():

@@ -167,7 +167,7 @@ class ScoreRequest:
             [
                 f"score {listed} in the held-out scenes of task {run.task.name}, with {', '.join(map(str, counts))} "
                 "rays per frame",
-                f"beside {', '.join(baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
+                f"against {', '.join(baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
                 *left_out(specifications, self.rays),
                 *notes,
                 *(line for design in specifications for line in outside_notes(design, run.config.space)),

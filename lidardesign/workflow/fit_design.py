@@ -75,7 +75,7 @@ class Fitter:
         effective = self.samples.independent
         if effective < LEAST_SAMPLES:
             raise DataError(
-                f"the density is too rough: its {len(self.samples)} samples are worth {effective:.0f}",
+                f"the density is too rough: its {len(self.samples)} samples count as only {effective:.0f}",
                 where=str(self.run.folder),
                 allowed=f"at least {LEAST_SAMPLES}",
                 hint=hint,

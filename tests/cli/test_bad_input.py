@@ -172,7 +172,7 @@ CASES = [
     ("fit run --weight train=many --dry-run", 2, "--weight train=many"),
     ("fit run --rays 6000 --dry-run", 2, "1 to 5000"),
     ("fit run --layout spinning --channels 16 --rays 8 --dry-run", 2, "16 channels"),
-    ("fit equal --layout grid --sensors 2", 3, "its 1000 samples are worth 1"),
+    ("fit equal --layout grid --sensors 2", 3, "its 1000 samples count as only 1"),
     ("fit elsewhere --layout grid --sensors 2", 3, "belong to another design space: range_m"),
     ("fit millimetres --layout grid --sensors 2", 3, "1000 of 1000 points outside"),
     ("fit run --parts , --sensors 1", 2, "has an empty part name"),

@@ -367,5 +367,5 @@ def test_a_density_that_is_too_rough_is_no_fault_of_constraints(lidardesign, fla
     save_samples(Samples(samples.points, samples.log_prob, log_target, samples.space), flat)
     result = lidardesign("fit", flat)
     assert result.code == 3
-    assert "samples are worth 3" in result.err
+    assert "samples count as only 3" in result.err
     assert "learn longer" in result.err

@@ -96,7 +96,7 @@ def test_a_file_is_written_once_and_kept(lidardesign, tmp_path):
     before = (tmp_path / "face.yaml").read_text()
     result = lidardesign("config", "init", "flatland", "--out", "face.yaml")
     assert result.code == 2
-    assert "is there already" in result.err
+    assert "already exists" in result.err
     assert (tmp_path / "face.yaml").read_text() == before == lidardesign("config", "init", "face").out
     assert lidardesign("config", "init", "face", "--json").json["text"] == before
 

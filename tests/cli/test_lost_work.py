@@ -255,7 +255,7 @@ def test_a_link_is_written_through(call, work, tmp_path):
 
 @pytest.mark.parametrize("command", [("init", "flatland"), ("schema", "config")])
 @pytest.mark.parametrize(
-    ("path", "code", "words"), [*((path, 3, words) for path, words in UNWRITABLE), ("file", 2, "is there already")]
+    ("path", "code", "words"), [*((path, 3, words) for path, words in UNWRITABLE), ("file", 2, "already exists")]
 )
 def test_a_configuration_goes_to_a_new_file_that_can_be_written(call, work, command, path, code, words):
     result = call("config", *command, "--out", path)

@@ -164,7 +164,7 @@ def test_without_a_condition_nothing_changes():
 
 
 FIXED = replace(SAMPLES, space=DesignSpace(AISLE.low, AISLE.high))
-WORTH = r"x_m=1 the 1000 nearest samples are worth [0-3]\n(.|\n)*at least 50"
+WORTH = r"x_m=1 the 1000 nearest samples count as only [0-3]\n(.|\n)*at least 50"
 
 
 @each_row(

@@ -99,7 +99,7 @@ def test_an_audit_fails_where_something_that_matters_is_skipped():
     assert evaluation.audit.failed
     assert "jitter" in evaluation.audit.skipped
     assert evaluation.audit.worst > 0.001
-    assert any("not simulated, as asked, though beyond the tolerance: jitter" in note for note in evaluation.notes)
+    assert any("not simulated, as requested, though beyond the tolerance: jitter" in note for note in evaluation.notes)
     tolerant = evaluate(make_request(task=RangeTask(1e4), planner=planner, audit=True))
     assert not tolerant.audit.failed
 

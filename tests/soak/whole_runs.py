@@ -34,7 +34,7 @@ DONE, TOO_ROUGH, INFEASIBLE = 0, 3, 4
 USAGE, TOO_FEW_SAMPLES = 2, re.compile(r"^\d+ rays from \d+ samples$")
 # It was the soak that somebody wanted to end.
 INTERRUPTED = (130, 143)
-TOO_ROUGH_WORDS = re.compile("the density is too rough|nearest samples are worth")
+TOO_ROUGH_WORDS = re.compile("the density is too rough|nearest samples count as only")
 NOTHING_SEEN_WORDS = "no ray of the design space reaches a target surface"
 # Outcomes: all four commands did their work; the two refusals that learning may end with.
 WHOLE, ROUGH, BLIND = "whole", "density too rough", "nothing in sight"

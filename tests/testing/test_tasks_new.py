@@ -127,7 +127,7 @@ def test_the_command_writes_every_file_and_says_what_comes_next(lidardesign, tmp
     assert "lidardesign tasks check landmark" in result.out
     again = lidardesign("tasks", "new", "landmark", "--json")
     assert again.code == 3
-    assert again.json["error"]["message"] == "is there already"
+    assert again.json["error"]["message"] == "already exists"
     elsewhere = lidardesign("tasks", "new", "landmark", "--out", "place", "--json").json
     assert {Path(path).as_posix() for path in elsewhere["files"]} == {f"place/{path}" for path in written}
 
@@ -152,9 +152,9 @@ def test_a_name_that_is_none_or_taken_is_refused_and_nothing_is_written(tmp_path
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(DataError, match="is there already"):
+    with pytest.raises(DataError, match="already exists"):
         new_task("landmark", tmp_path)
-    with pytest.raises(DataError, match="is there already"):
+    with pytest.raises(DataError, match="already exists"):
         new_task("landmark", tmp_path / "notes.txt")
     assert files_under(tmp_path) == {"notes.txt": b"mine"}
 

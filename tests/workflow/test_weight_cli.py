@@ -223,5 +223,5 @@ def test_settings_that_leave_no_weight_are_refused(lidardesign, runs, tmp_path):
     save_samples(Samples(points, samples.log_prob, samples.log_target, samples.space), run)
     result = lidardesign("fit", run, "--weight", "scene=discs", "--weight", "train=1")
     assert result.code == 3
-    assert "samples are worth" in result.err
+    assert "samples count as only" in result.err
     assert "a setting nearer to what was learned" in result.err

@@ -83,7 +83,7 @@ def _check_new(out: Path | None) -> None:
         return
     check_writable(out)
     if out.is_file():
-        raise ConfigError("is there already", where=f"--out {out}", hint="give another --out, or remove it")
+        raise ConfigError("already exists", where=f"--out {out}", hint="give another --out, or remove it")
 
 
 def _write(text: str, document: dict[str, Any], out: Path | None, output: Output) -> None:

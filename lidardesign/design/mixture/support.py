@@ -186,7 +186,7 @@ def check_support(support: Support, group: Group, *, mass: float | None, several
         which += f" at ({place}) m"
     if mass is not None and mass < LEAST_MASS:
         raise InfeasibleError(
-            f"the constraints of {which} hold {mass:.3g} of the density",
+            f"the constraints of {which} leave {mass:.3g} of the density",
             admissible_mass=mass,
             allowed=f"at least {LEAST_MASS:g}",
             hint="widen the origin box, the gate or the field of view, exclude less, or learn inside the smaller space",
@@ -268,7 +268,7 @@ def at_condition(
     best = int(np.argmax(effective))
     if effective[best] < LEAST_SAMPLES:
         raise DataError(
-            f"at {condition_text(condition)} the {len(moved)} nearest samples are worth only {effective[best]:.0f}",
+            f"at {condition_text(condition)} the {len(moved)} nearest samples count as only {effective[best]:.0f}",
             where="--at",
             allowed=f"at least {LEAST_SAMPLES}",
             hint="another value, learn longer (--preset standard or fine), or with more learning.samples",

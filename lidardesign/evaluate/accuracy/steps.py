@@ -67,7 +67,7 @@ def dtype_sweep(steps: LearningSteps, seed: int) -> Sweep:
     drawn = FlowSamples.of(steps.flow, SAMPLES, seed)
     return Sweep(
         knob="learning.dtype",
-        error_of="error of a step's gradient beside the noise of its batch, median over batches",
+        error_of="error of a step's gradient relative to the noise of its batch, median over batches",
         unit="",
         against="float64",
         tolerance=DTYPE_TOLERANCE,
@@ -144,7 +144,7 @@ def frames_sweep(steps: LearningSteps, seed: int) -> Sweep:
     exact = [gradient(flow, steps.pathwise(), number, steps.settings.clip_norm) for number in seeds]
     return Sweep(
         knob="learning.frames",
-        error_of="error of a step's gradient beside the noise of its batch",
+        error_of="error of a step's gradient relative to the noise of its batch",
         unit="",
         against="all scenes and frames",
         tolerance=FRAMES_TOLERANCE,

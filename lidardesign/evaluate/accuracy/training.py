@@ -40,7 +40,7 @@ BECAUSE = (
 # A quick fit shows what a density's errors are worth in the metric; a careful one would take the sweep's time.
 SCORED_SCENES = 8
 RESTARTS = 2
-STEPS_NOTE = "fewer steps are what this run had reached then, on its way; a run that is planned for as many does better"
+STEPS_NOTE = "fewer steps are what this run had reached on its way; a run planned for that many does better"
 
 
 def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
@@ -60,7 +60,7 @@ def _steps_sweep(request: AccuracyRequest, reached: Sequence[SnapshotQuality]) -
         # the error with the jitter from step to step
         figures, further = {**one.estimates, "misplaced": one.misplaced}, judge.values(own, scores[-1])
         measurements.append(_measure(str(one.step), figures, one.seconds, further, default=one is reached[-1]))
-    note = STEPS_NOTE if len(measurements) > 1 else "this run kept no snapshots; learned again, it keeps some"
+    note = STEPS_NOTE if len(measurements) > 1 else "this run kept no snapshots; a run that is learned now does"
     return _sweep("learning.steps", "learning up to there", measurements, note + judge.note)
 
 
@@ -74,7 +74,7 @@ def _stages_sweep(request: AccuracyRequest) -> Sequence[Sweep]:
         for stage in goal.stages
     ]
     note = f"measured when the run was learned to a tolerance of {goal.tolerance:g}"
-    return [_sweep("learning.steps, each anew", "learning and measuring", measurements, note)]
+    return [_sweep("learning.steps, each learned from the start", "learning and measuring", measurements, note)]
 
 
 def _preset_sweep(

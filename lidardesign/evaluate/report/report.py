@@ -175,7 +175,7 @@ def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
     )
     legend = f'<span class="switch">{swatch("#b8c1cb", None)}<span>learned density</span></span>{legend}'
     about = (
-        f"Drawn from {view.samples:,} weighted samples, worth {view.effective:,.0f} equal ones. "
+        f"Drawn from {view.samples:,} weighted samples, equivalent to {view.effective:,.0f} equal ones. "
         "Below, how much of the density observes each place, seen along an axis, over the outlines of targets (solid) "
         f"and occluders (dotted) of {view.scene}."
     )

@@ -83,7 +83,7 @@ def cut_behind(azimuth_rad: np.ndarray) -> np.ndarray:
     """Azimuths from -pi up to below pi; what is straight behind to rounding is at -pi."""
     start = -np.pi - ON_GRID_RAD
     there = (azimuth_rad >= start) & (azimuth_rad < start + 2 * np.pi)
-    # what is there already stays as it is, to the last bit
+    # what already exists stays as it is, to the last bit
     return np.where(there, azimuth_rad, np.mod(azimuth_rad - start, 2 * np.pi) + start)
 
 
