@@ -196,8 +196,7 @@ class Run(RunFolder):
             "quality": None if quality is None else {name: getattr(quality, name) for name in FIGURES},
             "verdict": None if quality is None else quality.verdict,
             "advice": None if quality is None else quality.advice(config.preset),
-            "seconds": learned.get("seconds") if learned else None,
-            "steps": learned.get("steps") if learned else None,
+            **{name: _figure(learned, name) for name in ("seconds", "steps")},
             "designs": designs,
             "writer": at_work,
             "next": [] if learned is None and at_work else self._next_commands(designs, finished=learned is not None),
@@ -283,6 +282,11 @@ class Run(RunFolder):
             ("designs", ", ".join(path.stem for path in self.design_paths()) or "none"),
         ]
         return html_table(f"run {self.folder}", (), rows)
+
+
+def _figure(learned: Mapping[str, Any] | None, name: str) -> float | None:
+    value = (learned or {}).get(name)
+    return value if isinstance(value, int | float) else None
 
 
 def _design_entry(path: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:

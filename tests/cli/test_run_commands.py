@@ -245,6 +245,6 @@ def test_what_cannot_be_read_is_said_beside_what_can(lidardesign, finished):
     shown = lidardesign("show", finished)
     assert shown.code == 0
     assert "cut cannot be read: " in shown.out
-    note(finished, scores={"fit": {"value": "many"}})
+    note(finished, learn={"seconds": "long", "steps": None}, scores={"fit": {"value": "many"}})
     assert "no scores are kept yet" in lidardesign("show", finished).out
     assert lidardesign("show", finished, "--at", "x_m=1").code == 2

@@ -103,9 +103,12 @@ def _show_summary(document: dict[str, Any], rich: RichConsole) -> None:
         rich.print(f"{document['writer']} is learning it" if document["writer"] else "learning was not finished")
     else:
         misplaced, kl, ess = 100 * quality["misplaced"], quality["kl_nats"], quality["ess"]
+        learned = ""
+        if None not in (document["seconds"], document["steps"]):
+            learned = f"learned in {duration(document['seconds'])} ({document['steps']} steps); "
         rich.print(
-            f"learned in {duration(document['seconds'])} ({document['steps']} steps); the density is "
-            f"{document['verdict']}: {misplaced:.2g} % misplaced, KL {kl:.2g} nats, ESS {ess:.2f}",
+            f"{learned}the density is {document['verdict']}: {misplaced:.2g} % misplaced, KL {kl:.2g} nats, "
+            f"ESS {ess:.2f}",
             soft_wrap=True,
         )
         if document["advice"] is not None:
@@ -131,7 +134,7 @@ def _design_row(entry: dict[str, Any]) -> list[str]:
     if score is None:
         return [*shape, number(entry["rays"]), "-", "-", "-"]
     difference = "-"
-    if score["rival"] is not None:
+    if None not in (score["rival"], score["difference"]):
         ends = {"ci_low": score["difference_low"], "ci_high": score["difference_high"]}
         difference = f"{score['difference']:+.3g} ({interval_text(ends, ' to ', 3)}) to {score['rival']}"
     under = [*score["settings"], *([score["detector"]] if score["detector"] != IDEAL else [])]
