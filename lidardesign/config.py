@@ -119,7 +119,7 @@ class RunConfig:
 
     Arguments:
         task_name: The task plugin's name.
-        seed: Root of every random stream.
+        seed: Seed of all random numbers.
         preset: draft, standard or fine.
         task: The task's own configuration.
         space: The design space, with the task's bounds or the user's.

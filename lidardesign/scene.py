@@ -352,11 +352,11 @@ class Scene:
         name: For people and messages.
         truth: Arrays that the task's score needs (never read by designs, densities or estimates).
         frame_rate_hz: Frames per second where bodies move.
-        notes: What making the scene met that a user should know, one line each.
+        notes: What a user should know of how the scene was made, one line each.
         medium: What fills the air; None: nothing.
         ambient: Light that the emitter did not send; None: darkness.
-        receiver: A fixed detector that all rays' light is heard by; None: every ray is heard at its own origin.
-        group: What was drawn independently, as the mesh that several scenes show; None: this scene alone.
+        receiver: A fixed detector that receives the light of all rays; None: every ray is received at its own origin.
+        group: What was drawn independently, such as the mesh that several scenes show; None: this scene alone.
 
     Example:
         >>> scene = run.scenes("test", seed=0)[0]

@@ -132,14 +132,14 @@ class Task(Protocol):
 
     `scenes` is deterministic in (config, split, seed), and the splits are disjoint, also those of two seeds: more
     training scenes are drawn with other seeds. `score` may use
-    `scene.truth` for judging only; the estimate is built from the returns alone.
+    `scene.truth` only for scoring; the estimate is built from the returns alone.
 
     A task whose space has conditions may also give `conditions(config)`, the condition values that designs are
     evaluated at, as [{"x_m": 0.0}, {"x_m": 1.2}]. `score` then gets one `Returns` per condition value (and, within
     each, per time frame), in this order.
 
     A task may name `weighing_keys`, keys of its configuration that only say what counts more in the density: designs
-    of runs that differ in them alone are judged side by side.
+    of runs that differ only in them are scored side by side.
 
     A task may also give `informs(scene, returns) -> Information`, what returns tell about a scene, for choosing rays;
     `returns` are as in `score`, of all candidate rays through open gates. Rays of a task without it are not chosen.

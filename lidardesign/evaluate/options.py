@@ -30,7 +30,7 @@ class ScoreOptions:
     Arguments:
         rays: Numbers of rays per frame; the task's by default, and those of smaller fixed patterns.
         baselines: Further baselines beside uniform, random, bounding, silhouette and greedy, by name.
-        seed: Root of every random stream; the run's by default.
+        seed: Seed of all random numbers; the run's by default.
         effects: auto, all, none, audit, or names of effects between commas.
         detector: The name of a detector, or its file.
         range_tolerance_mm: What all skipped effects together may change of ranges.

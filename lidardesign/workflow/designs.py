@@ -56,8 +56,8 @@ class Design(DesignSource):
 
     Arguments:
         specification: Sensors, layout, number of rays, constraints and where they came from.
-        run: The run that it was fitted in; None for a rig of others, or where the run has gone.
-        path: Its file; None while it was not saved.
+        run: The run that it was fitted in; None for somebody else's rig, or where the run is gone.
+        path: Its file; None until it is saved.
         result: What the fit found: log-likelihood, checks of constraints, standard errors; None for a loaded one.
 
     Example:
@@ -91,11 +91,11 @@ class Design(DesignSource):
 
     @property
     def name(self) -> str:
-        """Its name, which is its file's and its rows'."""
+        """Its name: that of its file and of its rows."""
         return self.specification.name
 
     def constrain(self, *, notes: Notes = log_note, progress: Notes = ignore, **options: Any) -> Design:
-        """Fit again in its run; what is not chosen anew stays as it is.
+        """Fit it again in its run; what is not given stays as it is.
 
         Arguments:
             notes: Called with every note.
@@ -178,7 +178,7 @@ class Design(DesignSource):
         return ExportRequest(self, exporter, target, rays, at or {}, rate_hz, seed, robot).write(notes=notes)
 
     def figure(self, count: int | None = None) -> Figure:
-        """Its sensors in space, with fields of view and gates; with a number of rays these, too (plotly)."""
+        """Its sensors in space, with fields of view and gates, and its rays where their number is given (plotly)."""
         from lidardesign.evaluate.report.figures import design_figure
 
         return design_figure(self.specification, None if count is None else self.rays(count))

@@ -266,7 +266,7 @@ class Scores:
         return {**self.evaluation.as_dict(), "set": list(settings_texts(self.request.options.settings))}
 
     def check(self) -> None:
-        """Hold the designs against what the request says that they must keep.
+        """Check the designs against the thresholds of the request.
 
         Raises:
             ThresholdError: One is worse than `fail_above`, or not better than `fail_unless_better`; or skipped effects
@@ -286,7 +286,7 @@ class Scores:
         return {SCORES: last_scores_of(self.evaluation, files, settings_texts(self.request.options.settings))}
 
     def with_accuracy(self, progress: Progress | None = None) -> Scores:
-        """The scores with what accuracy costs in time here; takes minutes.
+        """The scores, with what accuracy costs on this machine; takes minutes.
 
         Arguments:
             progress: Called with the sweeps done, all sweeps, and the name of the sweep.
@@ -314,7 +314,7 @@ class Scores:
         return Path(path)
 
     def figure_data(self) -> FigureData:
-        """What pictures and reports draw beside the scores."""
+        """What pictures and reports draw in addition to the scores."""
         from lidardesign.evaluate.figures.scene_figure import figure_data
 
         clock = outermost_clock()

@@ -61,12 +61,12 @@ class FitOptions:
         channels: Rings of each sensor that spins.
         gates: "sensor" or "ray": one gate per sensor, or one per ray.
         level: The share of rays and returns that fields of view and gates hold.
-        at: Values of conditions that the design is for, as {"x_m": 0.37}.
+        at: Values of conditions that the design is for, such as {"x_m": 0.37}.
         weights: Settings of the task towards which the learned density is weighted.
         parts: Real parts that the design is made of: names, `NAME:MODE`, paths of part files, or "catalog".
         like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
         name: The design's name.
-        seed: Root of every random stream; the run's by default.
+        seed: Seed of all random numbers; the run's by default.
 
     Raises:
         ConfigError: A name, a layout or gates that cannot be.

@@ -60,11 +60,11 @@ class LearnOptions:
     Arguments:
         out: The run folder to make; runs/TASK by default.
         preset: draft, standard or fine.
-        settings: Settings by dotted keys, as {"learning.steps": 60} or ["learning.steps=60"].
+        settings: Settings by dotted keys, such as {"learning.steps": 60} or ["learning.steps=60"].
         config: A YAML file of settings.
-        seed: Root of every random stream.
+        seed: Seed of all random numbers.
         device: auto, cpu or cuda.
-        resume: Go on with an interrupted run.
+        resume: Continue an interrupted run.
         overwrite: Replace a run that is in the folder, once the new one is learned.
         tolerance: Learn until at most this share of the density's mass is in the wrong place.
         time_budget_s: Learn as many steps as end within this time [s].
@@ -115,7 +115,7 @@ class LearnRequest:
         """The request of a user's choices; without a task, the one that its files name.
 
         Raises:
-            ConfigError: An unknown task, settings that cannot be, or a folder that is not empty.
+            ConfigError: An unknown task, impossible settings, or a folder that is not empty.
             DataError: There is no run to resume.
         """
         check_choice(options.device, "--device", ("auto", "cpu", "cuda"))

@@ -62,7 +62,7 @@ class LearnedQuality:
         return self._verdict.word
 
     def advice(self, preset: str) -> str | None:
-        """Why it is no better, and what to do next where it was learned with a preset; None where it is good."""
+        """Why it is not better, and what to do next after a preset; None where it is good."""
         return self._verdict.advice(preset) if self._verdict.why else None
 
     @property
@@ -76,7 +76,7 @@ class Run(RunFolder):
     """A run folder: a task with its configuration, the density that was learned, and the designs fitted to it.
 
     `lidardesign.learn(task)` makes one, `lidardesign.open_run(folder)` opens one. Everything about it is in its folder,
-    so commands and scripts go on with each other's runs.
+    so commands and scripts can share runs.
 
     Arguments:
         folder: The folder.
@@ -138,15 +138,15 @@ class Run(RunFolder):
         """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
 
         Arguments:
-            sensors: How many, "best": as many as score best on training scenes, or "auto": as many as held-out
-                likelihood says; by default the best.
+            sensors: How many, "best": as many as score best on training scenes, or "auto": as many as the
+                held-out likelihood favours; "best" by default.
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
             layout: grid, density, scan, distributed, selected or spinning; by default selected, where the task
-                says what returns tell.
-            at: Values of conditions that the design is for, as {"x_m": 0.37}.
+                has a method `informs`.
+            at: Values of conditions that the design is for, such as {"x_m": 0.37}.
             name: The design's name.
-            seed: Root of every random stream; the run's by default.
+            seed: Seed of all random numbers; the run's by default.
             notes: Called with every note; they are logged by default.
             progress: Called with every step, as "choosing 361 rays".
             further: channels, gates, level, weights and like, as of `FitOptions`.
@@ -170,7 +170,7 @@ class Run(RunFolder):
         return Design.fitted(request, notes=notes, progress=progress)
 
     def fit_request(self, *, notes: Notes = log_note, **options: Any) -> FitRequest:
-        """What `fit` of the same choices would do, resolved: its `plan()` says it."""
+        """What `fit` would do with the same choices; its `plan()` says it in words."""
         return FitRequest.resolve(self, FitOptions(**options), notes=notes)
 
     def designs(self) -> list[Design]:
@@ -234,16 +234,16 @@ class Run(RunFolder):
         notes: Notes = log_note,
         **further: Any,
     ) -> Scores:
-        """Score designs on held-out scenes beside uniform, random, bounding, silhouette and greedy.
+        """Score designs on held-out scenes against uniform, random, bounding, silhouette and greedy.
 
         Arguments:
             designs: Designs and design files, of other runs too; all that are saved in the run by default.
             rays: Numbers of rays per frame; the task's by default.
-            baselines: Further baselines, as "lloyd", "occupancy", "no-visibility", "cma" or "catalog:NAME".
-            seed: Root of every random stream; the run's by default.
-            effects: Physical effects: "auto", "all", "none", "audit" or names between commas.
-            detector: What measures: a name, or a YAML file.
-            settings: Settings of the task, to judge by other scenes than were learned.
+            baselines: Further baselines: "lloyd", "occupancy", "no-visibility", "cma" or "catalog:NAME".
+            seed: Seed of all random numbers; the run's by default.
+            effects: Physical effects: "auto", "all", "none", "audit" or names separated by commas.
+            detector: The name of a detector, or a YAML file.
+            settings: Settings of the task, to score in scenes other than the learned ones.
             progress: Called with the scenes done, all scenes, and the name of the scene.
             notes: Called with every note.
             further: range_tolerance_mm, return_tolerance, workers, cma_seconds, accuracy, scenes_seed, fail_above and
@@ -331,17 +331,17 @@ def learn(
         task: The name of a task; `lidardesign tasks` lists them. By default the one that `config` names.
         preset: Effort: draft, standard or fine.
         out: The folder to make; runs/TASK by default.
-        seed: Root of every random stream.
-        settings: Settings by dotted keys, as {"learning.steps": 60, "density.sigma_m": 0.01}.
+        seed: Seed of all random numbers.
+        settings: Settings by dotted keys, such as {"learning.steps": 60, "density.sigma_m": 0.01}.
         config: A YAML file of settings.
         device: auto, cpu or cuda.
-        resume: Go on with an interrupted run.
+        resume: Continue an interrupted run.
         progress: Called about every tenth step.
         notes: Called with every note; they are logged by default.
         further: tolerance or time_budget_s, which decide the number of steps; overwrite, which replaces a run.
 
     Raises:
-        ConfigError: An unknown task, settings that cannot be, or a folder that is not empty.
+        ConfigError: An unknown task, impossible settings, or a folder that is not empty.
         ThresholdError: The tolerance was not reached; the run is finished and can be opened.
     """
     options = LearnOptions(
@@ -369,7 +369,7 @@ def load_design(path: Path | str, run: Run | None = None, notes: Notes = log_not
 
     Arguments:
         path: The file.
-        run: The run that it is to be fitted in again; the one that it names by default, if that is there.
+        run: The run in which it can be fitted again; by default the one that it names, if that exists.
         notes: Called with every note.
 
     Raises:

@@ -53,10 +53,10 @@ def evaluate_seeds(
     notes: Notes = log_note,
     **options: Any,
 ) -> Scores:
-    """Score the designs that bear the same name in all runs, over seeds and held-out scenes.
+    """Score the designs that have the same name in all runs, over seeds and held-out scenes.
 
     Arguments:
-        runs: Two or more runs of one task that differ in their seed alone, or their folders.
+        runs: Two or more runs of one task that differ only in their seed, or their folders.
         progress: Called with the scenes done, all scenes, and the name of the scene.
         notes: Called with every note.
         options: designs (names; all that are common by default), scenes_seed (the first run's by default), and rays,
@@ -64,8 +64,8 @@ def evaluate_seeds(
             cma_seconds, fail_above and fail_unless_better, as of `ScoreOptions`.
 
     Raises:
-        ConfigError: Runs that differ in more than their seed, one run twice, or no design of one name.
-        DataError: A run is not there, or damaged.
+        ConfigError: Runs that differ in more than their seed, a run given twice, or no design of one name.
+        DataError: A run is missing or damaged.
     """
     opened = [run if isinstance(run, RunFolder) else RunFolder.open(run) for run in runs]
     return SeedsRequest.resolve(opened, ScoreOptions(**options), notes).score(progress)
@@ -91,7 +91,7 @@ class SeedsRequest:
             notes: Called with every note.
 
         Raises:
-            ConfigError: Runs that differ in more than their seed, one run twice, or no design of one name.
+            ConfigError: Runs that differ in more than their seed, a run given twice, or no design of one name.
             DataError: A run has no designs, or one cannot be read.
         """
         _check_runs(runs)

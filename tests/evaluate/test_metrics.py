@@ -241,7 +241,7 @@ def test_angles_and_range_of_the_space_bound_what_counts_as_visible():
     azimuth, elevation = angles(points - np.array([2.0, 0.0, 0.0]))
     assert np.abs(azimuth - math.pi).max() <= 0.3
     assert np.abs(elevation).max() <= 0.3
-    with pytest.raises(DataError, match="no admissible ray sees"):
+    with pytest.raises(DataError, match="no ray of the design space sees"):
         visible_surface_points(scene, looking_along_minus_x(reach=1.8), 100, generator())
 
 
@@ -250,7 +250,7 @@ def test_what_an_occluder_hides_is_not_visible():
     points = visible_surface_points(Scene((Body(Sphere(0.5)), plate)), looking_along_minus_x(), 500, generator())
     assert points[:, 1].max() < 0.01
     hidden = Body(Box((0.01, 2.0, 2.0)), "wall", "occluder", rigid(translation_m=(1.0, 0.0, 0.0)))
-    with pytest.raises(DataError, match="no admissible ray sees"):
+    with pytest.raises(DataError, match="no ray of the design space sees"):
         visible_surface_points(Scene((Body(Sphere(0.5)), hidden)), looking_along_minus_x(), 100, generator())
 
 

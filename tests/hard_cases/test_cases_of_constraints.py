@@ -316,7 +316,7 @@ class TestAlmostNothingLeft:
         exact = metrics.sample_body
         monkeypatch.setattr(metrics, "sample_body", lambda *a, **k: (draws.append(a[2]), exact(*a, **k))[1])
         away = DesignSpace((3.0, 0, 0, 0.0, -0.1, 0.1), (3.0, 0, 0, 0.1, 0.1, 2.0))
-        with pytest.raises(DataError, match="no admissible ray"):
+        with pytest.raises(DataError, match="no ray of the design space sees"):
             metrics.visible_surface(Scene((Body(Sphere(0.5)),)), away, 100, np.random.default_rng(0))
         assert len(draws) <= DRAW_ROUNDS
 

@@ -353,7 +353,7 @@ class TestEmitterAndDetectorTogetherOrBlind:
             Scene((BALL,), receiver=looking_away((0.0, 0.3, 0.0))),
             Scene((BALL, wall), receiver=replace(towards, origin_m=(0.9, 0.3, 0.0))),
         ):
-            with pytest.raises(DataError, match="no admissible ray") as caught:
+            with pytest.raises(DataError, match="no ray of the design space sees") as caught:
                 visible_surface(scene, space, 50, generator)
             assert caught.value.exit_code == 3
 

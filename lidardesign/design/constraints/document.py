@@ -228,9 +228,9 @@ def rules_of(rules: Sequence[SensorRules], sensor: int) -> SensorRules:
 
 
 class Constraints(SensorConstraints):
-    """What a design must keep to: fields of view, gates, places, rays and bandwidth; every key is optional.
+    """What a design must satisfy: fields of view, gates, places, rays and bandwidth; every key is optional.
 
-    Keys and units are those of a constraint file (docs/constraints.md): common to all sensors, or in `each` by sensor.
+    Keys and units are those of a constraint file (docs/constraints.md): for all sensors, or by sensor in `each`.
 
     Example:
         >>> narrow = Constraints.from_mapping({"gate": {"width_m": {"max": 0.1}}, "budget": {"rays": 64}})
