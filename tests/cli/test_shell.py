@@ -82,7 +82,7 @@ def test_a_configuration_comes_from_standard_input_with_its_paths_from_here(lida
     assert result.code == 2
     assert "-:2:19: task.variation" in result.err
     given("preset: draft\n")
-    planned = lidardesign("learn", "flatland", "--config", "-", "--time-budget", 9, "--dry-run", "--json").json
+    planned = lidardesign("learn", "flatland", "--config", "-", "--time-budget", 900, "--dry-run", "--json").json
     assert planned["settings"]["preset"] == "draft"
     assert planned["reads"] == [{"path": "-", "bytes": None}]
 
