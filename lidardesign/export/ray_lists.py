@@ -70,7 +70,7 @@ def rays_of_columns(columns: Mapping[str, np.ndarray], path: Path) -> Rays:
 
 def ray_list_losses(design: DesignSpec) -> list[str]:
     """What a ray list says nothing of."""
-    notes = ["sensors are numbered: their names, weights, spreads and origin covariances are lost"]
+    notes = ["names, weights, spreads and origin covariances of the sensors are lost: rows have their numbers"]
     return notes + constraint_losses(design)
 
 

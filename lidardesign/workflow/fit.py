@@ -39,7 +39,7 @@ from lidardesign.workflow.run_folder import (
 )
 from lidardesign.workflow.run_samples import Weighting
 
-BEST = "best"  # the number of sensors that scores best on training scenes
+BEST = "best"  # as many sensors as score best on training scenes
 COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
 CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones would only leave candidates out
 # Of designs: names that a file may have everywhere.
@@ -274,8 +274,8 @@ class FitRequest:
         rays = "rays left open" if choices["rays"] is None else f"{choices['rays']} rays"
         counted = {
             None: "as many sensors as follow",
-            BEST: "the number of sensors that scores best on training scenes",
-            "auto": "the number of sensors that the held-out likelihood favours",
+            BEST: "as many sensors as score best on training scenes",
+            "auto": "as many sensors as the held-out likelihood favours",
         }
         sensors = counted.get(choices["sensors"], f"{choices['sensors']} sensors")
         sensors = "one sensor per ray" if LAYOUTS[choices["layout"]].one_sensor_per_ray else sensors

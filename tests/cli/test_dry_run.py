@@ -161,7 +161,7 @@ def test_people_are_told_in_words(lidardesign, flat, tmp_path):
     assert any(line.startswith(f"time   the last fit of {flat} took") for line in lines)
     assert lines[-1] == "nothing was done: leave out --dry-run to do it"
     chosen = (
-        "fit the number of sensors that scores best on training scenes, layout selected, rays left open, level 0.999"
+        "fit as many sensors as score best on training scenes, layout selected, rays left open, level 0.999"
     )
     assert chosen in lidardesign("fit", flat, "--dry-run").out
     told = lidardesign("evaluate", flat, "--rays", 9, "--rays", 16, "--baseline", "occupancy", "--dry-run").out

@@ -237,7 +237,7 @@ def show_times(timings: Mapping[str, float], memory_bytes: int | None, rich: Ric
     for key, seconds in shown.items():
         *outside, name = key.split(INSIDE)
         lines.append(("  " * len(outside) + name, f"{seconds:.2f}", f"{100 * seconds / total:.0f} %"))
-    memory = "" if memory_bytes is None else f"; the most memory that it took: {memory_bytes / MEBIBYTE:.0f} MiB"
+    memory = "" if memory_bytes is None else f"; peak memory: {memory_bytes / MEBIBYTE:.0f} MiB"
     print_table(f"where the time went{memory}", ("phase", "seconds", "share"), lines, rich, text=("phase",))
 
 

@@ -314,7 +314,7 @@ class Physics:
     Arguments:
         detector: How returns are measured.
         effects: Names out of `EFFECTS`.
-        seed: Root of every effect's own random stream.
+        seed: Seed of the random numbers of every effect.
         repeat: Which time the scene is measured: rays that are fired again from elsewhere meet other chance.
 
     Raises:
