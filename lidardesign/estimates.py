@@ -7,6 +7,7 @@ have a finite variance; of weights with heavy tails they are too small, as the E
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -45,6 +46,27 @@ class Estimate:
 def as_documents(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
     """The JSON form of named estimates: `error_estimates` of every command that has any."""
     return {name: estimate.as_dict() for name, estimate in estimates.items()}
+
+
+def figure_and_interval(value: float, low: float | None, high: float | None, *, sign: str = "") -> tuple[str, str, str]:
+    """A figure and the ends of its interval for people, as fine as the interval's half width has two digits.
+
+    Arguments:
+        value: The figure.
+        low: The lower end; None where there is no interval, and the figure has three digits.
+        high: The upper end.
+        sign: Before the figure: `+` for both signs.
+
+    Returns:
+        The figure, and both ends; dashes where there are none.
+    """
+    if low is None or high is None or not high > low:
+        end = "-" if low is None else f"{low:.3g}"
+        return f"{value:{sign}.3g}", end, end
+    decimals = max(0, 1 - math.floor(math.log10((high - low) / 2)))
+    # adding zero takes the sign from a rounded -0
+    figure, *ends = (round(one, decimals) + 0.0 for one in (value, low, high))
+    return f"{figure:{sign}.{decimals}f}", f"{ends[0]:.{decimals}f}", f"{ends[1]:.{decimals}f}"
 
 
 def standard_error(influence: np.ndarray) -> float:

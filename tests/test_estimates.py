@@ -11,6 +11,7 @@ from lidardesign.estimates import (
     Estimate,
     as_documents,
     effective_share_error,
+    figure_and_interval,
     log_mean_error,
     median_error,
     share_error,
@@ -81,3 +82,18 @@ def test_estimates_become_documents():
     assert found["ess"] == {"value": 0.5, "error": 0.01, "unit": "", "kind": "standard error"}
     assert found["kl"]["error"] is None
     assert found["kl"]["unit"] == "nats"
+
+
+@pytest.mark.parametrize(
+    ("figure", "expected"),
+    [
+        ((0.0485, -0.0653, 0.159), ("+0.05", "-0.07", "0.16")),
+        ((-12.764, -13.6, -11.93), ("-12.76", "-13.60", "-11.93")),
+        ((4321.0, 4000.0, 4700.0), ("+4321", "4000", "4700")),
+        ((-0.001, -0.3, 0.3), ("+0.00", "-0.30", "0.30")),
+        ((0.12345, None, None), ("+0.123", "-", "-")),
+        ((0.12345, 0.12345, 0.12345), ("+0.123", "0.123", "0.123")),
+    ],
+)
+def test_a_figure_is_as_fine_as_its_interval_says(figure, expected):
+    assert figure_and_interval(*figure, sign="+") == expected

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lidardesign.errors import ThresholdError
+from lidardesign.estimates import figure_and_interval
 from lidardesign.evaluate.results import Evaluation, Paired, Row, verdict
 
 
@@ -21,15 +22,17 @@ def difference_text(pair: Paired, better: str, unit: str) -> str:
     """
     sign = 1.0 if pair.difference > 0 else -1.0
     word = "better" if (sign < 0) == (better == "lower") else "worse"
-    by = f"{abs(pair.difference):.3g} {unit}".rstrip()
+    ends = (None, None) if pair.ci_low is None or pair.ci_high is None else (sign * pair.ci_low, sign * pair.ci_high)
+    low, high = ends if None in ends else sorted(ends)
+    size, low_text, high_text = figure_and_interval(abs(pair.difference), low, high)
+    by = f"{size} {unit}".rstrip()
     rays = f"at {pair.rays} rays" if pair.rays_b in (None, pair.rays) else f"at {pair.rays} and {pair.rays_b} rays"
     none = f"no difference between {pair.a} and {pair.b} was found {rays}"
-    if pair.ci_low is None or pair.ci_high is None:
+    if low is None:
         return f"{none} ({by} {word})"
-    low, high = sorted((sign * pair.ci_low, sign * pair.ci_high))
     if low > 0:
-        return f"{pair.a} is {word} than {pair.b} by {by} ({low:.3g} to {high:.3g}) {rays}"
-    return f"{none} ({by} {word}, {low:.3g} to {high:.3g})"
+        return f"{pair.a} is {word} than {pair.b} by {by} ({low_text} to {high_text}) {rays}"
+    return f"{none} ({by} {word}, {low_text} to {high_text})"
 
 
 def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:

@@ -19,10 +19,10 @@ from lidardesign.evaluate.score import evaluate
 @each_row(
     ("better", "difference", "told"),
     [
-        ("lower", (-0.6, -0.9, -0.3), "f3 is better than greedy by 0.6 mm (0.3 to 0.9) at 361 rays"),
-        ("higher", (-0.6, -0.9, -0.3), "f3 is worse than greedy by 0.6 mm (0.3 to 0.9) at 361 rays"),
-        ("lower", (0.6, 0.3, 0.9), "f3 is worse than greedy by 0.6 mm (0.3 to 0.9) at 361 rays"),
-        ("higher", (0.6, 0.3, 0.9), "f3 is better than greedy by 0.6 mm (0.3 to 0.9) at 361 rays"),
+        ("lower", (-0.6, -0.9, -0.3), "f3 is better than greedy by 0.60 mm (0.30 to 0.90) at 361 rays"),
+        ("higher", (-0.6, -0.9, -0.3), "f3 is worse than greedy by 0.60 mm (0.30 to 0.90) at 361 rays"),
+        ("lower", (0.6, 0.3, 0.9), "f3 is worse than greedy by 0.60 mm (0.30 to 0.90) at 361 rays"),
+        ("higher", (0.6, 0.3, 0.9), "f3 is better than greedy by 0.60 mm (0.30 to 0.90) at 361 rays"),
         (
             "lower",
             (0.05, -0.07, 0.16),
@@ -73,8 +73,8 @@ def test_designs_must_be_better_at_every_number_of_rays(kinds, better):
     with pytest.raises(ThresholdError) as refused:
         check_better(evaluation, "greedy")
     said = {
-        OPEN: "no difference between f3 and greedy was found at 361 rays (0.1 mm better, -0.1 to 0.3)",
-        WORSE: "f3 is worse than greedy by 0.6 mm (0.3 to 0.9) at 196 rays",
+        OPEN: "no difference between f3 and greedy was found at 361 rays (0.10 mm better, -0.10 to 0.30)",
+        WORSE: "f3 is worse than greedy by 0.60 mm (0.30 to 0.90) at 196 rays",
         None: "greedy has no score at 361 rays to compare f3 with",
     }
     (missed,) = [kind for kind in kinds if kind != BETTER]

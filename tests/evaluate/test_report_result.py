@@ -31,9 +31,9 @@ def pair(difference, low, high, rays=25, name="f"):
 @each_row(
     ("better", "found", "sentence"),
     [
-        ("lower", (-0.6, -0.9, -0.3), "f is better than greedy by 0.6 mm (0.3 to 0.9) at 25 rays."),
-        ("higher", (-0.6, -0.9, -0.3), "f is worse than greedy by 0.6 mm (0.3 to 0.9) at 25 rays."),
-        ("lower", (0.6, 0.3, 0.9), "f is worse than greedy by 0.6 mm (0.3 to 0.9) at 25 rays."),
+        ("lower", (-0.6, -0.9, -0.3), "f is better than greedy by 0.60 mm (0.30 to 0.90) at 25 rays."),
+        ("higher", (-0.6, -0.9, -0.3), "f is worse than greedy by 0.60 mm (0.30 to 0.90) at 25 rays."),
+        ("lower", (0.6, 0.3, 0.9), "f is worse than greedy by 0.60 mm (0.30 to 0.90) at 25 rays."),
         (
             "lower",
             (0.05, -0.07, 0.16),

@@ -11,7 +11,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.output import Output, command
 from lidardesign.cli.tables.designs import show_constraints, show_design
-from lidardesign.cli.tables.grids import RichConsole, duration, interval_text, number, print_table
+from lidardesign.cli.tables.grids import RichConsole, difference_cell, duration, number, print_table, value_cells
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.run.clock import phase
 
@@ -136,10 +136,9 @@ def _design_row(entry: dict[str, Any]) -> list[str]:
     difference = "-"
     if None not in (score["rival"], score["difference"]):
         ends = {"ci_low": score["difference_low"], "ci_high": score["difference_high"]}
-        difference = f"{score['difference']:+.3g} ({interval_text(ends, ' to ', 3)}) to {score['rival']}"
+        difference = f"{difference_cell({**score, **ends}, sign='+')} to {score['rival']}"
     under = [*score["settings"], *([score["detector"]] if score["detector"] != IDEAL else [])]
-    value = [number(score["rays"]), number(score["value"], 3), interval_text(score, digits=3)]
-    return [*shape, *value, ", ".join([difference, *under])]
+    return [*shape, number(score["rays"]), *value_cells(score), ", ".join([difference, *under])]
 
 
 def _show_readout(readout: BandwidthUse, rich: RichConsole) -> None:
@@ -224,8 +223,8 @@ def _show(document: dict[str, Any], rich: RichConsole) -> None:
     rows = [
         [
             row["design"],
-            *(number(row[name], 3) for name in ("rays", "value")),
-            interval_text(row, digits=3),
+            number(row["rays"]),
+            *value_cells(row),
             *(number(row[name], 3) for name in ("failures", "bandwidth_mbps")),
         ]
         for row in document["rows"]

@@ -27,10 +27,20 @@ def number(value: Any, digits: int = 4) -> str:
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
-def interval_text(entry: Mapping[str, Any], between: str = " - ", digits: int = 4) -> str:
-    """The interval of a row or pair; a dash where there is none."""
-    ends = [entry[name] for name in ("ci_low", "ci_high")]
-    return "-" if None in ends else between.join(number(end, digits) for end in ends)
+def value_cells(row: Mapping[str, Any]) -> list[str]:
+    """The value of a row and its interval, as fine as the interval says; a dash where there is none."""
+    from lidardesign.estimates import figure_and_interval
+
+    value, low, high = figure_and_interval(row["value"], row["ci_low"], row["ci_high"])
+    return [value, low if row["ci_low"] is None else f"{low} - {high}"]
+
+
+def difference_cell(pair: Mapping[str, Any], sign: str = "") -> str:
+    """The difference of a pair and its interval, as fine as the interval says."""
+    from lidardesign.estimates import figure_and_interval
+
+    difference, low, high = figure_and_interval(pair["difference"], pair["ci_low"], pair["ci_high"], sign=sign)
+    return f"{difference} ({low})" if pair["ci_low"] is None else f"{difference} ({low} to {high})"
 
 
 def duration(seconds: float) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import compress
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.cli.tables.grids import RichConsole, duration, interval_text, number, print_table
+from lidardesign.cli.tables.grids import RichConsole, difference_cell, duration, number, print_table, value_cells
 from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
@@ -43,8 +43,8 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
     shown = [row.as_dict() for row in rows.values()]
     columns = {
         "rays": [str(row["rays"]) for row in shown],
-        "value": [number(row["value"], 3) for row in shown],
-        "95 % interval": [interval_text(row, digits=3) for row in shown],
+        "value": [value_cells(row)[0] for row in shown],
+        "95 % interval": [value_cells(row)[1] for row in shown],
         "failures": [str(row["failures"]) for row in shown],
         "Mbit/s": [number(row["bandwidth_mbps"], 3) for row in shown],
     }
@@ -53,9 +53,7 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
     if not any(row["failures"] for row in shown):
         del columns["failures"]
     if pairs and evaluation.strongest_rival is not None:
-        apart = {
-            name: f"{pair.difference:+.3g} ({interval_text(pair.as_dict(), ' to ', 3)})" for name, pair in pairs.items()
-        }
+        apart = {name: difference_cell(pair.as_dict(), sign="+") for name, pair in pairs.items()}
         columns[f"difference to {evaluation.strongest_rival.name}"] = [apart.get(name, "-") for name in rows]
     metric = evaluation.metric
     title = f"{metric.name} [{metric.unit}] at {count} rays, {_scenes(document)} ({metric.better} is better)"
@@ -105,7 +103,7 @@ def _show_all(document: Entry, rich: RichConsole) -> None:
     if "mounting" in document:
         _show_mounting(document, rich, [True] * len(document["rows"]))
     title = f"difference to each baseline [{metric['unit']}], scene by scene, with its 95 % interval"
-    cells = [f"{number(pair['difference'], 3)} ({interval_text(pair, ' to ', 3)})" for pair in against]
+    cells = list(map(difference_cell, against))
     _show_grid(title, [(pair["a"], pair["rays"], pair["b"]) for pair in against], cells, rich)
     title = f"baselines with as much bandwidth as the design: value [{metric['unit']}] (rays)"
     cells = [f"{number(row['value'])} ({row['rays']})" for row in matched]
@@ -124,7 +122,7 @@ def _show_rows(document: Entry, rich: RichConsole) -> None:
     lines = []
     for row in rows:
         extra = [row["details"].get(name) for name in details]
-        cells = (row["rays"], row["value"], interval_text(row), row["failures"], *extra, row["bandwidth_mbps"])
+        cells = (row["rays"], *value_cells(row), row["failures"], *extra, row["bandwidth_mbps"])
         lines.append([row["design"], *(number(cell) for cell in cells), number(row["seconds"], 2)])
     print_table(title, headings, lines, rich)
     places = [(row["design"], row["rays"], f"seed {seed}") for row in rows for seed in document.get("seeds", [])]
@@ -137,9 +135,8 @@ def _show_mounting(document: Entry, rich: RichConsole, shown: Sequence[bool]) ->
     off = f"{MILLIMETRES * found['place_m']:.3g} mm and {math.degrees(found['angle_rad']):.3g} degrees"
     lines = []
     for row, own in compress(zip(found["rows"], exact, strict=True), shown):
-        cost = f"{number(row['cost']['difference'], 3)} ({interval_text(row['cost'], ' to ', 3)})"
         figures = map(number, (row["rays"], own["value"], row["value"], row["failures"]))
-        lines.append([row["design"], *figures, cost])
+        lines.append([row["design"], *figures, difference_cell(row["cost"])])
     headings = ("design", "rays", f"exact\n[{unit}]", f"careless\n[{unit}]", "failures", "difference (95 % interval)")
     print_table(f"mounted carelessly: every sensor off by {off} per axis", headings, lines, rich)
 

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 from lidardesign.design.layouts.rays import certificates_of
 from lidardesign.design.sensor import DesignSpec
+from lidardesign.estimates import figure_and_interval
 from lidardesign.evaluate.gates import difference_text
 from lidardesign.evaluate.report.markup import folded, paragraphs
-from lidardesign.evaluate.report.tables import counted, held_out_scenes, interval, table
+from lidardesign.evaluate.report.tables import counted, held_out_scenes, table
 from lidardesign.evaluate.results import Evaluation, Paired, Row, verdict
 
 MOST_SENTENCES = 3  # of designs that have one each; a table says the same of all
 MOST_NOTES = 2  # that are not folded
-DIGITS = 3
 
 
 def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str:
@@ -26,8 +26,8 @@ def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str
     rows, pairs = headline_rows(evaluation), headline_pairs(evaluation)
     said = [headline(evaluation, pairs[name]) for name in rows if name in pairs]
     if not said:
-        metric = evaluation.metric
-        said = [f"{row.design}: {_digits(row.value)} {metric.unit} at {row.rays} rays." for row in rows.values()]
+        unit = evaluation.metric.unit
+        said = [f"{row.design}: {_figures(row.value, row)[0]} {unit} at {row.rays} rays." for row in rows.values()]
     # a long list says less than the table below it
     said = said if len(said) <= MOST_SENTENCES else []
     notes = [paragraphs([note], "note") for note in evaluation.notes]
@@ -74,10 +74,11 @@ def _table(evaluation: Evaluation, rows: dict[str, Row], pairs: dict[str, Paired
         headings += [f"difference to {rival.name}", "design is"]
     lines = []
     for row in shown:
-        cells = [row.design, str(row.rays), _digits(row.value), interval(row, DIGITS), _digits(row.bandwidth_mbps)]
+        value, value_interval = _figures(row.value, row)
+        cells = [row.design, str(row.rays), value, value_interval, f"{row.bandwidth_mbps:.3g}"]
         pair = pairs.get(row.design)
         if rival is not None:
-            cells += ["", ""] if pair is None else [f"{pair.difference:+.{DIGITS}g} ({interval(pair, DIGITS)})", ""]
+            cells += ["", ""] if pair is None else ["{} ({})".format(*_figures(pair.difference, pair, sign="+")), ""]
         lines.append((cells, "" if pair is None else verdict(evaluation, pair), row.baseline))
     return table(headings, lines, text_columns=1, caption="Designs, and the strongest rival on training scenes.")
 
@@ -109,5 +110,7 @@ def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list
     return [f"{said} than {', '.join(gaps)}."]
 
 
-def _digits(value: float) -> str:
-    return f"{value:.{DIGITS}g}"
+def _figures(value: float, item: Row | Paired, sign: str = "") -> tuple[str, str]:
+    """A figure and its interval, which stays in one line, also where cells wrap."""
+    figure, low, high = figure_and_interval(value, item.ci_low, item.ci_high, sign=sign)
+    return figure, low if item.ci_low is None else f"{low}\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}{high}"

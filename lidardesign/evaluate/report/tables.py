@@ -154,14 +154,12 @@ def sensors_table(design: DesignSpec) -> str:
     return table(headings, lines, text_columns=1, caption=caption) + more
 
 
-def interval(item: Row | Paired, digits: int | None = None) -> str:
+def interval(item: Row | Paired) -> str:
     """The interval of a row or pair, with four digits or fewer; a dash where it has none."""
     if item.ci_low is None or item.ci_high is None:
         return "-"
     # in one line, also where cells wrap
-    return "\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}".join(
-        four_digits(end) if digits is None else f"{end:.{digits}g}" for end in (item.ci_low, item.ci_high)
-    )
+    return "\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}".join(map(four_digits, (item.ci_low, item.ci_high)))
 
 
 def _words(name: str) -> str:
