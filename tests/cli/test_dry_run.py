@@ -165,7 +165,7 @@ def test_people_are_told_in_words(lidardesign, flat, tmp_path):
     )
     assert chosen in lidardesign("fit", flat, "--dry-run").out
     told = lidardesign("evaluate", flat, "--rays", 9, "--rays", 16, "--baseline", "occupancy", "--dry-run").out
-    assert "beside uniform, random, bounding, silhouette, greedy, occupancy: 14 rows at equal rays" in told
+    assert "against uniform, random, bounding, silhouette, greedy, occupancy: 14 rows at equal rays" in told
     assert "up to 12 at equal bandwidth" in told
 
 

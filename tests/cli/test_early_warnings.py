@@ -173,7 +173,7 @@ def test_a_rig_that_hears_only_far_beyond_the_space_is_told(flat):
     near = read_design(rig(flat, "near.csv", 1))
     far = read_design(rig(flat, "far.csv", 1, start=500.0))
     assert outside_notes(near, space) == []
-    assert "hears from 500 m on" in outside_notes(far, space)[0]
+    assert "listens from 500 m on" in outside_notes(far, space)[0]
 
 
 def test_an_evaluation_says_what_its_task_says_of_the_configuration(capsys, monkeypatch, flat):

@@ -54,7 +54,7 @@ OFF = {
     "sigma is wider than a ball, in a plane": ((BALL,), {"sigma_m": 0.5, "space": FLAT}, "blurs the targets", "lower"),
     "sigma is in millimetres": ((BALL,), {"sigma_m": 25.0}, "are all lengths in metres?", "lower density.sigma_m"),
     "a ball is in millimetres": ((body(Sphere(200.0), 1500.0),), {}, "are all lengths in metres?", "set space.range_m"),
-    "a ball around the sensors": ((body(Sphere(200.0)),), {}, "inside of the targets, which are 400 m", "out of them"),
+    "a ball around the sensors": ((body(Sphere(200.0)),), {}, "inside the targets, which are 400 m", "out of them"),
     "a ball that is far larger than the space": (
         (body(Sphere(1e3), 1002.0),), {"space": ranged(0.0, 5.0)}, "reaches 0.0", "cut the targets",
     ),

@@ -200,7 +200,7 @@ class TestSteepSplines:
         monkeypatch.setattr(training, "TOLERANCE_NATS", 0.0)
         (tmp_path / "straight").mkdir()
         result = learn(BallTask(), config_of(), tmp_path / "straight")
-        assert any("from step 60 on float64" in note for note in result.notes)
+        assert any("float64 was used from step 60 on" in note for note in result.notes)
         for step in (70, 110):  # before and after the first checkpoint in float64
             run = tmp_path / f"stopped at {step}"
             run.mkdir()

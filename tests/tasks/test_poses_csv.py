@@ -99,7 +99,7 @@ BAD = {
     "another column": (f"{HEADER},colour\n0,a,0,0,0,1\n", "p.csv:1", "colour"),
     "no angle of ours": (f"{HEADER},roll\n0,a,0,0,0,1\n", "p.csv:1", "^unknown or repeated: roll$"),
     "half a rotation": (f"{HEADER},qw,qx,qy\n0,a,0,0,0,1,0,0\n", "p.csv:1", "qz"),
-    "two rotations": (f"{HEADER},roll_deg,pitch_deg,yaw_deg,qw,qx,qy,qz\n", "p.csv:1", "in two ways"),
+    "two rotations": (f"{HEADER},roll_deg,pitch_deg,yaw_deg,qw,qx,qy,qz\n", "p.csv:1", "given twice, in two forms"),
     "no row": (f"{HEADER}\n", "p.csv", "no pose"),
     "nothing": ("", "p.csv", "0 rows"),
     "a word": (f"{HEADER}\n0,a,0,x,0\n", "p.csv:2:4", "y_m is 'x'"),

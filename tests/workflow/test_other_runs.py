@@ -101,7 +101,7 @@ def test_designs_of_two_runs_need_one_that_judges(lidardesign, runs):
     for command in ("evaluate", "compare"):
         refused = lidardesign(command, *files)
         assert refused.code == 2
-        assert "name the one run whose scenes judge" in " ".join(refused.err.split())
+        assert "name the run whose scenes are used" in " ".join(refused.err.split())
     assert lidardesign("evaluate", own, other).code == 2
     assert lidardesign("compare", *files, "--in", own, "--rays", 8).code == 0
 
