@@ -24,6 +24,7 @@ def difference_text(pair: Paired, better: str, unit: str) -> str:
     word = "better" if (sign < 0) == (better == "lower") else "worse"
     ends = (None, None) if pair.ci_low is None or pair.ci_high is None else (sign * pair.ci_low, sign * pair.ci_high)
     low, high = ends if None in ends else sorted(ends)
+    unit = "percentage points" if unit == "%" else unit
     size, low_text, high_text = figure_and_interval(abs(pair.difference), low, high)
     by = f"{size} {unit}".rstrip()
     rays = f"at {pair.rays} rays" if pair.rays_b in (None, pair.rays) else f"at {pair.rays} and {pair.rays_b} rays"

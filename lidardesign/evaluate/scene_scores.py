@@ -161,8 +161,8 @@ def silent_notes(scenes: Sequence[Scene], fired: Mapping[str, RaysPerCondition])
             silent += not (in_gate & (hits.body >= 0) & is_target[hits.body]).any()
         if silent > MOST_SILENT * len(watched):
             notes.append(
-                f"in {silent} of {len(watched)} frames that were checked, no ray of {name} returns from a target: "
-                "check that its places, directions and gates are where the targets are, and in metres"
+                f"in {silent} of {len(watched)} frames that were checked, no ray of {name} returns from a target; "
+                "where that is not expected, check that its places, directions and gates are right, and in metres"
             )
     return notes
 

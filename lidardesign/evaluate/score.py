@@ -261,8 +261,10 @@ def group_notes(scenes: Sequence[Scene]) -> list[str]:
         return [f"all {len(scenes)} held-out scenes are of one group, {scenes[0].group!r}: there are no intervals"]
     if groups == len(scenes):
         return []
-    kind = "intervals" if groups >= FEWEST_RESAMPLED else "Student's t intervals"
-    return [BackgroundNote(f"the {len(scenes)} held-out scenes are of {groups} groups, and {kind} are over groups")]
+    of = f"the {len(scenes)} held-out scenes are of {groups} groups"
+    if groups >= FEWEST_RESAMPLED:
+        return [BackgroundNote(f"{of}, and intervals are over groups")]
+    return [f"{of}, too few for narrow intervals: they are Student's t intervals over groups"]
 
 
 def worst_notes(rows: Sequence[Row], metric: Metric) -> list[str]:

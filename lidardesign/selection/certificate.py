@@ -74,12 +74,14 @@ def certificate_document(
         candidates, gates, scenes: How many there were.
         unit: Of the losses.
     """
+    # nothing loses less than nothing, but for rounding
+    value, bound, held_back_value = (max(float(loss), 0.0) for loss in (value, bound, held_back_value))
     return {
         "rays": rays,
-        "value": float(value),
-        "bound": float(max(bound, 0.0)),  # nothing loses less than nothing
-        "gap": float((value - max(bound, 0.0)) / value) if value > 0 else 0.0,
-        "held_back_value": float(held_back_value),
+        "value": value,
+        "bound": bound,
+        "gap": (value - bound) / value if value > 0 else 0.0,
+        "held_back_value": held_back_value,
         "candidates": candidates,
         "gates": gates,
         "scenes": scenes,

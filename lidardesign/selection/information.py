@@ -16,6 +16,7 @@ import numpy as np
 
 from lidardesign.errors import PluginError
 from lidardesign.geometry.rays import Returns
+from lidardesign.numerics import SLACK
 from lidardesign.registry import plugin_guard
 from lidardesign.scene import Scene
 from lidardesign.task import Information, Task
@@ -73,6 +74,7 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
     pairs, items = len(information.ray), len(information.frame)
     weight = np.ones(items) if information.weight is None else np.asarray(information.weight)
     harm = np.zeros((frames, rays)) if information.harm is None else np.asarray(information.harm)
+    most = 0.0 if information.sums is None else float(np.max(information.sums, initial=0.0))
     seen_in = np.zeros(0, dtype=int) if information.seen_in is None else information.seen_in
     faults = {
         "ray, item and worth of different lengths": not len(information.item) == len(information.worth) == pairs,
@@ -81,6 +83,7 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
         f"harm of shape {harm.shape}, not {(frames, rays)}": harm.shape != (frames, rays),
         "a unit that is not text": not isinstance(information.unit, str),
         "weights that are all zero": not weight.sum() > 0,
+        f"sums up to {most:g}, above complete, {information.complete:g}": most > (1 + SLACK) * information.complete,
     }
     for name, index, count in (
         ("ray", information.ray, rays),
@@ -94,6 +97,7 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
     for fault, found in faults.items():
         if found:
             raise PluginError(f"informs gave {fault}", where=where, allowed="see lidardesign.task.Information")
+
 
 
 def surface_information(

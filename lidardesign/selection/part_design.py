@@ -59,6 +59,7 @@ def choose_parts(
     seed: int,
     name: str,
     notes: Callable[[str], None],
+    progress: Callable[[str], None],
 ) -> FitResult:
     """The design of the best few parts at their best poses.
 
@@ -72,6 +73,7 @@ def choose_parts(
         seed: Root of the random streams.
         name: The design's name.
         notes: Called with every note.
+        progress: Called with every step.
 
     Raises:
         ConfigError: A part that is not there; a density with conditions.
@@ -115,7 +117,7 @@ def choose_parts(
             hint="loosen one of the constraints named, or fire fewer rays",
         )
     bundle = PartBundle(placed, most, next(scenes("choice")).frames)
-    chosen, coverage, held_back_loss, trained = _chosen_set(bundle, limits, informs, scenes, seed)
+    chosen, coverage, held_back_loss, trained = _chosen_set(bundle, limits, informs, scenes, seed, progress)
     if len(chosen.members) < count:
         notes(f"{len(chosen.members)} of {count} parts: no further part tells more or fits the bounds")
     design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays)
@@ -139,6 +141,7 @@ def _chosen_set(
     informs: Callable[[Scene, Sequence[Returns]], Information],
     scenes: Callable[[str], Iterator[Scene]],
     seed: int,
+    progress: Callable[[str], None],
 ) -> tuple[ChosenSet, Coverage, float, list[InformedScene]]:
     """The best set, what all parts tell, its loss on scenes held back, and the scenes that it was chosen on.
 
@@ -150,6 +153,7 @@ def _chosen_set(
     training, wanted, loss = scenes("choice"), information.FEW_SCENES, np.inf
     informed: list[InformedScene] = []
     while True:
+        progress(f"choosing among {len(bundle.placed)} poses of parts on {wanted} training scenes")
         informed += inform(itertools.islice(training, wanted - len(informed)), first_scene=len(informed))
         coverage = part_table(informed, len(bundle.placed))
         with phase("choice"):
@@ -158,7 +162,7 @@ def _chosen_set(
             raise DataError(
                 "none of the parts tells anything about the scenes",
                 where="--parts",
-                hint="parts whose ranges reach the targets, or looser bounds of boresight and origin",
+                hint="parts whose ranges reach the targets, or looser bounds of gate, boresight and origin",
             )
         judged = part_table(inform(held_back, among=chosen.members), len(chosen.members))
         before, loss = loss, judged.loss_of(np.zeros(len(chosen.members), dtype=np.intp))

@@ -106,7 +106,8 @@ def check_noise(subject: Subject) -> LawHolds:
     steps = ", ".join(f"{mean:.4g} with {share:.0%} noise" for share, mean in zip(NOISE_SHARES, found, strict=True))
     said = f"{value:.4g} exact, {steps} [{metric.unit}]"
     if min(losses) < -metric.tolerance:
-        raise BrokenLawError(f"noise on the ranges makes the score better: {said}")
+        hint = "an estimate that noise makes better is biased: correct the bias, or judge by another figure"
+        raise BrokenLawError(f"noise on the ranges makes the score better: {said}", hint=hint)
     figures = {"exact": value, "noisy": float(found[-1])}
     return LawHolds(said if max(losses) > 0 else f"{said}: ranges do not matter", figures)
 

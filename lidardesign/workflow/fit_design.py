@@ -286,6 +286,7 @@ def _fitted(fitter: Fitter, request: FitRequest, *, is_trial: bool = False) -> F
             seed=request.seed,
             name=request.name,
             notes=fitter.notes,
+            progress=fitter.progress,
         )
     if layout == "spinning":
         from lidardesign.selection.spinning import CHANNELS, choose_rings

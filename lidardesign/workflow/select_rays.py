@@ -104,9 +104,7 @@ def select_rays(
     tables = [one.rays for one in selected]
     fired = tables[-1][0]
     own = [np.flatnonzero(fired.sensor == index) for index in range(len(spec.sensors))]
-    sensors = spec.sensors
-    if len(counts) == 1:
-        sensors = tuple(replace(sensor, rays=len(rows)) for sensor, rows in zip(sensors, own, strict=True))
+    sensors = tuple(replace(sensor, rays=len(rows)) for sensor, rows in zip(spec.sensors, own, strict=True))
     if spec.gates != "ray":
         sensors = tuple(
             _with_gate(sensor, fired.gate_m[rows[0]], spec.level) if len(rows) else sensor

@@ -275,4 +275,4 @@ def test_people_are_told_how_long_it_takes_and_what_is_read(lidardesign, tmp_pat
         r"^time   about .* s: preparing .*, 2 steps of [0-9]+ and [0-9]+ ms, measuring", shown, re.MULTILINE
     )
     assert re.search(r"^memory about [0-9,]+ MB$", shown, re.MULTILINE)
-    assert "not known: balancing steps" in shown
+    assert "not known: how long balancing steps" in shown

@@ -71,10 +71,10 @@ def test_an_evaluation_prints_a_line_per_design_against_the_strongest_rival(lida
     lines = lidardesign(f"{evaluate} --csv scores.csv").out.splitlines()
     assert f"at {rival['rays']} rays, 6 held-out scenes" in lines[0]
     assert lines[1].endswith(f"difference to {rival['name']}")
-    assert [line.split()[0] for line in lines[2:4]] == ["one", "two"]
-    assert lines[4].startswith(f"against {rival['name']}, the strongest rival on training scenes")
+    assert [line.split()[0] for line in lines[2:5]] == ["one", "two", rival["name"]]
+    assert lines[5].startswith(f"against {rival['name']}, the strongest rival on training scenes")
     assert lines[-1] == "csv: scores.csv"
-    assert len(lines) <= 5 + 2
+    assert len(lines) <= 6 + 2
     assert lidardesign(f"{evaluate} --csv scores.csv --quiet").out == "scores.csv\n"
     assert lidardesign(f"{evaluate} --quiet").out == ""
     loud = lidardesign(f"{evaluate} -v").out

@@ -240,6 +240,9 @@ def test_a_verdict_needs_an_interval_that_excludes_zero_and_the_metrics_directio
 )
 def test_rivals_are_hidden_at_first_where_they_are_far_worse_than_all_designs(better, strongest, far):
     rows = [make_row("d", 9, 10.0), make_row("close", 9, 14.0, True), make_row("awful", 9, 90.0, True)]
+    # one that is far worse with few rays alone
+    rows += [make_row("d", 25, 8.0), make_row("late", 9, 90.0, True), make_row("late", 25, 8.0, True)]
+    rows += [make_row("awful", 25, 60.0, True)]
     metric = Metric("score", "mm", better, worst=200.0, tolerance=0.1)
     rival = StrongestRival(strongest, 9, 20, {})
     assert far_rivals(Evaluation(metric, 1, rows, [], strongest_rival=rival)) == far

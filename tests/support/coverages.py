@@ -22,7 +22,8 @@ def scene_of(generator, rays, items, pairs, table):
     weight, frame = generator.uniform(0.5, 1, items), np.zeros(items, dtype=int)
     sums = None if len(table) == 0 else table
     returns = SimpleNamespace(range_m=generator.uniform(1, 2, rays))
-    return InformedScene.of(Information(ray, item, worth, frame, weight, sums=sums), [returns])
+    information = Information(ray, item, worth, frame, weight, sums=sums, complete=max(table, default=1.0))
+    return InformedScene.of(information, [returns])
 
 
 def small(seed, rays=7, gates=2, items=12, scenes=3, table=LARGEST, harm=0.0):

@@ -118,6 +118,7 @@ BROKEN = {
          "informs returned NoneType"),
         (SCORE, INFORMS.replace("0 * ray", "1 + ray") + SCORE, "informs gave item outside 0 to 0"),
         (SCORE, INFORMS.replace("np.ones", "-np.ones") + SCORE, "informs gave worth that is negative"),
+        (SCORE, INFORMS.replace("int))", "int), sums=(0, 1, 2))") + SCORE, "sums up to 2, above complete, 1"),
         (SCORE, INFORMS.replace("returns[0].returned", "returns[0].range_m") + SCORE, "without a return have worth"),
         (SCORE, INFORMS.replace("np.flatnonzero(", "np.repeat(*np.where(").replace("turned)", "turned), 2)") + SCORE,
          "given twice"),

@@ -134,7 +134,8 @@ class TestDesignsWithChosenRays:
 class TestTheCommand:
     def test_says_how_far_from_the_best_they_are(self, lidardesign, run):
         printed = lidardesign("fit", run, "--layout", "selected", "--sensors", 2, "--rays", 9, "--name", "a")
-        assert re.search(r"^chosen among \d+ rays on \d+ training scenes; any other choice", printed.out, re.MULTILINE)
+        words = r"^chosen among \d+ rays on \d+ training scenes; these 9 have a loss of"
+        assert re.search(words, printed.out, re.MULTILINE)
         fitted = lidardesign("fit", run, "--layout", "selected", "--sensors", 2, "--rays", 9, "--name", "a", "--json")
         shown = lidardesign("show", run / "designs" / "a.yaml", "--json")
         assert json.loads(fitted.out)["certificates"] == json.loads(shown.out)["provenance"]["certificates"]
@@ -150,7 +151,7 @@ class TestTheCommand:
     @each_row(
         ("options", "message"),
         [
-            (("--weight", "variation=0.1"), "layout selected beside --weight"),
+            (("--weight", "variation=0.1"), "layout selected with --weight"),
             (("--rays", "5001"), "--rays: 5001"),
         ],
     )

@@ -71,7 +71,9 @@ def run_fit(request: FitRequest, output: Output) -> None:
     from lidardesign.design.files import design_text
     from lidardesign.workflow.designs import Design
 
-    check_writable(request.run.design_path(request.name))
+    path = request.run.design_path(request.name)
+    label = "design (replaced)" if path.exists() else "design"
+    check_writable(path)
     check_lock(request.run.folder)
     with output.progress("fitting") as progress:
         design = Design.fitted(request, notes=output.remark, progress=lambda step: progress.show(label=step))
@@ -87,7 +89,7 @@ def run_fit(request: FitRequest, output: Output) -> None:
         checks = design.result.constraints if design.result else ()
         show_fit(document, design.specification, checks, rich, verbose=output.verbose)
 
-    output.result(document, show, files={"design": Path(document["design"])})
+    output.result(document, show, files={label: Path(document["design"])})
 
 
 def constrain(

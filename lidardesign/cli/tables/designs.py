@@ -233,10 +233,11 @@ def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
 
     entries = certificates_of(design)
     if entries:
-        gap, last = max(entry["gap"] for entry in entries), entries[-1]
+        last, are_parts = entries[-1], all(sensor.part is not None for sensor in design.sensors)
+        what, count = ("poses of parts", len(design.sensors)) if are_parts else ("rays", last["rays"])
         rich.print(
-            f"chosen among {last['candidates']} rays on {last['scenes']} training scenes; any other choice lowers the "
-            f"loss by {100 * gap:.1f} % at most",
+            f"chosen among {last['candidates']} {what} on {last['scenes']} training scenes; these {count} have a loss "
+            f"of {last['value']:.3g}, any others of at least {last['bound']:.3g} ({100 * last['gap']:.1f} % less)",
             soft_wrap=True,
         )
 

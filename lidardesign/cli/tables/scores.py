@@ -37,10 +37,11 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
     """Every design at one number of rays, against the strongest rival there; what else was asked for in a line each."""
-    from lidardesign.evaluate.report.result import headline_pairs, headline_rows
+    from lidardesign.evaluate.report.result import headline_pairs, headline_rival, headline_rows
 
     rows, pairs, count = headline_rows(evaluation), headline_pairs(evaluation), evaluation.middle_rays
-    shown = [row.as_dict() for row in rows.values()]
+    rival = evaluation.strongest_rival
+    shown = [row.as_dict() for row in (*rows.values(), *headline_rival(evaluation))]
     columns = {
         "rays": [str(row["rays"]) for row in shown],
         "value": [value_cells(row)[0] for row in shown],
@@ -52,13 +53,13 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
         del columns["rays"]
     if not any(row["failures"] for row in shown):
         del columns["failures"]
-    if pairs and evaluation.strongest_rival is not None:
+    if pairs and rival is not None:
         apart = {name: difference_cell(pair.as_dict(), sign="+") for name, pair in pairs.items()}
-        columns[f"difference to {evaluation.strongest_rival.name}"] = [apart.get(name, "-") for name in rows]
-    metric = evaluation.metric
+        columns[f"difference to {rival.name}"] = [apart.get(row["design"], "-") for row in shown]
+    metric, names = evaluation.metric, [row["design"] for row in shown]
     title = f"{metric.name} [{metric.unit}] at {count} rays, {_scenes(document)} ({metric.better} is better)"
     rich.print(title, soft_wrap=True)
-    print_table(None, ("design", *columns), list(zip(rows, *columns.values(), strict=True)), rich)
+    print_table(None, ("design", *columns), list(zip(names, *columns.values(), strict=True)), rich)
     if pairs:
         rich.print(sentence(evaluation, list(pairs.values())), soft_wrap=True)
     if "mounting" in document:

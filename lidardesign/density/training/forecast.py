@@ -16,7 +16,7 @@ from lidardesign.density.training.schedule import WRITING_S, StepTimes, Timekeep
 from lidardesign.density.training.training import CHECKPOINT
 from lidardesign.run.clock import peak_memory_bytes, phase
 
-UNTRAINED = "balancing steps and the measurement at the end, which were timed before anything was learned"
+UNTRAINED = "how long balancing steps and the measurement take on a learned density; an untrained one was timed"
 STAGES = "how many stages the tolerance takes, and whether it asks for finer distance fields"
 
 

@@ -104,9 +104,10 @@ def check_feasible(
 
 def _refuse(message: str, conflicts: Sequence[str]) -> None:
     names = [name for name in dict.fromkeys(conflicts) if name]
-    raise InfeasibleError(
-        f"{message} ({', '.join(names)})", conflicts=names, hint="loosen one of the constraints named"
-    )
+    hint = "loosen one of the constraints named"
+    if any(name.startswith("space.") for name in names):
+        hint = "loosen the constraint; space is the run's, and another one has to be learned"
+    raise InfeasibleError(f"{message} ({', '.join(names)})", conflicts=names, hint=hint)
 
 
 def _origin_limits(rules: SensorRules, axis: int, space: DesignSpace) -> tuple[list[_Bound], list[_Bound]]:

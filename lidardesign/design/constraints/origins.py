@@ -210,21 +210,27 @@ def snap_place_to_space(origin_m: Sequence[float], space: DesignSpace) -> list[f
 
 
 def snap_to_space(constraints: Constraints, space: DesignSpace) -> tuple[Constraints, list[str]]:
-    """Constraints whose pinned origins are where the space fixes them, and a note for each that was moved there.
+    """Constraints whose fixed origins and mounts are where the space fixes them, and a note of those moved there.
 
     The same object where nothing moves.
     """
     document: dict[str, Any] = constraints.as_document()
     notes, changed = [], False
     for name, one in (("", document), *((f"each[{i}].", one) for i, one in enumerate(document.get("each", [])))):
-        given = (one.get("origin") or {}).get("fixed_m")
-        place = given if given is None else snap_place_to_space(given, space)
-        if given is not None and place != list(given):
-            one["origin"], changed = {**one["origin"], "fixed_m": place}, True
-            off = float(np.abs(np.subtract(place, given)).max())
+        origin = dict(one.get("origin") or {})
+        for key in ("fixed_m", "mounts_m"):
+            given = origin.get(key)
+            if given is None:
+                continue
+            moved = [snap_place_to_space(place, space) for place in np.reshape(given, (-1, 3))]
+            off = float(np.abs(np.reshape(given, (-1, 3)) - moved).max(initial=0.0))
+            if off > 0:
+                origin[key], changed = moved if key == "mounts_m" else moved[0], True
             if off > SLACK:
                 stand = "from where the run's sensors stand: treated as being there"
-                notes.append(f"{name}origin.fixed_m is {1e3 * off:.2g} mm {stand}")
+                notes.append(f"{name}origin.{key} is {1e3 * off:.2g} mm {stand}")
+        if origin:
+            one["origin"] = origin
     return (Constraints.from_mapping(document) if changed else constraints), notes
 
 

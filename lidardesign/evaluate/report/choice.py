@@ -42,6 +42,8 @@ def choice_section(designs: Sequence[DesignSpec], evaluation: Evaluation, looks:
     axis = f"loss [{unit}]"
     scores = {(row.design, row.rays): row for row in evaluation.rows}
     curves = {name: _curve(entries) for name, entries in chosen.items()}
+    if max(map(len, curves.values())) < 2:
+        curves = {}
     counts = {entry["rays"] for entries in chosen.values() for entry in entries if "curve" in entry}
     rays = " or ".join(map(str, sorted(counts)))
     pairs = {name: _pair_with_scores(name, entries, scores) for name, entries in chosen.items()}

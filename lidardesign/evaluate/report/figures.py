@@ -59,19 +59,19 @@ SYMBOLS = {
 DASH_NAMES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
 
 
-FAR_SHARE = 0.5  # of the designs' scores: rivals that are worse by more at some number of rays are hidden at first
+FAR_SHARE = 0.5  # of the worst design's score: rivals that are always worse by more are hidden at first
 
 
 def far_rivals(evaluation: Evaluation) -> set[str]:
-    """Rivals so much worse than all designs that a plot of both would show little of the designs."""
+    """Rivals so much worse than all designs, at every number of rays, that they only take room in a plot."""
     sign, rival = (1.0 if evaluation.metric.better == "lower" else -1.0), evaluation.strongest_rival
-    values = [sign * row.value for row in evaluation.rows if not row.baseline]
-    if not values:
-        return set()
-    low, high = min(values), max(values)
-    limit = high + FAR_SHARE * max(high - low, abs(high + low) / 2)
-    far = {row.design for row in evaluation.rows if row.baseline and sign * row.value > limit}
-    return far - {rival.name if rival is not None else ""}
+    worst: dict[int, float] = {}
+    for row in evaluation.rows:
+        if not row.baseline:
+            worst[row.rays] = max(sign * row.value, worst.get(row.rays, -math.inf))
+    rivals = [row for row in evaluation.rows if row.baseline and row.rays in worst]
+    near = {row.design for row in rivals if sign * row.value - worst[row.rays] <= FAR_SHARE * abs(worst[row.rays])}
+    return {row.design for row in rivals} - near - {rival.name if rival is not None else ""}
 
 
 def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[str] = ()) -> dict[str, Any]:

@@ -146,8 +146,9 @@ def _scores(evaluation: Evaluation) -> str:
         for index, curve in enumerate(series(evaluation))
     )
     hidden = [curve.name for curve in series(evaluation) if curve.name in far]
-    note = paragraphs([f"Hidden at first, far worse than all designs: {', '.join(hidden)}."]) if hidden else ""
-    means = f"means over {held_out_scenes(evaluation.scenes)}, with 95 % bootstrap intervals as bands."
+    note = f"Hidden at first, far worse than all designs at every number of rays: {', '.join(hidden)}."
+    said = paragraphs([note] if hidden else [])
+    means = f"means over {held_out_scenes(evaluation.scenes)}, with 95 % intervals as bands."
     captions = {
         "rays": f"Score against rays per frame: {means}",
         "bandwidth": "The same scores against the bandwidth that it takes to read the gates out.",
@@ -158,7 +159,7 @@ def _scores(evaluation: Evaluation) -> str:
     )
     matched = len(evaluation.equal_bandwidth)
     return (
-        f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>{note}{figures}'
+        f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>{said}{figures}'
         + folded("All scores", rows_table(evaluation), len(evaluation.rows))
         + paired_tables(evaluation)
         + folded("Designs against rivals at equal bandwidth", bandwidth_table(evaluation), matched)

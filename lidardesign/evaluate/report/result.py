@@ -50,6 +50,12 @@ def headline_rows(evaluation: Evaluation) -> dict[str, Row]:
     return {name: found[name] for name in dict.fromkeys(row.design for row in rows)}
 
 
+def headline_rival(evaluation: Evaluation) -> list[Row]:
+    """The strongest rival's row; none where no rival was scored."""
+    rival = evaluation.strongest_rival
+    return [row for row in evaluation.rows if rival and (row.design, row.rays) == (rival.name, rival.rays)]
+
+
 def headline_pairs(evaluation: Evaluation) -> dict[str, Paired]:
     """Every design against the strongest rival, by the design's name, at the rival's number of rays."""
     rival = evaluation.strongest_rival
@@ -66,9 +72,7 @@ def headline(evaluation: Evaluation, pair: Paired) -> str:
 
 def _table(evaluation: Evaluation, rows: dict[str, Row], pairs: dict[str, Paired]) -> str:
     metric, rival = evaluation.metric, evaluation.strongest_rival
-    shown = list(rows.values())
-    if rival is not None:
-        shown += [row for row in evaluation.rows if (row.design, row.rays) == (rival.name, rival.rays)]
+    shown = [*rows.values(), *headline_rival(evaluation)]
     headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "Mbit/s"]
     if rival is not None:
         headings += [f"difference to {rival.name}", "design is"]

@@ -106,7 +106,7 @@ def _paired_table(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
         )
         for index, pair in enumerate(pairs)
     ]
-    caption = "Differences scene by scene at equal numbers of rays, with their 95 % bootstrap intervals over scenes."
+    caption = "Differences scene by scene at equal numbers of rays, with their 95 % intervals over scenes."
     return table(headings, lines, text_columns=2, caption=caption)
 
 
