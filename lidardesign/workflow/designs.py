@@ -314,6 +314,13 @@ def judging_run(designs: Sequence[Design], runs: Sequence[RunFolder], notes: Not
         hint = f"lidardesign fit {quote(str(judge.folder))}"
         raise DataError("the run has no designs yet", where=str(judge.folder), hint=hint)
     for design in designs:
+        track = design.specification.track
+        if track is not None and track.dimension not in judge.config.space.condition:
+            raise ConfigError(
+                f"its rays follow {track.dimension}, which the task {judge.task.name} does not have as a condition",
+                where=f"design {design.name}",
+                hint="fit a design at one value: lidardesign fit RUN --at",
+            )
         if design.run is not None and _settings(design.run) != _settings(judge):
             outside = outside_space(design.specification, judge.config.space)
             there = f"; {outside} its design space" if outside else ""

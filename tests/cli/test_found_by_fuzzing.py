@@ -46,8 +46,8 @@ def good_arrays():
 
 
 BAD_SAMPLES = {
-    "no archive": (b"words", "no .npz file"),
-    "cut short": (lambda content: content[:-30], "no .npz file"),
+    "no archive": (b"words", "is not an .npz file"),
+    "cut short": (lambda content: content[:-30], "is not an .npz file"),
     "a wrong checksum": (lambda content: content.replace(struct.pack("<d", 1.0), struct.pack("<d", 2.0), 1), "CRC"),
     "one array missing": ({"log_target": None}, "has no log_target"),
     "another type": ({"log_prob": np.array(["a"] * 9)}, "of type <U1"),

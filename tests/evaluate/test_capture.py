@@ -204,7 +204,7 @@ def test_rays_that_were_not_captured_return_nothing_and_say_why(clean):
     ("rays", "message"),
     [
         (looking([[0, 0]], origin=(0.4, 0.0, 0.0)), r"start 0.4 m from \[0.0, 0.0, 0.0\]"),
-        (looking([[30, 0]]), "look 15 degrees past"),
+        (looking([[30, 0]]), "point 15 degrees past"),
         (looking([[0, 0]], gate=(5.0, 6.0)), "no bin between 0.2998 and 2.099 m"),
     ],
 )

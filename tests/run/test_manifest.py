@@ -300,5 +300,5 @@ def test_a_file_that_nobody_recorded_is_told_from_one_that_is_not_there_yet(run)
     (run / "foreign.bin").write_bytes(b"?")
     with pytest.raises(DataError, match="not listed"):
         verify(run, "foreign.bin")
-    with pytest.raises(DataError, match=r"holds no absent\.bin yet"):
+    with pytest.raises(DataError, match=r"has no absent\.bin yet"):
         verify(run, "absent.bin")

@@ -409,7 +409,7 @@ def test_the_constraints_of_the_page_are_those_of_the_example():
     blocks = re.findall(r"```yaml\n# (\w+)\.yaml.*?\n(.*?)```", page, re.DOTALL)
     example = (root / "examples" / "emitter.py").read_text("utf-8")
     written = re.findall(r'^([A-Z]+) = """\\\n# .*?\n(.*?)"""', example, re.DOTALL | re.MULTILINE)
-    assert {name.upper(): text for name, text in blocks} == dict(written)
-    assert [name for name, _ in blocks] == ["laser", "flood", "floods", "bistatic"]
-    for name, text in blocks:
+    assert [name for name, _ in blocks] == ["floods"]
+    assert {name.upper(): text for name, text in blocks}.items() <= dict(written).items()
+    for name, text in written:
         Constraints.from_mapping(parse_yaml(text, where=name).value)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -339,17 +338,6 @@ def test_gltf_text_that_names_weights_it_does_not_have_is_refused(tmp_path):
     path.write_text(json.dumps(document))
     with pytest.raises(DataError, match=r"ball\.gltf"):
         load_mesh(path, painted=Painted("_care"))
-
-
-def test_the_example_of_the_page_paints_a_mesh_that_loads(tmp_path, monkeypatch):
-    page = (Path(__file__).parents[2] / "docs" / "importance.md").read_text(encoding="utf-8")
-    block = next(text for text in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "trimesh.load" in text)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "cups").mkdir()
-    trimesh.creation.box((0.08, 0.12, 0.1)).export("cup.stl")
-    exec(block, {})
-    mesh = load_mesh("cups/cup.ply", painted=Painted("care"))
-    assert np.allclose(mesh.importance, np.where(mesh.vertices[:, 1] > 0.04, 10.0, 1.0))
 
 
 @each_row("kind", [FaceConfig, EmitterConfig, MeshesConfig])

@@ -224,4 +224,4 @@ def test_settings_that_leave_no_weight_are_refused(lidardesign, runs, tmp_path):
     result = lidardesign("fit", run, "--weight", "scene=discs", "--weight", "train=1")
     assert result.code == 3
     assert "samples count as only" in result.err
-    assert "a setting nearer to what was learned" in result.err
+    assert "a setting nearer to the learned one" in result.err

@@ -58,7 +58,8 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
         columns[f"difference to {rival.name}"] = [apart.get(row["design"], "-") for row in shown]
     metric, names = evaluation.metric, [row["design"] for row in shown]
     title = f"{metric.name} [{metric.unit}] at {count} rays, {_scenes(document)} ({metric.better} is better)"
-    rich.print(title, soft_wrap=True)
+    others = sorted({row.rays for row in evaluation.rows} - {count})
+    rich.print(f"{title}; -v: {', '.join(map(str, others))} rays too" if others else title, soft_wrap=True)
     print_table(None, ("design", *columns), list(zip(names, *columns.values(), strict=True)), rich)
     if pairs:
         rich.print(sentence(evaluation, list(pairs.values())), soft_wrap=True)
