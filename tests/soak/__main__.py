@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     runs.add_argument("--page", type=Path, default=PAGES / f"runs-{TODAY}.md")
     seeds = commands.add_parser("seeds", help="learn tasks at presets from many seeds")
     every = [f"{task}:{preset}" for task, preset in LIMITS]
-    seeds.add_argument("presets", nargs="*", default=every, metavar="TASK:PRESET", help=f"of {', '.join(every)}")
+    seeds.add_argument("presets", nargs="*", type=_preset, metavar="TASK:PRESET", help=f"of {', '.join(every)}")
     seeds.add_argument("--count", type=int, default=20, help="seeds 0 to N - 1")
     seeds.add_argument("--page", type=Path, default=PAGES / f"seeds-{TODAY}.md")
     one = commands.add_parser("one", help="one random run, with its configuration")
@@ -59,6 +59,13 @@ def _parser() -> argparse.ArgumentParser:
         if command is not one:
             command.add_argument("--jobs", type=int, default=1, help="processes at once")
     return parser
+
+
+def _preset(text: str) -> tuple[str, ...]:
+    named = tuple(text.split(":"))
+    if named not in LIMITS:
+        raise argparse.ArgumentTypeError(f"{text!r} is not one of {', '.join(map(':'.join, LIMITS))}")
+    return named
 
 
 def _runs(given: argparse.Namespace, folder: Path) -> int:
@@ -73,9 +80,9 @@ def _runs(given: argparse.Namespace, folder: Path) -> int:
 
 
 def _seeds(given: argparse.Namespace, folder: Path) -> int:
-    presets = [tuple(one.split(":")) for one in given.presets]
+    presets = given.presets or list(LIMITS)
     learned = learn_seeds(presets, range(given.count), folder, Pieces("soak-seeds"), jobs=given.jobs, tell=_tell)
-    seeds_page(given.page, learned, f"python -m soak seeds {' '.join(given.presets)} --count {given.count}")
+    seeds_page(given.page, learned, f"python -m soak seeds {' '.join(map(':'.join, presets))} --count {given.count}")
     faults = sum(bool(one.fault) for one in learned)
     _tell(f"{len(learned)} densities, {faults} beyond their limits: {given.page}")
     return int(faults > 0)
