@@ -104,7 +104,10 @@ def _checked(model: mujoco.MjModel, path: Path) -> Recording:
         raise DataError(f"{unknown[0]!r} is not a joint", where=str(path), allowed=listed([TIME, *names]), hint=hint)
     if missing:
         raise DataError(
-            f"joints are missing: {listed(missing)}", where=str(path), allowed=f"a column each of {listed(names)}"
+            f"joints are missing: {listed(missing)}",
+            where=str(path),
+            allowed=f"a column each of {listed(names)}",
+            hint="of a joint that rests, the value at which it rests in every row",
         )
     shapes = {np.shape(column) for column in (time_s, *table.values())}
     if len(shapes) > 1 or len(time_s) < 2 or np.ndim(time_s) != 1:
