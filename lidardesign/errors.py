@@ -16,7 +16,7 @@ from typing import TypeVar
 # What files and options say may be quoted; nobody reads more of it than this.
 LONGEST_PART = 1500
 Text = TypeVar("Text", str, None)
-# The largest root of random streams.
+# The largest seed.
 MAX_SEED = 2**63 - 1
 # What to do where an option or a key has nothing behind it.
 UNSET_HINT = "a shell variable that is not set expands to nothing: give a value, or leave it out"

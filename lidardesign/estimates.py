@@ -18,6 +18,8 @@ import numpy as np
 STANDARD_ERROR = "standard error"
 HALF_INTERVAL = "half of the 95 % interval"
 ROUNDING = "rounding"
+# Of a figure for people.
+MOST_DIGITS = 4
 # So many of either kind are added to a share's counts (Agresti and Coull), so that none of a few is not known exactly.
 ADDED = 2
 
@@ -49,7 +51,7 @@ def as_documents(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
 
 
 def figure_and_interval(value: float, low: float | None, high: float | None, *, sign: str = "") -> tuple[str, str, str]:
-    """A figure and the ends of its interval for people, as fine as the interval's half width has two digits.
+    """A figure and the ends of its interval for people: two digits of the half width, at most four of the largest.
 
     Arguments:
         value: The figure.
@@ -63,7 +65,8 @@ def figure_and_interval(value: float, low: float | None, high: float | None, *, 
     if low is None or high is None or not high > low:
         end = "-" if low is None else f"{low:.3g}"
         return f"{value:{sign}.3g}", end, end
-    decimals = max(0, 1 - math.floor(math.log10((high - low) / 2)))
+    fine, largest = 1 - math.floor(math.log10((high - low) / 2)), max(abs(value), abs(low), abs(high))
+    decimals = max(0, min(fine, MOST_DIGITS - 1 - math.floor(math.log10(largest))))
     # adding zero takes the sign from a rounded -0
     figure, *ends = (round(one, decimals) + 0.0 for one in (value, low, high))
     return f"{figure:{sign}.{decimals}f}", f"{ends[0]:.{decimals}f}", f"{ends[1]:.{decimals}f}"

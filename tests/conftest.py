@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 
 # Set before numpy and torch are imported: two thread pools on shared cores spin against each other.
@@ -85,6 +86,20 @@ def lidardesign(capsys, tmp_path, monkeypatch):
 
 
 call = lidardesign
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A small run that no test changes."""
+    from support.command_line import make_run
+
+    return make_run(tmp_path_factory.mktemp("made") / "run")
+
+
+@pytest.fixture
+def flat(made, tmp_path):
+    """A copy of the small run."""
+    return shutil.copytree(made, tmp_path / "run")
 
 
 @pytest.fixture

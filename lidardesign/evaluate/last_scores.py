@@ -56,14 +56,12 @@ def last_scores_of(
     """
     if evaluation.seeds:  # means over several runs are of none of them
         return {}
-    rival = evaluation.strongest_rival
-    pairs = {pair.a: pair for pair in evaluation.paired if rival and (pair.b, pair.rays) == (rival.name, rival.rays)}
-    kept = {}
+    pairs, kept = evaluation.headline_pairs, {}
     for row in evaluation.rows:
         path, pair = paths.get(row.design), pairs.get(row.design)
         if row.baseline or path is None or row.rays != evaluation.middle_rays or not path.is_file():
             continue
-        ends = () if pair is None or rival is None else (rival.name, pair.difference, pair.ci_low, pair.ci_high)
+        ends = () if pair is None else (pair.b, pair.difference, pair.ci_low, pair.ci_high)
         score = LastScore(
             sha256_file(path), row.rays, len(row.per_scene), row.value, row.ci_low, row.ci_high,
             evaluation.detector, tuple(settings), *ends,

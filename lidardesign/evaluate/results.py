@@ -214,6 +214,25 @@ class Evaluation:
         return middle_rays(self.rows)
 
     @property
+    def headline_rows(self) -> dict[str, Row]:
+        """Every design's row by its name: at the middle number of rays, or the closest that it has."""
+        rows, count = [row for row in self.rows if not row.baseline], self.middle_rays
+        closest = {row.design: row for row in sorted(rows, key=lambda row: -abs(row.rays - count))}
+        return {name: closest[name] for name in dict.fromkeys(row.design for row in rows)}
+
+    @property
+    def headline_pairs(self) -> dict[str, Paired]:
+        """Every design against the strongest rival, by the design's name, at the rival's number of rays."""
+        rival = self.strongest_rival
+        return {pair.a: pair for pair in self.paired if rival and (pair.b, pair.rays) == (rival.name, rival.rays)}
+
+    @property
+    def rival_rows(self) -> list[Row]:
+        """The strongest rival's row; none where no rival was scored."""
+        rival = self.strongest_rival
+        return [row for row in self.rows if rival and (row.design, row.rays) == (rival.name, rival.rays)]
+
+    @property
     def groups(self) -> int:
         """The number of groups of held-out scenes that were drawn independently: what intervals are over."""
         known = next((row.groups for row in self.rows if row.groups is not None), None)

@@ -410,11 +410,12 @@ def put_in_place(folder: Path) -> None:
             except OSError:
                 aside.rename(place)
                 raise
-        shutil.rmtree(aside)
     except (ConfigError, OSError) as error:
         reason = error.message if isinstance(error, ConfigError) else error.strerror or error
         hint = "the new run is finished: use it where it is, or move it"
         raise DataError(f"cannot replace {folder}: {reason}", where=str(new), hint=hint) from error
+    # what cannot be removed is named by the next replacement
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def _was_killed_before_it_began(run: Path) -> bool:

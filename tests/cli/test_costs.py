@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from pathlib import Path
 
 import pytest
-from support.command_line import caller, files_under, make_run
+from support.command_line import caller, files_under
 
 from lidardesign.cli.tables.scores import show_times
 from lidardesign.run.files import run_lock
@@ -26,16 +25,6 @@ def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process, in an empty folder."""
     program = caller(capsys, tmp_path, monkeypatch)
     return lambda line, *more: program(*line.split(), *more)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("made") / "run")
-
-
-@pytest.fixture
-def flat(made, tmp_path):
-    return shutil.copytree(made, tmp_path / "run")
 
 
 def adds_up(document):

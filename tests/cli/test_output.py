@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import shutil
 from types import SimpleNamespace
 
 import pytest
-from support.command_line import caller, make_run
+from support.command_line import caller
 from support.tables import each_row
 
 from lidardesign.cli import progress
@@ -23,16 +22,6 @@ def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process, in an empty folder."""
     program = caller(capsys, tmp_path, monkeypatch)
     return lambda line, *more: program(*line.split(), *more)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("made") / "run")
-
-
-@pytest.fixture
-def flat(made, tmp_path):
-    return shutil.copytree(made, tmp_path / "run")
 
 
 @each_row(

@@ -8,7 +8,7 @@ from support.report_pages import NASTY, make_evaluation, make_row, make_sensor
 from support.tables import each_row
 
 from lidardesign.design.sensor import CERTIFICATES, DesignSpec
-from lidardesign.evaluate.report.result import headline, headline_pairs, headline_rows, result_section
+from lidardesign.evaluate.report.result import headline, result_section
 from lidardesign.evaluate.results import Evaluation, Paired
 from lidardesign.evaluate.rivals import StrongestRival
 from lidardesign.task import Metric
@@ -54,7 +54,7 @@ def test_a_pair_is_told_in_a_sentence(better, found, sentence):
 def test_only_pairs_at_the_rivals_number_of_rays_are_told():
     told = pair(-0.6, -0.9, -0.3)
     evaluation = evaluation_of(pair(1.0, 0.5, 1.5, rays=9), told, Paired("f", "uniform", 25, -9.0, -9.0, -9.0))
-    assert headline_pairs(evaluation) == {"f": told}
+    assert evaluation.headline_pairs == {"f": told}
     text = result_section(evaluation, [])
     assert text.count('class="verdict"') == 1
     assert "The strongest rival is greedy, the best of 2 on 20 training scenes." in text
@@ -64,7 +64,7 @@ def test_a_design_without_the_middle_number_of_rays_is_shown_at_the_closest():
     evaluation = evaluation_of(pair(-0.6, -0.9, -0.3), pair(-0.6, -0.9, -0.3, name="g"))
     rows = [row for row in evaluation.rows if row.design != "g"]
     fewer = replace(evaluation, rows=[*rows, make_row("g", 30, 2.5)])
-    assert {name: row.rays for name, row in headline_rows(fewer).items()} == {"f": 25, "g": 30}
+    assert {name: row.rays for name, row in fewer.headline_rows.items()} == {"f": 25, "g": 30}
 
 
 def test_without_rivals_every_design_has_its_score():

@@ -21,7 +21,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from support.command_line import files_under, make_run
+from support.command_line import files_under
 from support.hard_cases import hard_case
 from support.learning import interrupt_after_a_checkpoint
 from support.small_runs import shifted
@@ -62,16 +62,6 @@ FLATLAND = (
 BYTES = ("flow.safetensors", "samples.npz")
 GRID, DENSITY = (("--layout", name, "--sensors", "2") for name in ("grid", "density"))
 NOT_NUMBERS = (math.nan, math.inf, -math.inf)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("made") / "run")
-
-
-@pytest.fixture
-def flat(made, tmp_path):
-    return shutil.copytree(made, tmp_path / "run")
 
 
 def strict(text):

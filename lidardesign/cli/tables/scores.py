@@ -37,15 +37,14 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
     """Every design at one number of rays, against the strongest rival there; what else was asked for in a line each."""
-    from lidardesign.evaluate.report.result import headline_pairs, headline_rival, headline_rows
-
-    rows, pairs, count = headline_rows(evaluation), headline_pairs(evaluation), evaluation.middle_rays
+    rows, pairs, count = evaluation.headline_rows, evaluation.headline_pairs, evaluation.middle_rays
     rival = evaluation.strongest_rival
-    shown = [row.as_dict() for row in (*rows.values(), *headline_rival(evaluation))]
+    shown = [row.as_dict() for row in (*rows.values(), *evaluation.rival_rows)]
+    values, intervals = zip(*map(value_cells, shown), strict=True)
     columns = {
         "rays": [str(row["rays"]) for row in shown],
-        "value": [value_cells(row)[0] for row in shown],
-        "95 % interval": [value_cells(row)[1] for row in shown],
+        "value": values,
+        "95 % interval": intervals,
         "failures": [str(row["failures"]) for row in shown],
         "Mbit/s": [number(row["bandwidth_mbps"], 3) for row in shown],
     }

@@ -77,7 +77,7 @@ def forecast(
         tolerance, time_budget_s: What decides the number of steps, where the configuration does not.
 
     Raises:
-        ConfigError: The time is over before anything worth having is learned.
+        ConfigError: The time budget is too short to learn anything useful.
     """
     prepared, place, share = elapsed_s(), choose_device(device), config.learning.balance
     times = StepTimes.measured(data, config, run, place)

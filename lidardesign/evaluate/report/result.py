@@ -23,7 +23,7 @@ def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str
         evaluation: The scores.
         designs: The designs, whose chosen rays may have certificates.
     """
-    rows, pairs = headline_rows(evaluation), headline_pairs(evaluation)
+    rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
     said = [headline(evaluation, pairs[name]) for name in rows if name in pairs]
     if not said:
         unit = evaluation.metric.unit
@@ -41,29 +41,6 @@ def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str
     )
 
 
-def headline_rows(evaluation: Evaluation) -> dict[str, Row]:
-    """Every design's row by its name: at the middle number of rays, or the closest that it has."""
-    count = evaluation.middle_rays
-    rows = [row for row in evaluation.rows if not row.baseline]
-    closest = sorted(rows, key=lambda row: abs(row.rays - count), reverse=True)
-    found = {row.design: row for row in closest}
-    return {name: found[name] for name in dict.fromkeys(row.design for row in rows)}
-
-
-def headline_rival(evaluation: Evaluation) -> list[Row]:
-    """The strongest rival's row; none where no rival was scored."""
-    rival = evaluation.strongest_rival
-    return [row for row in evaluation.rows if rival and (row.design, row.rays) == (rival.name, rival.rays)]
-
-
-def headline_pairs(evaluation: Evaluation) -> dict[str, Paired]:
-    """Every design against the strongest rival, by the design's name, at the rival's number of rays."""
-    rival = evaluation.strongest_rival
-    if rival is None:
-        return {}
-    return {pair.a: pair for pair in evaluation.paired if (pair.b, pair.rays) == (rival.name, rival.rays)}
-
-
 def headline(evaluation: Evaluation, pair: Paired) -> str:
     """A pair in a sentence: who is better and by how much, or that no difference was found."""
     text = difference_text(pair, evaluation.metric.better, evaluation.metric.unit)
@@ -72,7 +49,7 @@ def headline(evaluation: Evaluation, pair: Paired) -> str:
 
 def _table(evaluation: Evaluation, rows: dict[str, Row], pairs: dict[str, Paired]) -> str:
     metric, rival = evaluation.metric, evaluation.strongest_rival
-    shown = [*rows.values(), *headline_rival(evaluation)]
+    shown = [*rows.values(), *evaluation.rival_rows]
     headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "Mbit/s"]
     if rival is not None:
         headings += [f"difference to {rival.name}", "design is"]
