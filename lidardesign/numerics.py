@@ -265,14 +265,21 @@ def _floats(*values: Any) -> tuple[Any, ...]:
     single = bool(arrays) and all(value.dtype == np.float32 for value in arrays)
     dtype = np.float32 if single else np.float64
     converted = [np.asarray(value, dtype=dtype) for value in values]
-    return array_namespace(converted[0]), *converted
+    return _namespace(converted[0]), *converted
+
+
+def _namespace(array: Any) -> Any:
+    """The functions of an array's library by their standard names, which numpy's own have since version 2."""
+    if isinstance(array, np.ndarray) and hasattr(np, "__array_namespace_info__"):
+        return np  # its twin in array_api_compat imports all parts of numpy, and their tests
+    return array_namespace(array)
 
 
 def _as(value: Any, like: Any) -> Any:
     """A value as an array of the dtype and on the device of another."""
     if is_torch_array(value):
         return value.to(like)
-    return array_namespace(like).asarray(value, dtype=like.dtype, device=device(like))
+    return _namespace(like).asarray(value, dtype=like.dtype, device=device(like))
 
 
 def _constant(values: Any) -> Any:
@@ -287,7 +294,7 @@ def _scalar(values: Any) -> Any:
 
 def _series_limit(values: Any) -> float:
     """Squares of angles below which four terms of a series in the square, and their derivative, are exact."""
-    return float(array_namespace(values).finfo(values.dtype).eps) ** 0.25
+    return float(_namespace(values).finfo(values.dtype).eps) ** 0.25
 
 
 def _series(squared: Any, coefficients: tuple[float, ...]) -> Any:

@@ -44,7 +44,7 @@ HOMES = {
     "drjit": ("simulate.light_transport.worker",),
 }
 SLOW_AT_TOP = {
-    "torch", "cma", "numba", "trimesh", "matplotlib", "plotly", "igl", "h5py", "scipy.stats", "zuko", "embreex",
+    "torch", "cma", "numba", "trimesh", "matplotlib", "plotly", "igl", "h5py", "scipy", "zuko", "embreex",
 }  # fmt: skip
 FAST_ROOMS = ("run", "design", "cli", "registry", "task", "workflow", "config", "samples")
 

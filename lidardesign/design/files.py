@@ -18,9 +18,6 @@ from typing import Any, get_args
 import numpy as np
 
 from lidardesign.design.layouts.track import TRAVELLED
-from lidardesign.design.rigs.dispatch import read_rig
-from lidardesign.design.rigs.ray_lists import begins_as_sensor_csv, read_sensor_csv
-from lidardesign.design.rigs.rig import rig_design
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     LEVELS,
@@ -205,6 +202,10 @@ def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
         DataError: The file cannot be read, or a CSV, an NPZ or an XML file holds what cannot be used (exit 3).
         ConfigError: The file is not YAML, or not a design (exit 2).
     """
+    from lidardesign.design.rigs.dispatch import read_rig
+    from lidardesign.design.rigs.ray_lists import begins_as_sensor_csv, read_sensor_csv
+    from lidardesign.design.rigs.rig import rig_design
+
     path = Path(path)
     hint = "give a design file, as RUN/designs/NAME.yaml"
     head = read_head(path, RAY_TABLE, hint=f"{hint}, or - for standard input")

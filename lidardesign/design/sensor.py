@@ -13,10 +13,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from statistics import NormalDist
 from typing import Any, Literal
 
 import numpy as np
-from scipy.special import ndtri
 
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import sphere_exp, sphere_log
@@ -38,7 +38,7 @@ Gates = Literal["sensor", "ray"]
 
 def interval_factor(level: float) -> float:
     """The number of standard deviations on each side of the mean that hold `level` of a normal distribution."""
-    return float(ndtri((1 + level) / 2))
+    return NormalDist().inv_cdf((1 + level) / 2)
 
 
 def boresight_frame(azimuth_rad: float, elevation_rad: float, roll_rad: float = 0.0) -> np.ndarray:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from lidardesign.evaluate.results import Evaluation
 from lidardesign.run.files import sha256_file
+
+if TYPE_CHECKING:
+    from lidardesign.evaluate.results import Evaluation
 
 SCORES = "scores"
 

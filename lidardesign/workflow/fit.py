@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 from lidardesign.config import with_task_settings
-from lidardesign.design.catalog.library import named_parts
 from lidardesign.design.constraints.document import MOST_FITTED, Constraints
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import is_mounted, snap_to_space
@@ -335,6 +334,8 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
         asked = Constraints.from_mapping({**document, "parts": {**document.get("parts", {}), "names": options.parts}})
     if asked is None or asked.parts is None:
         return asked
+    from lidardesign.design.catalog.library import named_parts
+
     named_parts(asked.parts.names, asked.parts.each)
     lacking = {
         "the number of parts is missing": not isinstance(options.sensors, int) and asked.parts.count is None,

@@ -30,8 +30,6 @@ from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
 from lidardesign.evaluate.baselines.candidates import mean_mbps
-from lidardesign.evaluate.request import can_fire
-from lidardesign.evaluate.scene_scores import score_lists, silent_notes
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import versions
@@ -40,7 +38,6 @@ from lidardesign.samples import Samples, load_samples
 from lidardesign.scene import Scene, group_numbers
 from lidardesign.selection import information
 from lidardesign.selection.information import checked_information
-from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import mount_of, random_generator
 from lidardesign.workflow import fit as fit_choices
 from lidardesign.workflow.fit import BEST, FitRequest
@@ -159,7 +156,12 @@ def _silent_notes(fitter: Fitter, request: FitRequest, design: DesignSpec) -> li
     """Whether the most rays of a design have hardly a return from scenes that the fit has made anyway."""
     run, count = request.run, request.choices["rays"] or max(request.run.task.defaults.rays)
     scenes = vars(fitter).get("first_scenes", {}).get("held back")
-    if not scenes or not can_fire(design, count):
+    if not scenes:
+        return []
+    from lidardesign.evaluate.request import can_fire
+    from lidardesign.evaluate.scene_scores import silent_notes
+
+    if not can_fire(design, count):
         return []
     conditions = [request.at] if request.at else run.conditions()
     fired = tuple(rays_at(design, count, fitter.samples, at=at or None) for at in conditions)
@@ -208,6 +210,9 @@ def trials_of(
     Raises:
         InfeasibleError: No number of sensors keeps the constraints; says why the fewest do not.
     """
+    from lidardesign.evaluate.scene_scores import score_lists
+    from lidardesign.simulate.simulate import build_casters
+
     run, constraints = request.run, request.constraints or Constraints()
     budgets = sorted(run.task.defaults.rays)
     rays = request.choices["rays"] or budgets[len(budgets) // 2]

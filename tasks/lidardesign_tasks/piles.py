@@ -13,8 +13,6 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.transform import Rotation
 
 from lidardesign.errors import DataError
 from lidardesign.geometry.rays import Outcome, Returns
@@ -139,6 +137,8 @@ def settled_poses(meshes: tuple[Mesh, ...], background: Background, seed: int) -
     Raises:
         DataError: They come to rest in no attempt, or a mesh is flat.
     """
+    from scipy.spatial.transform import Rotation
+
     hulls = [_hull(mesh) for mesh in meshes]
     simulation = _simulation(meshes, background)
     low, high = background.bounds_m + np.array([[-1.0], [1.0]]) * background.overlap_m
@@ -175,6 +175,8 @@ class _Hull:
 @lru_cache(maxsize=256)
 def _hull(mesh: Mesh) -> _Hull:
     """The hull of a mesh; raises DataError where it is flat."""
+    from scipy.spatial import ConvexHull, QhullError
+
     used = mesh.vertices[np.unique(mesh.faces)]
     try:
         hull = ConvexHull(used)
@@ -224,6 +226,8 @@ class _Simulation:
 
     def dropped(self, generator: np.random.Generator) -> np.ndarray | None:
         """Scaled places and quaternions (N, 7) of the objects at rest; None where some are not."""
+        from scipy.spatial.transform import Rotation
+
         mujoco, count = import_mujoco(), self.model.nbody - 1
         mujoco.mj_resetData(self.model, self.data)
         free = max(self.scale * self.background.dropped_half_m - SIMULATED_M / 2, 0.0)

@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidardesign.evaluate.metrics import SurfaceCloud, delaunay_surface, ray_spacing, surface_cloud, visible_surface
 from lidardesign.geometry.rays import Returns
@@ -170,6 +169,8 @@ def information_of(surfaces: Sequence[SurfaceCloud | None], scene: Scene, return
 
 def importance_at(scene: Scene, points_m: np.ndarray, frame: int) -> np.ndarray:
     """How much the targets' meshes count at points (K, 3) on them, as at the nearest vertex, (K,); others count 1."""
+    from scipy.spatial import cKDTree
+
     meshes = [body for body in scene.bodies if body.is_target and isinstance(body.shape, Mesh)]
     if all(body.shape.importance is None for body in meshes):
         return np.ones(len(points_m))

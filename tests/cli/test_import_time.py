@@ -6,9 +6,10 @@ import subprocess
 import sys
 
 import pytest
+from support.command_line import make_run
 
-HEAVY = ["torch", "zuko", "numba", "scipy.stats", "trimesh", "igl", "embreex", "h5py", "matplotlib", "plotly"]
-NUMERIC = ["numpy", "scipy", "yaml"]
+HEAVY = ["torch", "zuko", "numba", "scipy", "trimesh", "igl", "embreex", "h5py", "matplotlib", "plotly", "numpy.f2py"]
+NUMERIC = ["numpy", "yaml"]
 
 
 def modules_after(code: str) -> set[str]:
@@ -35,16 +36,22 @@ def test_help_imports_nothing_heavy(arguments):
     assert not modules_after(run_program(*arguments)) & {*HEAVY, *NUMERIC}
 
 
-def test_listing_formats_and_tasks_imports_no_torch():
-    loaded = modules_after(run_program("export", "--list") + "\n" + run_program("tasks", "list"))
-    assert not loaded & {"torch", "zuko", "plotly", "matplotlib"}
+@pytest.mark.parametrize("arguments", [["export", "--list"], ["tasks", "list"], ["catalog", "list"]])
+def test_lists_import_nothing_heavy(arguments):
+    assert not modules_after(run_program(*arguments)) & {*HEAVY}
 
 
-def test_the_modules_that_constrain_needs_import_no_torch():
-    constraints = ("design.constraints.check", "design.constraints.document")
-    names = ("config", "samples", "design.files", "design.fit", *constraints)
-    code = "\n".join(f"import lidardesign.{name}" for name in names)
-    assert not modules_after(code) & {"torch", "zuko", "numba", "trimesh", "matplotlib", "plotly", "scipy.stats"}
+def test_a_fitted_mixture_is_constrained_shown_and_exported_without_heavy_libraries(tmp_path):
+    run, rays = make_run(tmp_path / "run"), tmp_path / "rays.csv"
+    commands = (
+        ["constrain", run, "--layout", "grid", "--sensors", 2, "--set", "gate.width_m.max=0.2", "--name", "narrow"],
+        ["show", run],
+        ["show", run / "designs" / "narrow.yaml"],
+        ["export", run / "designs" / "narrow.yaml", "--rays", 100, "--format", "csv", "--out", rays],
+    )
+    loaded = modules_after("\n".join(run_program(*map(str, words)) for words in commands))
+    assert not loaded & {*HEAVY}
+    assert rays.exists()
 
 
 def test_threads_are_limited_before_torch_can_be_imported():

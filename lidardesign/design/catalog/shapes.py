@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidardesign.design.catalog.library import Pose
 from lidardesign.design.catalog.part import Part, to_angles, to_directions
@@ -146,6 +145,8 @@ def useful_ray_filter(
         weights: Non-negative, shape (M,).
         least: So many rays in any case, where something is in view: then those that look nearest to it, too.
     """
+    from scipy.spatial import cKDTree
+
     offset = observed_point(points) - pose.origin_m
     range_m = np.linalg.norm(offset, axis=1)
     kept = (range_m > 0) & (weights > 0)

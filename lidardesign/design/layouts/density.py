@@ -13,8 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.special import ndtri
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.document import Constraints
@@ -149,6 +147,8 @@ def shared_rays(design: DesignSpec, shares: np.ndarray, samples: Samples, seed: 
         samples: Samples of the density.
         seed: For the quantisation.
     """
+    from scipy.spatial import cKDTree
+
     seen = _Seen.of(design, samples)
     origins = np.array([sensor.origin_m for sensor in design.sensors], dtype=np.float64)
     places, place = np.unique(origins, axis=0, return_inverse=True)
@@ -218,6 +218,8 @@ def _narrowed(design: DesignSpec, gates: np.ndarray, sensor: np.ndarray, samples
 
     Rays of which too little is known count as hearing most in the middle of their gates.
     """
+    from scipy.special import ndtri
+
     constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
     model, limit = bandwidth_limit(constraints, len(gates))
     if limit is None or int(model.bins(gates[:, 1] - gates[:, 0]).sum()) <= limit:

@@ -31,7 +31,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import chdtri, ndtri
 
 from lidardesign.design.constraints.document import Constraints, rules_of
 from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, origin_box
@@ -139,6 +138,8 @@ def owned(
 
 def in_region(sensor: Sensor, points: np.ndarray) -> np.ndarray:
     """Which design points (N, 6) lie in a sensor's joint region, shape (N,) bool."""
+    from scipy.special import chdtri
+
     origin, tangent, _ = relative(sensor, points)
     inside = (np.abs(tangent) <= np.array(sensor.field_of_view_rad) / 2 + FIELD_ROUNDING_RAD).all(axis=1)
     spreads, axes = principal_axes(sensor)
@@ -319,6 +320,8 @@ def _gaussian_rays(
         box: Lowest and highest origins, shape (2, 3) [m].
         space: Bounds of the directions.
     """
+    from scipy.special import ndtri
+
     spreads, axes = principal_axes(sensor)
     unit = low_discrepancy(count, len(spreads) + 2)
     origin = (normal_ball(unit[:, : len(spreads)], sensor.level) * spreads) @ axes.T
@@ -341,6 +344,8 @@ def _gaussian_rays(
 
 def normal_ball(unit: np.ndarray, level: float) -> np.ndarray:
     """Points of the unit cube as a standard normal vector inside the ball of the level, (N, k) to (N, k), k <= 3."""
+    from scipy.special import chdtri, ndtri
+
     axes = unit.shape[1]
     if axes <= 1:
         return ndtri((1 - level) / 2 + level * unit)

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.document import Constraints
@@ -346,6 +345,8 @@ def ray_gates(
 
     Inside its sensor's gate, and moved no further than the design's constraints ask: they bound every ray.
     """
+    from scipy.spatial import cKDTree
+
     constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
     gates = []
     for index, (sensor, tangent, inside) in enumerate(zip(design.sensors, tangents, seen, strict=True)):

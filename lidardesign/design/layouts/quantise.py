@@ -11,7 +11,6 @@ Making k-means even faster, 2010). The answers are those of a search over all po
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import COARSE_SLACK, SLACK, SQUARABLE
@@ -40,9 +39,8 @@ class Nearest:
             centres: Shape (K, F).
         """
         if len(centres) == 1 or centres.shape != self._centres.shape:
-            found, labels = cKDTree(centres).query(self._points, k=min(2, len(centres)))
-            found, labels = found.reshape(len(found), -1), labels.reshape(len(labels), -1)
-            distance, self._labels, self._others = found[:, 0], labels[:, 0].copy(), found[:, -1].copy()
+            found, self._labels = _two_nearest(self._points, centres)
+            distance, self._others = found[:, 0].copy(), found[:, 1].copy()
         else:
             moved = np.sqrt(np.square(centres - self._centres).sum(axis=1))
             farthest = int(moved.argmax())
@@ -53,11 +51,29 @@ class Nearest:
             distance = np.sqrt(np.square(self._points - centres[self._labels]).sum(axis=1))
             doubtful = np.flatnonzero(distance + self._slack >= self._others)
             if len(doubtful):
-                found, labels = cKDTree(centres).query(self._points[doubtful], k=2)
+                found, self._labels[doubtful] = _two_nearest(self._points[doubtful], centres)
                 distance[doubtful], self._others[doubtful] = found.T
-                self._labels[doubtful] = labels[:, 0]
         self._centres = centres.copy()
         return distance, self._labels.copy()
+
+
+# Up to so many centres, looking at all of them costs as little as a tree, and nothing to import.
+FEW_CENTRES = 10
+
+
+def _two_nearest(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances to the nearest centre and to the next, shape (N, 2), and the index of the nearest, shape (N,).
+
+    Where there is one centre alone, it is the next as well.
+    """
+    if len(centres) > FEW_CENTRES:
+        from scipy.spatial import cKDTree
+
+        found, labels = cKDTree(centres).query(points, k=2)
+        return found, labels[:, 0].copy()
+    squared = np.stack([np.square(points - centre).sum(axis=1) for centre in centres], axis=1)
+    next_one = min(1, len(centres) - 1)
+    return np.sqrt(np.partition(squared, next_one, axis=1)[:, [0, next_one]]), squared.argmin(axis=1)
 
 
 # The iteration stops when no centre moves by more than this share of the features' extent: far below the
@@ -170,6 +186,8 @@ def _distinct(features: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np
     inverse = np.zeros(len(features), dtype=np.int64)
     inverse[positive] = inner
     if not positive.all():
+        from scipy.spatial import cKDTree
+
         inverse[~positive] = cKDTree(distinct).query(features[~positive])[1]
     merged = np.bincount(inner, weights=weights[positive], minlength=len(distinct))
     return distinct, inverse, np.maximum(merged / merged.sum(), SMALLEST_WEIGHT)

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidardesign.numerics import SLACK, safe_divide
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
@@ -161,6 +160,8 @@ def ray_features(features: Features) -> np.ndarray:
 
     Directions where origins are given, else points of the mean surface.
     """
+    from scipy.spatial import cKDTree
+
     aiming = features.embedding
     if features.axes.range:
         aiming = np.delete(aiming, len(features.axes.origin), axis=1)
