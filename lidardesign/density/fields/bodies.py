@@ -15,6 +15,7 @@ import numpy as np
 
 from lidardesign.density.fields.grids import Grid, cached_distance_grids, grid_around
 from lidardesign.geometry.primitives import SIZES, half_extents_m
+from lidardesign.numerics import EPSILON
 from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, inverse_rigid
 
 # Kinds of bodies, as the compiled loops know them.
@@ -24,6 +25,7 @@ KINDS: dict[type, int] = {
 }  # fmt: skip
 # Frames of one motion are close together: so many of them are looked at, or passed over, at once.
 GROUP_COLUMNS = 16
+ROUNDINGS = 8
 BuildGrid = Callable[[Mesh], tuple[Grid, np.ndarray]]
 Entry = tuple[int, Body, int]
 
@@ -143,7 +145,9 @@ class Bodies:
     @cached_property
     def arrays(self) -> BodyArrays:
         """All of it, for the compiled loops."""
-        grids, edges = self.grids, np.concatenate([self.low.T, self.high.T])
+        # a little wider, so that no rounding passes over a surface on a face of its box
+        grids, slack = self.grids, ROUNDINGS * EPSILON * np.maximum(np.abs(self.low), np.abs(self.high))
+        edges = np.concatenate([(self.low - slack).T, (self.high + slack).T])
         return BodyArrays(
             self.kinds, self.sizes, self.to_body, self.grid, grids.values,
             np.column_stack([grids.lows, grids.counts, grids.inverse_steps, grids.starts]),

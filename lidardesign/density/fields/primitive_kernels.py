@@ -1,4 +1,8 @@
-"""Compiled closed forms of single primitives in their own frames: signed distances, crossings by lines, normals."""
+"""Compiled closed forms of single primitives in their own frames: signed distances, crossings by lines, normals.
+
+Points, directions and sizes are tuples of three numbers: compiled loops keep them in registers, where arrays would cost
+as much as the arithmetic.
+"""
 
 from __future__ import annotations
 
@@ -17,126 +21,125 @@ MOST_NEWTON_STEPS = 60
 
 
 @njit(cache=True, nogil=True)
-def _ellipsoid_distance(axes, q, gradient):  # noqa: ANN001, ANN202
-    """Signed distance of an ellipsoid at a point in its own frame, with its gradient (3,).
+def _ellipsoid_distance(axes, q):  # noqa: ANN001, ANN202
+    """Signed distance of an ellipsoid at a point in its own frame, and its gradient.
 
     The nearest point is e_i^2 q_i / (t + e_i^2), where t makes it lie on the surface (Eberly 2013, "Distance from a
     point to an ellipse, an ellipsoid, or a hyperellipsoid"). With w = 1 + t / e^2 for the smallest semi-axis e, the
     sum of squares is convex and falls in w > 0: Newton's steps from the left of its root never pass it.
     """
     least = min(axes[0], axes[1], axes[2])
+    ratio, place, share = np.empty(3), np.empty(3), np.empty(3)
     w, inside = 0.0, 0.0
     for k in range(3):
-        ratio = (axes[k] / least) * (axes[k] / least)
-        place = abs(q[k]) / axes[k]
-        inside += place * place
+        ratio[k] = (axes[k] / least) * (axes[k] / least)
+        place[k] = abs(q[k]) / axes[k]
+        inside += place[k] * place[k]
         if axes[k] == least:
-            place = max(place, OFF_MIDDLE)
-        w = max(w, ratio * (place - 1.0) + 1.0)
+            place[k] = max(place[k], OFF_MIDDLE)
+        w = max(w, ratio[k] * (place[k] - 1.0) + 1.0)
     for _ in range(MOST_NEWTON_STEPS):
         value, slope = -1.0, 0.0
         for k in range(3):
-            ratio = (axes[k] / least) * (axes[k] / least)
-            place = abs(q[k]) / axes[k]
-            if axes[k] == least:
-                place = max(place, OFF_MIDDLE)
-            below = w + (ratio - 1.0)
-            share = ratio * place / below
-            value += share * share
-            slope += 2.0 * share * share / below
+            below = w + (ratio[k] - 1.0)
+            part = ratio[k] * place[k] / below
+            value += part * part
+            slope += 2.0 * part * part / below
         step = value / slope
         w += step
         if step <= EPSILON * w:
             break
     squared, length = 0.0, 0.0
     for k in range(3):
-        ratio = (axes[k] / least) * (axes[k] / least)
-        place = abs(q[k]) / axes[k]
-        if axes[k] == least:
-            place = max(place, OFF_MIDDLE)
         # the nearest point as a share of the semi-axis
-        share = ratio * place / (w + (ratio - 1.0))
-        away = axes[k] * share - abs(q[k])
+        share[k] = ratio[k] * place[k] / (w + (ratio[k] - 1.0))
+        away = axes[k] * share[k] - abs(q[k])
         squared += away * away
-        gradient[k] = share / axes[k] * (1.0 if q[k] >= 0.0 else -1.0)
-        length += gradient[k] * gradient[k]
-    for k in range(3):
-        gradient[k] /= math.sqrt(length)
-    return math.sqrt(squared) * (-1.0 if inside < 1.0 else 1.0)
+        share[k] *= (1.0 if q[k] >= 0.0 else -1.0) / axes[k]
+        length += share[k] * share[k]
+    length = math.sqrt(length)
+    gradient = share[0] / length, share[1] / length, share[2] / length
+    return math.sqrt(squared) * (-1.0 if inside < 1.0 else 1.0), gradient
 
 
-@njit(cache=True, nogil=True)
-def _cylinder_distance(radius, half_length, q, gradient):  # noqa: ANN001, ANN202
-    """Signed distance of a cylinder at a point in its own frame, with its gradient (3,)."""
-    radial = math.sqrt(q[0] * q[0] + q[1] * q[1])
-    side, end = radial - radius, abs(q[2]) - half_length
-    by_side, by_end = max(side, 0.0), max(end, 0.0)
-    distance = math.sqrt(by_side * by_side + by_end * by_end)
-    if distance > 0.0:
-        by_side, by_end = by_side / distance, by_end / distance
-    else:
-        distance = max(side, end)
-        by_side, by_end = (1.0, 0.0) if side > end else (0.0, 1.0)
-    gradient[0] = by_side * q[0] / radial if radial > 0.0 else 0.0
-    gradient[1] = by_side * q[1] / radial if radial > 0.0 else 0.0
-    gradient[2] = by_end if q[2] >= 0.0 else -by_end
-    return distance
-
-
-@njit(cache=True, nogil=True)
-def primitive_distance(kind, size, q, gradient):  # noqa: ANN001, ANN201
-    """Signed distance of any primitive but a sphere at a point in its own frame, with its gradient (3,)."""
+@njit(cache=True, nogil=True, inline="always")
+def primitive_distance(kind, size, q):  # noqa: ANN001, ANN201
+    """Signed distance of any primitive at a point in its own frame."""
+    x, y, z = q
+    if kind in (SPHERE, CAPSULE):
+        if kind == CAPSULE:
+            z -= min(max(z, -size[1]), size[1])
+        return math.sqrt(x * x + y * y + z * z) - size[0]
+    if kind == BOX:
+        x, y, z = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
+        deepest = max(x, y, z)
+        if deepest <= 0.0:
+            return deepest
+        x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
+        return math.sqrt(x * x + y * y + z * z)
     if kind == CYLINDER:
-        return _cylinder_distance(size[0], size[1], q, gradient)
+        side, end = math.sqrt(x * x + y * y) - size[0], abs(z) - size[1]
+        if side <= 0.0 and end <= 0.0:
+            return max(side, end)
+        side, end = max(side, 0.0), max(end, 0.0)
+        return math.sqrt(side * side + end * end)
     if kind == ELLIPSOID:
-        return _ellipsoid_distance(size, q, gradient)
-    if kind == CAPSULE:
-        z = q[2] - min(max(q[2], -size[1]), size[1])
-        length = math.sqrt(q[0] * q[0] + q[1] * q[1] + z * z)
-        gradient[0] = q[0] / length if length > 0.0 else 0.0
-        gradient[1] = q[1] / length if length > 0.0 else 0.0
-        gradient[2] = z / length if length > 0.0 else 0.0
-        return length - size[0]
+        return _ellipsoid_distance(size, q)[0]
+    return z
+
+
+@njit(cache=True, nogil=True)
+def primitive_gradient(kind, size, q):  # noqa: ANN001, ANN201
+    """The gradient of the signed distance of any primitive at a point in its own frame."""
+    x, y, z = q
+    if kind in (SPHERE, CAPSULE):
+        if kind == CAPSULE:
+            z -= min(max(z, -size[1]), size[1])
+        length = math.sqrt(x * x + y * y + z * z)
+        scale = 1.0 / length if length > 0.0 else 0.0
+        return x * scale, y * scale, z * scale
+    if kind == CYLINDER:
+        radial = math.sqrt(x * x + y * y)
+        side, end = radial - size[0], abs(z) - size[1]
+        by_side, by_end = max(side, 0.0), max(end, 0.0)
+        distance = math.sqrt(by_side * by_side + by_end * by_end)
+        if distance > 0.0:
+            by_side, by_end = by_side / distance, by_end / distance
+        else:
+            by_side, by_end = (1.0, 0.0) if side > end else (0.0, 1.0)
+        outward = by_side / radial if radial > 0.0 else 0.0
+        return outward * x, outward * y, by_end if z >= 0.0 else -by_end
+    if kind == ELLIPSOID:
+        return _ellipsoid_distance(size, q)[1]
     if kind == PLANE:
-        gradient[0], gradient[1], gradient[2] = 0.0, 0.0, 1.0
-        return q[2]
-    squared, deepest, axis = 0.0, -np.inf, 0
-    for k in range(3):
-        beyond = abs(q[k]) - size[k]
-        if beyond > deepest:
-            deepest, axis = beyond, k
-        if beyond > 0.0:
-            squared += beyond * beyond
-        gradient[k] = 0.0
-    if squared == 0.0:
-        gradient[axis] = 1.0 if q[axis] >= 0.0 else -1.0
-        return deepest
-    distance = math.sqrt(squared)
-    for k in range(3):
-        beyond = abs(q[k]) - size[k]
-        if beyond > 0.0:
-            gradient[k] = beyond / distance * (1.0 if q[k] >= 0.0 else -1.0)
-    return distance
+        return 0.0, 0.0, 1.0
+    right, ahead, up = (1.0 if x >= 0.0 else -1.0), (1.0 if y >= 0.0 else -1.0), (1.0 if z >= 0.0 else -1.0)
+    x, y, z = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
+    deepest = max(x, y, z)
+    if deepest > 0.0:
+        x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
+        distance = math.sqrt(x * x + y * y + z * z)
+        return x / distance * right, y / distance * ahead, z / distance * up
+    if x == deepest:
+        return right, 0.0, 0.0
+    return (0.0, ahead, 0.0) if y == deepest else (0.0, 0.0, up)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _ball_roots(origin, direction, radius):  # noqa: ANN001, ANN202
     """Both crossings of a line with a ball, NaN where it passes by; |direction| is 1."""
     along = origin[0] * direction[0] + origin[1] * direction[1] + origin[2] * direction[2]
-    squared = 0.0
-    for k in range(3):
-        across = origin[k] - along * direction[k]
-        squared += across * across
-    room = radius * radius - squared
+    x, y, z = origin[0] - along * direction[0], origin[1] - along * direction[1], origin[2] - along * direction[2]
+    room = radius * radius - (x * x + y * y + z * z)
     if room < 0.0:
         return np.nan, np.nan
     half = math.sqrt(room)
     return -along - half, -along + half
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def box_roots(low, high, origin, direction):  # noqa: ANN001, ANN201
-    """Where a line enters and leaves a box between two corners (3,) each; NaN where it passes."""
+    """Where a line enters and leaves a box between two corners; NaN where it passes."""
     near, far = -np.inf, np.inf
     for k in range(3):
         if direction[k] == 0.0:
@@ -151,7 +154,7 @@ def box_roots(low, high, origin, direction):  # noqa: ANN001, ANN201
 
 
 @njit(cache=True, nogil=True)
-def _capsule_roots(size, origin, direction, centred):  # noqa: ANN001, ANN202
+def _capsule_roots(size, origin, direction):  # noqa: ANN001, ANN202
     """A line meets the side, or the cap on whose side it meets the endless cylinder (as in `primitives`)."""
     radius, half_length = size[0], size[1]
     across = direction[0] * direction[0] + direction[1] * direction[1]
@@ -168,9 +171,8 @@ def _capsule_roots(size, origin, direction, centred):  # noqa: ANN001, ANN202
         height = origin[2] + side * direction[2] if across > 0.0 else end * direction[2] * np.inf
         value = side
         if not abs(height) <= half_length:
-            centred[0], centred[1] = origin[0], origin[1]
-            centred[2] = origin[2] - (half_length if height > 0.0 else -half_length)
-            first, second = _ball_roots(centred, direction, radius)
+            cap = half_length if height > 0.0 else -half_length
+            first, second = _ball_roots((origin[0], origin[1], origin[2] - cap), direction, radius)
             value = first if end < 0.0 else second
         if end < 0.0:
             near = value
@@ -180,8 +182,9 @@ def _capsule_roots(size, origin, direction, centred):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _cylinder_roots(radius, half_length, origin, direction):  # noqa: ANN001, ANN202
+def _cylinder_roots(size, origin, direction):  # noqa: ANN001, ANN202
     """Where a line is both between the planes of the ends and in the endless cylinder (as in `primitives`)."""
+    radius, half_length = size[0], size[1]
     near, far = -np.inf, np.inf
     across = direction[0] * direction[0] + direction[1] * direction[1]
     along = (origin[0] * direction[0] + origin[1] * direction[1]) / across if across > 0.0 else 0.0
@@ -203,30 +206,24 @@ def _cylinder_roots(radius, half_length, origin, direction):  # noqa: ANN001, AN
 @njit(cache=True, nogil=True)
 def _ellipsoid_roots(axes, origin, direction):  # noqa: ANN001, ANN202
     """Stretched along its axes it is a ball of radius 1 (as in `primitives`)."""
-    start, along, length = np.empty(3), np.empty(3), 0.0
-    for k in range(3):
-        start[k], along[k] = origin[k] / axes[k], direction[k] / axes[k]
-        length += along[k] * along[k]
-    length = math.sqrt(length)
-    for k in range(3):
-        along[k] /= length
-    near, far = _ball_roots(start, along, 1.0)
+    x, y, z = direction[0] / axes[0], direction[1] / axes[1], direction[2] / axes[2]
+    length = math.sqrt(x * x + y * y + z * z)
+    start = origin[0] / axes[0], origin[1] / axes[1], origin[2] / axes[2]
+    near, far = _ball_roots(start, (x / length, y / length, z / length), 1.0)
     return near / length, far / length
 
 
 @njit(cache=True, nogil=True)
-def primitive_roots(kind, size, origin, direction, work):  # noqa: ANN001, ANN201
-    """Where a line enters and leaves a primitive, NaN where it passes; `work` (3,) is overwritten."""
+def primitive_roots(kind, size, origin, direction):  # noqa: ANN001, ANN201
+    """Where a line enters and leaves a primitive, NaN where it passes."""
     if kind == SPHERE:
         return _ball_roots(origin, direction, size[0])
     if kind == BOX:
-        for k in range(3):
-            work[k] = -size[k]
-        return box_roots(work, size, origin, direction)
+        return box_roots((-size[0], -size[1], -size[2]), size, origin, direction)
     if kind == CAPSULE:
-        return _capsule_roots(size, origin, direction, work)
+        return _capsule_roots(size, origin, direction)
     if kind == CYLINDER:
-        return _cylinder_roots(size[0], size[1], origin, direction)
+        return _cylinder_roots(size, origin, direction)
     if kind == ELLIPSOID:
         return _ellipsoid_roots(size, origin, direction)
     if direction[2] == 0.0:
@@ -234,31 +231,28 @@ def primitive_roots(kind, size, origin, direction, work):  # noqa: ANN001, ANN20
     return -origin[2] / direction[2], np.nan
 
 
-@njit(cache=True, nogil=True, inline="always")
-def primitive_normal(kind, size, point, out):  # noqa: ANN001, ANN201
+@njit(cache=True, nogil=True)
+def primitive_normal(kind, size, point):  # noqa: ANN001, ANN201
     """Outward normal of a primitive at a point on it, in its frame."""
-    out[0], out[1], out[2] = 0.0, 0.0, 0.0
+    x, y, z = point
     if kind == PLANE:
-        out[2] = 1.0
-    elif kind == BOX:
-        axis, largest = 0, -1.0
-        for k in range(3):
-            share = abs(point[k]) / size[k]
-            if share > largest:
-                axis, largest = k, share
-        out[axis] = 1.0 if point[axis] >= 0.0 else -1.0
-    elif kind == CYLINDER:
-        radial = math.sqrt(point[0] * point[0] + point[1] * point[1])
-        if abs(point[2]) * size[0] > radial * size[1]:
-            out[2] = 1.0 if point[2] >= 0.0 else -1.0
-        else:
-            out[0], out[1] = point[0] / radial, point[1] / radial
-    elif kind == ELLIPSOID:
-        x, y, z = point[0] / size[0] ** 2, point[1] / size[1] ** 2, point[2] / size[2] ** 2
-        length = math.sqrt(x * x + y * y + z * z)
-        out[0], out[1], out[2] = x / length, y / length, z / length
-    else:
-        z = point[2] - min(max(point[2], -size[1]), size[1]) if kind == CAPSULE else point[2]
-        length = math.sqrt(point[0] * point[0] + point[1] * point[1] + z * z)
-        if length > 0.0:
-            out[0], out[1], out[2] = point[0] / length, point[1] / length, z / length
+        return 0.0, 0.0, 1.0
+    if kind == BOX:
+        across, along, above = abs(x) / size[0], abs(y) / size[1], abs(z) / size[2]
+        if across >= along and across >= above:
+            return 1.0 if x >= 0.0 else -1.0, 0.0, 0.0
+        if along >= above:
+            return 0.0, 1.0 if y >= 0.0 else -1.0, 0.0
+        return 0.0, 0.0, 1.0 if z >= 0.0 else -1.0
+    if kind == CYLINDER:
+        radial = math.sqrt(x * x + y * y)
+        if abs(z) * size[0] > radial * size[1]:
+            return 0.0, 0.0, 1.0 if z >= 0.0 else -1.0
+        return x / radial, y / radial, 0.0
+    if kind == ELLIPSOID:
+        x, y, z = x / size[0] ** 2, y / size[1] ** 2, z / size[2] ** 2
+    elif kind == CAPSULE:
+        z -= min(max(z, -size[1]), size[1])
+    length = math.sqrt(x * x + y * y + z * z)
+    scale = 1.0 / length if length > 0.0 else 0.0
+    return x * scale, y * scale, z * scale

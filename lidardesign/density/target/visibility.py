@@ -40,6 +40,8 @@ from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
 # A grazing hit moves without bound when its ray turns; its derivative is capped at this cosine.
 MINIMUM_COSINE = 0.05
 ROWS_AT_ONCE = 8192
+# Room for meshes that a ray and a column may meet is not touched before it is used; too little costs a second pass.
+MESHES_PER_PAIR = 4
 # The width of the soft edge of a receiver's view, in sigmas.
 EDGE_SIGMAS = 0.25
 # Which columns matter to which rays: a mask (N, columns), or pairs of both.
@@ -292,41 +294,45 @@ class BodyRaycast(Visibility):
         """Ranges of first hits before a limit, infinite without one (P,), and normals facing the origin (P, 3)."""
         from lidardesign.density.fields import body_kernels
 
-        count, lines = len(pairs.columns), (rays.origins, rays.directions, limit_m)
-        hits, normals = np.empty(count), np.zeros((count, 3))
-        body_kernels.first_hits(self.bodies.arrays, pairs.row_starts, pairs.columns, lines, hits, normals)
-        if self.bodies.grids.meshes:
-            rows, chosen, body = self._candidates(rays, pairs, limit_m)
-            for number, caster in enumerate(self._casters, start=1):
-                mine = np.flatnonzero(self.bodies.grid[body] == number)
-                pose, ray, pair = self.bodies.to_body[body[mine]], rows[mine], chosen[mine]
-                origins = np.einsum("pij,pj->pi", pose[:, :, :3], rays.origins[ray]) + pose[:, :, 3]
-                directions = np.einsum("pij,pj->pi", pose[:, :, :3], rays.directions[ray])
-                range_m, normal = caster.first_hits(origins, directions, np.minimum(limit_m[ray], hits[pair]))
-                nearer = np.flatnonzero(range_m < hits[pair])
-                # a pair may meet the same mesh in two poses: the nearest is written last
-                nearer = nearer[np.argsort(-range_m[nearer], kind="stable")]
-                facing = np.sign(np.einsum("pk,pk->p", normal[nearer], directions[nearer]))
-                turned = np.einsum("pij,pi->pj", pose[nearer, :, :3], normal[nearer])
-                hits[pair[nearer]] = range_m[nearer]
-                normals[pair[nearer]] = -np.where(facing == 0, 1.0, facing)[:, None] * turned
+        bodies, count, lines = self.bodies, len(pairs.columns), (rays.origins, rays.directions, limit_m)
+        hits, normals, room = np.empty(count), np.empty((count, 3)), MESHES_PER_PAIR * count
+        while True:
+            met = tuple(np.empty(room, dtype=np.int64) for _ in range(3))
+            meshes = body_kernels.first_hits(
+                bodies.arrays, bodies.mesh_bounds, pairs.row_starts, pairs.columns, lines, hits, normals, met
+            )
+            if meshes <= room:
+                break
+            room = meshes
+        if meshes:
+            self._cast(rays, limit_m, tuple(values[:meshes] for values in met), hits, normals)
         return hits, normals
 
-    def _candidates(
-        self, rays: RayBatch, pairs: Pairs, limit_m: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rays, pairs and mesh bodies whose own bounding box the ray passes before its limit."""
+    def _cast(
+        self, rays: RayBatch, limit_m: np.ndarray, met: tuple[np.ndarray, ...], hits: np.ndarray, normals: np.ndarray
+    ) -> None:
+        """Enter what rays meet of meshes before anything else; `met` are rays, pairs and bodies, (K,) each."""
         from lidardesign.density.fields import body_kernels
 
-        lines, room = (rays.origins, rays.directions, limit_m), max(len(pairs.columns), 1)
-        while True:
-            out = tuple(np.empty(room, dtype=np.int64) for _ in range(3))
-            count = body_kernels.mesh_candidates(
-                self.bodies.arrays, self.bodies.mesh_bounds, pairs.row_starts, pairs.columns, lines, out
-            )
-            if count <= room:
-                return tuple(values[:count] for values in out)
-            room = count
+        bodies = self.bodies
+        # all of one mesh together
+        number = bodies.grid[met[2]]
+        order = np.argsort(number.astype(np.int16), kind="stable")
+        row, pair, body = (values[order] for values in met)
+        starts = np.searchsorted(number[order], np.arange(1, len(self._casters) + 2))
+        local = np.empty((len(row), 3)), np.empty((len(row), 3))
+        body_kernels.rays_in_frames(bodies.to_body, body, row, (rays.origins, rays.directions), local)
+        for caster, first, last in zip(self._casters, starts[:-1], starts[1:], strict=True):
+            origins, directions = local[0][first:last], local[1][first:last]
+            limits = np.minimum(limit_m[row[first:last]], hits[pair[first:last]])
+            found, range_m, _, normal = caster.trace(origins, directions, limits)
+            # a pair may meet the same mesh in two poses: the nearest is written last
+            farthest = np.argsort(-range_m, kind="stable")
+            found, range_m, normal = found[farthest], range_m[farthest], normal[farthest]
+            facing = np.where(np.einsum("pk,pk->p", normal, directions[found]) >= 0, -1.0, 1.0)
+            at, turn = first + found, bodies.to_body[body[first + found], :, :3]
+            hits[pair[at]] = range_m
+            normals[pair[at]] = np.einsum("pij,pi->pj", turn, facing[:, None] * normal)
 
 
 def common_receiver(scenes: Sequence[Scene]) -> Receiver | None:
