@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -145,7 +145,13 @@ def ray_spacing(directions: np.ndarray) -> np.ndarray:
         Chords of the unit sphere, shape (N,); infinite where fewer than three directions, or all on a line, have no
         triangles.
     """
-    distinct, inverse = np.unique(directions, axis=0, return_inverse=True)
+    return _ray_spacing(np.ascontiguousarray(directions, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=512)
+def _ray_spacing(directions: bytes) -> np.ndarray:
+    """Found once for rays that are fired in many scenes."""
+    distinct, inverse = np.unique(np.frombuffer(directions).reshape(-1, 3), axis=0, return_inverse=True)
     spacing = np.full(len(distinct), np.inf)
     faces, seen = _delaunay_faces(distinct)
     if faces is not None:

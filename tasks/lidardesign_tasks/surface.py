@@ -104,9 +104,14 @@ def reconstruct(returns: Sequence[Returns], viewpoint_m: np.ndarray | None = Non
     if not len(origins):
         return None
     points = np.concatenate([frame.points_m for frame in returns])
+    is_one_place = viewpoint_m is None and bool((origins == origins[0]).all())
     viewpoint_m = origins.mean(axis=0) if viewpoint_m is None else viewpoint_m
-    spacing = np.concatenate([_spacing(frame, viewpoint_m) for frame in returns])
-    surface = delaunay_surface(points, viewpoint_m, steepest_deg=STEEPEST_DEG, spacing=spacing)
+    if is_one_place:
+        # whatever they meet, rays are seen where they look
+        spacing = [ray_spacing(frame.rays.direction)[frame.returned] for frame in returns]
+    else:
+        spacing = [_spacing(frame, viewpoint_m) for frame in returns]
+    surface = delaunay_surface(points, viewpoint_m, steepest_deg=STEEPEST_DEG, spacing=np.concatenate(spacing))
     if surface is None:
         return None
     return surface_cloud(*surface, RECONSTRUCTION_POINTS, random_generator(0, "reconstruction"))

@@ -118,16 +118,15 @@ def lattice_rays(found: Survey, count: int) -> np.ndarray:
     supported = found.supported
     if not count or field is None or field.area_sr < TINY:
         return _even_rays(found, count)
-    every = np.arange(len(table.points))
 
     def inside(spacing_rad: float) -> tuple[np.ndarray, np.ndarray]:
         looking = field.lattice(spacing_rad)
         points = np.tile(found.low, (len(looking), 1))
         points[:, AZIMUTH:] = looking
-        share = table.share[table.nearest(points, every)] if len(points) else np.zeros(0)
+        share = table.share[table.nearest(points)] if len(points) else np.zeros(0)
         return points[share >= LEAST_SHARE], share[share >= LEAST_SHARE]
 
-    wide = math.sqrt(field.area_sr * len(supported) / len(every) / count / SIXTH)
+    wide = math.sqrt(field.area_sr * len(supported) / len(table.points) / count / SIXTH)
     narrow = wide
     while len(inside(narrow)[0]) < count:
         narrow *= CLOSER
@@ -153,7 +152,7 @@ def _lloyd_rays(found: Survey, count: int) -> np.ndarray:
     """Rays in the weighted middles of their cells, shape (count, 5)."""
     many = max(FEWEST_POINTS, POINTS_PER_RAY * count)
     points, chance = _fine_points(found, many)
-    nearest = found.table.nearest(points, np.arange(len(found.table.points)))
+    nearest = found.table.nearest(points)
     density = found.table.share[nearest] ** PROBABILITY_POWER * found.table.area_m2_sr[nearest] ** AREA_POWER
     points, chance, density = points[density > 0], chance[density > 0], density[density > 0] / density.max()
     # resting points are as dense as the square root of the density in a plane

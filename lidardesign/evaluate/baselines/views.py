@@ -77,10 +77,20 @@ class ReturnTable:
         order = np.argsort(range_m, kind="stable")
         return range_m[order], ray[order]
 
-    def nearest(self, points: np.ndarray, among: np.ndarray) -> np.ndarray:
-        """The nearest of some rays of the table (K,) to each of others (N, 5), shape (N,)."""
-        scale = _scales(self.points)
-        return among[cKDTree(_features(self.points[among], scale)).query(_features(points, scale))[1]]
+    @cached_property
+    def _scale(self) -> tuple[float, float]:
+        return _scales(self.points)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(_features(self.points, self._scale))
+
+    def nearest(self, points: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
+        """The nearest of the table's rays, or of some (K,), to each of others (N, 5), shape (N,)."""
+        asked = _features(points, self._scale)
+        if among is None:
+            return self._tree.query(asked)[1]
+        return among[cKDTree(self._tree.data[among]).query(asked)[1]]
 
     def gates(self, points: np.ndarray, tail: float, margin_m: float) -> np.ndarray:
         """Gates that hold what the table's rays return that are nearer to each ray than to any other, (N, 5) to (N, 2).
@@ -92,8 +102,7 @@ class ReturnTable:
         """
         if not len(points):
             return np.zeros((0, 2))
-        scale = _scales(self.points)
-        cell = cKDTree(_features(points, scale)).query(_features(self.points, scale))[1]
+        cell = cKDTree(_features(points, self._scale)).query(self._tree.data)[1]
         low, high = self._ends(cell, len(points), tail)
         empty = np.isnan(low)
         if empty.any():
