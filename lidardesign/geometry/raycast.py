@@ -8,9 +8,9 @@ rays, cast once: vertices have no share of a density.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Literal
-from weakref import WeakKeyDictionary, ref
+from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import numpy as np
 
@@ -198,6 +198,7 @@ def _checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarr
 class _AtRest:
     def __init__(self, bodies: Sequence[tuple[int, Body]]) -> None:
         self.body_of_geometry = np.array([index for index, _ in bodies], dtype=np.int64)
+        self._meshes = [body.shape for _, body in bodies]  # as long as they live, nothing else has their identities
         self.triangles = Triangles([body.shape.transformed(body.poses) for _, body in bodies])
         self.radius_m = self.triangles.radius_m
 
@@ -211,18 +212,19 @@ class _AtRest:
         return hits
 
 
-# By the first of its bodies: what they are in their scene, and what was built of them.
-_at_rest: WeakKeyDictionary[Body, list[tuple[list[tuple[int, ref[Body]]], _AtRest]]] = WeakKeyDictionary()
+# By the first of its bodies and by geometry: what was built of them.
+_at_rest: WeakKeyDictionary[Body, dict[Hashable, _AtRest]] = WeakKeyDictionary()
+_by_geometry: WeakValueDictionary[Hashable, _AtRest] = WeakValueDictionary()
 
 
 def _shared_at_rest(bodies: Sequence[tuple[int, Body]]) -> _AtRest:
-    """What does not move is built once for all frames of a scene, and for scenes of the same bodies."""
-    known = _at_rest.setdefault(bodies[0][1], [])
-    for members, built in known:
-        if [(index, member()) for index, member in members] == list(bodies):
-            return built
-    known.append(([(index, ref(body)) for index, body in bodies], _AtRest(bodies)))
-    return known[-1][1]
+    """What does not move is built once for all frames of a scene, and for scenes of the same meshes in their places."""
+    geometry = tuple((index, id(body.shape), body.poses.tobytes()) for index, body in bodies)
+    known = _at_rest.setdefault(bodies[0][1], {})
+    if geometry not in known:
+        known[geometry] = _by_geometry.get(geometry) or _AtRest(bodies)
+        _by_geometry[geometry] = known[geometry]
+    return known[geometry]
 
 
 class _Moving:

@@ -103,6 +103,9 @@ class _Search:
     def take(self, ray: int, gate: int) -> None:
         """Fires a ray through a gate."""
         self._change(ray, gate, adding=True)
+        self._count(ray, gate)
+
+    def _count(self, ray: int, gate: int) -> None:
         self.gate[ray] = gate
         self.left[self.sensor[ray]] -= 1
         self.spent_mbps += self.coverage.bits[ray, gate]
@@ -129,9 +132,11 @@ class _Search:
 
     def swap(self, full: bool, smallest: float) -> bool:
         """Every chosen ray leaves once and the best comes in, where that gains; says whether anything changed."""
-        changed = False
+        changed, entries = False, self.coverage.entries
         for ray in np.flatnonzero(self.gate >= 0):
             gate = int(self.gate[ray])
+            items = entries.item[entries.start[ray] : entries.start[ray + 1]]
+            known, gains = self.known[items], self.gains.copy()
             self.drop(int(ray))
             own = float(self.gains[ray, gate] - self.cost[ray, gate])
             other, new_gate, net = self.best()
@@ -139,7 +144,8 @@ class _Search:
                 self.take(other, new_gate)
                 changed = True
             elif full or own >= 0:
-                self.take(int(ray), gate)
+                self._count(int(ray), gate)
+                self.known[items], self.gains = known, gains
             else:
                 changed = True
         return changed
