@@ -209,7 +209,7 @@ def flow_of(coordinates: Any, settings: Any) -> Any:
 
     sizes = {"layers": settings.layers, "hidden": settings.hidden, "bins": settings.bins}
     generator = torch.Generator().manual_seed(0)
-    return DesignFlow(coordinates.blocks, len(coordinates.conditions), **sizes, generator=generator).double()
+    return DesignFlow(len(coordinates.learned), len(coordinates.conditions), **sizes, generator=generator).double()
 
 
 TABLES: dict[str, tuple[str, Callable[[Any], tuple[Table, list[str]]]]] = {

@@ -74,8 +74,8 @@ class LearningSettings(BaseModel):
     frames: int = Field(
         256, ge=1, le=1_000_000, description="scenes and frames that stand for all in each path-wise step, drawn anew"
     )
-    layers: int = Field(3, ge=1, le=32, description="autoregressive spline layers per block of the chain")
-    hidden: int = Field(96, ge=4, le=8_192, description="hidden width of each layer's network")
+    layers: int = Field(2, ge=1, le=32, description="splines one after the other in each dimension of the flow")
+    hidden: int = Field(96, ge=4, le=8_192, description="hidden width of each dimension's network")
     bins: int = Field(16, ge=2, le=1_024, description="spline bins per dimension")
     dtype: Literal["float64", "float32"] = Field(
         "float32",
@@ -103,7 +103,7 @@ class LearningSettings(BaseModel):
 PRESET_LEARNING: dict[str, dict[str, Any]] = {
     "draft": {"steps": 350, "hidden": 64, "samples": 40_000},
     "standard": {},
-    "fine": {"steps": 2400, "batch": 4096, "layers": 4, "hidden": 128, "bins": 24, "samples": 200_000},
+    "fine": {"steps": 2400, "batch": 4096, "layers": 3, "hidden": 128, "bins": 24, "samples": 200_000},
 }
 
 

@@ -249,7 +249,7 @@ def make_flow(config: RunConfig, generator: torch.Generator) -> DesignFlow:
     """The flow of a configuration with its initial weights."""
     coordinates, settings = Coordinates(config.space), config.learning
     return DesignFlow(
-        coordinates.blocks,
+        len(coordinates.learned),
         len(coordinates.conditions),
         layers=settings.layers,
         hidden=settings.hidden,

@@ -82,7 +82,7 @@ def test_values_and_gradients_are_those_of_the_compiled_loops(space, visibility,
 def flow_of(space):
     coordinates = Coordinates(space)
     generator = torch.Generator().manual_seed(1)
-    flow = DesignFlow(coordinates.blocks, 0, layers=2, hidden=16, bins=8, generator=generator)
+    flow = DesignFlow(len(coordinates.learned), 0, layers=2, hidden=16, bins=8, generator=generator)
     return flow.double(), coordinates
 
 

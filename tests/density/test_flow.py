@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 
 import numpy as np
@@ -12,8 +11,6 @@ from support.flows import FLOWS, draw, flow_of
 from support.tables import each_row
 
 from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates
-from lidardesign.space import DesignSpace
 
 
 @each_row("name", FLOWS)
@@ -28,7 +25,7 @@ def test_the_density_is_the_jacobian_of_sampling(name):
         assert float(log_prob[row].detach()) == pytest.approx(float(expected.detach()), abs=1e-8)
 
 
-@pytest.mark.parametrize(("name", "dimensions"), [("one dimension", 1), ("one on a circle", 1), ("a block of two", 2)])
+@pytest.mark.parametrize(("name", "dimensions"), [("one dimension", 1), ("one on a circle", 1), ("two dimensions", 2)])
 def test_the_density_integrates_to_one(name, dimensions):
     flow = flow_of(name, scale=1.5)
     count = 20_000 if dimensions == 1 else 160
@@ -64,7 +61,7 @@ def test_every_parameter_gets_a_finite_gradient(name):
     assert all((parameter.grad != 0).any() for parameter in last)
 
 
-@pytest.mark.parametrize("name", ["one on a circle", "circle, then two blocks"])
+@pytest.mark.parametrize("name", ["one on a circle", "circle, then two"])
 def test_the_density_is_continuous_around_the_circle(name):
     flow = flow_of(name)
     features = flow.features
@@ -84,19 +81,25 @@ def test_the_density_is_continuous_around_the_circle(name):
     assert max(fine) < 1e-2
 
 
-def test_an_azimuth_on_a_circle_is_a_block_of_its_own_and_an_arc_is_not():
-    low, high = (0, 0, 0, 0, -1, 0), (1, 1, 0, 2 * math.pi, 1, 3)
-    assert Coordinates(DesignSpace(low, high)).blocks == [[0, 1], [2], [3], [4]]
-    arc = (1, 1, 0, 2.0, 1, 3)
-    assert Coordinates(DesignSpace(low, arc)).blocks == [[0, 1], [2, 3], [4]]
-    assert Coordinates(DesignSpace(low, arc, condition=("x_m",))).blocks == [[0], [1, 2], [3]]
+@each_row("name", FLOWS)
+def test_the_density_of_held_samples_changes_with_the_weights_as_that_of_the_same_points(name):
+    flow = flow_of(name, scale=1.5)
+    base, context = draw(flow, 64)
+    points, held = flow(base, context, held=True)
+    assert not points.requires_grad
+    foreign = flow.log_prob(points, context)
+    torch.testing.assert_close(held, foreign)
+    weights = torch.randn(64, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    found, expected = (torch.autograd.grad((weights * one).sum(), list(flow.parameters())) for one in (held, foreign))
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-8)
 
 
 def test_a_fresh_flow_is_near_the_identity_and_its_seed_is_all_that_matters():
-    blocks, context, periodic = FLOWS["all six"]
+    periodic, context = FLOWS["all six"]
     options = {"layers": 2, "hidden": 16, "bins": 6, "periodic": periodic}
     first, second = (
-        DesignFlow(blocks, context, **options, generator=torch.Generator().manual_seed(5)) for _ in range(2)
+        DesignFlow(len(periodic), context, **options, generator=torch.Generator().manual_seed(5)) for _ in range(2)
     )
     for a, b in zip(first.parameters(), second.parameters(), strict=True):
         assert torch.equal(a, b)

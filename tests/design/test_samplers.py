@@ -89,10 +89,10 @@ def test_pools_expect_enough_draws_and_lose_none():
 GRIDS = {
     "one dimension": ([60], 64, 5.0),
     "one on a circle": ([60], 64, 5.0),
-    "a block of two": ([16, 16], 12, 5.0),
-    "circle, then two blocks": ([8, 8, 8], 6, 3.0),
+    "two dimensions": ([16, 16], 12, 4.0),
+    "circle, then two": ([8, 8, 8], 6, 3.0),
     "one, given one": ([60], 64, 4.0),
-    "chain, given two": ([8, 8, 8], 6, 3.0),
+    "three, given two": ([8, 8, 8], 6, 3.0),
 }
 
 
@@ -119,7 +119,7 @@ def test_samples_of_a_flow_have_its_integrated_density(name, dtype):
 
 
 def test_a_sampler_that_is_a_little_wrong_is_found_out():
-    flow = flow_of("a block of two", layers=2, scale=5.0)
+    flow = flow_of("two dimensions", layers=2, scale=5.0)
     edges = edges_of(16, 16)
     mass = mass_of_cells(of_flow(flow, None), edges, 12)
     with torch.no_grad():
@@ -145,7 +145,7 @@ def test_samples_weighted_by_their_inverse_density_measure_the_volume_of_every_p
 
 
 def learned_in(space, seed=4):
-    flow = flow_of("circle, then two blocks", layers=2, scale=3.0)
+    flow = flow_of("circle, then two", layers=2, scale=3.0)
     target = FlatTarget(Optics(0.1, 1e3, 1e3, 0.1), space)
     return SimpleNamespace(
         flow=flow, target=target, coordinates=Coordinates(space), generator=torch.Generator().manual_seed(seed)
@@ -170,7 +170,7 @@ def test_samples_of_a_run_have_the_density_per_chart_volume_that_is_stored_with_
 
 def test_conditions_and_proposals_are_drawn_as_they_say():
     generator = torch.Generator().manual_seed(5)
-    conditions = flow_of("chain, given two").draw(DRAWS, generator)[1].numpy()
+    conditions = flow_of("three, given two").draw(DRAWS, generator)[1].numpy()
     edges = edges_of(10, 10)
     assert p_value(counts_of_cells(conditions, edges), np.full(100, DRAWS / 100)) > UNLIKELY
     log_weights = np.random.default_rng(6).normal(0, 2, 400)

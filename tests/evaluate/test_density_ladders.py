@@ -361,7 +361,7 @@ def steps(tmp_path_factory):
     probes = draw_probes(target, 512, 0, "test")
     coordinates = Coordinates(SPACE)
     flow = DesignFlow(
-        coordinates.blocks, 0, layers=1, hidden=8, bins=4, generator=torch.Generator().manual_seed(0)
+        len(coordinates.learned), 0, layers=1, hidden=8, bins=4, generator=torch.Generator().manual_seed(0)
     ).double()
     pool = Pool.of(SPACE.to_unit(probes.points), target.log_density(probes.points), probes.log_proposal)
     return LearningSteps(flow, target, LearningSettings(batch=64, layers=1, hidden=8, bins=4, frames=2), pool)

@@ -252,10 +252,7 @@ class TestScenesOfAnyScale:
 
 def flow_of(coordinates, dtype):
     generator = torch.Generator().manual_seed(0)
-    flow = DesignFlow(
-        coordinates.blocks, 0, layers=1, hidden=8, bins=4, periodic=[False] * len(coordinates.learned),
-        generator=generator,
-    )  # fmt: skip
+    flow = DesignFlow(len(coordinates.learned), layers=1, hidden=8, bins=4, generator=generator)
     return flow.to(dtype), generator
 
 

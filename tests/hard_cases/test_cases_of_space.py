@@ -203,10 +203,8 @@ class TestElevationAtThePoles:
 
     def test_the_flow_has_a_finite_density_at_the_poles(self):
         coordinates = Coordinates(AROUND)
-        flow = DesignFlow(
-            coordinates.blocks, 0, layers=1, hidden=8, bins=4, periodic=[False] * 3 + [True, False, False],
-            generator=torch.Generator().manual_seed(0),
-        ).double()  # fmt: skip
+        circular, generator = [False] * 3 + [True, False, False], torch.Generator().manual_seed(0)
+        flow = DesignFlow(6, layers=1, hidden=8, bins=4, periodic=circular, generator=generator).double()
         points = AROUND.sample(50, np.random.default_rng(8))
         points[:, ELEVATION] = np.repeat([-math.pi / 2, math.pi / 2], 25)
         unit = torch.as_tensor(AROUND.to_unit(points))
@@ -355,7 +353,7 @@ class TestFixedDimensions:
         coordinates = Coordinates(space)
         generator = torch.Generator().manual_seed(1)
         circular = [False, False, True, False, False]
-        flow = DesignFlow(coordinates.blocks, 0, layers=1, hidden=8, bins=4, periodic=circular, generator=generator)
+        flow = DesignFlow(5, layers=1, hidden=8, bins=4, periodic=circular, generator=generator)
         assert flow.features == 5
         learned, _ = flow(*flow.draw(200, generator))
         points = space.from_unit(coordinates.join(learned, None).detach().double().numpy())

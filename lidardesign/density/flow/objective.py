@@ -26,7 +26,7 @@ from lidardesign.density.target.target import Target
 from lidardesign.density.target.visibility import NoVisibility, Optics
 from lidardesign.errors import NumericalError
 from lidardesign.numerics import logsumexp, safe_sqrt
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, X, Y, Z
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 
 # Beyond so many sharpness lengths a sigmoid is 0 or 1 to every digit, and its exponential would overflow float32.
 EXPONENT_LIMIT = 60.0
@@ -51,18 +51,6 @@ class Coordinates:
     def conditions(self) -> list[int]:
         """Positions of the conditioning dimensions among the free ones."""
         return [n for n, i in enumerate(self.space.free) if i in self.space.conditioned]
-
-    @property
-    def blocks(self) -> list[list[int]]:
-        """Learned dimensions by block of the flow's chain: origin, then direction, then range.
-
-        An azimuth on a circle stands alone, so that everything after it sees its sine and cosine: inside a block the
-        elevation would see where the circle was cut open.
-        """
-        names = [self.space.free[n] for n in self.learned]
-        angles = ((AZIMUTH,), (ELEVATION,)) if self.space.full_azimuth else ((AZIMUTH, ELEVATION),)
-        parts = ([k for k, i in enumerate(names) if i in group] for group in ((X, Y, Z), *angles, (RANGE,)))
-        return [part for part in parts if part]
 
     @cached_property
     def half_widths(self) -> np.ndarray:

@@ -70,58 +70,78 @@ class BoundedSpline(MonotonicRQSTransform):
         return self._turned(x0 + share * (x1 - x0))
 
 
-class _CompiledSpline(torch.autograd.Function):
+class _CompiledSplines(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, values: Tensor, parameters: Tensor, periodic: Tensor, inverted: bool
+        ctx: Any, values: Tensor, parameters: Tensor, periodic: bool, inverted: bool, held: bool
     ) -> tuple[Tensor, Tensor]:
         from lidardesign.density.flow import spline_kernels
 
         values, parameters = values.detach().contiguous(), parameters.detach().contiguous()
-        shares = parameters.new_empty(*values.shape, 2 * (parameters.shape[-1] // 3))
-        bins = torch.empty(values.shape, dtype=torch.int32)
+        count, layers, each = parameters.shape
+        shares = parameters.new_empty(count, layers, 2 * (each // 3))
+        bins, places = torch.empty(count, layers, dtype=torch.int32), torch.empty(count, layers, dtype=torch.float64)
         out, log_slopes = torch.empty_like(values), torch.empty_like(values)
-        arrays = [tensor.numpy() for tensor in (shares, bins, out, log_slopes)]
+        arrays = [tensor.numpy() for tensor in (shares, bins, places, out, log_slopes)]
         kernel = spline_kernels.inverse if inverted else spline_kernels.forward
-        kernel(parameters.numpy(), values.numpy(), periodic.numpy(), SOFTNESS, EDGE, *arrays)
-        ctx.save_for_backward(parameters, shares, bins, out if inverted else values, periodic)
-        ctx.inverted = inverted
+        kernel(parameters.numpy(), values.numpy(), periodic, SOFTNESS, EDGE, *arrays)
+        ctx.save_for_backward(parameters, shares, bins, places)
+        ctx.periodic, ctx.inverted, ctx.held = periodic, inverted, held
+        if held:
+            ctx.mark_non_differentiable(out)
         return out, log_slopes
 
     @staticmethod
-    def backward(ctx: Any, by_value: Tensor, by_slope: Tensor) -> tuple[Tensor, Tensor, None, None]:
+    def backward(ctx: Any, by_value: Tensor, by_slope: Tensor) -> tuple[Tensor | None, Tensor, None, None, None]:
         from lidardesign.density.flow import spline_kernels
 
-        parameters, shares, bins, base, periodic = ctx.saved_tensors
-        by_parameters, by_argument = torch.empty_like(parameters), torch.empty_like(base)
+        parameters, *kept = ctx.saved_tensors
+        by_parameters, by_argument = torch.empty_like(parameters), torch.empty_like(by_slope)
         spline_kernels.gradient(
-            *(tensor.numpy() for tensor in (parameters, shares, bins, base, periodic)),
+            parameters.numpy(),
+            *(tensor.numpy() for tensor in kept),
+            ctx.periodic,
             SOFTNESS,
-            ctx.inverted,
+            ctx.inverted or ctx.held,
             *(tensor.contiguous().numpy() for tensor in (by_value, by_slope)),
             by_parameters.numpy(),
             by_argument.numpy(),
         )
-        return by_argument, by_parameters, None, None
+        return None if ctx.held else by_argument, by_parameters, None, None, None
 
 
-def spline(values: Tensor, parameters: Tensor, periodic: Tensor, *, inverted: bool = False) -> tuple[Tensor, Tensor]:
-    """Values of splines, or of their inverses, and the log slopes of the splines there.
+def array_splines(values: Tensor, parameters: Tensor, periodic: bool, *, inverted: bool) -> tuple[Tensor, Tensor]:
+    """The same as `splines` as array operations, but for held values."""
+    count, total = parameters.shape[-1] // 3, torch.zeros_like(values)
+    circles = torch.tensor([True], device=values.device) if periodic else None
+    layers = [layer.split([count, count, count + 1], dim=-1) for layer in parameters[:, :, None].unbind(dim=1)]
+    for layer in reversed(layers) if inverted else layers:
+        made = BoundedSpline(*layer, circles)
+        there = made.inv(values[:, None]) if inverted else values[:, None]
+        out, log_slope = made.call_and_ladj(there)
+        values, total = (there if inverted else out)[:, 0], total + log_slope[:, 0]
+    return values, total
+
+
+def splines(
+    values: Tensor, parameters: Tensor, periodic: bool, *, inverted: bool = False, held: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Values of stacks of splines, or of their inverses, and the log slopes of the stacks there.
 
     Arguments:
-        values: In [-1, 1], shape (N, D).
-        parameters: Unconstrained widths, heights and slopes one after another, shape (N, D, 3 K + 1).
-        periodic: Which dimensions lie on a circle, shape (D,).
+        values: In [-1, 1], shape (N,).
+        parameters: Unconstrained widths, heights and slopes one after another, shape (N, splines, 3 K + 1).
+        periodic: Whether the dimension lies on a circle.
         inverted: Whether `values` are outputs whose arguments are wanted.
+        held: Whether the values found are fixed: log slopes then change with parameters as those of the inverse do.
 
     Returns:
-        Both of shape (N, D), differentiable by values and parameters.
+        Both of shape (N,), differentiable by values and parameters.
     """
     if values.device.type == "cpu":
-        return _CompiledSpline.apply(values, parameters, periodic, inverted)
-    count = parameters.shape[-1] // 3
-    made = BoundedSpline(*parameters.split([count, count, count + 1], dim=-1), periodic if periodic.any() else None)
-    if inverted:
-        values = made.inv(values)
-        return values, made.call_and_ladj(values)[1]
-    return made.call_and_ladj(values)
+        return _CompiledSplines.apply(values, parameters, periodic, inverted, held)
+    if held:
+        with torch.no_grad():
+            values, _ = array_splines(values, parameters, periodic, inverted=False)
+        return values, array_splines(values, parameters, periodic, inverted=True)[1]
+    return array_splines(values, parameters, periodic, inverted=inverted)

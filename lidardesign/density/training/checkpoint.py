@@ -29,7 +29,8 @@ from lidardesign.run.files import remove_stray_temporaries
 from lidardesign.run.inputs import STATE, check_file, parse_json
 from lidardesign.run.manifest import forget, read_manifest, verify, write_recorded
 
-FORMAT = "lidardesign-1"
+# 2: one network for each dimension of the flow; files of version 1 had one for each spline.
+FORMAT = "lidardesign-2"
 
 
 def save_arrays(run: Path, name: str, arrays: Mapping[str, np.ndarray], state: Mapping[str, Any]) -> None:
@@ -61,7 +62,8 @@ def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, 
     if FORMAT not in metadata:
         found = ", ".join(sorted(metadata)) or "none"
         ours = found.startswith(FORMAT.rstrip("0123456789"))
-        hint = "use the version of lidardesign that wrote it, or a newer one" if ours else "learn the run again"
+        again = "learn the run again"
+        hint = f"{again}, or use the version of lidardesign that wrote it" if ours else again
         raise DataError(f"has the format {found!r}", where=str(path), allowed=FORMAT, hint=hint)
     for key, value in arrays.items():
         if value.dtype.kind == "f" and not np.isfinite(value).all():

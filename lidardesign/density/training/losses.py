@@ -121,18 +121,16 @@ def balancing_loss(
 ) -> tuple[Tensor, float, float]:
     """A loss whose gradient balances mass by values of p*; also the reverse KL loss and the batch's ESS."""
     base, conditions = flow.draw(count, generator)
-    with torch.no_grad():
-        learned, log_prob = flow(base, conditions)
+    learned, own = flow(base, conditions, held=True)
+    log_prob = own.detach()
     log_weights = log_target_values(coordinates.join(learned, conditions), target, coordinates) - log_prob
     log_z = logsumexp(log_weights) - np.log(count)
     centred = log_weights - log_z
     pull = centred.clamp(-LARGEST_PULL_NATS, LARGEST_PULL_NATS)
     pull = pull - pull.mean()
     proposed, proposed_target, proposed_weights = pool.draw(count, generator, learned)
-    foreign = proposed[:, coordinates.learned]
-    contexts = None if conditions is None else torch.cat([conditions, proposed[:, coordinates.conditions]])
-    both = flow.log_prob(torch.cat([learned, foreign]), contexts)
-    own, others = both[: len(learned)], both[len(learned) :]
+    contexts = None if conditions is None else proposed[:, coordinates.conditions]
+    others = flow.log_prob(proposed[:, coordinates.learned], contexts)
     starved = (proposed_target - others.detach() - log_z).clamp(max=np.log(LARGEST_EMPHASIS)).exp()
     loss = -(pull * own).sum() / count - FORWARD_SHARE * (proposed_weights * starved * others).sum() / count
     leaked = centred < -LARGEST_PULL_NATS
