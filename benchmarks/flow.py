@@ -4,9 +4,9 @@ Every contestant maps the same uniform base points to samples with their log den
 `mean(log q + |x|^2 / 2)` by its weights; the optimiser is left out. All have the same dimensions, spline bins, as many
 splines for each dimension, and networks of two hidden layers, in the same arithmetic. Ours has one network for each
 dimension, which finds the parameters of all its splines; the others have one masked network for each layer. Each
-library runs in the direction in which sampling takes one network pass a layer, and zuko also in its default one. Log densities are held against the Jacobian that
-automatic differentiation finds. Two floors are timed beside them: the networks' matrix products alone, with unmasked
-weights, and those with one exponential for each of their outputs.
+library runs in the direction in which sampling takes one network pass a layer, and zuko also in its default one. Log
+densities are held against the Jacobian that automatic differentiation finds. Two floors are timed beside them: the
+masked networks' matrix products alone, with unmasked weights, and those with one exponential for each of their outputs.
 
     python -m pip install -r benchmarks/requirements.txt      # the libraries that are compared with
     python benchmarks/flow.py [--compile]

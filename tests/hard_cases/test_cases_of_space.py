@@ -202,7 +202,6 @@ class TestElevationAtThePoles:
         assert abs(height.mean() - middle) < references.STANDARD_ERRORS * spread / math.sqrt(20_000)
 
     def test_the_flow_has_a_finite_density_at_the_poles(self):
-        coordinates = Coordinates(AROUND)
         circular, generator = [False] * 3 + [True, False, False], torch.Generator().manual_seed(0)
         flow = DesignFlow(6, layers=1, hidden=8, bins=4, periodic=circular, generator=generator).double()
         points = AROUND.sample(50, np.random.default_rng(8))
