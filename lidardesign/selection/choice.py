@@ -73,7 +73,7 @@ class _Search:
         self.limit_mbps, self.spent_mbps = np.inf, 0.0
         self.gate = np.full(coverage.shape[0], -1)
         self.known = np.zeros(len(coverage.weight))
-        self.gains = coverage.gains(self.known)
+        self.gains = coverage.first_gains.copy()
 
     def improve(self, price: float, limit_mbps: float, *, full: bool, passes: int) -> None:
         """Takes rays at a price and within a bandwidth, then swaps them."""
@@ -82,8 +82,6 @@ class _Search:
         self.limit_mbps = limit_mbps
         self.fill(full)
         for _ in range(passes):
-            # sums of many changes drift by rounding
-            self.gains = coverage.gains(self.known)
             worth = float(coverage.weight @ coverage.counted(self.known))
             changed = self.swap(full, SMALLEST_GAIN * worth)
             self.fill(full)

@@ -136,6 +136,11 @@ class Coverage:
         kernels.gate_gains(self.by_item, known, gains)
         return gains
 
+    @cached_property
+    def first_gains(self) -> np.ndarray:
+        """What each gate of every ray would add where nothing is known, (N, G)."""
+        return self.gains(np.zeros(len(self.weight)))
+
     def value_of(self, gate: np.ndarray) -> float:
         """F of a choice of one gate per ray, -1 for none, (N,)."""
         return float(self.weight @ self.counted(self.known(gate)))
