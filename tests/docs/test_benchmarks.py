@@ -257,6 +257,33 @@ def test_a_page_takes_what_was_measured_between_its_marks_and_keeps_the_rest(scr
         script("rivals").write_page(page, {"arm": found})
 
 
+def test_a_journey_is_compared_command_by_command_and_what_is_kept_is_not_measured_again(
+    script, monkeypatch, tmp_path
+):
+    journey, ran = script("journey"), []
+
+    def measured(root, words, here, caches):
+        here.mkdir(parents=True, exist_ok=True)
+        ran.append(words[0])
+        half = 0.5 if root == ROOT else 1.0
+        took = {"wall_s": 9.0, "cpu_s": 8 * half, "mib": 100.0, "cold_s": None, "misplaced": 0.1}
+        return took | {"score": 5.0 if half < 1 else 4.0, "better": -1}
+
+    monkeypatch.setattr(journey, "measured", measured)
+    words = ["--folder", tmp_path, "--before", tmp_path, "--only", "aisle", "--seeds", "2", "--json", tmp_path / "out"]
+    monkeypatch.setattr(sys, "argv", ["journey", *map(str, words)])
+    for _ in range(2):
+        journey.main()
+        found = json.loads((tmp_path / "out").read_text())
+        times, quality = found["tables"].values()
+        assert {row["CPU / before"] for row in times} == {0.5}
+        assert times[-1] | {"command": "all", "CPU s": 24.0, "before: CPU s": 48.0} == times[-1]
+        assert quality[0]["worse by"] == 0.8
+        assert all(line.startswith("holds") for line in found["conclusions"])
+    assert len(ran) == 2 * 2 * 6
+    assert ran[:4] == ["learn", "learn", "fit", "fit"]
+
+
 @pytest.fixture
 def run_script(run_here, tmp_path):
     """What a script writes as JSON."""
