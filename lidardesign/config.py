@@ -68,7 +68,13 @@ class LearningSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    steps: int = Field(1000, ge=1, le=100_000_000, description="optimiser steps")
+    misplaced: float = Field(
+        0.15, ge=0, le=1, description="share of the density's mass in the wrong place at which learning stops"
+    )
+    steps: int = Field(300, ge=1, le=100_000_000, description="the most optimiser steps")
+    pathwise: int = Field(
+        50, ge=0, le=100_000_000, description="the first steps, which move samples up log p* while sigma falls"
+    )
     batch: int = Field(1024, ge=2, le=1_000_000, description="design points per step")
     rate: float = Field(1e-2, ge=COARSE_SLACK, le=1, description="initial Adam step size")
     frames: int = Field(
@@ -85,8 +91,6 @@ class LearningSettings(BaseModel):
     sigma_start_m: float | None = Field(
         None, ge=SHORTEST_M, le=FARTHEST_M, description="where sigma's annealing starts; default 6 sigma"
     )
-    anneal: float = Field(0.7, ge=0, le=1, description="share of the path-wise steps over which sigma falls")
-    balance: float = Field(0.5, ge=0, le=1, description="share of the steps, at the end, that balance by values")
     balance_proposals: int = Field(
         32768, ge=256, le=10_000_000, description="independent proposals that balancing draws from"
     )
@@ -99,11 +103,16 @@ class LearningSettings(BaseModel):
         8192, ge=256, le=10_000_000, description="independent proposals that coverage is measured on"
     )
 
+    @property
+    def pathwise_steps(self) -> int:
+        """Steps before balancing begins; half of all, where these are few."""
+        return min(self.pathwise, self.steps // 2)
+
 
 PRESET_LEARNING: dict[str, dict[str, Any]] = {
-    "draft": {"steps": 350, "hidden": 64, "samples": 40_000},
+    "draft": {"misplaced": 0.25, "steps": 150, "samples": 40_000},
     "standard": {},
-    "fine": {"steps": 2400, "batch": 4096, "layers": 3, "hidden": 128, "bins": 24, "samples": 200_000},
+    "fine": {"misplaced": 0.05, "steps": 2000, "layers": 3, "hidden": 128, "bins": 24, "samples": 200_000},
 }
 
 
@@ -111,6 +120,8 @@ FILE_NAME = "config.yaml"
 SCHEMA_VERSION = 1
 SECTIONS = ("task", "space", "density", "learning")
 HEADER = ("schema_version", "task_name", "seed", "preset")
+# Keys that runs of earlier versions have and nothing reads any more.
+RETIRED = ("anneal", "balance")
 
 
 @dataclass(frozen=True)
@@ -302,6 +313,8 @@ def config_of(document: Document) -> tuple[Task, RunConfig]:
     layers = _Layers({section: {} for section in SECTIONS})
     header = _header(task, document, None, None)
     _lay_file(layers, task, document)
+    for key in RETIRED:
+        layers.values["learning"].pop(key, None)
     return task, _build(task, header, layers)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidardesign.config import LearningSettings, RunConfig
+from lidardesign.config import RunConfig
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates, on_device, stays_on
 from lidardesign.density.target.prepare import prepare_target, training_scenes
@@ -20,8 +20,8 @@ from lidardesign.density.target.target import Target
 from lidardesign.density.target.visibility import common_receiver
 from lidardesign.density.training.checkpoint import clear_snapshots, save_flow
 from lidardesign.density.training.losses import Pool
-from lidardesign.density.training.quality import draw_probes, measure
-from lidardesign.density.training.training import PROGRESS, LearnProgress, Trainer
+from lidardesign.density.training.quality import IndependentProbes, draw_probes, measure
+from lidardesign.density.training.training import PROGRESS, STOPPING_POINTS, LearnProgress, Trainer
 from lidardesign.density.verdict import Verdict
 from lidardesign.errors import BackgroundNote, ConfigError, DataError
 from lidardesign.estimates import Estimate
@@ -78,12 +78,13 @@ class LearnResult:
 class TrainingData:
     """What learning stands on, however many steps it takes: the target of the training scenes, notes, and proposals.
 
-    `pool` is what balancing draws from.
+    `pool` is what balancing draws from, `probes` are what is measured on while learning.
     """
 
     target: Target
     notes: tuple[str, ...]
     pool: Pool
+    probes: IndependentProbes | None = None
 
 
 def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str], None] | None = None) -> TrainingData:
@@ -125,7 +126,8 @@ def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str],
         # points on the space's faces may leave it by rounding
         unit = config.space.to_unit(points).clip(-1.0, 1.0)
         pool = Pool.of(unit, target.log_density(points), log_density)
-    return TrainingData(target, (*task_notes, *of_lengths, *notes), pool)
+        probes = draw_probes(target, STOPPING_POINTS, random_generator(config.seed, "stopping"))
+    return TrainingData(target, (*task_notes, *of_lengths, *notes), pool, probes)
 
 
 def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
@@ -152,7 +154,7 @@ def learn(
     device: str = "auto",
     progress: Callable[[LearnProgress], None] | None = None,
     data: TrainingData | None = None,
-    replan: Callable[[Trainer], LearningSettings] | None = None,
+    is_over: Callable[[Trainer], bool] | None = None,
     remark: Callable[[str], None] | None = None,
 ) -> LearnResult:
     """Learn the density of a task into a run folder.
@@ -165,7 +167,7 @@ def learn(
         device: auto, cpu or cuda: where the flow lives, and what of the target can (`device_target`).
         progress: Called about every tenth step.
         data: What `prepare_training_data` made of the same task and configuration, to be learned on again.
-        replan: Asked for the settings anew when balancing begins; see `Trainer`.
+        is_over: Asked whether time is over; see `Trainer`.
         remark: See `prepare_training_data`.
 
     Raises:
@@ -176,7 +178,7 @@ def learn(
     with running() as clock:
         data = prepare_training_data(task, config, remark) if data is None else data
         trainer = make_trainer(data, config, run, place)
-        trainer.replan = replan
+        trainer.is_over = is_over
         if resume:
             trainer.resume()
         else:
@@ -184,14 +186,12 @@ def learn(
             clear_snapshots(run)
         with phase("learning"):
             trainer.train(progress)
-        # float32 steps train as well and cost less; samples and their densities are worth float64
-        trainer.flow.double()
-        generator = random_generator(config.seed, "coverage")
+        learned, generator = trainer.learned(), random_generator(config.seed, "coverage")
         with phase("measuring"):
             probes = draw_probes(trainer.target, config.learning.coverage_proposals, generator)
-        measured = measure(trainer, probes, config.learning.samples)
+        measured = measure(learned, probes, config.learning.samples)
         with phase("writing"):
-            save_flow(trainer.flow, run, FLOW, **({} if measured.thinning is None else asdict(measured.thinning)))
+            save_flow(learned.flow, run, FLOW, **({} if measured.thinning is None else asdict(measured.thinning)))
             save_samples(measured.samples, run)
             if (run / PROGRESS).exists():
                 record(run, [PROGRESS])
@@ -242,7 +242,7 @@ def make_trainer(data: TrainingData, config: RunConfig, run: Path, device: torch
     flow = make_flow(config, generator).to(device=device, dtype=getattr(torch, config.learning.dtype))
     target = data.target if device.type == "cpu" else on_device(data.target, device)
     coordinates, pool = Coordinates(config.space), data.pool.to(device)
-    return Trainer(flow, target, coordinates, generator, config.learning, run, pool)
+    return Trainer(flow, target, coordinates, generator, config.learning, run, pool, data.probes)
 
 
 def make_flow(config: RunConfig, generator: torch.Generator) -> DesignFlow:

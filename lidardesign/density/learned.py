@@ -27,7 +27,7 @@ from lidardesign.density.learn import FLOW, make_flow, training_scenes
 from lidardesign.density.target.prepare import prepare_target
 from lidardesign.density.target.target import Target
 from lidardesign.density.target.visibility import Optics
-from lidardesign.density.training.checkpoint import load_arrays, measured_steps, stored_snapshots, twin_step
+from lidardesign.density.training.checkpoint import load_arrays, stored_snapshots
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.density.training.quality import IndependentProbes, measure
 from lidardesign.density.training.sampling import LearnedFlow, Thinning, draw_samples, log_density_of
@@ -51,23 +51,12 @@ class SnapshotQuality:
         seconds: What they took [s].
         estimates: ess, kl_nats, log_z, coverage and misplaced, with standard errors.
         samples: The samples that these were measured on.
-        twin: The misplaced share of the snapshot shortly before, where one was kept.
     """
 
     step: int
     seconds: float
     estimates: Mapping[str, Estimate]
     samples: Samples
-    twin: Estimate | None = None
-
-    @property
-    def misplaced(self) -> Estimate:
-        """The share that flows around this step misplace: the mean of the twins, with half of what they are apart."""
-        own = self.estimates["misplaced"]
-        if self.twin is None:
-            return own
-        error = max(own.error or 0.0, self.twin.error or 0.0)
-        return Estimate((own.value + self.twin.value) / 2, math.hypot(error, (own.value - self.twin.value) / 2))
 
 
 def check_kept(run: Path) -> None:
@@ -98,15 +87,11 @@ def remeasured(
     Raises:
         DataError: The run is unfinished or damaged.
     """
-    files = {**stored_snapshots(run), config.learning.steps: FLOW}
-    rungs = [step for step in measured_steps(config.learning) if step in files]
-    seconds, qualities = seconds_at(run, rungs), []
-    for step in rungs:
-        reached = measure(load_flow(run, files[step], config, target, seed), probes, count)
-        twin = files.get(twin_step(config.learning, step))
-        other = measure(load_flow(run, twin, config, target, seed), probes, count).estimates if twin else {}
-        misplaced = other.get("misplaced")
-        qualities.append(SnapshotQuality(step, seconds[step], reached.estimates, reached.samples, misplaced))
+    seconds, qualities = seconds_at(run), []
+    for step, name in {**stored_snapshots(run), max(seconds): FLOW}.items():
+        reached = measure(load_flow(run, name, config, target, seed), probes, count)
+        taken = float(np.interp(step, list(seconds), list(seconds.values())))
+        qualities.append(SnapshotQuality(step, taken, reached.estimates, reached.samples))
     return qualities
 
 
@@ -129,8 +114,8 @@ def load_flow(run: Path, name: str, config: RunConfig, target: Target | FlatTarg
     return LearnedFlow(flow, target, Coordinates(config.space), generator.manual_seed(seed))
 
 
-def seconds_at(run: Path, steps: list[int]) -> dict[int, float]:
-    """How long learning had taken after each step, from the run's progress, interpolated between its rows [s].
+def seconds_at(run: Path) -> dict[int, float]:
+    """How long learning had taken after steps, ascending, from the run's progress [s]; nothing after none.
 
     Raises:
         DataError: The progress is missing or damaged.
@@ -138,15 +123,15 @@ def seconds_at(run: Path, steps: list[int]) -> dict[int, float]:
     verify(run, PROGRESS)
     try:
         rows = [json.loads(line) for line in read_file(run / PROGRESS, RECORD).decode().splitlines()]
-        done = np.array([0.0, *(float(row["step"]) for row in rows)])
-        taken = np.array([0.0, *(float(row["seconds"]) for row in rows)])
-        if not (np.isfinite(done).all() and np.isfinite(taken).all() and (np.diff(done) > 0).all()):
+        done = [0, *(int(row["step"]) for row in rows)]
+        taken = [0.0, *(float(row["seconds"]) for row in rows)]
+        if not (np.isfinite(taken).all() and (np.diff(done) > 0).all()):
             raise ValueError("steps do not ascend, or a value is not a number")
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         raise DataError(
             "does not hold the progress of learning", where=str(run / PROGRESS), hint="learn the run again"
         ) from None
-    return {step: float(np.interp(step, done, taken)) for step in steps}
+    return dict(zip(done, taken, strict=True))
 
 
 Loss = Callable[[DesignFlow, torch.Generator], torch.Tensor]

@@ -49,6 +49,8 @@ CHECKPOINTS = "checkpoint*"
 LEARNED_FILES = (
     CONFIGURATION, MANIFEST, "progress.jsonl", "checkpoint.safetensors", "flow.safetensors", SAMPLES, "snapshots/",
 )  # fmt: skip
+# What a tolerance or a time budget sets.
+SET_BY_GOALS = (("learning", "misplaced"), ("learning", "steps"), ("density", "field_resolution"))
 # The sections that learning takes its time from; a seed changes nothing of that.
 TIME_SECTIONS = ("task_name", "task", "space", "density", "learning")
 
@@ -185,11 +187,10 @@ class LearnRequest:
     def plan(self) -> RequestPlan:
         """What learning would do."""
         settings, learning, goal = self.settings, self.settings.learning, self.goal
-        length = f"{learning.steps:,} steps of {learning.batch:,} points"
-        if goal.tolerance is not None:
-            length = f"until at most {goal.tolerance:g} of its mass is in the wrong place, in stages from "
-            length += f"{learning.steps // 8:,} steps"
-        elif goal.time_budget_s is not None:
+        least = learning.misplaced if goal.tolerance is None else goal.tolerance
+        length = f"until at most {least:g} of its mass is in the wrong place, {learning.steps:,} steps of "
+        length += f"{learning.batch:,} points at most"
+        if goal.time_budget_s is not None:
             length = f"as many steps as end within {goal.time_budget_s:g} s"
         steps = [
             f"{'go on with' if self.has_checkpoint else 'learn'} task {self.task.name}, preset {settings.preset}, "
@@ -287,8 +288,6 @@ class LearnRequest:
         checkpoints = sorted(path.name for path in self.place.glob(CHECKPOINTS))
         if checkpoints:
             rest = f"the last checkpoint is {self.place / checkpoints[-1]}"
-        elif has_stages(self.place):
-            rest = f"{self.place} keeps what the finished stages reached"
         else:
             return "before the first checkpoint; nothing was kept"
         again = f"--out {quote(str(self.folder))} {'--overwrite ' if self.replaces else ''}--resume"
@@ -302,7 +301,7 @@ class LearnRequest:
         except BaseException:
             entries = [entry for entry in self.place.iterdir() if entry.name != LOCK]
             nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
-            if not self.begun and nothing_learned and not has_stages(self.place):
+            if not self.begun and nothing_learned:
                 with contextlib.suppress(OSError):
                     # without its configuration a run has not begun, whatever else is left of it
                     (self.place / CONFIGURATION).unlink(missing_ok=True)
@@ -437,10 +436,8 @@ def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tu
         seed=stored.seed if choices["seed"] is None else choices["seed"],
     )
     old, new = dict(leaves(stored.as_document())), dict(leaves(wanted.as_document()))
-    steps = ("learning", "steps")
-    if new[steps] == (read_manifest(run).get(GOAL) or {}).get("planned_steps"):
-        # the stage at work towards a tolerance has its own number of them
-        new[steps] = old[steps]
+    if read_manifest(run).get(GOAL):
+        new.update((path, old.get(path)) for path in SET_BY_GOALS)
     for path in [*old, *new]:
         if old.get(path) != new.get(path):
             raise ConfigError(
@@ -466,10 +463,3 @@ def _new_folder(run: Path) -> Iterator[None]:
             for folder in new:
                 folder.rmdir()
         raise
-
-
-def has_stages(run: Path) -> bool:
-    """Whether trainings were finished on the way to a tolerance: what they reached can be gone on from."""
-    with contextlib.suppress(DataError):
-        return bool((read_manifest(run).get(GOAL) or {}).get("stages"))
-    return False

@@ -10,16 +10,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.config import RunConfig
+from lidardesign.config import RunConfig, save_run_config
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, ThresholdError, check_number
 from lidardesign.run.clock import Clock, outermost_clock, phase
 from lidardesign.run.manifest import DAMAGED_HINT, FILE_NAME, read_manifest
+from lidardesign.run.manifest import note as note_in_manifest
 from lidardesign.run.yaml import leaves, load_yaml
 from lidardesign.task import Task
 
 if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress, LearnResult
-    from lidardesign.density.training.schedule import ToleranceGoal
 
     Train = Callable[..., LearnResult]
 
@@ -30,6 +30,10 @@ TOLERANCES = (1e-4, 0.9999)
 SHORTEST_S, LONGEST_S = 1.0, 366 * 24 * 3600.0
 STEPS_KEY, FIELDS_KEY = "learning.steps", "density.field_resolution"
 GOAL = "goal"
+# A tolerance may take so many times the steps of the preset, a time budget as many as there is time for.
+TOLERANCE_STEPS, MOST_STEPS = 4, 100_000_000
+# A tolerance is met where the measured share is at most so many standard errors above it.
+STANDARD_ERRORS = 2.0
 # What passes before a command's clock runs, where the system does not tell: the program's own imports take 0.3 s.
 STARTUP_S = 0.5
 # A process that is older than this did something else before.
@@ -45,12 +49,13 @@ class Goal:
     Arguments:
         tolerance: The misplaced share to reach.
         time_budget_s: The time to end within.
-        fixed_fields: Whether the resolution of distance fields is the user's own choice.
+        fixed_fields, fixed_steps: Whether the resolution of distance fields and the most steps are the user's choice.
     """
 
     tolerance: float | None = None
     time_budget_s: float | None = None
     fixed_fields: bool = field(default=False, compare=False)
+    fixed_steps: bool = field(default=False, compare=False)
 
     @property
     def is_none(self) -> bool:
@@ -80,7 +85,7 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
         check_number(tolerance, TOLERANCE, *TOLERANCES)
     keys, path = {text.partition("=")[0].strip() for text in given["overrides"]}, given["config_file"]
     if time_budget_s is None:
-        return Goal(tolerance, fixed_fields=path is not None or FIELDS_KEY in keys)
+        return Goal(tolerance, None, path is not None or FIELDS_KEY in keys, path is not None or STEPS_KEY in keys)
     check_number(time_budget_s, TIME_BUDGET, SHORTEST_S, LONGEST_S)
     if STEPS_KEY in keys:
         raise ConfigError(f"the time budget sets {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
@@ -140,32 +145,29 @@ class Learner:
         train = partial(learn_density, self.task, run=self.run, device=self.device, progress=self.progress)
         if goal.tolerance is not None:
             return self._to_tolerance(config, goal, resume, train)
-        if goal.time_budget_s is not None and not resume:
-            return self._within(config, goal.time_budget_s, train)
-        result = train(config, resume=resume, remark=self.remark)
-        return result if goal.is_none else replace(result, goal=read_manifest(self.run)[GOAL])
+        if goal.time_budget_s is not None:
+            return self._within(config, goal.time_budget_s, resume, train)
+        return train(config, resume=resume, remark=self.remark)
 
     def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool, train: Train) -> LearnResult:
-        from lidardesign.density.learn import prepare_training_data
-        from lidardesign.density.training.schedule import goal_of, learn_to_tolerance
+        """Learn until the density and the target's own distance fields are within the tolerance: shares add up."""
+        found = read_manifest(self.run).get(GOAL) or {}
+        of_fields, note = found.get("target_misplaced"), ""
+        if of_fields is None:
+            config, of_fields, note = self._with_fields(config, goal)
+            save_run_config(config, self.run)
+            record = {**goal.as_dict(), "target_misplaced": of_fields}
+            note_in_manifest(self.run, **{GOAL: record})
+        result = train(config, resume=resume, remark=self.remark)
+        error = result.error_estimates["misplaced"].error or 0.0
+        met = result.misplaced + of_fields <= goal.tolerance + STANDARD_ERRORS * error
+        reached = {**goal.as_dict(), "target_misplaced": of_fields, "met": met}
+        note_in_manifest(self.run, **{GOAL: reached})
+        return self._whole(result, note, reached)
 
-        begun, note = goal_of(self.run), ""
-        if begun is None:
-            config, begun, note = self._begun(config, goal)
-        data = prepare_training_data(self.task, config, self.remark)
-
-        def once(staged: RunConfig, going_on: bool) -> LearnResult:
-            return train(staged, resume=going_on, data=data)
-
-        result, reached = learn_to_tolerance(config, self.run, begun, once, resume=resume)
-        tried = ", ".join(f"{stage.misplaced:.3g} with {stage.steps}" for stage in reached.stages)
-        summary = f"misplaced {tried} steps; the tolerance is {reached.tolerance:g}"
-        return self._whole(result, "; ".join(filter(None, [summary, note])), reached.as_dict())
-
-    def _begun(self, config: RunConfig, goal: Goal) -> tuple[RunConfig, ToleranceGoal, str]:
-        """The configuration with fields for the tolerance, and what they leave of it to learning."""
+    def _with_fields(self, config: RunConfig, goal: Goal) -> tuple[RunConfig, float, str]:
+        """The configuration with fields for the tolerance and what they leave of it to learning."""
         from lidardesign.density.target.prepare import training_scenes
-        from lidardesign.density.training.schedule import ToleranceGoal
         from lidardesign.evaluate.accuracy.fields import fields_within
 
         scenes = training_scenes(self.task, config)
@@ -177,25 +179,29 @@ class Learner:
                 allowed=f"above {chosen.misplaced:.2g}",
                 hint=f"a larger {FIELDS_KEY}, or a larger tolerance",
             )
-        begun = ToleranceGoal(goal.tolerance, config.learning.steps, (), chosen.misplaced)
-        return replace(config, density=chosen.density), begun, chosen.note
+        update = {"misplaced": goal.tolerance - chosen.misplaced}
+        if not goal.fixed_steps:
+            update["steps"] = TOLERANCE_STEPS * config.learning.steps
+        learning = config.learning.model_copy(update=update)
+        return replace(config, density=chosen.density, learning=learning), chosen.misplaced, chosen.note
 
-    def _within(self, config: RunConfig, time_budget_s: float, train: Train) -> LearnResult:
+    def _within(self, config: RunConfig, time_budget_s: float, resume: bool, train: Train) -> LearnResult:
+        """Learn until the time is over; config.yaml then has the number of steps."""
         from lidardesign.density.learn import choose_device, prepare_training_data
-        from lidardesign.density.training.schedule import Timekeeper
+        from lidardesign.density.training.schedule import StepTimes, Timekeeper
 
         place, startup = choose_device(self.device), self._startup_s()
-        keeper = Timekeeper(time_budget_s, lambda: self.clock.seconds + startup, config, self.run)
+        config = replace(config, learning=config.learning.model_copy(update={"misplaced": 0.0, "steps": MOST_STEPS}))
+        keeper = Timekeeper(time_budget_s, lambda: self.clock.seconds + startup, config)
         data = prepare_training_data(self.task, config, self.remark)
         with phase("planning"):
-            planned = keeper.plan(data, place)
-        result = train(planned, data=data, replan=keeper.replan)
-        plan = keeper.planned
-        summary = (
-            f"{plan.pathwise_steps} + {plan.balancing_steps} steps fit into {time_budget_s:g} s: "
-            f"{1e3 * plan.pathwise_s:.0f} and {1e3 * plan.balancing_s:.0f} ms each"
-        )
-        return self._whole(result, summary, plan.as_dict())
+            keeper.check(StepTimes.measured(data, config, self.run, place))
+        save_run_config(config, self.run)
+        result = train(config, resume=resume, data=data, is_over=keeper.is_over)
+        reached = config.learning.model_copy(update={"steps": result.steps})
+        save_run_config(replace(config, learning=reached), self.run)
+        note = f"{result.steps} steps fit into {time_budget_s:g} s"
+        return self._whole(result, note, {"time_budget_s": time_budget_s, "steps": result.steps})
 
     def _startup_s(self) -> float:
         """What passed before the clock was made, if it is a command's: that counts for whoever waits [s]."""
@@ -205,9 +211,8 @@ class Learner:
         return STARTUP_S if age is None or age - self.clock.seconds > MOST_STARTUP_S else age - self.clock.seconds
 
     def _whole(self, result: LearnResult, note: str, goal: dict[str, Any]) -> LearnResult:
-        return replace(
-            result, notes=(*result.notes, BackgroundNote(note)), goal=goal, seconds=round(self.clock.seconds, 3)
-        )
+        notes = (*result.notes, *([BackgroundNote(note)] if note else []))
+        return replace(result, notes=notes, goal=goal, seconds=round(self.clock.seconds, 3))
 
 
 def _age_s() -> float | None:

@@ -72,7 +72,6 @@ class ArmTask:
         rays=(400, 1000, 1200),
         level=0.99,  # a path is as bad as its worst frame, so a lost return costs more than a bin
         density={"sigma_m": 0.025, "surface_tolerance_nats": 10.0},
-        learning={"standard": {"steps": 800, "hidden": 64}},
     )
 
     def space(self, config: ArmConfig) -> DesignSpace:

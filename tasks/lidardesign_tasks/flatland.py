@@ -56,11 +56,7 @@ class FlatlandTask:
     defaults: ClassVar[Defaults] = Defaults(
         rays=(8, 16, 32, 64),
         density={"sigma_m": 0.02},
-        learning={
-            "draft": {"steps": 300, "batch": 512, "samples": 20_000},
-            "standard": {"samples": 50_000},
-            "fine": {"samples": 100_000},
-        },
+        learning={"draft": {"samples": 20_000}, "standard": {"samples": 50_000}, "fine": {"samples": 100_000}},
     )
 
     def space(self, config: FlatlandConfig) -> DesignSpace:

@@ -187,9 +187,7 @@ def bodies_by_rest(
     return at_rest, others
 
 
-def build_field(
-    scenes: Sequence[Scene], chosen: Callable[[Body], bool], *, resolution: int, padding_m: float
-) -> Field:
+def build_field(scenes: Sequence[Scene], chosen: Callable[[Body], bool], *, resolution: int, padding_m: float) -> Field:
     """The distances of the chosen bodies of all scenes.
 
     Arguments:
@@ -225,9 +223,7 @@ def check_table(grid: Grid, columns: int, tables: int = 1) -> None:
         )
 
 
-def _table_field(
-    bodies: list[tuple[int, Body]], columns: int, resolution: int, padding_m: float
-) -> TableField:
+def _table_field(bodies: list[tuple[int, Body]], columns: int, resolution: int, padding_m: float) -> TableField:
     meshes = [body.shape.transformed(body.pose()) for _, body in bodies]
     corners = np.concatenate([mesh.bounds_m for mesh in meshes])
     grid = grid_around(np.stack([corners.min(axis=0), corners.max(axis=0)]), resolution, padding_m)

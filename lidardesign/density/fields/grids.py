@@ -130,9 +130,9 @@ def nearest_known(beyond: np.ndarray, grid: Grid) -> np.ndarray:
     """For the grid points that are `beyond` a band, shape (size,) bool: the rows of the nearest ones that are not."""
     from scipy.ndimage import distance_transform_edt
 
-    nearest = distance_transform_edt(
-        beyond.reshape(grid.counts), return_distances=False, return_indices=True
-    ).reshape(3, -1)[:, beyond]
+    nearest = distance_transform_edt(beyond.reshape(grid.counts), return_distances=False, return_indices=True).reshape(
+        3, -1
+    )[:, beyond]
     return np.ravel_multi_index(tuple(nearest), tuple(grid.counts))
 
 

@@ -28,7 +28,6 @@ FLOAT32_BIAS, FLOAT32_MANTISSA_BITS = 127, 23
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
-
 @njit(cache=True, nogil=True, inline="always")
 def locate(counts, low, inverse_step, p, cell, fraction, excess):  # noqa: ANN001, ANN201
     """Cell, fraction in it and excess beyond the grid of one point; returns the squared excess."""
@@ -64,9 +63,7 @@ def _blend(table, index, weight, out):  # noqa: ANN001, ANN202
     r0, r1, r2, r3 = table[index[0]], table[index[1]], table[index[2]], table[index[3]]
     r4, r5, r6, r7 = table[index[4]], table[index[5]], table[index[6]], table[index[7]]
     for c in range(table.shape[1]):
-        out[c] = (
-            w0 * r0[c] + w1 * r1[c] + w2 * r2[c] + w3 * r3[c] + w4 * r4[c] + w5 * r5[c] + w6 * r6[c] + w7 * r7[c]
-        )
+        out[c] = w0 * r0[c] + w1 * r1[c] + w2 * r2[c] + w3 * r3[c] + w4 * r4[c] + w5 * r5[c] + w6 * r6[c] + w7 * r7[c]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, inline="always")
@@ -325,5 +322,3 @@ def table_value_gradient(field, points, weights, out):  # noqa: ANN001, ANN201
             dots[corner] = total
         for axis in range(3):
             out[n, axis] = trilinear_slope(dots, fraction, axis) * inverse_step if excess[axis] == 0.0 else 0.0
-
-

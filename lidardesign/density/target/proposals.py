@@ -46,9 +46,7 @@ MINIMUM_COSINE = 1e-3
 MAXIMUM_COLUMNS = 128
 
 
-def independent_points(
-    target: Target, count: int, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def independent_points(target: Target, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 6) inside the space, at most `count`, and their log density per chart volume up to a constant.
 
     Empty where no ray of the space comes near a target.
@@ -65,9 +63,7 @@ def independent_points(
     return proposals.points, proposals.log_density
 
 
-def resampled_proposals(
-    target: Target, count: int, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def resampled_proposals(target: Target, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Uniform points resampled by surface proximity, (count, 6), and their log density up to a constant, (count,).
 
     Empty where no candidate comes within `FARTHEST_SIGMAS` of any surface.

@@ -4,16 +4,13 @@ A checkpoint holds every array and counter that a bit-identical resume needs: co
 weight, the random stream. safetensors runs no code and refuses truncated files; the hash in the manifest catches
 flipped bits and `load_arrays` checks that values are finite.
 
-Snapshots are the flow as it was at a few steps of learning: what more steps bought can then be measured. They lie where
-the target is the final one: when balancing begins, and at a quarter and half of it. Before that, steps sharpen the
-target instead of reducing an error. Within it the error jitters from step to step while steps are long, so those two
-have a twin shortly before: how far twins are apart tells by how much. After the last step the flow itself is there.
+Snapshots are the averaged flow as it was when balancing began and after each doubling of the steps from there: what
+more steps bought can then be measured.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -77,6 +74,8 @@ def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, 
     return arrays, state
 
 
+# The flow that steps move, and the average of where it was.
+FLOWS = ("flow", "average")
 COUNTERS = ("step", "skipped", "skipped_in_a_row", "halvings")
 # A step size is divided by 2 to this power.
 MOST_HALVINGS, MOST_STEPS, MOST_SECONDS = 64, 10**12, 1e12
@@ -108,11 +107,13 @@ def check_resumable(
         whole = isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
         if not whole and not (name == "doubled_at" and value is None):
             raise DataError(f"has {name} = {value!r}", where=str(path), allowed="a whole number", hint=HINT)
+    if not isinstance(state.get("stopped"), bool):
+        raise DataError(f"has stopped = {state.get('stopped')!r}", where=str(path), allowed="true or false", hint=HINT)
     seconds = state.get("seconds")
     if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= MOST_SECONDS:
         raise DataError(f"has seconds = {seconds!r}", where=str(path), allowed="a number from 0", hint=HINT)
-    weights = {f"flow.{name}": value.numel() for name, value in flow.state_dict().items()}
-    held = {name: array.size for name, array in arrays.items() if name.startswith("flow.")}
+    weights = {f"{of}.{name}": value.numel() for of in FLOWS for name, value in flow.state_dict().items()}
+    held = {name: array.size for name, array in arrays.items() if name.partition(".")[0] in FLOWS}
     if held != weights:
         differing = sorted(name for name in {*held, *weights} if held.get(name) != weights.get(name))
         raise DataError(f"the checkpoint belongs to another flow: {differing[0]} differs", where=str(path), hint=HINT)
@@ -139,36 +140,13 @@ def check_resumable(
 
 
 FOLDER = "snapshots"
-# Of the last phase. Error falls by a power of the steps: doublings show it best.
-SHARES = (0.0, 1 / 4, 1 / 2)
-# Twins lie this share of the last phase apart: far enough for the flow to have moved, too near to have learned much.
-TWIN_SHARE = 1 / 32
 _NAME = re.compile(rf"{FOLDER}/step-(\d+)\.safetensors")
 
 
-def last_phase_begins(settings: LearningSettings) -> int:
-    """The step from which on the target is the final one."""
-    pathwise = round((1 - settings.balance) * settings.steps)
-    return pathwise if settings.balance else math.ceil(settings.anneal * pathwise)
-
-
-def measured_steps(settings: LearningSettings) -> tuple[int, ...]:
-    """The steps that a training is judged after, ascending; the last one is its end."""
-    first, steps = last_phase_begins(settings), settings.steps
-    return tuple(sorted({*(first + int(share * (steps - first)) for share in SHARES), steps} - {0}))
-
-
-def twin_step(settings: LearningSettings, step: int) -> int | None:
-    """The step of a rung's twin; None for the first rung, the last one, and where there is no room for one."""
-    twin = step - max(round(TWIN_SHARE * (settings.steps - last_phase_begins(settings))), 1)
-    before = max((rung for rung in measured_steps(settings) if rung < step), default=step)
-    return twin if before < twin and step < settings.steps else None
-
-
-def snapshot_steps(settings: LearningSettings) -> tuple[int, ...]:
-    """The steps after which a snapshot is kept, ascending."""
-    rungs = [step for step in measured_steps(settings) if step < settings.steps]
-    return tuple(sorted({*rungs, *(twin_step(settings, step) for step in rungs)} - {None}))
+def is_snapshot(step: int, settings: LearningSettings) -> bool:
+    """Whether the flow is kept after a step: error falls by a power of the steps, and doublings show it best."""
+    doublings, rest = divmod(step, max(settings.pathwise_steps, 1))
+    return rest == 0 and doublings.bit_count() == 1 and step < settings.steps
 
 
 def snapshot_name(step: int) -> str:

@@ -12,12 +12,13 @@ import torch
 from lidardesign.config import RunConfig
 from lidardesign.density.learn import TrainingData, choose_device
 from lidardesign.density.training.checkpoint import load_arrays
-from lidardesign.density.training.schedule import WRITING_S, StepTimes, Timekeeper, stage_steps
-from lidardesign.density.training.training import CHECKPOINT
+from lidardesign.density.training.schedule import WRITING_S, StepTimes, Timekeeper
+from lidardesign.density.training.training import CHECKPOINT, STRETCH
 from lidardesign.run.clock import peak_memory_bytes, phase
 
 UNTRAINED = "how long balancing steps and the measurement take on a learned density; an untrained one was timed"
-STAGES = "how many stages the tolerance takes, and whether it asks for finer distance fields"
+GOOD_ENOUGH = "after how many steps the density is good enough"
+FINER = "whether the tolerance asks for finer distance fields"
 
 
 @dataclass(frozen=True)
@@ -25,12 +26,12 @@ class Forecast:
     """What learning will take on this machine, as far as a few steps tell.
 
     Arguments:
-        seconds: The whole command [s]; with a tolerance its first stage.
-        longest_seconds: With a tolerance all of its stages, else the same [s].
+        seconds: The whole command, where learning stops as soon as it may [s].
+        longest_seconds: The whole command with all steps [s].
         preparing_s: Scenes, fields and proposals [s].
         pathwise_s, balancing_s: One step of each phase [s].
         finishing_s: Measuring [s].
-        steps: Of both phases; with a tolerance those of its first stage.
+        steps: The most that are taken.
         peak_memory_bytes: The most that was held until then; None where the system does not tell.
         gpu_memory_bytes: The most that was held on the GPU; None without one.
         unknown: What a few steps do not tell.
@@ -79,28 +80,32 @@ def forecast(
     Raises:
         ConfigError: The time budget is too short to learn anything useful.
     """
-    prepared, place, share = elapsed_s(), choose_device(device), config.learning.balance
-    times = StepTimes.measured(data, config, run, place)
-    stages = [config.learning.steps]
+    prepared, place, learning = elapsed_s(), choose_device(device), config.learning
+    times, done = StepTimes.measured(data, config, run, place), 0
     if resume:
         _, state = load_arrays(run, CHECKPOINT)
-        stages = [max(config.learning.steps - int(state["step"]), 0)]
-    elif tolerance is not None:
-        stages = list(stage_steps(config.learning.steps))
-    elif time_budget_s is not None:
-        stages = [Timekeeper(time_budget_s, lambda: prepared, config, run).fitting(times).steps]
+        done = int(state["step"])
+    steps = learning.steps
+    if time_budget_s is not None:
+        keeper = Timekeeper(time_budget_s, lambda: prepared, config)
+        keeper.check(times)
+        steps = learning.pathwise_steps + times.balancing_within(keeper.left_s, learning.pathwise_steps)
+    # the first time that it is measured how good the density is
+    fewest = min(learning.pathwise_steps + STRETCH, steps) if learning.misplaced else steps
     # what a budget keeps in reserve for writing is more than writing takes
     times = replace(times, finishing_s=times.finishing_s - WRITING_S)
-    taken = [times.of(steps, share) for steps in stages]
+    pathwise = max(learning.pathwise_steps - done, 0)
+    taken = [times.of(pathwise, max(most - max(done, learning.pathwise_steps), 0)) for most in (fewest, steps)]
+    unknown = [UNTRAINED, *([GOOD_ENOUGH] if fewest < steps else []), *([FINER] if tolerance is not None else [])]
     return Forecast(
         prepared + taken[0],
-        prepared + sum(taken),
+        prepared + taken[1],
         prepared,
         times.pathwise_s,
         times.balancing_s,
         times.finishing_s,
-        stages[0],
+        max(steps - done, 0),
         peak_memory_bytes(),
         torch.cuda.max_memory_allocated(place) if place.type == "cuda" else None,
-        (*([UNTRAINED] if share > 0 else []), *([STAGES] if tolerance is not None and not resume else [])),
+        tuple(unknown),
     )

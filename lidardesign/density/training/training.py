@@ -1,21 +1,30 @@
-"""Training the flow on the target: annealing, then balancing, with divergence handling and exact resume.
+"""Training the flow on the target until it is good enough, with divergence handling and exact resume.
 
-First the reverse KL along paths, while sigma falls geometrically from its start to its final value, so that surfaces
-are found while they are wide; eta falls to zero with it. The last steps balance the mass by values of p* (`losses`).
+The first steps follow the reverse KL along paths while sigma falls geometrically from its start to its final value, so
+that surfaces are found while they are wide; eta falls to zero with it. All further ones balance the mass by values of
+p* (`losses`), with steps of one size. What is learned is the average of the weights on the way, the later ones counting
+more: it is at every step about as good as steps of falling size would have been that were planned to end there, so
+training may stop at any. Every `STRETCH` steps the average is measured against the target, and training stops once the
+share of its mass in the wrong place is small enough.
+
 A step whose loss or gradient is not finite is skipped; several in a row take the last good weights back and halve the
 step size; when that does not help either, training stops with the last good checkpoint. Balancing looks back from
 places to densities: where float32 cannot (`losses.round_trip_nats`), the remaining steps are taken in float64.
 
-Every `SNAPSHOT_STEPS` steps the whole state is copied. Checkpoints are these copies, also after an interruption: a
-resumed run falls back on the same weights as an uninterrupted one would, so both stay the same bit for bit.
+Every `STRETCH` steps the whole state is copied. Checkpoints are these copies, also after an interruption: a resumed run
+falls back on the same weights as an uninterrupted one would, so both stay the same bit for bit.
+
+References:
+    Averages of polynomial weight, Shamir and Zhang 2013, arXiv:1212.1824.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,16 +37,18 @@ from lidardesign.config import LearningSettings
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.checkpoint import (
     COUNTERS,
+    FLOWS,
     MOMENTS,
     check_resumable,
     clear_snapshots,
+    is_snapshot,
     load_arrays,
     save_arrays,
     save_flow,
     snapshot_name,
-    snapshot_steps,
 )
 from lidardesign.density.training.losses import TOLERANCE_NATS, Pool, balancing_loss, pathwise_loss, round_trip_nats
+from lidardesign.density.training.quality import IndependentProbes, measure
 from lidardesign.density.training.sampling import LearnedFlow
 from lidardesign.errors import DataError, DivergenceError, NumericalError
 from lidardesign.numerics import HALF_DIGITS
@@ -105,12 +116,19 @@ class Adam:
 CHECKPOINT = "checkpoint.safetensors"
 PROGRESS = "progress.jsonl"
 SIGMA_START_RATIO = 6.0
-# The step size falls over each phase on a cosine between these shares of its initial value.
-PATHWISE_RATES = (1.0, 0.1)
-BALANCING_RATES = (0.6, 0.006)
+# The share of the path-wise steps over which sigma falls.
+ANNEALED = 0.7
+# The step size falls on a cosine to this share over the path-wise steps; it is a constant share while balancing.
+LAST_PATHWISE_RATE = 0.1
+BALANCING_RATE = 0.6
+# The average after k steps has the weights after step j in proportion to (j / k)^AVERAGING, about.
+AVERAGING = 4
 SKIPS_BEFORE_BACKING_OFF = 5
 HALVINGS_BEFORE_GIVING_UP = 6
-SNAPSHOT_STEPS = 50
+STRETCH = 50
+# What is measured on the way is known to about 0.01; it has to be below the goal by so many standard errors.
+STOPPING_POINTS = 2048
+STANDARD_ERRORS = 1.0
 PROGRESS_STEPS = 10
 ROUND_TRIPS = 256
 
@@ -120,10 +138,10 @@ class LearnProgress:
     """Where learning stands, for progress bars and progress.jsonl.
 
     Arguments:
-        step, steps: Done and planned.
+        step, steps: Done, and the most that are taken; 0 where time decides.
         loss: Mean of (1 + eta) log p - log p* over the batch [nats].
         ess: Effective share of the batch at the present sigma.
-        seconds: Spent so far; seconds_left: estimated.
+        seconds: Spent so far; seconds_left: with all steps, None where time decides.
         phase: "fields", "learning" or "measuring".
     """
 
@@ -132,7 +150,7 @@ class LearnProgress:
     loss: float
     ess: float
     seconds: float
-    seconds_left: float
+    seconds_left: float | None
     phase: str = "learning"
 
 
@@ -144,23 +162,27 @@ _State = tuple[dict[str, np.ndarray], dict[str, Any]]
 class Trainer(LearnedFlow):
     """The state of training: flow, optimiser, random stream and counters.
 
-    `replan` is asked for other settings once, when balancing begins; they may differ in the number of balancing steps.
-    `doubled_at` is the step from which on float64 replaced float32, None where it did not have to.
+    `average` is what is learned, in place of `flow`, which steps move. `is_over` is asked before each balancing step
+    once these are as many as the path-wise ones: a time budget. `doubled_at` is the step from which on float64 replaced
+    float32, None where it did not have to.
     """
 
     settings: LearningSettings
     run: Path
     pool: Pool
+    probes: IndependentProbes | None = None
+    is_over: Callable[[Trainer], bool] | None = None
     step: int = 0
+    stopped: bool = False
     skipped: int = 0
     skipped_in_a_row: int = 0
     halvings: int = 0
     doubled_at: int | None = None
     seconds_before: float = 0.0
-    replan: Callable[[Trainer], LearningSettings] | None = None
     _snapshot: _State | None = None
 
     def __post_init__(self) -> None:
+        self.average = copy.deepcopy(self.flow)
         self.optimiser = Adam(self.flow.parameters(), self.settings.rate)
         self._started = time.perf_counter()
 
@@ -172,59 +194,109 @@ class Trainer(LearnedFlow):
     @property
     def pathwise_steps(self) -> int:
         """Steps before balancing begins."""
-        return round((1 - self.settings.balance) * self.settings.steps)
+        return self.settings.pathwise_steps
+
+    @property
+    def balanced_steps(self) -> int:
+        """Balancing steps that are done; negative before they begin."""
+        return self.step - self.pathwise_steps
+
+    def learned(self, generator: torch.Generator | None = None) -> LearnedFlow:
+        """What is learned by now, in float64: the average; samples are drawn from the trainer's own stream, or another.
+
+        Steps are taken in float32 as well and cost less; samples and their densities are worth float64.
+        """
+        average = copy.deepcopy(self.average).double()
+        return LearnedFlow(average, self.target, self.coordinates, generator or self.generator)
 
     def sigma_m(self, step: int) -> float:
         """The annealed sigma of a step [m]."""
         final = self.target.optics.sigma_m
         start = max(self.settings.sigma_start_m or SIGMA_START_RATIO * final, final)
-        fraction = min(step / max(self.settings.anneal * self.pathwise_steps, 1.0), 1.0)
+        fraction = min(step / max(ANNEALED * self.pathwise_steps, 1.0), 1.0)
         return start * (final / start) ** fraction
 
     def _rate(self) -> float:
-        pathwise = self.step < self.pathwise_steps
-        first, last = PATHWISE_RATES if pathwise else BALANCING_RATES
-        begin, end = (0, self.pathwise_steps) if pathwise else (self.pathwise_steps, self.settings.steps)
-        angle = math.pi * ((self.step - begin) / max(end - begin, 1))
-        return self.settings.rate * (last + (first - last) * (1 + math.cos(angle)) / 2) / 2**self.halvings
+        share = BALANCING_RATE
+        if self.step < self.pathwise_steps:
+            cosine = math.cos(math.pi * self.step / self.pathwise_steps)
+            share = LAST_PATHWISE_RATE + (1 - LAST_PATHWISE_RATE) * (1 + cosine) / 2
+        return self.settings.rate * share / 2**self.halvings
 
     def train(self, progress: Callable[[LearnProgress], None] | None = None) -> None:
-        """Run the remaining steps, with checkpoints, one of them when it is interrupted; raises DivergenceError."""
+        """Run until it is good enough or all steps are done, with checkpoints, one of them when it is interrupted.
+
+        Raises:
+            DivergenceError: Learning stayed non-finite.
+        """
         try:
             checkpointed = time.perf_counter()
-            while self.step < self.settings.steps:
-                if self.step % SNAPSHOT_STEPS == 0 or self.step == self.pathwise_steps:
+            while not self.stopped and self.step < self.settings.steps:
+                if self.balanced_steps % STRETCH == 0 or self._snapshot is None:
                     self._begin_stretch()
-                if self.step % SNAPSHOT_STEPS == 0 or self._snapshot is None:
                     self._snapshot = self._state()
                     if time.perf_counter() - checkpointed > self.settings.checkpoint_seconds:
                         self._save(*self._snapshot)
                         checkpointed = time.perf_counter()
-                if self.replan is not None and self.step == self.pathwise_steps:
-                    self.settings, self.replan = self.replan(self), None
                 loss, ess = self._advance()
-                if self.step in snapshot_steps(self.settings):
-                    save_flow(self.flow, self.run, snapshot_name(self.step), step=self.step)
-                if self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
-                    seconds = self.seconds
-                    left = seconds / self.step * (self.settings.steps - self.step)
-                    row = {
-                        "step": self.step,
-                        "loss": loss if math.isfinite(loss) else None,
-                        "ess": ess if math.isfinite(ess) else None,
-                        "sigma_m": self.sigma_m(self.step),
-                        "rate": self._rate(),
-                        "skipped": self.skipped,
-                        "seconds": round(seconds, 3),
-                    }
-                    append_line(self.run / PROGRESS, json.dumps(row))
-                    if progress:
-                        progress(LearnProgress(self.step, self.settings.steps, loss, ess, seconds, left))
+                if is_snapshot(self.step, self.settings):
+                    save_flow(self.average, self.run, snapshot_name(self.step), step=self.step)
+                reached = self._reached()
+                self.stopped = self._is_good_enough(reached) or self._is_over()
+                if reached or self.stopped or self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
+                    self._report(loss, ess, reached, progress)
         except KeyboardInterrupt:
             if self._snapshot is not None:
                 self._save(*self._snapshot)
             raise
         self._save(*self._state())
+
+    def _reached(self) -> dict[str, float]:
+        """The misplaced share and its standard error, after a stretch of balancing; nothing where nobody asks."""
+        if not self.settings.misplaced or self.probes is None or self.balanced_steps <= 0:
+            return {}
+        if self.balanced_steps % STRETCH or self.step == self.settings.steps:
+            return {}
+        own = torch.Generator().manual_seed(self.step)
+        with phase("measuring"):
+            try:
+                found = measure(self.learned(own), self.probes, STOPPING_POINTS).estimates["misplaced"]
+            except NumericalError:  # a flow without numbers is not good
+                return {}
+        return {"misplaced": found.value, "misplaced_error": found.error or 0.0}
+
+    def _is_good_enough(self, reached: Mapping[str, float]) -> bool:
+        if not reached:
+            return False
+        return reached["misplaced"] + STANDARD_ERRORS * reached["misplaced_error"] <= self.settings.misplaced
+
+    def _is_over(self) -> bool:
+        return self.is_over is not None and self.balanced_steps >= self.pathwise_steps and self.is_over(self)
+
+    def _report(
+        self,
+        loss: float,
+        ess: float,
+        reached: Mapping[str, float],
+        progress: Callable[[LearnProgress], None] | None,
+    ) -> None:
+        seconds = self.seconds
+        row = {
+            "step": self.step,
+            "loss": loss if math.isfinite(loss) else None,
+            "ess": ess if math.isfinite(ess) else None,
+            "sigma_m": self.sigma_m(self.step),
+            "rate": self._rate(),
+            "skipped": self.skipped,
+            "seconds": round(seconds, 3),
+            **reached,
+        }
+        append_line(self.run / PROGRESS, json.dumps(row))
+        if progress:
+            steps, left = self.settings.steps, seconds / self.step * (self.settings.steps - self.step)
+            if self.is_over is not None:
+                steps, left = 0, None
+            progress(LearnProgress(self.step, steps, loss, ess, seconds, left))
 
     def _advance(self) -> tuple[float, float]:
         self.optimiser.rate = self._rate()
@@ -236,7 +308,15 @@ class Trainer(LearnedFlow):
         else:
             self._skip()
         self.step += 1
+        self._average()
         return value, ess
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        """Follow the flow: exactly until balancing begins, as the mean of polynomial weight from there."""
+        done = max(self.balanced_steps, 1)
+        share = (AVERAGING + 1) / (AVERAGING + done)
+        torch._foreach_lerp_(list(self.average.parameters()), list(self.flow.parameters()), share)
 
     def find_gradient(self) -> tuple[torch.Tensor, torch.Tensor, float, float]:
         """Fill the gradients of a step without taking it: the loss, their norm, the loss and the ESS for reports."""
@@ -278,6 +358,7 @@ class Trainer(LearnedFlow):
     def _double(self, step: int) -> None:
         self.doubled_at = step
         self.flow.double()
+        self.average.double()
         for parameter in self.flow.parameters():
             state = self.optimiser.state.get(parameter, {})
             state.update({name: _moved(name, value, parameter) for name, value in state.items()})
@@ -307,7 +388,11 @@ class Trainer(LearnedFlow):
         self._restore_arrays(self._snapshot[0])
 
     def _state_arrays(self) -> dict[str, np.ndarray]:
-        arrays = {f"flow.{name}": value.detach().cpu().numpy().copy() for name, value in self.flow.state_dict().items()}
+        arrays = {
+            f"{of}.{name}": value.detach().cpu().numpy().copy()
+            for of in FLOWS
+            for name, value in getattr(self, of).state_dict().items()
+        }
         for index, parameter in enumerate(self.flow.parameters()):
             for name, value in self.optimiser.state.get(parameter, {}).items():
                 arrays[f"adam.{index}.{name}"] = torch.as_tensor(value).cpu().numpy().copy()
@@ -315,10 +400,11 @@ class Trainer(LearnedFlow):
         return arrays
 
     def _restore_arrays(self, arrays: dict[str, np.ndarray]) -> None:
-        prefix = "flow."
-        flow = {key[len(prefix) :]: torch.as_tensor(value) for key, value in arrays.items() if key.startswith(prefix)}
         try:
-            self.flow.load_state_dict(flow)
+            for of in FLOWS:
+                start = f"{of}."
+                weights = {key[len(start) :]: torch.as_tensor(v) for key, v in arrays.items() if key.startswith(start)}
+                getattr(self, of).load_state_dict(weights)
         except RuntimeError as error:
             raise DataError(
                 f"the checkpoint belongs to another flow: {str(error).splitlines()[-1].strip()}",
@@ -331,7 +417,7 @@ class Trainer(LearnedFlow):
             self.optimiser.state[parameter] = {name: _moved(name, value, parameter) for name, value in moments.items()}
 
     def _state(self) -> _State:
-        counters = {name: getattr(self, name) for name in (*COUNTERS, "doubled_at")}
+        counters = {name: getattr(self, name) for name in (*COUNTERS, "stopped", "doubled_at")}
         return self._state_arrays(), {**counters, "seconds": self.seconds}
 
     def _save(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
@@ -347,7 +433,7 @@ class Trainer(LearnedFlow):
             self._double(state["doubled_at"])
         self._restore_arrays(arrays)
         self.generator.set_state(torch.as_tensor(arrays["generator"]))
-        for name in COUNTERS:
+        for name in (*COUNTERS, "stopped"):
             setattr(self, name, state[name])
         self.seconds_before, self._started = state["seconds"], time.perf_counter()
         clear_snapshots(self.run, beyond=self.step)

@@ -14,7 +14,6 @@ from lidardesign.density.learn import FLOW
 from lidardesign.density.learned import SnapshotQuality, load_flow, remeasured
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.quality import IndependentProbes, draw_probes, measure
-from lidardesign.density.training.schedule import goal_of
 from lidardesign.design.fit import fit_like
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec
@@ -40,16 +39,16 @@ BECAUSE = (
 # A quick fit shows what a density's errors are worth in the metric; a careful one would take the sweep's time.
 SCORED_SCENES = 8
 RESTARTS = 2
-STEPS_NOTE = "fewer steps are what this run had reached on its way; a run planned for that many does better"
+STEPS_NOTE = "fewer steps are what this run had reached on its way; a run of that many does as well"
 
 
 def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """The run's own snapshots; the stages of a tolerance, and runs of other presets beside it, where there are any."""
+    """The run's own snapshots, and runs of other presets beside it, where there are any."""
     seed, target = request.config.seed, request.target
     probes = draw_probes(target, PROBES, random_generator(seed, "accuracy", "training"))
     reached = remeasured(request.run, request.config, target, probes, count=SAMPLES, seed=seed)
     by_steps = _steps_sweep(request, reached)
-    return [by_steps, *_stages_sweep(request), *_preset_sweep(request, reached[-1], target, probes)]
+    return [by_steps, *_preset_sweep(request, reached[-1], target, probes)]
 
 
 def _steps_sweep(request: AccuracyRequest, reached: Sequence[SnapshotQuality]) -> Sweep:
@@ -57,24 +56,10 @@ def _steps_sweep(request: AccuracyRequest, reached: Sequence[SnapshotQuality]) -
     scores = [judge.scores(one.samples) for one in reached]
     measurements = []
     for one, own in zip(reached, scores, strict=True):
-        # the error with the jitter from step to step
-        figures, further = {**one.estimates, "misplaced": one.misplaced}, judge.values(own, scores[-1])
-        measurements.append(_measure(str(one.step), figures, one.seconds, further, default=one is reached[-1]))
+        further, is_last = judge.values(own, scores[-1]), one is reached[-1]
+        measurements.append(_measure(str(one.step), one.estimates, one.seconds, further, default=is_last))
     note = STEPS_NOTE if len(measurements) > 1 else "this run kept no snapshots; a run that is learned now does"
     return _sweep("learning.steps", "learning up to there", measurements, note + judge.note)
-
-
-def _stages_sweep(request: AccuracyRequest) -> Sequence[Sweep]:
-    """What `learn --tolerance` measured on its way to this run, if it was."""
-    goal = goal_of(request.run)
-    if goal is None or len(goal.stages) < 2:
-        return []
-    measurements = [
-        Measurement(str(stage.steps), stage.misplaced, stage.error, stage.seconds, default=stage is goal.stages[-1])
-        for stage in goal.stages
-    ]
-    note = f"measured when the run was learned to a tolerance of {goal.tolerance:g}"
-    return [_sweep("learning.steps, each learned from the start", "learning and measuring", measurements, note)]
 
 
 def _preset_sweep(
