@@ -21,7 +21,7 @@ from lidardesign.registry import UnknownTaskError, load_task, plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, verify, write_recorded
 from lidardesign.run.overrides import Override, apply_override, parse_override
-from lidardesign.run.validation import anchor_paths, check_model, is_name, suggest
+from lidardesign.run.validation import anchor_paths, check_model, is_name
 from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml
 from lidardesign.space import DIMENSIONS, FARTHEST_M, SHORTEST_M, DesignSpace
 from lidardesign.task import Task, TaskConfig
@@ -313,8 +313,6 @@ def config_of(document: Document) -> tuple[Task, RunConfig]:
     layers = _Layers({section: {} for section in SECTIONS})
     header = _header(task, document, None, None)
     _lay_file(layers, task, document)
-    for key in RETIRED:
-        layers.values["learning"].pop(key, None)
     return task, _build(task, header, layers)
 
 
@@ -331,7 +329,7 @@ def _header(task: Task, document: Document, preset: str | None, seed: int | None
             f"unknown section {unknown[0]!r}",
             where=document.locate((unknown[0],), key=True),
             allowed=", ".join((*HEADER, *SECTIONS)),
-            hint=suggest(unknown[0], (*HEADER, *SECTIONS)) or _meant(task, unknown[0]),
+            hint=_meant(task, unknown[0]),
         )
     if values.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
         raise ConfigError(
@@ -364,6 +362,7 @@ def _header(task: Task, document: Document, preset: str | None, seed: int | None
 
 
 def _lay_file(layers: _Layers, task: Task, document: Document) -> None:
+    is_of_run = Path(document.where).name == FILE_NAME
     for section in SECTIONS:
         values = document.mapping.get(section)
         if values is None:
@@ -374,6 +373,8 @@ def _lay_file(layers: _Layers, task: Task, document: Document) -> None:
                 where=document.locate((section,), key=True),
                 allowed="keys and values",
             )
+        if is_of_run and section == "learning":
+            values = {key: value for key, value in values.items() if key not in RETIRED}
         _merge(layers.values[section], values)
         for path, _ in leaves(values, (section,)):
             for length in range(2, len(path) + 1):
@@ -406,6 +407,7 @@ def _meant(task: Task, key: str, section: str = "") -> str | None:
     own = list(models[section].model_fields) if section else []
     keys = {name: f"{owner}.{name}" for owner, model in models.items() for name in model.model_fields}
     names = {**{name: name for name in models}, **keys}
+    names |= {} if section else {name: name for name in HEADER}
     close = difflib.get_close_matches(key, [*own, *names], n=1)
     return f"did you mean {names[close[0]]!r}?" if close and close[0] not in own else None
 

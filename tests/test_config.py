@@ -21,8 +21,9 @@ from lidardesign.design.catalog.statements import PartFile
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.registry import list_tasks, load_task
-from lidardesign.run.manifest import start_manifest
+from lidardesign.run.manifest import start_manifest, write_recorded
 from lidardesign.run.overrides import parse_override
+from lidardesign.run.yaml import dump_yaml
 from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig
 
@@ -267,6 +268,24 @@ def test_what_was_saved_is_loaded_back(tmp_path, monkeypatch):
     assert loaded == saved
     assert DensitySettings().model_dump().keys() <= loaded.as_document()["density"].keys()
     assert [name for name in DIMENSIONS if name not in loaded.as_document()["space"]] == []
+
+
+def test_settings_that_only_earlier_versions_had_are_left_out_of_their_runs_and_refused_elsewhere(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(config_module, "load_task", lambda name: {"toy": TASK}[name])
+    start_manifest(tmp_path, command=[], seed=0)
+    document = resolve(TASK, overrides=["learning.steps=700"]).as_document()
+    for key in ("misplaced", "pathwise"):
+        del document["learning"][key]
+    document["learning"] |= {"anneal": 0.7, "balance": 0.5}
+    write_recorded(tmp_path, "config.yaml", dump_yaml(document).encode())
+    loaded = load_run_config(tmp_path)[1]
+    assert loaded == resolve(TASK, config_file=tmp_path / "config.yaml")
+    assert (loaded.learning.steps, loaded.learning.pathwise) == (700, LearningSettings().pathwise)
+    other = (tmp_path / "config.yaml").rename(tmp_path / "mine.yaml")
+    with pytest.raises(ConfigError, match=r"mine\.yaml:\d+:3: unknown key 'learning\.(anneal|balance)'"):
+        resolve(TASK, config_file=other)
 
 
 def test_a_saved_configuration_that_was_edited_is_noticed(tmp_path):

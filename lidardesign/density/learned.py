@@ -125,7 +125,7 @@ def seconds_at(run: Path) -> dict[int, float]:
         rows = [json.loads(line) for line in read_file(run / PROGRESS, RECORD).decode().splitlines()]
         done = [0, *(int(row["step"]) for row in rows)]
         taken = [0.0, *(float(row["seconds"]) for row in rows)]
-        if not (np.isfinite(taken).all() and (np.diff(done) > 0).all()):
+        if not (np.isfinite(taken).all() and (np.diff(np.array(done, dtype=float)) > 0).all()):
             raise ValueError("steps do not ascend, or a value is not a number")
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         raise DataError(

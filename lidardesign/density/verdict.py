@@ -12,7 +12,7 @@ from typing import Literal
 # The most of its mass in the wrong place, the largest KL [nats] and the least ESS of a density with this verdict.
 BOUNDS: dict[str, tuple[float, float, float]] = {"good": (0.25, 0.5, 0.2), "usable": (0.5, 2.0, 0.05)}
 NEXT = {"draft": "--preset standard learns longer", "standard": "--preset fine learns longer"}
-LAST = "more learning.steps, a smaller space or a larger density.sigma_m are easier to learn"
+LAST = "more learning.steps to a smaller learning.misplaced; a smaller space or a larger density.sigma_m learn faster"
 
 
 @dataclass(frozen=True)

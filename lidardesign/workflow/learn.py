@@ -19,7 +19,7 @@ from lidardesign.run.files import is_temporary, run_lock, writer
 from lidardesign.run.manifest import note, read_manifest, start_manifest
 from lidardesign.run.yaml import dump_yaml, leaves, load_yaml, parse_yaml
 from lidardesign.task import Task, notes_of
-from lidardesign.workflow.learning_budget import GOAL, Goal, Learner, checked_goal, resumed_goal
+from lidardesign.workflow.learning_budget import GOAL, SETS, Goal, Learner, checked_goal, resumed_goal
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
     DESIGN_FOLDER,
@@ -49,8 +49,6 @@ CHECKPOINTS = "checkpoint*"
 LEARNED_FILES = (
     CONFIGURATION, MANIFEST, "progress.jsonl", "checkpoint.safetensors", "flow.safetensors", SAMPLES, "snapshots/",
 )  # fmt: skip
-# What a tolerance or a time budget sets.
-SET_BY_GOALS = (("learning", "misplaced"), ("learning", "steps"), ("density", "field_resolution"))
 # The sections that learning takes its time from; a seed changes nothing of that.
 TIME_SECTIONS = ("task_name", "task", "space", "density", "learning")
 
@@ -144,7 +142,7 @@ class LearnRequest:
             if options.resume:
                 notes("the run has nothing to resume from yet; it starts from the beginning")
             check_can_start(place)
-            settings = resolve(plugin, **choices)
+            settings = goal.applied(resolve(plugin, **choices))
         request = cls(plugin, folder, settings, goal, options.device, begun, replaces, config_file, options.command)
         if replaces:
             notes(f"once it is learned it replaces the run {folder}{request._lost_designs()}")
@@ -187,11 +185,11 @@ class LearnRequest:
     def plan(self) -> RequestPlan:
         """What learning would do."""
         settings, learning, goal = self.settings, self.settings.learning, self.goal
-        least = learning.misplaced if goal.tolerance is None else goal.tolerance
-        length = f"until at most {least:g} of its mass is in the wrong place, {learning.steps:,} steps of "
-        length += f"{learning.batch:,} points at most"
+        length = f"{learning.steps:,} steps of {learning.batch:,} points"
         if goal.time_budget_s is not None:
             length = f"as many steps as end within {goal.time_budget_s:g} s"
+        elif learning.misplaced:
+            length = f"until at most {learning.misplaced:g} of its mass is in the wrong place, at most {length}"
         steps = [
             f"{'go on with' if self.has_checkpoint else 'learn'} task {self.task.name}, preset {settings.preset}, "
             f"seed {settings.seed}, on {self.device}",
@@ -436,8 +434,8 @@ def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tu
         seed=stored.seed if choices["seed"] is None else choices["seed"],
     )
     old, new = dict(leaves(stored.as_document())), dict(leaves(wanted.as_document()))
-    if read_manifest(run).get(GOAL):
-        new.update((path, old.get(path)) for path in SET_BY_GOALS)
+    for goal in read_manifest(run).get(GOAL) or {}:
+        new.update((path, old[path]) for path in (tuple(key.split(".")) for key in SETS.get(goal, ())))
     for path in [*old, *new]:
         if old.get(path) != new.get(path):
             raise ConfigError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,8 +28,11 @@ TOLERANCE, TIME_BUDGET = "--tolerance", "--time-budget"
 TOLERANCES = (1e-4, 0.9999)
 # The program takes longer to start; more than a year is a mistake in the unit, too.
 SHORTEST_S, LONGEST_S = 1.0, 366 * 24 * 3600.0
-STEPS_KEY, FIELDS_KEY = "learning.steps", "density.field_resolution"
-GOAL = "goal"
+STEPS_KEY, MISPLACED_KEY, FIELDS_KEY = "learning.steps", "learning.misplaced", "density.field_resolution"
+# What each goal sets.
+SETS = {"tolerance": (MISPLACED_KEY,), "time_budget_s": (MISPLACED_KEY, STEPS_KEY)}
+# The manifest's word of a goal, and in it what the target's own distance fields misplace.
+GOAL, FIELDS = "goal", "target_misplaced"
 # A tolerance may take so many times the steps of the preset, a time budget as many as there is time for.
 TOLERANCE_STEPS, MOST_STEPS = 4, 100_000_000
 # A tolerance is met where the measured share is at most so many standard errors above it.
@@ -66,6 +69,16 @@ class Goal:
         """What the manifest has of it before anything is learned."""
         return {"time_budget_s": self.time_budget_s} if self.tolerance is None else {"tolerance": self.tolerance}
 
+    def applied(self, config: RunConfig) -> RunConfig:
+        """The configuration that a new run towards the goal begins with."""
+        update: dict[str, Any] = {}
+        if self.time_budget_s is not None:
+            update = {"misplaced": 0.0, "steps": MOST_STEPS}
+        elif self.tolerance is not None:
+            times = 1 if self.fixed_steps else TOLERANCE_STEPS
+            update = {"misplaced": self.tolerance, "steps": min(times * config.learning.steps, MOST_STEPS)}
+        return replace(config, learning=config.learning.model_copy(update=update))
+
 
 def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Mapping[str, Any]) -> Goal:
     """The goal of the two options.
@@ -75,26 +88,30 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
         given: The other options of the configuration, as `lidardesign.config.resolve` takes them.
 
     Raises:
-        ConfigError: Both, a value that is none, or a number of steps beside a time.
+        ConfigError: Both, a value that is none, or beside them a setting that they set.
     """
     if tolerance is not None and time_budget_s is not None:
         raise ConfigError(
             "both set the number of steps", where=f"{TOLERANCE}, {TIME_BUDGET}", allowed="only one of them"
         )
-    if tolerance is not None:
-        check_number(tolerance, TOLERANCE, *TOLERANCES)
     keys, path = {text.partition("=")[0].strip() for text in given["overrides"]}, given["config_file"]
-    if time_budget_s is None:
-        return Goal(tolerance, None, path is not None or FIELDS_KEY in keys, path is not None or STEPS_KEY in keys)
-    check_number(time_budget_s, TIME_BUDGET, SHORTEST_S, LONGEST_S)
-    if STEPS_KEY in keys:
-        raise ConfigError(f"the time budget sets {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
-    if path is not None:
+    goal = Goal(tolerance, time_budget_s, path is not None or FIELDS_KEY in keys, path is not None or STEPS_KEY in keys)
+    if goal.is_none:
+        return goal
+    where, said, bounds = TOLERANCE, "the tolerance", TOLERANCES
+    if tolerance is None:
+        where, said, bounds = TIME_BUDGET, "the time budget", (SHORTEST_S, LONGEST_S)
+    ((name, value),) = goal.as_dict().items()
+    check_number(value, where, *bounds)
+    for key in SETS[name]:
+        if key in keys:
+            raise ConfigError(f"{said} sets {key}", where=where, hint=f"leave out --set {key}")
+    if path is not None and time_budget_s is not None:
         document, key = load_yaml(path, empty_sections=True), tuple(STEPS_KEY.split("."))
         if key in dict(leaves(document.value)):
             where = f"{TIME_BUDGET}, {document.locate(key)}"
             raise ConfigError(f"the time budget sets {STEPS_KEY}", where=where, hint=f"leave out {STEPS_KEY} there")
-    return Goal(None, time_budget_s)
+    return goal
 
 
 def resumed_goal(asked: Goal, run: Path) -> Goal:
@@ -106,7 +123,7 @@ def resumed_goal(asked: Goal, run: Path) -> Goal:
     """
     recorded = read_manifest(run).get(GOAL) or {}
     stored = Goal(recorded.get("tolerance"), recorded.get("time_budget_s"))
-    if not all(isinstance(value, float | int | None) for value in stored.as_dict().values()):
+    if not all(isinstance(value, float | int | None) for value in (*asdict(stored).values(), recorded.get(FIELDS))):
         raise DataError(f"the manifest's {GOAL!r} is damaged", where=str(run / FILE_NAME), hint=DAMAGED_HINT)
     if asked.is_none or asked == stored:
         return stored
@@ -151,17 +168,15 @@ class Learner:
 
     def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool, train: Train) -> LearnResult:
         """Learn until the density and the target's own distance fields are within the tolerance: shares add up."""
-        found = read_manifest(self.run).get(GOAL) or {}
-        of_fields, note = found.get("target_misplaced"), ""
+        of_fields, note = (read_manifest(self.run).get(GOAL) or {}).get(FIELDS), ""
         if of_fields is None:
             config, of_fields, note = self._with_fields(config, goal)
             save_run_config(config, self.run)
-            record = {**goal.as_dict(), "target_misplaced": of_fields}
-            note_in_manifest(self.run, **{GOAL: record})
+            note_in_manifest(self.run, **{GOAL: {**goal.as_dict(), FIELDS: of_fields}})
         result = train(config, resume=resume, remark=self.remark)
         error = result.error_estimates["misplaced"].error or 0.0
         met = result.misplaced + of_fields <= goal.tolerance + STANDARD_ERRORS * error
-        reached = {**goal.as_dict(), "target_misplaced": of_fields, "met": met}
+        reached = {**goal.as_dict(), FIELDS: of_fields, "met": met}
         note_in_manifest(self.run, **{GOAL: reached})
         return self._whole(result, note, reached)
 
@@ -179,10 +194,7 @@ class Learner:
                 allowed=f"above {chosen.misplaced:.2g}",
                 hint=f"a larger {FIELDS_KEY}, or a larger tolerance",
             )
-        update = {"misplaced": goal.tolerance - chosen.misplaced}
-        if not goal.fixed_steps:
-            update["steps"] = TOLERANCE_STEPS * config.learning.steps
-        learning = config.learning.model_copy(update=update)
+        learning = config.learning.model_copy(update={"misplaced": goal.tolerance - chosen.misplaced})
         return replace(config, density=chosen.density, learning=learning), chosen.misplaced, chosen.note
 
     def _within(self, config: RunConfig, time_budget_s: float, resume: bool, train: Train) -> LearnResult:
@@ -191,12 +203,10 @@ class Learner:
         from lidardesign.density.training.schedule import StepTimes, Timekeeper
 
         place, startup = choose_device(self.device), self._startup_s()
-        config = replace(config, learning=config.learning.model_copy(update={"misplaced": 0.0, "steps": MOST_STEPS}))
         keeper = Timekeeper(time_budget_s, lambda: self.clock.seconds + startup, config)
         data = prepare_training_data(self.task, config, self.remark)
         with phase("planning"):
             keeper.check(StepTimes.measured(data, config, self.run, place))
-        save_run_config(config, self.run)
         result = train(config, resume=resume, data=data, is_over=keeper.is_over)
         reached = config.learning.model_copy(update={"steps": result.steps})
         save_run_config(replace(config, learning=reached), self.run)
@@ -232,7 +242,7 @@ def check_met(result: LearnResult, goal: Goal) -> None:
     """
     if goal.tolerance is None or result.goal["met"]:
         return
-    error, fields = result.error_estimates["misplaced"].error, result.goal["target_misplaced"]
+    error, fields = result.error_estimates["misplaced"].error, result.goal[FIELDS]
     doubt = "" if error is None else f" +- {error:.2g}"
     if fields:
         doubt += f", and {fields:.2g} of the target's by its distance fields,"

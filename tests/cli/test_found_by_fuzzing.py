@@ -114,7 +114,7 @@ def test_progress_that_is_none_is_refused_and_cut_back_at_resume(tmp_path, case)
     (run / "progress.jsonl").write_text(f"{good}\n{BAD_PROGRESS[case]}\n")
     record(run, ["progress.jsonl"])
     with pytest.raises(DataError, match="does not hold the progress of learning"):
-        seconds_at(run, [10])
+        seconds_at(run)
     assert _step_of(good) == 10
     assert _step_of(BAD_PROGRESS[case]) in (20, 5, math.inf)
 

@@ -1,110 +1,189 @@
-"""Learning within a time budget or to a tolerance: plans and stages, and the same bytes as a run of their steps."""
+"""Learning that ends when it is good enough, or when its time is over: the same bytes as a run of its steps."""
 
 from __future__ import annotations
+
+import json
+import shutil
 
 import numpy as np
 import pytest
 import torch
 from support.learning import BallTask, Interrupter, config_of, result_bytes
+from support.tables import each_row
 
-from lidardesign.config import LearningSettings, save_run_config
+from lidardesign.config import save_run_config
 from lidardesign.density.learn import learn, make_trainer, prepare_training_data
 from lidardesign.density.training import schedule as budget
-from lidardesign.density.training.checkpoint import FOLDER
-from lidardesign.density.training.schedule import (
-    LEAST_STEPS,
-    Stage,
-    Timekeeper,
-    TimePlan,
-    ToleranceGoal,
-    goal_of,
-    learn_to_tolerance,
-    stage_steps,
-    with_steps,
-)
+from lidardesign.density.training import training
+from lidardesign.density.training.checkpoint import load_arrays
+from lidardesign.density.training.schedule import StepTimes, TimedProbes, Timekeeper
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.run.manifest import note, read_manifest, start_manifest, verify
+from lidardesign.run.clock import Clock
+from lidardesign.run.manifest import note, start_manifest
 from lidardesign.run.yaml import load_yaml
+from lidardesign.workflow.learning_budget import GOAL, MOST_STEPS, Goal, Learner, resumed_goal
 
 CPU = torch.device("cpu")
-FINISHING_S = 2.0
+STRETCH = 10
+# The flow misplaces more when balancing begins, and less after all steps.
+REACHABLE = 0.33
+EARLY = {"pathwise": 20, "layers": 2}
 
 
-@pytest.fixture
-def steps_take(monkeypatch):
-    """Pretend how long steps and the end take, so that no plan depends on the machine."""
-
-    def pretend(*step_seconds):
-        times = iter(step_seconds)
-        monkeypatch.setattr(budget, "_seconds_per_step", lambda trainer, step: next(times))
-        monkeypatch.setattr(budget, "_finishing_s", lambda *_: FINISHING_S)
-
-    return pretend
+@pytest.fixture(autouse=True)
+def short_stretches(monkeypatch):
+    """Measure what is reached every few steps, so that small runs may stop."""
+    monkeypatch.setattr(training, "STRETCH", STRETCH)
 
 
-def keeper_for(run, seconds, **settings):
+def learned(run, progress=None, *, resume=False, is_over=None, **settings):
     run.mkdir(exist_ok=True)
-    start_manifest(run, command=[], seed=0)
-    return Timekeeper(seconds, lambda: 1.0, config_of(**settings), run)
+    return learn(BallTask(), config_of(**{**EARLY, **settings}), run, progress=progress, resume=resume, is_over=is_over)
 
 
-def test_the_plan_fills_the_time_with_steps_of_both_phases(tmp_path, steps_take):
-    steps_take(0.01, 0.02, 0.06)
-    keeper = keeper_for(tmp_path, 31.0)
-    config = keeper.plan(prepare_training_data(BallTask(), keeper.config), CPU)
-    # the slower of the path-wise steps counts: (31 - 1) * 0.9 - 2 s at (0.02 + 0.06) / 2 s a step
-    assert config.learning.steps == 625
-    assert keeper.planned.pathwise_steps == pytest.approx(312, abs=1)
+def is_over_at(step):
+    return lambda trainer: trainer.step >= step
 
 
-@pytest.mark.parametrize("balancing_s", [0.06, 0.5, 50.0])
-def test_a_budgeted_run_is_the_run_of_its_own_configuration_bit_for_bit(tmp_path, steps_take, balancing_s):
-    run, plain = tmp_path / "run", tmp_path / "plain"
-    plain.mkdir()
-    steps_take(0.1, 0.1, 0.1, balancing_s)
-    keeper = keeper_for(run, 15.0)
-    data = prepare_training_data(BallTask(), keeper.config)
-    config = keeper.plan(data, CPU)
-    result = learn(BallTask(), config, run, data=data, replan=keeper.replan)
-    final = load_yaml(run / "config.yaml").mapping["learning"]
-    again = config_of(steps=final["steps"], balance=final["balance"])
-    learn(BallTask(), again, plain)
-    assert result.steps == final["steps"] == keeper.planned.steps
-    assert result_bytes(run) == result_bytes(plain)
-    kept = {path.name: path.read_bytes() for path in (run / FOLDER).iterdir()}
-    assert kept == {path.name: path.read_bytes() for path in (plain / FOLDER).iterdir()}
-    noted = read_manifest(run)["goal"]
-    assert noted["settled"]
-    assert noted["balancing_steps"] == result.steps - noted["pathwise_steps"]
+@pytest.fixture(scope="module")
+def good_enough(tmp_path_factory):
+    """A run that stopped once it was good enough."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(training, "STRETCH", STRETCH)
+        run = tmp_path_factory.mktemp("good")
+        return run, learned(run, misplaced=REACHABLE)
 
 
-def test_too_little_time_is_refused_with_the_least_that_would_do(tmp_path, steps_take):
-    steps_take(0.1, 0.1, 0.3)
-    keeper = keeper_for(tmp_path, 10.0)
-    data = prepare_training_data(BallTask(), keeper.config)
-    with pytest.raises(ConfigError, match=r"--time-budget.*too short to learn.*\n.*at least 26 s") as caught:
-        keeper.plan(data, CPU)
+def test_learning_stops_once_it_is_good_enough_and_measures_at_stretches_only(good_enough):
+    run, result = good_enough
+    rows = [row for row in load_rows(run) if "misplaced" in row]
+    assert result.steps < config_of().learning.steps
+    assert [row["step"] for row in rows] == list(range(40, result.steps + 1, STRETCH))
+    reached = [row["misplaced"] + training.STANDARD_ERRORS * row["misplaced_error"] for row in rows]
+    assert [found <= REACHABLE for found in reached] == [False] * (len(rows) - 1) + [True]
+    # samples that know nothing of those that stopped it
+    assert result.misplaced < REACHABLE + 4 * (result.error_estimates["misplaced"].error + rows[-1]["misplaced_error"])
+
+
+def load_rows(run):
+    return [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+
+
+def test_a_run_that_stopped_is_the_run_of_the_steps_that_it_reached(good_enough, tmp_path):
+    run, result = good_enough
+    learned(tmp_path / "plain", steps=result.steps)
+    assert result_bytes(tmp_path / "plain") == result_bytes(run)
+
+
+def test_a_smaller_goal_takes_no_fewer_steps_and_none_takes_all(good_enough, tmp_path):
+    steps = [learned(tmp_path / str(goal), misplaced=goal, steps=90).steps for goal in (0.0, 1e-6, 1.0)]
+    assert steps == [90, 90, 40]
+    assert steps[-1] <= good_enough[1].steps
+    assert not any("misplaced" in row for row in load_rows(tmp_path / "0.0"))
+
+
+@pytest.mark.parametrize("step", [20, 40, "the last"])
+def test_a_run_that_stops_is_resumed_to_the_same_bytes(good_enough, tmp_path, step):
+    run, straight = good_enough
+    last = straight.steps if step == "the last" else step
+    with pytest.raises(KeyboardInterrupt):
+        learned(tmp_path / "run", Interrupter(last), misplaced=REACHABLE)
+    assert learned(tmp_path / "run", resume=True, misplaced=REACHABLE).steps == straight.steps
+    assert result_bytes(tmp_path / "run") == result_bytes(run)
+
+
+def test_a_run_that_was_killed_after_it_stopped_takes_no_further_step(good_enough, tmp_path, monkeypatch):
+    shutil.copytree(good_enough[0], tmp_path / "run")
+    for name in ("flow.safetensors", "samples.npz"):
+        (tmp_path / "run" / name).unlink()
+    monkeypatch.setattr(training.Trainer, "_advance", lambda *_: pytest.fail("took a step"))
+    assert load_arrays(tmp_path / "run", "checkpoint.safetensors")[1]["stopped"] is True
+    learned(tmp_path / "run", resume=True, misplaced=REACHABLE)
+    assert result_bytes(tmp_path / "run") == result_bytes(good_enough[0])
+
+
+def test_time_decides_only_after_as_many_balancing_steps_as_path_wise_ones(tmp_path):
+    config = config_of()
+    data = prepare_training_data(BallTask(), config)
+    assert learn(BallTask(), config, tmp_path, data=data, is_over=lambda _: True).steps == 100
+
+
+@pytest.mark.parametrize("end", [40, 73])
+def test_a_run_whose_time_was_over_is_the_run_of_its_steps(tmp_path, end):
+    result = learned(tmp_path / "run", is_over=is_over_at(end), steps=MOST_STEPS)
+    plain = learned(tmp_path / "plain", steps=end)
+    assert result.steps == plain.steps == end
+    assert result_bytes(tmp_path / "run") == result_bytes(tmp_path / "plain")
+    (tmp_path / "killed").mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        learned(tmp_path / "killed", Interrupter(end), is_over=is_over_at(end), steps=MOST_STEPS)
+    learned(tmp_path / "killed", resume=True, is_over=is_over_at(end), steps=MOST_STEPS)
+    assert result_bytes(tmp_path / "killed") == result_bytes(tmp_path / "plain")
+
+
+def keeper_for(seconds, elapsed_s=1.0, finishing_s=2.0, **settings):
+    """A keeper of a time, with steps that take 0.1 and 0.3 s and an end of some seconds."""
+    keeper = Timekeeper(seconds, lambda: elapsed_s, config_of(**settings))
+    return keeper, StepTimes(0.1, 0.3, finishing_s, TimedProbes(np.zeros((0, 6)), 1.0, 0.0))
+
+
+@each_row("pathwise", [0, 30, 60])
+def test_too_little_time_is_refused_with_the_least_that_would_do(pathwise):
+    keeper, times = keeper_for(5.0, pathwise=pathwise)
+    with pytest.raises(ConfigError, match=r"--time-budget.*too short to learn.*\n.*at least \d+ s") as caught:
+        keeper.check(times)
     assert caught.value.exit_code == 2
-    steps_take(0.1, 0.1, 0.3)
-    assert keeper_for(tmp_path, 26.0).plan(data, CPU).learning.steps >= LEAST_STEPS
+    least = float(caught.value.allowed.split()[2])
+    keeper_for(least, pathwise=pathwise)[0].check(times)
+    with pytest.raises(ConfigError, match="too short"):
+        keeper_for(least - 1, pathwise=pathwise)[0].check(times)
 
 
-@pytest.mark.parametrize("balance", [0.0, 1.0])
-def test_trainings_of_one_phase_are_planned_too(tmp_path, steps_take, balance):
-    steps_take(0.05, 0.05, 0.05)
-    keeper = keeper_for(tmp_path, 20.0, balance=balance)
-    config = keeper.plan(prepare_training_data(BallTask(), keeper.config), CPU)
-    assert config.learning.balance == balance
-    assert config.learning.steps > LEAST_STEPS
+def test_as_many_balancing_steps_are_foreseen_as_fit_before_the_end():
+    _, times = keeper_for(1.0)
+    for seconds in np.linspace(1.0, 60.0, 20):
+        steps = times.balancing_within(seconds, 30)
+        assert steps == 0 or times.of(30, steps) <= seconds
+        assert times.of(30, steps + 1) > seconds
 
 
-def test_planned_phases_come_back_from_the_settings_exactly():
-    generator = np.random.default_rng(0)
-    for pathwise, balancing in generator.integers(1, 100_000, size=(2000, 2)).tolist():
-        plan = TimePlan(1.0, 1.0, 1.0, 1.0, pathwise, balancing)
-        settings = plan.applied(LearningSettings())
-        assert settings.steps == pathwise + balancing
-        assert round((1 - settings.balance) * settings.steps) == pathwise
+def test_time_is_over_when_another_step_would_leave_too_little_to_finish(monkeypatch, tmp_path):
+    monkeypatch.setattr(budget, "_finishing_s", lambda *_: 4.0)
+    trainer = make_trainer(prepare_training_data(BallTask(), config_of()), config_of(), tmp_path, CPU)
+    for elapsed_s in np.linspace(0.0, 60.0, 61):
+        keeper, times = keeper_for(60.0, elapsed_s)
+        keeper.times = times
+        left_s = (60.0 - elapsed_s) * (1 - budget.RESERVE)
+        assert keeper.is_over(trainer) == (left_s < 4.0 + times.balancing_s)
+
+
+def test_a_time_budget_writes_the_steps_that_it_took_into_the_configuration(tmp_path, monkeypatch):
+    run, plain = tmp_path / "run", tmp_path / "plain"
+    for folder in (run, plain):
+        folder.mkdir()
+        start_manifest(folder, command=[], seed=0)
+    goal = Goal(time_budget_s=3600.0)
+    begun = goal.applied(config_of(misplaced=0.3))
+    save_run_config(begun, run)
+    monkeypatch.setattr(Timekeeper, "is_over", lambda self, trainer: trainer.step >= 105)
+    result = Learner(BallTask(), run, "cpu", None, Clock()).learn(begun, goal, resume=False)
+    kept = load_yaml(run / "config.yaml").mapping["learning"]
+    assert result.goal == {"time_budget_s": 3600.0, "steps": 105}
+    assert (kept["misplaced"], kept["steps"]) == (0.0, 105)
+    learn(BallTask(), config_of(misplaced=kept["misplaced"], steps=kept["steps"]), plain)
+    assert result_bytes(run) == result_bytes(plain)
+
+
+def test_a_goal_sets_what_a_new_run_begins_with():
+    config = config_of(misplaced=0.3)
+    assert Goal().applied(config) == config
+    for goal, misplaced, steps in (
+        (Goal(tolerance=0.1), 0.1, 480),
+        (Goal(tolerance=0.1, fixed_steps=True), 0.1, 120),
+        (Goal(time_budget_s=60.0), 0.0, MOST_STEPS),
+    ):
+        learning = goal.applied(config).learning
+        assert (learning.misplaced, learning.steps) == (misplaced, steps)
 
 
 def test_timing_steps_and_the_end_leaves_the_trainer_as_it_was(tmp_path):
@@ -113,7 +192,7 @@ def test_timing_steps_and_the_end_leaves_the_trainer_as_it_was(tmp_path):
     trainer = make_trainer(data, config, tmp_path, CPU)
     before, step = trainer._state_arrays(), trainer.step
     assert budget._seconds_per_step(trainer, trainer.pathwise_steps) > 0
-    assert budget._finishing_s(trainer, budget._timed_probes(data.target, config), config) > 0
+    assert budget._finishing_s(trainer.learned(), budget._timed_probes(data.target, config), config) > 0
     after = trainer._state_arrays()
     assert trainer.step == step
     assert before.keys() == after.keys()
@@ -141,7 +220,7 @@ def test_what_is_only_compiled_once_is_not_planned_for_every_point(tmp_path, mon
     compiling("draw_samples")
     compiling("log_density_of")
     points_per_s = 1000 * budget.TIMED_POINTS
-    planned_s = budget._finishing_s(trainer, budget._timed_probes(data.target, config), config)
+    planned_s = budget._finishing_s(trainer.learned(), budget._timed_probes(data.target, config), config)
     assert planned_s == pytest.approx(100_000 / points_per_s + 0.001 + budget.WRITING_S)
 
 
@@ -159,107 +238,12 @@ def test_what_drawing_takes_however_few_is_planned_once(monkeypatch):
     assert budget._timed_probes(data.target, config).seconds == pytest.approx(4.8)
 
 
-PLANNED = 40
-
-
-def staged(run, tolerance, progress=None, **options):
-    config = config_of(steps=PLANNED)
-    start_manifest(run, command=[], seed=config.seed)
-    data = prepare_training_data(BallTask(), config)
-
-    def once(config, resume):
-        return learn(BallTask(), config, run, resume=resume, data=data, progress=progress)
-
-    return learn_to_tolerance(config, run, ToleranceGoal(tolerance, PLANNED), once, **options)
-
-
-def goal_with(tolerance, *shares, planned=100, error=0.001):
-    stages = [Stage(n, share, error, 1.0) for n, share in zip(stage_steps(planned), shares, strict=False)]
-    return ToleranceGoal(tolerance, planned, tuple(stages))
-
-
-def test_stages_double_from_an_eighth_to_four_times_the_planned_steps():
-    assert stage_steps(1000) == (125, 250, 500, 1000, 2000, 4000)
-    assert stage_steps(3) == (1, 2, 3, 6, 12)
-
-
-def test_learning_ends_with_the_first_stage_within_the_tolerance(tmp_path):
-    result, goal = staged(tmp_path, 0.9)
-    assert goal.met
-    assert [stage.steps for stage in goal.stages] == [5]
-    assert result.steps == 5
-
-
-def test_a_run_to_a_tolerance_is_the_run_of_its_last_stage_bit_for_bit(tmp_path):
-    (tmp_path / "staged").mkdir()
-    (tmp_path / "plain").mkdir()
-    (tmp_path / "first").mkdir()
-    first, _ = staged(tmp_path / "first", 0.99)
-    result, goal = staged(tmp_path / "staged", first.misplaced - 1e-6)
-    assert len(goal.stages) > 1
-    config = with_steps(config_of(steps=PLANNED), result.steps)
-    learn(BallTask(), config, tmp_path / "plain")
-    assert result_bytes(tmp_path / "staged") == result_bytes(tmp_path / "plain")
-    assert load_yaml(tmp_path / "staged" / "config.yaml").mapping["learning"]["steps"] == result.steps
-    listed = read_manifest(tmp_path / "staged")["files"]
-    for name in listed:
-        verify(tmp_path / "staged", name)
-    assert goal_of(tmp_path / "staged") == goal
-
-
-@pytest.mark.parametrize("stop", [5, 20])
-def test_an_interrupted_stage_is_continued_and_earlier_ones_are_not_repeated(tmp_path, stop):
-    (tmp_path / "straight").mkdir()
-    (tmp_path / "resumed").mkdir()
-    _, straight = staged(tmp_path / "straight", 1e-9)
-    run = tmp_path / "resumed"
-    with pytest.raises(KeyboardInterrupt):
-        staged(run, 1e-9, progress=Interrupter(stop))
-    before = goal_of(run)
-    config = with_steps(config_of(steps=PLANNED), load_yaml(run / "config.yaml").mapping["learning"]["steps"])
-    learned = []
-
-    def once(config, resume):
-        learned.append(config.learning.steps)
-        return learn(BallTask(), config, run, resume=resume)
-
-    resume = (run / "checkpoint.safetensors").exists()
-    _, goal = learn_to_tolerance(config, run, before, once, resume=resume)
-    assert [stage.steps for stage in goal.stages] == [stage.steps for stage in straight.stages]
-    assert [stage.misplaced for stage in goal.stages] == [stage.misplaced for stage in straight.stages]
-    assert not set(learned) & {stage.steps for stage in before.stages}
-    assert result_bytes(run) == result_bytes(tmp_path / "straight")
-
-
-def test_hope_is_given_up_only_where_the_last_fall_repeated_would_not_do():
-    falling = (0.4, 0.3, 0.2, 0.1)
-    assert not goal_with(0.03, *falling).hopeless  # 0.1 -> 0.05 -> 0.025
-    assert goal_with(0.02, *falling).hopeless
-    assert goal_with(0.1, 0.5, 0.4, 0.3, 0.29).hopeless
-    assert not goal_with(0.01, 0.5, 0.49).hopeless  # fewer steps than planned fall by another law
-    assert goal_with(1e-9, 0.4, 0.3, 0.2, 0.1, 0.05, 0.02).hopeless
-
-
-def test_a_stage_that_is_learned_again_replaces_its_first_result():
-    goal = goal_with(0.1, 0.5, 0.4).with_stage(Stage(25, 0.39, 0.001, 2.0))
-    assert [stage.misplaced for stage in goal.stages] == [0.5, 0.39]
-
-
-def test_a_run_without_a_tolerance_has_none(tmp_path):
+@each_row("damaged", [{"tolerance": "x"}, {"time_budget_s": []}, {"tolerance": 0.1, "target_misplaced": "much"}])
+def test_a_damaged_word_of_the_goal_is_told(tmp_path, damaged):
     start_manifest(tmp_path, command=[], seed=0)
-    save_run_config(config_of(), tmp_path)
-    assert goal_of(tmp_path) is None
-
-
-DAMAGES = ({"stages": [{"steps": 1}]}, {"stages": 3}, {"tolerance": "x"}, {"planned_steps": 0.5})
-
-
-@pytest.mark.parametrize("change", DAMAGES)
-def test_a_damaged_word_of_the_tolerance_is_told(tmp_path, change):
-    start_manifest(tmp_path, command=[], seed=0)
-    known = goal_with(0.1, 0.3, 0.2)
-    note(tmp_path, goal=known.as_dict())
-    assert goal_of(tmp_path) == known
-    note(tmp_path, goal=change)
+    assert resumed_goal(Goal(), tmp_path).is_none
+    note(tmp_path, **{GOAL: {"tolerance": 0.1, "target_misplaced": 0.01, "met": True}})
+    assert resumed_goal(Goal(), tmp_path) == Goal(0.1)
+    note(tmp_path, **{GOAL: damaged})
     with pytest.raises(DataError, match="'goal' is damaged"):
-        goal_of(tmp_path)
+        resumed_goal(Goal(), tmp_path)

@@ -375,7 +375,7 @@ class PatchesTask:
 def learned(tmp_path_factory):
     run = tmp_path_factory.mktemp("patches")
     settings = LearningSettings(
-        steps=300, batch=256, layers=2, hidden=24, bins=12, samples=20_000, balance_proposals=8192, balance=0.6,
+        misplaced=0.0, steps=300, batch=256, layers=2, hidden=24, bins=12, samples=20_000, balance_proposals=8192,
         coverage_proposals=2048,
     )  # fmt: skip
     config = RunConfig(

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
 from support.tables import each_row
 
@@ -22,15 +21,14 @@ from lidardesign.density.target.prepare import prepare_target
 from lidardesign.density.training.checkpoint import (
     FOLDER,
     clear_snapshots,
+    is_snapshot,
     load_arrays,
-    measured_steps,
+    save_arrays,
     snapshot_name,
-    snapshot_steps,
     stored_snapshots,
-    twin_step,
 )
 from lidardesign.density.training.sampling import log_density_of
-from lidardesign.density.training.training import BETAS, Adam
+from lidardesign.density.training.training import AVERAGING, BETAS, Adam
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.manifest import verify
@@ -156,18 +154,18 @@ def test_samples_carry_the_density_that_the_flow_has_there(tmp_path, monkeypatch
     kept = {}
     measure = learning.measure
 
-    def keep(trainer, *rest):
-        kept["trainer"], kept["measured"] = trainer, measure(trainer, *rest)
+    def keep(flow, *rest):
+        kept["flow"], kept["measured"] = flow, measure(flow, *rest)
         return kept["measured"]
 
     monkeypatch.setattr(learning, "measure", keep)
     learn(BallTask(), config_of(dtype=dtype), tmp_path)
     samples = load_samples(tmp_path).subset(np.arange(500))
-    again = log_density_of(kept["trainer"], samples.points)
+    again = log_density_of(kept["flow"], samples.points)
     thinned = kept["measured"].thinning.log_prob(again, samples.log_target)
     np.testing.assert_allclose(thinned, samples.log_prob, atol=1e-6)
     outside = samples.points + np.array([0, 0, 0, 0, 0, 5.0])
-    assert (log_density_of(kept["trainer"], outside) == -np.inf).all()
+    assert (log_density_of(kept["flow"], outside) == -np.inf).all()
 
 
 def test_a_conditioned_dimension_stays_uniform(tmp_path):
@@ -253,40 +251,87 @@ def test_steps_of_adam_are_those_of_the_paper_with_rates_that_change_and_weights
     assert [weight in optimiser.state for weight in weights] == [True, True, False]
 
 
-@each_row(
-    ("steps", "balance", "kept"),
-    [
-        (1000, 0.5, (500, 609, 625, 734, 750)),
-        (290, 0.5, (145, 176, 181, 212, 217)),
-        (8, 1.0, (2, 3, 4)),
-        (2, 0.5, (1,)),
-        (1, 0.5, ()),
-    ],
-)
-def test_snapshots_are_kept_when_balancing_begins_and_twins_at_a_quarter_and_half_of_it(steps, balance, kept):
-    assert snapshot_steps(LearningSettings(steps=steps, balance=balance)) == kept
+@each_row("steps", [1, 2, 60, 100, 101, 5000])
+@each_row("pathwise", [0, 1, 50])
+def test_snapshots_are_kept_when_balancing_begins_and_after_each_doubling(pathwise, steps):
+    settings = LearningSettings(steps=steps, pathwise=pathwise)
+    first = max(settings.pathwise_steps, 1)
+    doublings = [first * 2**power for power in range(20) if first * 2**power < steps]
+    assert [step for step in range(1, steps + 1) if is_snapshot(step, settings)] == doublings
 
 
-@given(st.integers(1, 5000), st.floats(0, 1), st.floats(0, 1))
-def test_rungs_ascend_to_the_last_step_and_twins_lie_between_the_first_rung_and_their_own(steps, balance, anneal):
-    settings = LearningSettings(steps=steps, balance=balance, anneal=anneal)
-    rungs = measured_steps(settings)
-    assert list(rungs) == sorted(set(rungs))
-    assert rungs[-1] == steps
-    for step in rungs:
-        twin = twin_step(settings, step)
-        assert twin is None or rungs[0] < twin < step < steps
-    assert all(0 < step < steps for step in snapshot_steps(settings))
+@each_row("steps", [1, 2, 60, 100, 101, 5000])
+@each_row("pathwise", [0, 1, 50, 5000])
+def test_no_more_than_half_of_the_steps_are_path_wise(pathwise, steps):
+    assert LearningSettings(steps=steps, pathwise=pathwise).pathwise_steps == min(pathwise, steps // 2)
 
 
-def test_nothing_is_kept_before_sigma_has_its_final_value(tmp_path):
-    learn(BallTask(), config_of(steps=40, balance=0.0, anneal=0.5), tmp_path)
-    assert list(stored_snapshots(tmp_path)) == [20, 24, 25, 29, 30]
+def moved(trainer, balanced_steps, weights):
+    """Let the average follow a flow that is at these weights after so many balancing steps."""
+    trainer.step = trainer.pathwise_steps + balanced_steps
+    with torch.no_grad():
+        for parameter, value in zip(trainer.flow.parameters(), weights, strict=True):
+            parameter.copy_(value)
+    trainer._average()
+    return [parameter.detach().clone() for parameter in trainer.average.parameters()]
+
+
+def like(trainer, generator):
+    return [torch.randn(parameter.shape, generator=generator).double() for parameter in trainer.flow.parameters()]
+
+
+def test_the_average_is_the_flow_until_balancing_begins_and_after_its_first_step(tmp_path):
+    trainer, generator = a_trainer(tmp_path), torch.Generator().manual_seed(0)
+    for step in range(-trainer.pathwise_steps + 1, 2):
+        weights = [value.float() for value in like(trainer, generator)]
+        for found, expected in zip(moved(trainer, step, weights), weights, strict=True):
+            assert torch.equal(found, expected)
+
+
+def test_the_average_is_the_mean_whose_weights_rise_with_a_power_of_the_step(tmp_path):
+    trainer, generator, path = a_trainer(tmp_path), torch.Generator().manual_seed(0), []
+    trainer.flow.double()
+    trainer.average.double()
+    for done in range(1, 41):
+        path.append(like(trainer, generator))
+        found = moved(trainer, done, path[-1])
+        # j (j + 1) ... (j + a - 1), about j^a
+        shares = np.array([math.comb(j + AVERAGING - 1, AVERAGING) for j in range(1, done + 1)], float)
+        for index, value in enumerate(found):
+            mean = np.tensordot(shares / shares.sum(), np.stack([weights[index].numpy() for weights in path]), 1)
+            np.testing.assert_allclose(value.numpy(), mean, rtol=1e-12, atol=1e-13)
+
+
+def test_the_average_of_equal_weights_is_them(tmp_path):
+    trainer = a_trainer(tmp_path)
+    weights = [value.float() for value in like(trainer, torch.Generator().manual_seed(1))]
+    for done in range(1, 200):
+        found = moved(trainer, done, weights)
+    assert all(map(torch.equal, found, weights))
+
+
+def test_what_is_learned_is_the_average(tmp_path):
+    learn(BallTask(), config_of(), tmp_path)
+    arrays, _ = load_arrays(tmp_path, "checkpoint.safetensors")
+    learned, _ = load_arrays(tmp_path, "flow.safetensors")
+    for name, value in learned.items():
+        np.testing.assert_array_equal(value, arrays[f"average.{name}"].astype(value.dtype))
+    assert any((arrays[f"flow.{name}"] != arrays[f"average.{name}"]).any() for name in learned)
+
+
+def test_a_checkpoint_of_an_earlier_version_is_refused_with_what_to_do(finished, tmp_path):
+    shutil.copytree(finished[0], tmp_path / "run")
+    arrays, state = load_arrays(tmp_path / "run", "checkpoint.safetensors")
+    earlier = {name: value for name, value in arrays.items() if not name.startswith("average.")}
+    del state["stopped"]
+    save_arrays(tmp_path / "run", "checkpoint.safetensors", earlier, state)
+    with pytest.raises(DataError, match=r"(?s)checkpoint.safetensors: is of an earlier version.*learn the run again"):
+        learn(BallTask(), config_of(), tmp_path / "run", resume=True)
 
 
 def test_a_run_lists_its_snapshots_with_their_hashes(finished):
     run, _ = finished
-    assert stored_snapshots(run) == {step: snapshot_name(step) for step in (60, 73, 75, 88, 90)}
+    assert stored_snapshots(run) == {step: snapshot_name(step) for step in (50, 100)}
     for name in stored_snapshots(run).values():
         verify(run, name)
 
@@ -294,9 +339,9 @@ def test_a_run_lists_its_snapshots_with_their_hashes(finished):
 def test_snapshots_hold_the_weights_of_the_flow_on_the_way_to_its_last_ones(finished):
     run, _ = finished
     last, _ = load_arrays(run, "flow.safetensors")
-    early, state = load_arrays(run, snapshot_name(60))
-    late, _ = load_arrays(run, snapshot_name(90))
-    assert state["step"] == 60
+    early, state = load_arrays(run, snapshot_name(50))
+    late, _ = load_arrays(run, snapshot_name(100))
+    assert state["step"] == 50
     assert early.keys() == last.keys()
 
     def distance(weights):
@@ -307,10 +352,10 @@ def test_snapshots_hold_the_weights_of_the_flow_on_the_way_to_its_last_ones(fini
 
 def test_clearing_keeps_earlier_snapshots_and_removes_what_a_killed_process_left(tmp_path):
     learn(BallTask(), config_of(), tmp_path)
-    (tmp_path / FOLDER / ".step-000060.safetensors.1.aa.tmp").write_bytes(b"half")
-    clear_snapshots(tmp_path, beyond=74)
-    assert sorted(os.listdir(tmp_path / FOLDER)) == ["step-000060.safetensors", "step-000073.safetensors"]
-    assert list(stored_snapshots(tmp_path)) == [60, 73]
+    (tmp_path / FOLDER / ".step-000050.safetensors.1.aa.tmp").write_bytes(b"half")
+    clear_snapshots(tmp_path, beyond=99)
+    assert os.listdir(tmp_path / FOLDER) == ["step-000050.safetensors"]
+    assert list(stored_snapshots(tmp_path)) == [50]
     clear_snapshots(tmp_path)
     assert not os.listdir(tmp_path / FOLDER)
     assert not stored_snapshots(tmp_path)

@@ -12,13 +12,12 @@ from support.small_runs import shifted
 from support.tables import each_row
 
 from lidardesign.config import load_run_config, resolve, save_run_config
-from lidardesign.density import learn as learning
 from lidardesign.density.learn import learn
 from lidardesign.density.learned import load_flow, remeasured, seconds_at
 from lidardesign.density.training import schedule as budget
+from lidardesign.density.training import training as steps
 from lidardesign.density.training.checkpoint import save_arrays
 from lidardesign.density.training.quality import draw_probes
-from lidardesign.density.training.schedule import Stage, ToleranceGoal
 from lidardesign.density.training.training import Trainer
 from lidardesign.design.fit import fit
 from lidardesign.errors import DataError, NumericalError
@@ -35,14 +34,14 @@ from lidardesign.workflow import evaluate as scoring
 
 SMALL = (
     "learning.batch=128", "learning.layers=1", "learning.hidden=16", "learning.bins=8", "learning.samples=2000",
-    "learning.balance_proposals=1024", "learning.coverage_proposals=512", "train=4", "test=3",
+    "learning.balance_proposals=1024", "learning.coverage_proposals=512", "learning.pathwise=16", "train=4", "test=3",
     "density.sigma_m=0.06",
 )  # fmt: skip
 
 
 def learned(folder, preset, steps, *further):
     task = load_task("flatland")
-    overrides = [*SMALL, f"learning.steps={steps}", *further]
+    overrides = [*SMALL, f"learning.steps={steps}", "learning.misplaced=0", *further]
     config = resolve(task, preset=preset, overrides=overrides, seed=shifted(1))
     folder.mkdir()
     start_manifest(folder, command=[], seed=1)
@@ -79,8 +78,8 @@ def sweeps(runs):
 def test_every_snapshot_and_the_flow_itself_are_measurements_with_errors_and_seconds(sweeps):
     steps = sweeps[0]
     assert steps.knob == "learning.steps"
-    assert [measurement.setting for measurement in steps.measurements] == ["32", "40", "48", "64"]
-    assert [measurement.default for measurement in steps.measurements] == [False] * 3 + [True]
+    assert [measurement.setting for measurement in steps.measurements] == ["16", "32", "64"]
+    assert [measurement.default for measurement in steps.measurements] == [False] * 2 + [True]
     assert all(0 < measurement.error < 1 and 0 < measurement.uncertainty < 0.1 for measurement in steps.measurements)
     seconds = [measurement.seconds for measurement in steps.measurements]
     assert seconds == sorted(seconds)
@@ -110,7 +109,7 @@ def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs
     probes = draw_probes(target, 8192, random_generator(99, "others"))
     again = remeasured(runs, config, target, probes, count=8192, seed=99)
     for measurement, reached in zip(sweeps[0].measurements, again, strict=True):
-        found = reached.misplaced
+        found = reached.estimates["misplaced"]
         assert abs(found.value - measurement.error) < 4 * np.hypot(found.error, measurement.uncertainty)
 
 
@@ -123,9 +122,12 @@ def test_a_snapshot_is_measured_as_the_flow_that_was_learned(runs):
         load_flow(runs, "flow.safetensors", wide, request.target, 0)
 
 
-def test_seconds_between_rows_of_the_progress_are_interpolated(runs):
-    seconds = seconds_at(runs, [20, 25, 30])
-    assert seconds[25] == pytest.approx((seconds[20] + seconds[30]) / 2)
+def test_seconds_of_steps_between_rows_of_the_progress_are_interpolated(runs, sweeps):
+    seconds = seconds_at(runs)
+    assert list(seconds) == [0, 10, 20, 30, 40, 50, 60, 64]
+    first, *_, last = (measurement.seconds for measurement in sweeps[0].measurements)
+    assert first == pytest.approx(0.4 * seconds[10] + 0.6 * seconds[20])
+    assert last == seconds[64]
 
 
 @each_row("text", ["{", "[]", '{"step": 1}', '{"step": null, "seconds": 1}'])
@@ -134,17 +136,7 @@ def test_progress_that_is_none_is_told(runs, tmp_path, text):
     (tmp_path / "run" / "progress.jsonl").write_text(text)
     record(tmp_path / "run", ["progress.jsonl"])
     with pytest.raises(DataError, match=r"progress.jsonl: does not hold the progress"):
-        seconds_at(tmp_path / "run", [20])
-
-
-def test_stages_of_a_tolerance_are_a_sweep_of_their_own(runs, tmp_path, sweeps):
-    goal = ToleranceGoal(0.4, 64, (Stage(32, 0.6, 0.01, 1.0), Stage(64, 0.3, 0.01, 2.0)))
-    shutil.copytree(runs, tmp_path / "run")
-    request = request_for(tmp_path / "run")
-    note(tmp_path / "run", goal=goal.as_dict())
-    (found,) = training._stages_sweep(request)
-    assert [(one.setting, one.error) for one in found.measurements] == [("32", 0.6), ("64", 0.3)]
-    assert "tolerance of 0.4" in found.note
+        seconds_at(tmp_path / "run")
 
 
 def test_runs_beside_this_one_that_cannot_be_measured_are_left_out(runs, tmp_path, sweeps):
@@ -167,7 +159,7 @@ def fitted(runs, lidardesign, tmp_path):
     return tmp_path / "run"
 
 
-@pytest.mark.parametrize("name", ["flow.safetensors", "progress.jsonl", "snapshots/step-000040.safetensors"])
+@pytest.mark.parametrize("name", ["flow.safetensors", "progress.jsonl", "snapshots/step-000032.safetensors"])
 def test_accuracy_of_a_damaged_run_is_refused_before_anything_is_evaluated(fitted, lidardesign, name, monkeypatch):
     monkeypatch.setattr(scoring, "score_designs", lambda *_, **__: pytest.fail("was evaluated"))
     (fitted / name).write_bytes(b"{")
@@ -206,6 +198,8 @@ def flatland(lidardesign, out, *options):
         ("--time-budget -3", "from 1 to 31622400"),
         ("--time-budget inf", "a finite number"),
         ("--time-budget 1e300", "from 1 to 31622400"),
+        ("--tolerance 0.1 --set learning.misplaced=0.2", "the tolerance sets learning.misplaced"),
+        ("--time-budget 60 --set learning.misplaced=0.2", "the time budget sets learning.misplaced"),
         ("--time-budget 60 --set learning.steps=7", "the time budget sets learning.steps"),
         ("--time-budget 60 --config other.yaml", "other.yaml:2:10: the time budget sets learning.steps"),
     ],
@@ -222,8 +216,8 @@ def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_r
     done = flatland(lidardesign, "run", "--set", "learning.steps=8", "--tolerance", "1e-4", "--json")
     assert done.code == 1
     document = done.json
-    assert [stage["steps"] for stage in document["goal"]["stages"]][:4] == [1, 2, 4, 8]
-    assert not document["goal"]["met"]
+    assert document["steps"] == 8
+    assert document["goal"] == {"tolerance": 1e-4, "target_misplaced": 0.0, "met": False}
     assert f"{document['misplaced']:.3g}" in done.err
     assert "--tolerance" in done.err
     assert lidardesign("fit", "run", "--layout", "grid", "--sensors", "2").code == 0
@@ -232,32 +226,17 @@ def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_r
     assert "started with tolerance = 0.0001" in again.err
 
 
-def test_a_tolerance_that_is_met_stops_there_and_resuming_changes_nothing(lidardesign, tmp_path):
+def test_a_tolerance_that_is_met_stops_there_and_resuming_changes_nothing(lidardesign, tmp_path, monkeypatch):
+    monkeypatch.setattr(steps, "STRETCH", 10)
     done = flatland(lidardesign, "run", "--set", "learning.steps=64", "--tolerance", "0.95", "--json")
     assert done.code == 0
     assert done.json["goal"]["met"]
-    assert done.json["steps"] == done.json["goal"]["stages"][-1]["steps"] < 64
+    assert done.json["steps"] == 36  # the first that may be the last
+    learning = load_run_config(tmp_path / "run")[1].learning
+    assert (learning.misplaced, learning.steps) == (0.95, 64)
     before = (tmp_path / "run" / "flow.safetensors").read_bytes()
     assert lidardesign("learn", "flatland", "--out", "run", "--resume").code == 0
     assert (tmp_path / "run" / "flow.safetensors").read_bytes() == before
-
-
-def test_an_interruption_between_stages_keeps_what_the_finished_ones_reached(lidardesign, tmp_path, monkeypatch):
-    made, make_trainer = [], learning.make_trainer
-
-    def interrupted(*arguments):
-        made.append(make_trainer(*arguments))
-        if len(made) == 2:
-            raise KeyboardInterrupt
-        return made[-1]
-
-    monkeypatch.setattr(learning, "make_trainer", interrupted)
-    done = flatland(lidardesign, "run", "--set", "learning.steps=16", "--tolerance", "1e-4")
-    assert done.code == 130
-    assert "keeps what the finished stages reached" in done.err
-    done = lidardesign("learn", "flatland", "--out", "run", "--resume", "--json")
-    assert [stage["steps"] for stage in done.json["goal"]["stages"]][:3] == [2, 4, 8]
-    assert len(made) == 1 + len(done.json["goal"]["stages"])
 
 
 def test_a_failure_before_the_first_checkpoint_leaves_nothing_behind(lidardesign, tmp_path, monkeypatch):
@@ -268,15 +247,12 @@ def test_a_failure_before_the_first_checkpoint_leaves_nothing_behind(lidardesign
 
 
 def test_a_time_budget_writes_its_steps_into_the_configuration(lidardesign, tmp_path, monkeypatch):
-    # steps that pretend to be slow: the plan then depends on no machine
-    monkeypatch.setattr(budget, "_seconds_per_step", lambda *_: 600.0)
-    done = flatland(lidardesign, "run", "--time-budget", "100000", "--json")
+    with monkeypatch.context() as patched:
+        patched.setattr(budget.Timekeeper, "is_over", lambda self, trainer: trainer.step >= 45)
+        done = flatland(lidardesign, "run", "--time-budget", "100000", "--json")
     assert done.code == 0
-    plan = done.json["goal"]
-    assert plan["pathwise_steps"] == pytest.approx(75, abs=1)
-    assert plan["balancing_steps"] == pytest.approx(149, abs=2)  # almost all of the time turned out to be left
-    assert done.json["steps"] == plan["pathwise_steps"] + plan["balancing_steps"]
-    assert load_run_config(tmp_path / "run")[1].learning.steps == done.json["steps"]
+    assert done.json["goal"] == {"time_budget_s": 100000.0, "steps": 45}
+    assert load_run_config(tmp_path / "run")[1].learning.steps == done.json["steps"] == 45
     soon = flatland(lidardesign, "soon", "--time-budget", "1")
     assert soon.code == 2
     assert "at least" in soon.err

@@ -29,7 +29,7 @@ from support.pieces import Pieces
 from support.result_pages import heading, write_page
 
 from faults.processes import Ended, Fork, forked, fresh, import_all
-from faults.runs import COMMANDS, FINISHED, LEARN, STAGED, Straight, contents, strays, unreadable
+from faults.runs import COMMANDS, FINISHED, LEARN, TO_TOLERANCE, Straight, contents, strays, unreadable
 
 # Kills of a command per 10: learning is the longest, and writes the most.
 SHARES = {"learn": 5, "fit": 2, "evaluate": 3}
@@ -233,8 +233,8 @@ def main() -> None:
         at_steps(killing, asked.steps, "asked")
         in_pairs(killing, asked.pairs, asked.seed)
         if asked.kills + asked.terms:
-            staged = Straight(folder / "staged", {"learn --tolerance": STAGED})
-            at_steps(Killing(folder, staged, tally, pieces), asked.steps)
+            to_tolerance = Straight(folder / "tolerance", {"learn --tolerance": TO_TOLERANCE})
+            at_steps(Killing(folder, to_tolerance, tally, pieces), asked.steps)
             seconds = killing.straight.measure_fresh(folder)
             at_random(killing, "SIGKILL", asked.kills, asked.seed, seconds)
             at_random(killing, "SIGTERM", asked.terms, asked.seed, seconds)

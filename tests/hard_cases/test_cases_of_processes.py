@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -26,7 +27,6 @@ from support.hard_cases import hard_case
 from lidardesign import registry
 from lidardesign import registry as probe
 from lidardesign.config import load_run_config, save_run_config
-from lidardesign.density.training.schedule import with_steps
 from lidardesign.errors import PluginError
 from lidardesign.run import files as lock
 from lidardesign.run.files import run_lock
@@ -205,18 +205,17 @@ class TestKillsFullDisksAndTwoWriters:
         assert (result.code, "as far as this" in result.err) == (6, True), result.err
         assert files_under(run) == {}
 
-    def test_a_stage_towards_a_tolerance_is_resumed_by_the_command_that_started_it(
-        self, tmp_path, lidardesign, monkeypatch
-    ):
+    def test_a_run_to_a_tolerance_is_resumed_by_the_command_that_started_it(self, tmp_path, lidardesign, monkeypatch):
         run = make_run(tmp_path / "run", count=1000)
         task, config = load_run_config(run)
-        note(run, goal={"tolerance": 0.1, "planned_steps": 400, "stages": []})
-        save_run_config(with_steps(config, 50), run)
+        note(run, goal={"tolerance": 0.1, "target_misplaced": 0.02})
+        learning = config.learning.model_copy(update={"misplaced": 0.08, "steps": 400})
+        save_run_config(replace(config, learning=learning), run)
         monkeypatch.setattr(FlatlandTask, "scenes", lambda *_: (_ for _ in ()).throw(RuntimeError("as far as this")))
         again = ("learn", task.name, "--preset", "draft", "--out", run, "--tolerance", 0.1, "--resume", "--set")
         assert "as far as this" in lidardesign(*again, "learning.steps=400").err
         other = lidardesign(*again, "learning.steps=500")
-        assert (other.code, "learning.steps = 50, not 500" in other.err) == (2, True)
+        assert (other.code, "learning.steps = 400, not 500" in other.err) == (2, True)
 
     def test_a_run_that_was_only_started_is_no_density_yet_and_says_who_is_at_it(self, tmp_path, lidardesign):
         run = make_run(tmp_path / "run", count=1000)

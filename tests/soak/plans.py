@@ -172,8 +172,8 @@ UNUSUAL_LEARNING: dict[str, list[Any]] = {
     "balance_proposals": [256, 4096],
     "dtype": ["float64"],
     "entropy": [0.3],
-    "anneal": [0.0, 1.0],
-    "balance": [0.0, 1.0],
+    "misplaced": [0.0, 0.5],
+    "pathwise": [0, 1000],
     "clip_norm": [0.1],
 }
 UNUSUAL_SHARE = 0.1

@@ -19,8 +19,8 @@ from support.small_runs import shifted
 SPACE = DesignSpace((0, 0, 0, -0.4, 0, 0.2), (0, 0, 0, 0.4, 0, 2.5))
 
 SMALL = {
-    "steps": 120, "batch": 48, "layers": 1, "hidden": 12, "bins": 8, "samples": 2000, "balance_proposals": 512,
-    "coverage_proposals": 512, "checkpoint_seconds": 1e-9,
+    "misplaced": 0.0, "steps": 120, "pathwise": 50, "batch": 48, "layers": 1, "hidden": 12, "bins": 8, "samples": 2000,
+    "balance_proposals": 512, "coverage_proposals": 512, "checkpoint_seconds": 1e-9,
 }  # fmt: skip
 
 
@@ -84,5 +84,5 @@ def interrupt_after_a_checkpoint(monkeypatch, folder):
         return learn_density(*arguments, progress=stop, **options)
 
     monkeypatch.setattr(density_learn, "learn", interrupted)
-    monkeypatch.setattr(training, "SNAPSHOT_STEPS", 7)
+    monkeypatch.setattr(training, "STRETCH", 7)
     monkeypatch.setattr(training, "PROGRESS_STEPS", 2)

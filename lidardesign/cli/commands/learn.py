@@ -65,8 +65,8 @@ def learn(
         typer.Option(
             "--tolerance",
             metavar="SHARE",
-            help="Learn until at most this share of the density's mass is in the wrong place, in stages of doubled "
-            "steps from an eighth to four times those of the preset; exit 1 if none is good enough.",
+            help="Learn until at most this share of the density's mass is in the wrong place, with at most four times "
+            "the steps of the preset; exit 1 if that is not enough.",
             show_default=False,
         ),
     ] = None,
@@ -75,8 +75,7 @@ def learn(
         typer.Option(
             "--time-budget",
             metavar="SECONDS",
-            help="Learn as many steps as let the command end within this time; they are planned from its own first "
-            "steps.",
+            help="Learn as long as lets the command end within this time, however good the density is.",
             show_default=False,
         ),
     ] = None,

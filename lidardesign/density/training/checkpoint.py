@@ -101,14 +101,17 @@ def check_resumable(
     Raises:
         DataError: A counter or an array is missing, or is none.
     """
+    if "stopped" not in state:
+        found = "is of an earlier version, which did not average the weights"
+        raise DataError(found, where=str(path), hint="learn the run again, or finish it with the version that began it")
     for name in (*COUNTERS, "doubled_at"):
         value = state.get(name)
         most = MOST_HALVINGS if name == "halvings" else MOST_STEPS
         whole = isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
         if not whole and not (name == "doubled_at" and value is None):
             raise DataError(f"has {name} = {value!r}", where=str(path), allowed="a whole number", hint=HINT)
-    if not isinstance(state.get("stopped"), bool):
-        raise DataError(f"has stopped = {state.get('stopped')!r}", where=str(path), allowed="true or false", hint=HINT)
+    if not isinstance(state["stopped"], bool):
+        raise DataError(f"has stopped = {state['stopped']!r}", where=str(path), allowed="true or false", hint=HINT)
     seconds = state.get("seconds")
     if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= MOST_SECONDS:
         raise DataError(f"has seconds = {seconds!r}", where=str(path), allowed="a number from 0", hint=HINT)

@@ -75,27 +75,26 @@ def forecast(
         device: auto, cpu or cuda.
         elapsed_s: How long the command has been running.
         resume: Whether it goes on from the checkpoint there.
-        tolerance, time_budget_s: What decides the number of steps, where the configuration does not.
+        tolerance, time_budget_s: What decides beside the configuration.
 
     Raises:
         ConfigError: The time budget is too short to learn anything useful.
     """
     prepared, place, learning = elapsed_s(), choose_device(device), config.learning
-    times, done = StepTimes.measured(data, config, run, place), 0
-    if resume:
-        _, state = load_arrays(run, CHECKPOINT)
-        done = int(state["step"])
-    steps = learning.steps
-    if time_budget_s is not None:
+    times = StepTimes.measured(data, config, run, place)
+    state = load_arrays(run, CHECKPOINT)[1] if resume else {"step": 0}
+    done = int(state["step"])
+    begun, pathwise = max(done, learning.pathwise_steps), max(learning.pathwise_steps - done, 0)
+    steps = done if state.get("stopped") else learning.steps
+    if time_budget_s is not None and not state.get("stopped"):
         keeper = Timekeeper(time_budget_s, lambda: prepared, config)
         keeper.check(times)
-        steps = learning.pathwise_steps + times.balancing_within(keeper.left_s, learning.pathwise_steps)
+        steps = begun + times.balancing_within(keeper.left_s, pathwise)
     # the first time that it is measured how good the density is
-    fewest = min(learning.pathwise_steps + STRETCH, steps) if learning.misplaced else steps
+    fewest = min(begun + max(STRETCH, pathwise), steps) if learning.misplaced else steps
     # what a budget keeps in reserve for writing is more than writing takes
     times = replace(times, finishing_s=times.finishing_s - WRITING_S)
-    pathwise = max(learning.pathwise_steps - done, 0)
-    taken = [times.of(pathwise, max(most - max(done, learning.pathwise_steps), 0)) for most in (fewest, steps)]
+    taken = [times.of(pathwise, max(most - begun, 0)) for most in (fewest, steps)]
     unknown = [UNTRAINED, *([GOOD_ENOUGH] if fewest < steps else []), *([FINER] if tolerance is not None else [])]
     return Forecast(
         prepared + taken[0],

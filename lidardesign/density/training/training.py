@@ -253,7 +253,7 @@ class Trainer(LearnedFlow):
 
     def _reached(self) -> dict[str, float]:
         """The misplaced share and its standard error, after a stretch of balancing; nothing where nobody asks."""
-        if not self.settings.misplaced or self.probes is None or self.balanced_steps <= 0:
+        if not self.settings.misplaced or self.probes is None or not self._may_stop:
             return {}
         if self.balanced_steps % STRETCH or self.step == self.settings.steps:
             return {}
@@ -270,8 +270,13 @@ class Trainer(LearnedFlow):
             return False
         return reached["misplaced"] + STANDARD_ERRORS * reached["misplaced_error"] <= self.settings.misplaced
 
+    @property
+    def _may_stop(self) -> bool:
+        """Whether as many steps balance as are path-wise: a run of so many steps in all has as many path-wise ones."""
+        return self.balanced_steps >= max(self.pathwise_steps, 1)
+
     def _is_over(self) -> bool:
-        return self.is_over is not None and self.balanced_steps >= self.pathwise_steps and self.is_over(self)
+        return self.is_over is not None and self._may_stop and self.is_over(self)
 
     def _report(
         self,
@@ -429,7 +434,7 @@ class Trainer(LearnedFlow):
         """Take the state of the run's checkpoint; progress.jsonl and snapshots are cut back to it."""
         arrays, state = load_arrays(self.run, CHECKPOINT)
         check_resumable(arrays, state, self.flow, self.generator, self.run / CHECKPOINT)
-        if state.get("doubled_at") is not None:  # older checkpoints have no such entry
+        if state.get("doubled_at") is not None:
             self._double(state["doubled_at"])
         self._restore_arrays(arrays)
         self.generator.set_state(torch.as_tensor(arrays["generator"]))
