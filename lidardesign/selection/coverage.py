@@ -221,7 +221,7 @@ class InformedScene:
 
 
 def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndarray) -> Coverage:
-    """The table over scenes, each of which counts as much as any other.
+    """The table over scenes, each of which counts as much as any other; its items are in an order of its own.
 
     Arguments:
         informed: What a task says of each scene.
@@ -257,12 +257,17 @@ def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndar
     ray = _joined(columns[0])
     order = np.argsort(ray, kind="stable")
     item, worth, opens = (_joined(column)[order] for column in columns[1:])
+    start, best = _begins(ray, rays), np.empty(items, dtype=np.int32)
+    # items that one ray tells most of are numbered in a row: what follows rays to items finds them side by side
+    kernels.best_rays(start, item, worth, best)
+    by_ray, number = np.argsort(best, kind="stable"), np.empty(items, dtype=np.int32)
+    number[by_ray] = np.arange(items)
     return Coverage(
-        start=_begins(ray, rays),
-        item=item,
+        start=start,
+        item=number[item],
         worth=worth,
         gates=opens,
-        weight=np.concatenate(weights) / len(weights),
+        weight=np.concatenate(weights)[by_ray] / len(weights),
         bits=bits,
         harm=harm / len(weights),
         table=sums,

@@ -52,6 +52,17 @@ class ByItem(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def best_rays(start: np.ndarray, item: np.ndarray, worth: np.ndarray, best: np.ndarray) -> None:
+    """The ray that tells most of each item, one beyond the last for none: fills `best`, (U,)."""
+    most = np.zeros(len(best), dtype=worth.dtype)
+    best[:] = len(start) - 1
+    for ray in range(len(start) - 1):
+        for entry in range(start[ray], start[ray + 1]):
+            if worth[entry] > most[item[entry]]:
+                most[item[entry]], best[item[entry]] = worth[entry], ray
+
+
+@njit(cache=True, nogil=True)
 def order_by_item(item: np.ndarray, worth: np.ndarray, start: np.ndarray) -> np.ndarray:
     """The order (E,) of entries by item, and by falling worth; those of each item begin at `start`, (U + 1,)."""
     order, place = np.empty(len(item), dtype=np.int64), start.copy()
