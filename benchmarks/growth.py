@@ -63,7 +63,7 @@ def learning(options: Any) -> tuple[Table, list[str]]:
     for count in options.scenes:
         with tempfile.TemporaryDirectory() as folder:
             words = ["learn", "face", "--preset", "draft", "--json", "--out", Path(folder) / "run"]
-            settings = [f"train={count}", f"learning.steps={options.steps}", *options.set]
+            settings = [f"train={count}", "learning.misplaced=0", f"learning.steps={options.steps}", *options.set]
             for setting in [*settings, *(f"{key}={value}" for key, value in face_settings(options.model).items())]:
                 words += ["--set", setting]
             result = run_process(lidardesign(*words), {"LIDARDESIGN_CACHE": str(Path(folder) / "cache")})
