@@ -23,6 +23,7 @@ from lidardesign.density.fields.primitive_kernels import (
     primitive_normal,
     primitive_roots,
 )
+from lidardesign.density.fields.table_kernels import along_axis
 from lidardesign.numerics import TINY
 
 
@@ -59,22 +60,13 @@ def _turned_back(to_body, b, v):  # noqa: ANN001, ANN202
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _along_axis(low, count, inverse_step, place):  # noqa: ANN001, ANN202
-    """Cell, fraction in it and excess beyond the grid of a coordinate."""
-    t = (place - low) * inverse_step
-    inside = min(max(t, 0.0), count - 1.0)
-    cell = min(int(inside), int(count) - 2)
-    return cell, inside - cell, (t - inside) / inverse_step
-
-
 @njit(cache=True, nogil=True)
 def _cell(values, grids, g, q):  # noqa: ANN001, ANN202
     """A point in grid g, a row of `grids`: values at the corners of its cell, fractions in it, excess beyond it."""
     counts, inverse_step = (grids[g, 3], grids[g, 4], grids[g, 5]), grids[g, 6]
-    i, fx, ex = _along_axis(grids[g, 0], counts[0], inverse_step, q[0])
-    j, fy, ey = _along_axis(grids[g, 1], counts[1], inverse_step, q[1])
-    k, fz, ez = _along_axis(grids[g, 2], counts[2], inverse_step, q[2])
+    i, fx, ex = along_axis(grids[g, 0], counts[0], inverse_step, q[0])
+    j, fy, ey = along_axis(grids[g, 1], counts[1], inverse_step, q[1])
+    k, fz, ez = along_axis(grids[g, 2], counts[2], inverse_step, q[2])
     row = int(counts[2])
     plane, a = int(counts[1]) * row, int(grids[g, 7])
     a += i * plane + j * row + k

@@ -24,114 +24,128 @@ EXP_POLYNOMIAL = tuple(
 )
 EXPONENT_LIMIT = np.float32(60.0)
 FLOAT32_BIAS, FLOAT32_MANTISSA_BITS = 127, 23
+# Elements that compiled loops take at a time.
+UNROLLED = 32
 # Reassociation vectorises the sums; NaN and infinity keep their meaning (no `nnan`, no `ninf`).
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
 @njit(cache=True, nogil=True, inline="always")
-def locate(counts, low, inverse_step, p, cell, fraction, excess):  # noqa: ANN001, ANN201
-    """Cell, fraction in it and excess beyond the grid of one point; returns the squared excess."""
-    squared = 0.0
-    for k in range(3):
-        t = (p[k] - low[k]) * inverse_step
-        top = counts[k] - 1.0
-        clamped = min(max(t, 0.0), top)
-        excess[k] = (t - clamped) / inverse_step
-        squared += excess[k] * excess[k]
-        cell[k] = min(int(clamped), counts[k] - 2)
-        fraction[k] = clamped - cell[k]
-    return squared
+def along_axis(low, count, inverse_step, place):  # noqa: ANN001, ANN201
+    """Cell, fraction in it and excess beyond the grid of a coordinate."""
+    t = (place - low) * inverse_step
+    inside = min(max(t, 0.0), count - 1.0)
+    cell = min(int(inside), int(count) - 2)
+    return cell, inside - cell, (t - inside) / inverse_step
 
 
 @njit(cache=True, nogil=True, inline="always")
-def corners(counts, cell, fraction, index, weight):  # noqa: ANN001, ANN201
-    """Row indices and trilinear weights of a cell's eight corners."""
-    for corner in range(8):
-        i, j, k = corner & 1, (corner >> 1) & 1, (corner >> 2) & 1
-        index[corner] = ((cell[0] + i) * counts[1] + cell[1] + j) * counts[2] + cell[2] + k
-        wx = fraction[0] if i else 1.0 - fraction[0]
-        wy = fraction[1] if j else 1.0 - fraction[1]
-        wz = fraction[2] if k else 1.0 - fraction[2]
-        weight[corner] = wx * wy * wz
+def _cell(counts, low, inverse_step, x, y, z):  # noqa: ANN001, ANN202
+    """The row of the first corner of a point's cell, fractions in the cell and excess beyond the grid."""
+    i, fx, ex = along_axis(low[0], counts[0], inverse_step, x)
+    j, fy, ey = along_axis(low[1], counts[1], inverse_step, y)
+    k, fz, ez = along_axis(low[2], counts[2], inverse_step, z)
+    return (i * counts[1] + j) * counts[2] + k, (fx, fy, fz), (ex, ey, ez)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _squared(v):  # noqa: ANN001, ANN202
+    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _corners(counts, first):  # noqa: ANN001, ANN202
+    """The rows of the eight corners of a cell: x changes first, z last."""
+    up, across = counts[2], counts[1] * counts[2]
+    return (
+        (first, first + across, first + up, first + across + up),
+        (first + 1, first + across + 1, first + up + 1, first + across + up + 1),
+    )
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, inline="always")
-def _blend(table, index, weight, out):  # noqa: ANN001, ANN202
-    """The eight rows summed with their weights, shape (C,)."""
-    w0, w1, w2, w3 = weight[0], weight[1], weight[2], weight[3]
-    w4, w5, w6, w7 = weight[4], weight[5], weight[6], weight[7]
-    r0, r1, r2, r3 = table[index[0]], table[index[1]], table[index[2]], table[index[3]]
-    r4, r5, r6, r7 = table[index[4]], table[index[5]], table[index[6]], table[index[7]]
-    for c in range(table.shape[1]):
-        out[c] = w0 * r0[c] + w1 * r1[c] + w2 * r2[c] + w3 * r3[c] + w4 * r4[c] + w5 * r5[c] + w6 * r6[c] + w7 * r7[c]
+def _blend(table, corners, fraction, out):  # noqa: ANN001, ANN202
+    """The rows of a cell's corners summed with their trilinear weights, shape (C,)."""
+    (a, b, c, d), (e, f, g, h), (x, y, z) = corners[0], corners[1], fraction
+    wa, wb = np.float32((1.0 - x) * (1.0 - y) * (1.0 - z)), np.float32(x * (1.0 - y) * (1.0 - z))
+    wc, wd = np.float32((1.0 - x) * y * (1.0 - z)), np.float32(x * y * (1.0 - z))
+    we, wf = np.float32((1.0 - x) * (1.0 - y) * z), np.float32(x * (1.0 - y) * z)
+    wg, wh = np.float32((1.0 - x) * y * z), np.float32(x * y * z)
+    for n in range(table.shape[1]):
+        low = wa * table[a, n] + wb * table[b, n] + wc * table[c, n] + wd * table[d, n]
+        out[n] = low + we * table[e, n] + wf * table[f, n] + wg * table[g, n] + wh * table[h, n]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, inline="always")
-def _contract(table, index, column_weight, fraction, inverse_step, dots, out):  # noqa: ANN001, ANN202
-    """Gradient of sum_c weight_c * d_c inside one cell, added to out (3,); `dots` (8,) is room to work in."""
-    for corner in range(8):
-        row = table[index[corner]]
-        total = 0.0
-        for c in range(table.shape[1]):
-            total += row[c] * column_weight[c]
-        dots[corner] = total
-    fx, fy, fz = fraction[0], fraction[1], fraction[2]
-    gx = gy = gz = 0.0
-    for corner in range(8):
-        i, j, k = corner & 1, (corner >> 1) & 1, (corner >> 2) & 1
-        wx = fx if i else 1.0 - fx
-        wy = fy if j else 1.0 - fy
-        wz = fz if k else 1.0 - fz
-        gx += (1.0 if i else -1.0) * wy * wz * dots[corner]
-        gy += (1.0 if j else -1.0) * wx * wz * dots[corner]
-        gz += (1.0 if k else -1.0) * wx * wy * dots[corner]
-    out[0] += gx * inverse_step
-    out[1] += gy * inverse_step
-    out[2] += gz * inverse_step
+def _contract(table, corners, fraction, column_weight, zero):  # noqa: ANN001, ANN202
+    """Derivatives of sum_c weight_c * value_c by the axes inside one cell, per step; summed in the type of `zero`."""
+    (a, b, c, d), (e, f, g, h), (x, y, z) = corners[0], corners[1], fraction
+    sa = sb = sc = sd = se = sf = sg = sh = zero
+    for n in range(table.shape[1]):
+        weight = column_weight[n]
+        sa += table[a, n] * weight
+        sb += table[b, n] * weight
+        sc += table[c, n] * weight
+        sd += table[d, n] * weight
+        se += table[e, n] * weight
+        sf += table[f, n] * weight
+        sg += table[g, n] * weight
+        sh += table[h, n] * weight
+    by_x = (1.0 - z) * ((1.0 - y) * (sb - sa) + y * (sd - sc)) + z * ((1.0 - y) * (sf - se) + y * (sh - sg))
+    by_y = (1.0 - z) * ((1.0 - x) * (sc - sa) + x * (sd - sb)) + z * ((1.0 - x) * (sg - se) + x * (sh - sf))
+    by_z = (1.0 - y) * ((1.0 - x) * (se - sa) + x * (sf - sb)) + y * ((1.0 - x) * (sg - sc) + x * (sh - sd))
+    return by_x, by_y, by_z
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _lengthen(row, squared):  # noqa: ANN001, ANN202
+    """Distances (C,) on a face of the grid become those of a point beyond it."""
+    for c in range(row.shape[0]):
+        inner = max(row[c], 0.0)
+        row[c] = math.sqrt(squared + inner * inner)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def table_distances(field, points, out):  # noqa: ANN001, ANN201
     """Distances of all columns at points: points (N, 3), out (N, C)."""
-    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
-    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
-    index, weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
+    table, inverse_step = field.table, field.inverse_step
+    counts, low = (field.counts[0], field.counts[1], field.counts[2]), (field.low[0], field.low[1], field.low[2])
     for n in range(points.shape[0]):
-        squared = locate(counts, low, inverse_step, points[n], cell, fraction, excess)
-        corners(counts, cell, fraction, index, weight)
-        _blend(table, index, weight, out[n])
-        if squared > 0.0:
-            for c in range(table.shape[1]):
-                inner = max(out[n, c], 0.0)
-                out[n, c] = math.sqrt(squared + inner * inner)
+        first, fraction, excess = _cell(counts, low, inverse_step, points[n, 0], points[n, 1], points[n, 2])
+        _blend(table, _corners(counts, first), fraction, out[n])
+        if _squared(excess) > 0.0:
+            _lengthen(out[n], _squared(excess))
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def table_gradient(field, points, weights, out):  # noqa: ANN001, ANN201
     """Gradients of sum_c weights_nc * d_c(points_n): weights (N, C), out (N, 3)."""
-    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
-    columns = table.shape[1]
-    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
-    index, corner_weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
-    row, column_weight = np.zeros(columns, table.dtype), np.zeros(columns)
-    gradient, dots = np.zeros(3), np.zeros(8)
+    table, inverse_step = field.table, field.inverse_step
+    counts, low = (field.counts[0], field.counts[1], field.counts[2]), (field.low[0], field.low[1], field.low[2])
+    row, column_weight = np.zeros(table.shape[1], table.dtype), np.zeros(table.shape[1])
     for n in range(points.shape[0]):
-        squared = locate(counts, low, inverse_step, points[n], cell, fraction, excess)
-        corners(counts, cell, fraction, index, corner_weight)
-        gradient[:] = 0.0
-        outward = 0.0
-        for c in range(columns):
+        first, fraction, excess = _cell(counts, low, inverse_step, points[n, 0], points[n, 1], points[n, 2])
+        corners, squared, outward = _corners(counts, first), _squared(excess), 0.0
+        for c in range(table.shape[1]):
             column_weight[c] = weights[n, c]
         if squared > 0.0:
-            _blend(table, index, corner_weight, row)
-            for c in range(columns):
-                inner = max(row[c], 0.0)
-                share = column_weight[c] / math.sqrt(squared + inner * inner)
-                outward += share
-                column_weight[c] = share * inner
-        _contract(table, index, column_weight, fraction, inverse_step, dots, gradient)
+            _blend(table, corners, fraction, row)
+            outward = _pulled(row, squared, column_weight)
+        slope = _contract(table, corners, fraction, column_weight, 0.0)
         for k in range(3):
-            out[n, k] = outward * excess[k] if excess[k] != 0.0 else gradient[k]
+            out[n, k] = outward * excess[k] if excess[k] != 0.0 else slope[k] * inverse_step
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _pulled(row, squared, column_weight):  # noqa: ANN001, ANN202
+    """Beyond the grid: weights (C,) become those of the distances (C,) on its face; what is left pulls outwards."""
+    outward = 0.0
+    for c in range(row.shape[0]):
+        inner = max(row[c], 0.0)
+        share = column_weight[c] / math.sqrt(squared + inner * inner)
+        outward += share
+        column_weight[c] = share * inner
+    return outward
 
 
 @njit(cache=True, nogil=True)
@@ -175,7 +189,7 @@ def _insides(distance, sharpness, bits, powers, out):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def table_quadrature(field, clear, shell, rays, points_per_ray, attenuation, sharpness, cutoff, depth, slope) -> None:  # noqa: ANN001
+def table_quadrature(field, clear, shell, rays, points_per_ray, attenuation, sharpness, cutoff, depth, slopes) -> None:  # noqa: ANN001
     """Optical depths along rays by midpoints, and the slopes that their gradient needs.
 
     Cells whose every column is further than `cutoff` from a surface cannot attenuate and are never read.
@@ -185,140 +199,116 @@ def table_quadrature(field, clear, shell, rays, points_per_ray, attenuation, sha
         clear: The smallest distance in each cell, shape (G,).
         shell: Half thickness of surfaces without an inside, per column, shape (C,) [m].
         rays: Origins (N, 3), directions (N, 3) and lengths (N,) that are integrated from 0 [m].
-        points_per_ray: The number of midpoints.
+        points_per_ray: The number of midpoints, M.
         attenuation, sharpness: beta and k [1/m].
         depth: Out: integral of attenuation * sigmoid(-sharpness * d), shape (N, C).
-        slope: Out: derivative of the integrand by the distance times the step, shape (N, M, C); pass shape
-            (0, 0, 0) when no gradient is needed.
+        slopes: Out: where the midpoints that attenuate begin for each ray (N + 1,), which these are (N M,), and the
+            derivatives of the integrand by the distances there, times the step, shape (N M, C); (0, 0) when no
+            gradient is needed.
     """
-    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
-    origins, directions, lengths = rays
-    columns = table.shape[1]
-    cell, fraction, excess, p = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
-    index, weight, row = np.zeros(8, np.int64), np.zeros(8, table.dtype), np.zeros(columns, table.dtype)
-    inside, bits = np.zeros(columns, np.float32), np.zeros(columns, np.int32)
-    powers, total = bits.view(np.float32), np.zeros(columns, np.float32)
-    steepness, one, thickness = np.float32(sharpness), np.float32(1.0), shell.astype(np.float32)
-    keep = slope.shape[0] > 0
+    table, inverse_step = field.table, field.inverse_step
+    counts, low = (field.counts[0], field.counts[1], field.counts[2]), (field.low[0], field.low[1], field.low[2])
+    (origins, directions, lengths), (starts, midpoints, slope) = rays, slopes
+    columns, keep, kept = table.shape[1], slope.shape[0] > 0, 0
+    # room for whole turns of the loops: what is left over would be taken one by one
+    wide = -(-columns // UNROLLED) * UNROLLED
+    row, inside, bits = np.zeros(wide, table.dtype), np.zeros(wide, np.float32), np.zeros(wide, np.int32)
+    powers, total, thickness = bits.view(np.float32), np.zeros(wide, np.float32), np.zeros(wide, np.float32)
+    steepness, one = np.float32(sharpness), np.float32(1.0)
+    thickness[:columns] = shell
     for n in range(origins.shape[0]):
         step = lengths[n] / points_per_ray
         total[:] = 0.0
         for m in range(points_per_ray):
             along = (m + 0.5) * step
-            for k in range(3):
-                p[k] = origins[n, k] + along * directions[n, k]
-            squared = locate(counts, low, inverse_step, p, cell, fraction, excess)
-            first = (cell[0] * counts[1] + cell[1]) * counts[2] + cell[2]
+            first, fraction, excess = _cell(
+                counts, low, inverse_step,
+                origins[n, 0] + along * directions[n, 0],
+                origins[n, 1] + along * directions[n, 1],
+                origins[n, 2] + along * directions[n, 2],
+            )  # fmt: skip
+            squared = _squared(excess)
             if squared > cutoff * cutoff or clear[first] > cutoff:
                 continue
-            corners(counts, cell, fraction, index, weight)
-            _blend(table, index, weight, row)
+            _blend(table, _corners(counts, first), fraction, row)
             if squared > 0.0:
-                for c in range(columns):
-                    inner = max(row[c], 0.0)
-                    row[c] = math.sqrt(squared + inner * inner)
-            for c in range(columns):
+                _lengthen(row, squared)
+            for c in range(wide):
                 row[c] -= thickness[c]
             _insides(row, steepness, bits, powers, inside)
-            for c in range(columns):
+            for c in range(wide):
                 total[c] += inside[c]
             if keep:
                 factor = np.float32(-attenuation * step * sharpness)
                 for c in range(columns):
-                    slope[n, m, c] = factor * inside[c] * (one - inside[c])
+                    slope[kept, c] = factor * inside[c] * (one - inside[c])
+                midpoints[kept] = m
+                kept += 1
+        if keep:
+            starts[n + 1] = kept
         for c in range(columns):
             depth[n, c] = attenuation * step * total[c]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def table_quadrature_gradient(field, clear, rays, cutoff, slope, weights, by_origin, by_direction, by_length) -> None:  # noqa: ANN001
-    """Gradients of sum_c weights_nc * depth_nc by origin (N, 3), direction (N, 3) and length (N,), at fixed step.
+def table_quadrature_gradient(field, rays, points_per_ray, slopes, least, weights, out) -> None:  # noqa: ANN001
+    """Add the gradients of sum_c weights_nc * depth_nc to `out`: by origin (N, 3), direction (N, 3) and length (N,).
 
-    The caller adds the derivative by the step itself, which is depth / length.
+    The step stays the same here; the caller adds the derivative by it, which is depth / length. Midpoints whose
+    weighted slopes come to less than `least` [1/m] are passed over.
     """
-    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
-    origins, directions, lengths = rays
-    columns = table.shape[1]
-    points_per_ray = slope.shape[1]
-    cell, fraction, excess, p = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
-    index, corner_weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
+    table, inverse_step = field.table, field.inverse_step
+    counts, low = (field.counts[0], field.counts[1], field.counts[2]), (field.low[0], field.low[1], field.low[2])
+    (origins, directions, lengths), (starts, midpoints, slope) = rays, slopes
+    by_origin, by_direction, by_length = out
+    columns, zero = table.shape[1], np.float32(0.0)
     row, column_weight = np.zeros(columns, table.dtype), np.zeros(columns, table.dtype)
-    share, gradient, dots = np.zeros(columns, table.dtype), np.zeros(3), np.zeros(8)
+    share = np.zeros(columns, table.dtype)
     for n in range(origins.shape[0]):
         step = lengths[n] / points_per_ray
         for c in range(columns):
             share[c] = weights[n, c]
-        for m in range(points_per_ray):
-            along = (m + 0.5) * step
-            for k in range(3):
-                p[k] = origins[n, k] + along * directions[n, k]
-            squared = locate(counts, low, inverse_step, p, cell, fraction, excess)
-            first = (cell[0] * counts[1] + cell[1]) * counts[2] + cell[2]
-            if squared > cutoff * cutoff or clear[first] > cutoff:
-                continue
+        for kept in range(starts[n], starts[n + 1]):
+            followed = zero
             for c in range(columns):
-                column_weight[c] = share[c] * slope[n, m, c]
-            corners(counts, cell, fraction, index, corner_weight)
-            outward = 0.0
+                column_weight[c] = share[c] * slope[kept, c]
+                followed += abs(column_weight[c])
+            if followed < least:
+                continue
+            along = (midpoints[kept] + 0.5) * step
+            first, fraction, excess = _cell(
+                counts, low, inverse_step,
+                origins[n, 0] + along * directions[n, 0],
+                origins[n, 1] + along * directions[n, 1],
+                origins[n, 2] + along * directions[n, 2],
+            )  # fmt: skip
+            corners, squared, outward = _corners(counts, first), _squared(excess), 0.0
             if squared > 0.0:
-                _blend(table, index, corner_weight, row)
-                for c in range(columns):
-                    inner = max(row[c], 0.0)
-                    pull = column_weight[c] / math.sqrt(squared + inner * inner)
-                    outward += pull
-                    column_weight[c] = pull * inner
-            gradient[:] = 0.0
-            _contract(table, index, column_weight, fraction, inverse_step, dots, gradient)
+                _blend(table, corners, fraction, row)
+                outward = _pulled(row, squared, column_weight)
+            found = _contract(table, corners, fraction, column_weight, zero)
             for k in range(3):
-                value = outward * excess[k] if excess[k] != 0.0 else gradient[k]
+                value = outward * excess[k] if excess[k] != 0.0 else found[k] * inverse_step
                 by_origin[n, k] += value
                 by_direction[n, k] += along * value
-                by_length[n] += (m + 0.5) / points_per_ray * value * directions[n, k]
-
-
-@njit(cache=True, nogil=True, inline="always")
-def trilinear_slope(values, fraction, axis):  # noqa: ANN001, ANN201
-    """The derivative of a cell's trilinear value along an axis, per step; values (8,) at its corners."""
-    total = 0.0
-    for corner in range(8):
-        share = 1.0 if (corner >> axis) & 1 else -1.0
-        for k in range(3):
-            if k != axis:
-                share *= fraction[k] if (corner >> k) & 1 else 1.0 - fraction[k]
-        total += share * values[corner]
-    return total
+                by_length[n] += (midpoints[kept] + 0.5) / points_per_ray * value * directions[n, k]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def table_values(field, points, out):  # noqa: ANN001, ANN201
     """Values of all columns at points, constant beyond the grid's faces: points (N, 3), out (N, C)."""
-    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
-    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
-    index, weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
+    counts, low = (field.counts[0], field.counts[1], field.counts[2]), (field.low[0], field.low[1], field.low[2])
     for n in range(points.shape[0]):
-        locate(counts, low, inverse_step, points[n], cell, fraction, excess)
-        corners(counts, cell, fraction, index, weight)
-        for c in range(table.shape[1]):
-            out[n, c] = 0.0
-        for corner in range(8):
-            share, row = weight[corner], table[index[corner]]
-            for c in range(table.shape[1]):
-                out[n, c] += share * row[c]
+        first, fraction, _ = _cell(counts, low, field.inverse_step, points[n, 0], points[n, 1], points[n, 2])
+        _blend(field.table, _corners(counts, first), fraction, out[n])
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def table_value_gradient(field, points, weights, out):  # noqa: ANN001, ANN201
     """Gradients of sum_c weights_nc * value_c(points_n): weights (N, C), out (N, 3)."""
-    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
-    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
-    index, corner_weight, dots = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
+    counts, low = (field.counts[0], field.counts[1], field.counts[2]), (field.low[0], field.low[1], field.low[2])
     for n in range(points.shape[0]):
-        locate(counts, low, inverse_step, points[n], cell, fraction, excess)
-        corners(counts, cell, fraction, index, corner_weight)
-        for corner in range(8):
-            row, total = table[index[corner]], 0.0
-            for c in range(table.shape[1]):
-                total += row[c] * weights[n, c]
-            dots[corner] = total
-        for axis in range(3):
-            out[n, axis] = trilinear_slope(dots, fraction, axis) * inverse_step if excess[axis] == 0.0 else 0.0
+        first, fraction, excess = _cell(counts, low, field.inverse_step, points[n, 0], points[n, 1], points[n, 2])
+        found = _contract(field.table, _corners(counts, first), fraction, weights[n], 0.0)
+        for k in range(3):
+            out[n, k] = found[k] * field.inverse_step if excess[k] == 0.0 else 0.0

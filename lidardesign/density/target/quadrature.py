@@ -18,10 +18,15 @@ from lidardesign.density.target.visibility import (
     Transmittance,
     Visibility,
 )
+from lidardesign.numerics import EPSILON_FLOAT32
 
-# Beyond this many sharpness lengths from every surface, sigmoid(-k d) is below 1e-13 and is not evaluated.
-CUTOFF_LENGTHS = 30.0
+# Beyond this many sharpness lengths from every surface, sigmoid(-k d) is below 2e-9, far less than the rounding of the
+# sum along a ray, and is not evaluated.
+CUTOFF_LENGTHS = 20.0
 CHUNK_BYTES = 64 * 2**20
+# Derivatives of the integrand by the distances: of tables those of the midpoints that attenuate (`table_quadrature`),
+# of other fields those of all, shape (N, points, columns).
+Slopes = tuple[np.ndarray, np.ndarray, np.ndarray] | np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +35,8 @@ class _Depth:
 
     log_values: np.ndarray
     lengths: np.ndarray
-    slopes: list[tuple[slice, np.ndarray]]
-    add_gradient: Callable[[slice, np.ndarray, np.ndarray, RayGradient], None]
+    slopes: list[tuple[slice, Slopes]]
+    add_gradient: Callable[[slice, Slopes, np.ndarray, RayGradient], None]
 
     def gradient(self, weights: np.ndarray) -> RayGradient:
         out = RayGradient.zeros(len(self.lengths))
@@ -84,51 +89,51 @@ class Quadrature(Visibility):
             slope = self._integrate(rays, lengths, rows, optics, depth, differentiable)
             if differentiable:
                 slopes.append((rows, slope))
-        add_gradient = partial(self._add_gradient, rays, lengths, CUTOFF_LENGTHS / optics.sharpness_per_m)
+        add_gradient = partial(self._add_gradient, rays, lengths, EPSILON_FLOAT32 * optics.sharpness_per_m)
         return _Depth(np.where(columns, -depth, 0.0), lengths, slopes, add_gradient)
 
     def _integrate(
         self, rays: RayBatch, lengths: np.ndarray, rows: slice, optics: Optics, depth: np.ndarray, differentiable: bool
-    ) -> np.ndarray:
-        shape = (rows.stop - rows.start, self.points, self.field.columns)
-        slope = np.empty(shape if differentiable else (0, 0, 0), dtype=np.float32)
+    ) -> Slopes:
+        count, columns = rows.stop - rows.start, self.field.columns
         if isinstance(self.field, TableField):
             from lidardesign.density.fields import table_kernels
 
+            room = count * self.points if differentiable else 0
+            starts, midpoints = np.zeros(count + 1, dtype=np.int64), np.empty(room, dtype=np.int64)
+            slopes = starts, midpoints, np.empty((room, columns), dtype=np.float32)
             table_kernels.table_quadrature(
                 self.field.arrays, self._clear, self.field.shell_m,
                 (rays.origins[rows], rays.directions[rows], lengths[rows]), self.points,
                 optics.attenuation_per_m, optics.sharpness_per_m, CUTOFF_LENGTHS / optics.sharpness_per_m,
-                depth[rows], slope,
+                depth[rows], slopes,
             )  # fmt: skip
-            return slope
+            return slopes
         places = self._places(rays, lengths, rows).reshape(-1, 3)
-        distances = self.field.distances(places).reshape(shape) - self.field.shell_m
+        distances = self.field.distances(places).reshape(count, self.points, columns) - self.field.shell_m
         inside = 1.0 / (1.0 + np.exp(np.clip(optics.sharpness_per_m * distances, -60.0, 60.0)))
         rate = optics.attenuation_per_m * (lengths[rows] / self.points)[:, None, None]
         depth[rows] = (rate * inside).sum(axis=1)
-        if differentiable:
-            slope[:] = -rate * optics.sharpness_per_m * inside * (1.0 - inside)
-        return slope
+        return -rate * optics.sharpness_per_m * inside * (1.0 - inside)
 
     def _places(self, rays: RayBatch, lengths: np.ndarray, rows: slice) -> np.ndarray:
         along = (np.arange(self.points) + 0.5) / self.points * lengths[rows, None]
         return rays.origins[rows, None] + along[..., None] * rays.directions[rows, None]
 
     def _add_gradient(
-        self, rays: RayBatch, lengths: np.ndarray, cutoff_m: float,
-        rows: slice, slope: np.ndarray, weights: np.ndarray, out: RayGradient,
+        self, rays: RayBatch, lengths: np.ndarray, least: float,
+        rows: slice, slopes: Slopes, weights: np.ndarray, out: RayGradient,
     ) -> None:  # fmt: skip
         if isinstance(self.field, TableField):
             from lidardesign.density.fields import table_kernels
 
             table_kernels.table_quadrature_gradient(
-                self.field.arrays, self._clear, (rays.origins[rows], rays.directions[rows], lengths[rows]), cutoff_m,
-                slope, np.ascontiguousarray(weights), out.origins[rows], out.directions[rows], out.ranges[rows],
+                self.field.arrays, (rays.origins[rows], rays.directions[rows], lengths[rows]), self.points, slopes,
+                least, np.ascontiguousarray(weights), (out.origins[rows], out.directions[rows], out.ranges[rows]),
             )  # fmt: skip
             return
         places = self._places(rays, lengths, rows)
-        column_weights = (weights[:, None, :] * slope).reshape(-1, self.field.columns)
+        column_weights = (weights[:, None, :] * slopes).reshape(-1, self.field.columns)
         by_place = self.field.gradient(places.reshape(-1, 3), column_weights).reshape(places.shape)
         share = (np.arange(self.points) + 0.5) / self.points
         out.origins[rows] += by_place.sum(axis=1)
