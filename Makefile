@@ -27,25 +27,30 @@ $(BIN)/.ready: pyproject.toml constraints.txt
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --upgrade pip
 	@# setuptools announces every editable install with a warning
-	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
 	@touch $@
 
 demo: $(BIN)/.ready
 	$(BIN)/python examples/demo.py
 
+# What tests and documentation need besides
+$(BIN)/.dev: $(BIN)/.ready
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
 # The variable leaves out an announcement of the theme's makers
-docs: $(BIN)/.ready
+docs: $(BIN)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "build/site/index.html"
 
-$(BIN)/.transport: $(BIN)/.ready
+$(BIN)/.transport: $(BIN)/.dev
 	@echo "Adding the light-transport simulator: once, 200 MB"
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[transport]' \
 		&& touch $@ || echo "It could not be installed; its tests are skipped"
 
 # Models of robots, alone: what runs them is not needed
 MODELS := dm-control==1.0.50 gymnasium-robotics==1.4.2 robosuite==1.5.2
-$(BIN)/.consumers: $(BIN)/.ready
+$(BIN)/.consumers: $(BIN)/.dev
 	@echo "Adding the readers of exported files and models of robots: once, 450 MB"
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[consumers]' \
 		&& $(BIN)/python -m pip install --quiet --no-deps $(MODELS) && touch $@ \
@@ -58,23 +63,23 @@ system-programs: $(BIN)/.transport
 
 consumers: $(BIN)/.transport $(BIN)/.consumers system-programs
 
-test: $(BIN)/.ready $(BIN)/.transport $(BIN)/.consumers $(if $(filter true,$(CI)),system-programs)
+test: $(BIN)/.dev $(BIN)/.transport $(BIN)/.consumers $(if $(filter true,$(CI)),system-programs)
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 # Every kind of processor rounds in its own way, and a small run ends elsewhere on each: this is another one
-test-arithmetic: $(BIN)/.ready
+test-arithmetic: $(BIN)/.dev
 	ATEN_CPU_CAPABILITY=default MKL_CBWR=COMPATIBLE \
 		NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=$(CURDIR)/build/numba-generic \
 		$(BIN)/python -m pytest tests/docs/test_docs_run.py
 
 # What every other Python that is found makes of the installation and of the core
-test-pythons: $(BIN)/.ready
+test-pythons: $(BIN)/.dev
 	tools/test-pythons.sh $(BIN)/python
 
 # The suite with every line and branch that it takes; what numba compiles, apart, in a run without the compiler
 KERNELS := NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage
-coverage: $(BIN)/.ready
+coverage: $(BIN)/.dev
 	$(BIN)/python -m coverage erase
 	$(BIN)/python tools/coverage_pieces.py
 	@mkdir -p build
@@ -84,13 +89,13 @@ coverage: $(BIN)/.ready
 	$(BIN)/python -m coverage report --fail-under=90
 
 # Small changes of the core's code, and how many of them its tests notice: an hour
-mutation: $(BIN)/.ready
+mutation: $(BIN)/.dev
 	$(BIN)/python tools/mutation.py --out docs/soak/mutation-$$(date -u +%F).md
 
-lint: $(BIN)/.ready
+lint: $(BIN)/.dev
 	$(BIN)/python -m ruff check .
 
-fuzz: $(BIN)/.ready
+fuzz: $(BIN)/.dev
 	PYTHONPATH=tests $(BIN)/python -m fuzz.campaign --inputs 100000 --out docs/soak
 
 # JOBS=N does so many runs at once
@@ -98,19 +103,19 @@ JOBS ?= 2
 soak: soak-runs soak-seeds soak-kills fuzz mutation
 
 # 200 whole runs of random configurations: no fault, every constraint kept, the same bytes when done again
-soak-runs: $(BIN)/.ready
+soak-runs: $(BIN)/.dev
 	PYTHONPATH=tests $(BIN)/python -m soak runs --whole 200 --jobs $(JOBS)
 
 # The face and the arm at draft and standard from 20 seeds each: every one learns well enough
-soak-seeds: $(BIN)/.ready
+soak-seeds: $(BIN)/.dev
 	PYTHONPATH=tests $(BIN)/python -m soak seeds --count 20 --jobs $(JOBS)
 
 # Learning, fitting and evaluating are killed at random moments: what is left can be read, and going on repeats the bytes
-soak-kills: $(BIN)/.ready
+soak-kills: $(BIN)/.dev
 	PYTHONPATH=tests $(BIN)/python -m faults.kills --out docs/soak/kills-$$(date -u +%F).md
 
 # 2,000 random plans: nothing that is skipped changes more than is tolerated
-soak-promise: $(BIN)/.ready
+soak-promise: $(BIN)/.dev
 	PYTHONPATH=tests $(BIN)/python -m soak.promise --count 2000
 
 clean:
