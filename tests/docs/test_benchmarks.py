@@ -149,6 +149,12 @@ def test_bounds_only_count_towards_a_factor_that_they_support(script):
     assert occlusion.layout_line("density", (100, 200, 300), factors).endswith("at least 2 times at 200")
 
 
+def test_a_constant_and_a_power_are_found_in_what_grows(script):
+    sizes = (10, 100, 1000, 10_000)
+    found = script("growth").fitted(sizes, [5 + 0.1 * size**0.9 for size in sizes])
+    assert found == pytest.approx((5, 0.1, 0.9), rel=1e-6)
+
+
 def rows_of(**values):
     """Rows of an evaluation from name = (value, bandwidth), at 10 rays."""
     return {
