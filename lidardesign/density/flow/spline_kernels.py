@@ -26,7 +26,7 @@ SQUARINGS = 5
 TAYLOR = tuple(1.0 / math.factorial(power) for power in range(12))
 
 
-@njit(**OPTIONS, inline="always")
+@njit(**OPTIONS)
 def _exponential(x):  # noqa: ANN001, ANN202
     """exp(x) for |x| < 10 to 14 digits, by arithmetic alone: that is vectorised, and `math.exp` is not."""
     x = x / 2.0**SQUARINGS
@@ -47,12 +47,12 @@ def _exponential(x):  # noqa: ANN001, ANN202
     return out
 
 
-@njit(**OPTIONS, inline="always")
+@njit(**OPTIONS)
 def _softened(value, softness):  # noqa: ANN001, ANN202
     return value / (1.0 + abs(value) * softness)
 
 
-@njit(**OPTIONS, inline="always")
+@njit(**OPTIONS)
 def _find_shares(raw, softness, out) -> None:  # noqa: ANN001
     """Shares of widths and of heights, one after the other, from their unconstrained sizes, shape (2 K,)."""
     count = out.shape[0] // 2
@@ -68,7 +68,7 @@ def _find_shares(raw, softness, out) -> None:  # noqa: ANN001
         out[count + j] *= of_heights
 
 
-@njit(**OPTIONS, inline="always")
+@njit(**OPTIONS)
 def _slopes(raw, k, softness, periodic):  # noqa: ANN001, ANN202
     """The slopes at both knots of bin k; the outer ones of a circle are one."""
     last = raw.shape[0] - 1
@@ -80,7 +80,7 @@ def _slopes(raw, k, softness, periodic):  # noqa: ANN001, ANN202
     return _exponential(first), _exponential(second)
 
 
-@njit(**OPTIONS, inline="always")
+@njit(**OPTIONS)
 def _turned(value, periodic):  # noqa: ANN001, ANN202
     """A coordinate on a circle half a turn on."""
     if not periodic:
@@ -88,7 +88,7 @@ def _turned(value, periodic):  # noqa: ANN001, ANN202
     return value - BOUND if value >= 0.0 else value + BOUND
 
 
-@njit(**OPTIONS, inline="always")
+@njit(**OPTIONS)
 def _bin_of(shares, place):  # noqa: ANN001, ANN202
     """The bin that a place in (-1, 1) lies in, and where that bin begins."""
     begin = -BOUND
@@ -100,7 +100,7 @@ def _bin_of(shares, place):  # noqa: ANN001, ANN202
     return shares.shape[0] - 1, begin
 
 
-@njit(**OPTIONS, inline="always")
+@njit(**OPTIONS)
 def _begin_of(shares, k):  # noqa: ANN001, ANN202
     total = 0.0
     for j in range(k):
@@ -108,7 +108,7 @@ def _begin_of(shares, k):  # noqa: ANN001, ANN202
     return BOUND * (2.0 * total - 1.0)
 
 
-@njit(**OPTIONS, inline="always")
+@njit(**OPTIONS)
 def _log_slope(s, z, first, second):  # noqa: ANN001, ANN202
     """log of the spline's slope at the share z of a bin of mean slope s."""
     across = z * (1.0 - z)
@@ -193,7 +193,7 @@ def _add_shares(raw, share, k, by_begin, by_size, softness, out) -> None:  # noq
         out[j] = 2.0 * BOUND * share[j] * pull / (soft * soft)
 
 
-@njit(**OPTIONS, inline="always")
+@njit(**OPTIONS)
 def _add_slope(raw, j, by_log, softness, periodic, out) -> None:  # noqa: ANN001
     """The gradient by the unconstrained slope j, from that by its log."""
     last = raw.shape[0] - 1
