@@ -198,18 +198,20 @@ def _seed(points: np.ndarray, weights: np.ndarray, count: int, generator: np.ran
     if len(points) > SEED_POOL * count:
         pool = generator.choice(len(points), SEED_POOL * count, replace=False, shuffle=False)
         points, weights = points[pool], weights[pool]
+    # sums over a long axis are four times as fast as over a short one
+    columns = np.ascontiguousarray(points.T)
     chosen, squared = np.empty(count, dtype=np.int64), np.full(len(points), 1.0)
     for k, draw in enumerate(generator.uniform(size=count)):
         mass = weights * squared
         cumulative = np.cumsum(mass)
         if cumulative[-1] > 0:
-            # never one without mass
-            index = np.searchsorted(cumulative, draw * cumulative[-1], side="right")
-            chosen[k] = min(int(index), int(np.flatnonzero(mass)[-1]))
+            # never one without mass, where the draw rounds to the whole
+            index = int(np.searchsorted(cumulative, draw * cumulative[-1], side="right"))
+            chosen[k] = index if index < len(mass) else np.flatnonzero(mass)[-1]
         else:
             # every distance underflowed: points that differ by less than the square root of the smallest number
             chosen[k] = int(draw * len(mass))
-        away = np.square(points - points[chosen[k]]).sum(axis=1)
+        away = np.square(columns - columns[:, chosen[k], None]).sum(axis=0)
         squared = np.minimum(squared, away) if k else away
     return points[chosen]
 
