@@ -14,7 +14,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.surface import sample_body
+from lidardesign.geometry.surface import half_extents_m, sample_body
 from lidardesign.mujoco_model import FileState, ModelGeom, body_poses, load_model, model_files, visible_geoms
 from lidardesign.numerics import SLACK
 from lidardesign.run.validation import suggest
@@ -212,10 +212,16 @@ def refuse_sensors_inside(model: Model, poses: np.ndarray, origins_m: np.ndarray
     for piece in model.pieces:
         if isinstance(piece.shape, Plane) or (isinstance(piece.shape, Mesh) and piece.shape.sign != "solid"):
             continue
-        own = _moved(origins_m, inverse_rigid(poses[:, piece.body] @ piece.pose)).reshape(-1, 3)
-        caster, limits = SceneCaster(Scene((Body(piece.shape),))), np.full(len(own), np.inf)
-        passed = caster.crossings(own, np.tile(direction, (len(own), 1)), np.zeros(len(own)), limits).row
-        inside = (np.bincount(passed, minlength=len(own)) % 2 == 1).reshape(len(poses), -1).all(axis=1)
+        own = _moved(origins_m, inverse_rigid(poses[:, piece.body] @ piece.pose))
+        half = half_extents_m(piece.shape)
+        low, high = piece.shape.bounds_m if isinstance(piece.shape, Mesh) else (np.negative(half), half)
+        # mostly they are outside of its box
+        inside = ((own > low) & (own < high)).all(axis=(1, 2))
+        if inside.any():
+            flat = own.reshape(-1, 3)
+            caster, limits = SceneCaster(Scene((Body(piece.shape),))), np.full(len(flat), np.inf)
+            passed = caster.crossings(flat, np.tile(direction, (len(flat), 1)), np.zeros(len(flat)), limits).row
+            inside = (np.bincount(passed, minlength=len(flat)) % 2 == 1).reshape(len(poses), -1).all(axis=1)
         if 2 * inside.sum() > len(inside):
             raise ConfigError(
                 f"all places where sensors may stand are inside {piece.name!r} (frame {int(np.argmax(inside))})",
