@@ -120,7 +120,8 @@ SIGMA_START_RATIO = 6.0
 ANNEALED = 0.7
 # The step size falls on a cosine to this share over the path-wise steps; it is a constant share while balancing.
 LAST_PATHWISE_RATE = 0.1
-BALANCING_RATE = 0.6
+BALANCING_RATE = 0.3
+SLOWING_STEPS = 50
 # The average after k steps has the weights after step j in proportion to (j / k)^AVERAGING, about.
 AVERAGING = 4
 SKIPS_BEFORE_BACKING_OFF = 5
@@ -217,7 +218,7 @@ class Trainer(LearnedFlow):
         return start * (final / start) ** fraction
 
     def _rate(self) -> float:
-        share = BALANCING_RATE
+        share = BALANCING_RATE / math.sqrt(1 + max(self.balanced_steps, 0) / SLOWING_STEPS)
         if self.step < self.pathwise_steps:
             cosine = math.cos(math.pi * self.step / self.pathwise_steps)
             share = LAST_PATHWISE_RATE + (1 - LAST_PATHWISE_RATE) * (1 + cosine) / 2
