@@ -30,7 +30,7 @@ from lidardesign.density.target.visibility import Optics
 from lidardesign.density.training.checkpoint import load_arrays, stored_snapshots
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.density.training.quality import IndependentProbes, measure
-from lidardesign.density.training.sampling import LearnedFlow, Thinning, draw_samples, log_density_of
+from lidardesign.density.training.sampling import LearnedFlow, Thinning, condition_groups, draw_samples, log_density_of
 from lidardesign.density.training.training import PROGRESS, SIGMA_START_RATIO
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
@@ -327,7 +327,9 @@ class LearnedDensity:
         _, state = load_arrays(self._run, FLOW)
         # flows that are not thinned, as of older runs, have no such numbers
         names = [field.name for field in fields(Thinning)]
-        return Thinning(*(state[name] for name in names)) if all(name in state for name in names) else None
+        if not all(name in state for name in names):
+            return None
+        return Thinning(*(tuple(state[name]) for name in names))
 
     @cached_property
     def _flow(self) -> LearnedFlow:
@@ -352,7 +354,7 @@ class LearnedDensity:
             return draw_samples(self._flow, count).points
         kept = np.empty((0, 6))
         while len(kept) < count:
-            drawn = draw_samples(self._flow, math.ceil(KEPT_AT_ONCE * math.exp(-self._thinning.log_share)))
+            drawn = draw_samples(self._flow, math.ceil(KEPT_AT_ONCE * math.exp(-self._thinning.log_kept)))
             points = self._thinning.thinned(drawn, self._flow.generator).points
             if not len(points):
                 reason = "the task's training scenes are others than those that it was learned from"
@@ -372,4 +374,5 @@ class LearnedDensity:
         log_prob = log_density_of(self._flow, points)
         if self._thinning is None:
             return log_prob
-        return self._thinning.log_prob(log_prob, self._flow.target.log_density(points))
+        groups = condition_groups(self.space, points)
+        return self._thinning.log_prob(log_prob, self._flow.target.log_density(points), groups)

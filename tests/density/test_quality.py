@@ -10,7 +10,7 @@ import torch
 from support import references
 
 from lidardesign.density.training.quality import OverlapPoints, coverage, overlap, quality, worse_of
-from lidardesign.density.training.sampling import Thinning
+from lidardesign.density.training.sampling import Thinning, condition_groups
 from lidardesign.errors import NumericalError
 from lidardesign.estimates import Estimate
 from lidardesign.samples import Samples
@@ -219,10 +219,32 @@ def test_thinned_samples_have_the_lesser_of_both_densities(shift, spread):
     inside = np.abs(kept.points[:, 5]) < 0.5
     density = np.exp(log_prob) * (np.abs(grid) < 0.5)
     assert inside.mean() == pytest.approx(np.trapezoid(density, grid), abs=0.01)
-    least = thinning.log_least + thinning.log_share
+    least = thinning.log_least[0] + thinning.log_share[0]
     assert kept.log_weights.min() == pytest.approx(least, abs=1e-9)
     found = quality(kept.log_prob, kept.log_target)
     assert found.log_z == pytest.approx(LOG_Z, abs=0.05)
+
+
+def test_along_conditions_every_group_is_thinned_by_its_own_mean_weight_and_stays_as_frequent():
+    generator = np.random.default_rng(11)
+    points = np.zeros((COUNT, 6))
+    points[:, 0], points[:, 5] = generator.uniform(size=COUNT), generator.normal(size=COUNT)
+    near, x = points[:, 0] < 0.5, points[:, 5]
+    log_target = np.where(near, gaussian(x, 0.7) + LOG_Z, gaussian(x, -1.4) - LOG_Z)
+    space = DesignSpace((0,) * 6, (1,) * 6, condition=("x_m",))
+    samples = Samples(points, gaussian(x), log_target, space)
+    thinning = Thinning.of(samples.log_weights, condition_groups(space, points))
+    kept = thinning.thinned(samples, torch.Generator().manual_seed(0))
+    assert len(kept) / COUNT == pytest.approx(math.exp(thinning.log_kept), abs=0.02)
+    assert (kept.points[:, 0] < 0.5).mean() == pytest.approx(0.5, abs=0.02)
+    for here, shift, log_z in ((True, 0.7, LOG_Z), (False, -1.4, -LOG_Z)):
+        part = kept.subset((kept.points[:, 0] < 0.5) == here)
+        grid = np.linspace(-12, 12, 10_001)
+        shared = np.trapezoid(np.exp(np.minimum(gaussian(grid), gaussian(grid, shift))), grid)
+        expected = np.minimum(gaussian(part.points[:, 5]), gaussian(part.points[:, 5], shift)) - math.log(shared)
+        np.testing.assert_allclose(part.log_prob, expected, atol=0.25)  # groups know their own Z from 1 in 32 samples
+        assert np.mean(part.log_prob - expected) == pytest.approx(0.0, abs=0.02)
+        assert quality(part.log_prob, part.log_target).log_z == pytest.approx(log_z, abs=0.05)
 
 
 def test_what_the_target_rules_out_is_never_kept():

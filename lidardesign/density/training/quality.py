@@ -33,13 +33,19 @@ from scipy.optimize import brentq
 from lidardesign.density.target.proposals import independent_points
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.losses import TOLERANCE_NATS, round_trip_nats
-from lidardesign.density.training.sampling import LearnedFlow, Thinning, draw_samples, log_density_of
+from lidardesign.density.training.sampling import (
+    CONDITION_GROUPS,
+    LearnedFlow,
+    Thinning,
+    condition_groups,
+    draw_samples,
+    log_density_of,
+)
 from lidardesign.errors import NumericalError
 from lidardesign.estimates import Estimate, effective_share_error, log_mean_error, standard_error, weighted_mean_error
 from lidardesign.numerics import SLACK, TINY, logsumexp, normalised_weights
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
-from lidardesign.space import DesignSpace
 
 # A point counts as covered where p >= COVERED_RATIO * p* / Z.
 COVERED_RATIO = 0.1
@@ -265,7 +271,6 @@ def _bracket(gap: Callable[[float], float], start: float) -> tuple[float, float]
     return ends[0], ends[1]
 
 
-CONDITION_GROUPS = 32
 # So many samples go back to the flow's base.
 ROUND_TRIPS = 1000
 NOT_COVERED = (
@@ -325,8 +330,8 @@ def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> Meas
     samples, thinning, notes = draw_samples(learned, count), None, []
     space, log_weights = samples.space, samples.log_weights
     # what is no number is refused with the figures
-    if not space.conditioned and np.isfinite(log_weights.max()):
-        thinning = Thinning.of(log_weights)
+    if np.isfinite(log_weights.max()):
+        thinning = Thinning.of(log_weights, condition_groups(space, samples.points))
         samples = thinning.thinned(samples, learned.generator)
     groups = condition_groups(space, samples.points)
     figures, covered = quality(samples.log_prob, samples.log_target, groups), Estimate(0.0, None)
@@ -334,7 +339,7 @@ def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> Meas
     if len(probes.points):
         log_prob, theirs = log_density_of(learned, probes.points), condition_groups(space, probes.points)
         if thinning is not None:
-            log_prob = thinning.log_prob(log_prob, probes.log_target)
+            log_prob = thinning.log_prob(log_prob, probes.log_target, theirs)
         log_z = _log_z_at(probes.points, samples, groups, figures.log_z)
         covered = coverage(log_prob, probes.log_target, probes.log_proposal, log_z)
         log_weights = probes.log_target - probes.log_proposal
@@ -350,15 +355,6 @@ def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> Meas
             "float64; fewer learning.layers are easier to invert"
         )
     return MeasuredFlow(samples, estimates, off, tuple(notes), thinning)
-
-
-def condition_groups(space: DesignSpace, points: np.ndarray) -> np.ndarray | None:
-    """Which part of the first conditioning dimension's bounds points (N, 6) lie in, shape (N,)."""
-    if not space.conditioned:
-        return None
-    first = space.conditioned[0]
-    share = (points[:, first] - space.low[first]) / (space.high[first] - space.low[first])
-    return np.clip((share * CONDITION_GROUPS).astype(int), 0, CONDITION_GROUPS - 1)
 
 
 def _log_z_at(points: np.ndarray, samples: Samples, groups: np.ndarray | None, mean_log_z: float) -> np.ndarray | float:

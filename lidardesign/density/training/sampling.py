@@ -7,8 +7,8 @@ kept with the probability w / Z alone. What is kept has the density
 
     min(p, p* / Z) / A,    with A the share that is kept, which is 1 - TV(p, pi),
 
-and weights of max(w, Z) A. Nothing is lost: what is left out weighs little. Where rays are learned
-along conditions A is another one for each of their values, and the flow is not thinned.
+and weights of max(w, Z) A. Nothing is lost: what is left out weighs little. Where rays are learned along conditions, Z
+and A are those of a condition's group, and of every group as many are kept as of the one that keeps fewest.
 
 References:
     Rejection control and sequential importance sampling, Liu, Chen and Wong 1998.
@@ -28,8 +28,19 @@ from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.target.target import Target
 from lidardesign.numerics import logsumexp
 from lidardesign.samples import Samples
+from lidardesign.space import DesignSpace
 
 POINTS_AT_ONCE = 16384
+CONDITION_GROUPS = 32
+
+
+def condition_groups(space: DesignSpace, points: np.ndarray) -> np.ndarray | None:
+    """Which part of the first conditioning dimension's bounds points (N, 6) lie in, shape (N,)."""
+    if not space.conditioned:
+        return None
+    first = space.conditioned[0]
+    share = (points[:, first] - space.low[first]) / (space.high[first] - space.low[first])
+    return np.clip((share * CONDITION_GROUPS).astype(int), 0, CONDITION_GROUPS - 1)
 
 
 @dataclass(eq=False)
@@ -47,29 +58,57 @@ class Thinning:
     """Which samples of a flow are kept.
 
     Arguments:
-        log_least: log of the weight p* / p below which a sample is kept by chance.
-        log_share: log of the share that is kept.
+        log_least: log of the weight p* / p below which a sample is kept by chance, by condition group; one without.
+        log_share: log of the share that this keeps, by group.
     """
 
-    log_least: float
-    log_share: float
+    log_least: tuple[float, ...]
+    log_share: tuple[float, ...]
 
     @classmethod
-    def of(cls, log_weights: np.ndarray) -> Self:
-        """The thinning at the mean weight of a flow's samples, from log p* - log p, shape (N,)."""
-        log_count = math.log(len(log_weights))
-        log_least = float(logsumexp(log_weights)) - log_count
-        return cls(log_least, float(logsumexp(np.minimum(log_weights - log_least, 0.0))) - log_count)
+    def of(cls, log_weights: np.ndarray, groups: np.ndarray | None = None) -> Self:
+        """The thinning at the mean weight of a flow's samples.
 
-    def log_prob(self, log_prob: np.ndarray, log_target: np.ndarray) -> np.ndarray:
-        """The log density that is left of a flow's at any points with log p*, shapes (N,)."""
-        return np.minimum(log_prob, log_target - self.log_least) - self.log_share
+        Arguments:
+            log_weights: log p* - log p, shape (N,).
+            groups: Their condition groups, shape (N,), where there are conditions.
+        """
+        parts = [log_weights]
+        if groups is not None:
+            # a group without samples is as all of them
+            parts = [log_weights[groups == n] if (groups == n).any() else log_weights for n in range(CONDITION_GROUPS)]
+        log_least = [_log_mean(part) for part in parts]
+        log_share = [_log_mean(np.minimum(part - least, 0.0)) for part, least in zip(parts, log_least, strict=True)]
+        return cls(tuple(log_least), tuple(log_share))
+
+    @property
+    def log_kept(self) -> float:
+        """log of the share of a flow's samples that is kept."""
+        return min(self.log_share)
+
+    def log_prob(self, log_prob: np.ndarray, log_target: np.ndarray, groups: np.ndarray | None = None) -> np.ndarray:
+        """The log density that is left of a flow's at any points with log p* and their groups, shapes (N,)."""
+        least, share = self._of(groups)
+        return np.minimum(log_prob, log_target - least) - share
 
     def thinned(self, samples: Samples, generator: torch.Generator) -> Samples:
         """Those of a flow's samples that are kept, with the thinned density."""
+        groups = condition_groups(samples.space, samples.points)
+        least, share = self._of(groups)
         chance = torch.rand(len(samples), generator=generator, dtype=torch.float64, device=generator.device)
-        kept = samples.subset(np.log(chance.cpu().numpy()) < samples.log_weights - self.log_least)
-        return replace(kept, log_prob=self.log_prob(kept.log_prob, kept.log_target))
+        log_chance = np.minimum(samples.log_weights - least, 0.0) + self.log_kept - share
+        kept = np.log(chance.cpu().numpy()) < log_chance
+        log_prob = self.log_prob(samples.log_prob, samples.log_target, groups)
+        return replace(samples.subset(kept), log_prob=log_prob[kept])
+
+    def _of(self, groups: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """log_least and log_share of points' groups, shapes (N,), or () without conditions."""
+        numbers = 0 if groups is None else groups
+        return np.asarray(self.log_least)[numbers], np.asarray(self.log_share)[numbers]
+
+
+def _log_mean(log_values: np.ndarray) -> float:
+    return float(logsumexp(log_values)) - math.log(len(log_values))
 
 
 def draw_samples(learned: LearnedFlow, count: int) -> Samples:

@@ -2,8 +2,8 @@
 
 The first steps follow the reverse KL along paths while sigma falls geometrically from its start to its final value, so
 that surfaces are found while they are wide; eta falls to zero with it. All further ones balance the mass by values of
-p* (`losses`), with steps of one size. What is learned is the average of the weights on the way, the later ones counting
-more: it is at every step about as good as steps of falling size would have been that were planned to end there, so
+p* (`losses`), with steps that fall as the root of their number. What is learned is the average of the weights on the
+way, the later ones counting more: it is at every step about as good as if training had been planned to end there, so
 training may stop at any. Every `STRETCH` steps the average is measured against the target, and training stops once the
 share of its mass in the wrong place is small enough.
 
@@ -118,8 +118,9 @@ PROGRESS = "progress.jsonl"
 SIGMA_START_RATIO = 6.0
 # The share of the path-wise steps over which sigma falls.
 ANNEALED = 0.7
-# The step size falls on a cosine to this share over the path-wise steps; it is a constant share while balancing.
+# The step size falls on a cosine to this share over the path-wise steps.
 LAST_PATHWISE_RATE = 0.1
+# Balancing begins with this share; after so many steps it is divided by the root of 2.
 BALANCING_RATE = 0.3
 SLOWING_STEPS = 50
 # The average after k steps has the weights after step j in proportion to (j / k)^AVERAGING, about.
