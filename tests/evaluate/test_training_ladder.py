@@ -83,7 +83,7 @@ def test_every_snapshot_and_the_flow_itself_are_measurements_with_errors_and_sec
     assert all(0 < measurement.error < 1 and 0 < measurement.uncertainty < 0.1 for measurement in steps.measurements)
     seconds = [measurement.seconds for measurement in steps.measurements]
     assert seconds == sorted(seconds)
-    assert steps.falls
+    assert steps.measurements[-1].error < steps.measurements[0].error
 
 
 def test_measurements_carry_ess_kl_coverage_and_the_score_of_a_quick_fit(sweeps):
