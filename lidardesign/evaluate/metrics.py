@@ -145,7 +145,7 @@ def ray_spacing(directions: np.ndarray) -> np.ndarray:
         Chords of the unit sphere, shape (N,); infinite where fewer than three directions, or all on a line, have no
         triangles.
     """
-    return _ray_spacing(np.ascontiguousarray(directions, dtype=np.float64).tobytes())
+    return _ray_spacing(np.ascontiguousarray(directions, dtype=np.float64).tobytes()).copy()
 
 
 @lru_cache(maxsize=512)
