@@ -13,16 +13,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidardesign.design.catalog.library import SUFFIX, load_library
-from lidardesign.design.catalog.part import Part
 from lidardesign.design.sensor import boresight_frame
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import COARSE_SLACK, ROUNDING, SLACK
 from lidardesign.space import direction
+
+if TYPE_CHECKING:
+    from lidardesign.design.catalog.part import Part
 
 # A reported interval may differ from its mean and spread by this share (decimal digits in a file).
 AGREEMENT = COARSE_SLACK
@@ -428,6 +429,8 @@ def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list
 
 def _admitted_part(name: str, named: Sequence[str]) -> Part | None:
     """The part that a sensor names, if the constraints admit it."""
+    from lidardesign.design.catalog.library import SUFFIX, load_library
+
     # an entry is a name or a path, with a mode behind it or not
     entries: list[tuple[Path | None, str, str]] = []
     for text in named:
