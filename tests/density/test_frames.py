@@ -171,6 +171,35 @@ def test_first_hits_of_pairs_are_those_of_the_scene(with_mesh):
         assert same[np.isfinite(one.range_m)].mean() > 0.98
 
 
+def first_hits_of_one_column(shapes_and_poses, origin, toward, limit_m=10.0):
+    """Range and normal of a ray's first hit on occluders."""
+    scene = Scene(tuple(Body(shape, f"body {n}", "both", pose) for n, (shape, pose) in enumerate(shapes_and_poses)))
+    rays = RayBatch(np.array([origin], float), np.array([toward], float), np.array([limit_m]))
+    pairs = Pairs(np.array([0, 1]), np.zeros(1, int), np.zeros(1), np.zeros(1, int))
+    hits, normals = BodyRaycast(occluding_bodies([scene])).first_hits(rays, pairs, rays.ranges)
+    return float(hits[0]), normals[0]
+
+
+def test_of_more_meshes_along_a_ray_than_there_is_room_for_the_nearest_is_met():
+    mesh = cube(None)
+    row = [(mesh, rigid(translation_m=(0.5 * n, 0, 0))) for n in range(12, 0, -1)]
+    range_m, normal = first_hits_of_one_column(row, (0, 0.01, 0.02), (1, 0, 0))
+    assert range_m == pytest.approx(0.45, abs=1e-6)
+    np.testing.assert_allclose(normal, (-1, 0, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_ray_along_a_face_of_a_box_meets_it(side):
+    box = Box((0.1, 0.2, 0.3))
+    for axis in (1, 2):
+        origin = np.array([-1.0, 0, 0])
+        origin[axis] = side * box.half_extents_m[axis]
+        range_m, normal = first_hits_of_one_column([(box, np.eye(4))], origin, (1, 0, 0))
+        assert range_m == pytest.approx(0.9)
+        # on an edge either face is met
+        assert np.abs(normal).max() == 1
+
+
 def test_points_near_a_ball_follow_its_surface_term():
     scenes = [Scene((Body(Sphere(0.1), "ball", "target", rigid(translation_m=(0.2, 0, 0.3))),))]
     target = build_target(scenes, CEILING, DensitySettings(sigma_m=0.05), "off")
