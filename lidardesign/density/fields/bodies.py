@@ -25,6 +25,7 @@ KINDS: dict[type, int] = {
 }  # fmt: skip
 # Frames of one motion are close together: so many of them are looked at, or passed over, at once.
 GROUP_COLUMNS = 16
+# Of the sides of bounding boxes.
 ROUNDINGS = 8
 BuildGrid = Callable[[Mesh], tuple[Grid, np.ndarray]]
 Entry = tuple[int, Body, int]
