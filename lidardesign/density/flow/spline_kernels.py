@@ -125,7 +125,7 @@ def forward(parameters, values, periodic, softness, edge, shares, bins, places, 
         parameters: Shape (N, splines, 3 K + 1).
         values: Where to evaluate, shape (N,).
         periodic: Whether the dimension lies on a circle.
-        softness: 2 / |log of the smallest slope|.
+        softness: 2 / |log of the smallest slope of a spline|.
         edge: Values are kept this far inside [-1, 1].
         shares: Out: shares of widths and heights, shape (N, splines, 2 K), for the gradient.
         bins: Out: the bin at each spline, shape (N, splines).

@@ -19,9 +19,9 @@ from lidardesign.numerics import FLOAT32_ROUNDING, safe_sqrt
 BOUND = 1.0
 # Foreign points and base samples are kept this far inside the box, where splines are smooth.
 EDGE = FLOAT32_ROUNDING
-# The smallest slope that a spline may take; its inverse is the steepest: 1e4 resolves a 0.1 mm shell in a 1 m range.
+# The smallest slope that a stack of splines may take; its inverse is the steepest. What may be steeper has gradients
+# that grow without end where a steep spline follows a flat one, and learning by steps of one size diverges.
 MINIMUM_SLOPE = 1e-4
-SOFTNESS = 2 / abs(math.log(MINIMUM_SLOPE))
 
 
 class BoundedSpline(MonotonicRQSTransform):
@@ -32,11 +32,19 @@ class BoundedSpline(MonotonicRQSTransform):
         heights: Unconstrained bin heights, with shape (*, K).
         derivatives: Unconstrained knot slopes, with shape (*, K + 1).
         periodic: Mask of the dimensions on a circle, with shape (D,), or None.
+        slope: The smallest slope that it may take; its inverse is the steepest.
     """
 
-    def __init__(self, widths: Tensor, heights: Tensor, derivatives: Tensor, periodic: Tensor | None = None) -> None:
-        super().__init__(widths, heights, derivatives[..., 1:-1], bound=BOUND, slope=MINIMUM_SLOPE)
-        softened = derivatives / (1 + abs(derivatives / math.log(MINIMUM_SLOPE)))
+    def __init__(
+        self,
+        widths: Tensor,
+        heights: Tensor,
+        derivatives: Tensor,
+        periodic: Tensor | None = None,
+        slope: float = MINIMUM_SLOPE,
+    ) -> None:
+        super().__init__(widths, heights, derivatives[..., 1:-1], bound=BOUND, slope=slope)
+        softened = derivatives / (1 + abs(derivatives / math.log(slope)))
         slopes = torch.exp(softened)
         if periodic is not None:
             outer = torch.exp((softened[..., :1] + softened[..., -1:]) / 2)
@@ -70,6 +78,11 @@ class BoundedSpline(MonotonicRQSTransform):
         return self._turned(x0 + share * (x1 - x0))
 
 
+def _softness(layers: int) -> float:
+    """How soon the splines of a stack give way to what their slopes may be."""
+    return 2 * layers / abs(math.log(MINIMUM_SLOPE))
+
+
 class _CompiledSplines(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -84,7 +97,7 @@ class _CompiledSplines(torch.autograd.Function):
         out, log_slopes = torch.empty_like(values), torch.empty_like(values)
         arrays = [tensor.numpy() for tensor in (shares, bins, places, out, log_slopes)]
         kernel = spline_kernels.inverse if inverted else spline_kernels.forward
-        kernel(parameters.numpy(), values.numpy(), periodic, SOFTNESS, EDGE, *arrays)
+        kernel(parameters.numpy(), values.numpy(), periodic, _softness(layers), EDGE, *arrays)
         ctx.save_for_backward(parameters, shares, bins, places)
         ctx.periodic, ctx.inverted, ctx.held = periodic, inverted, held
         if held:
@@ -101,7 +114,7 @@ class _CompiledSplines(torch.autograd.Function):
             parameters.numpy(),
             *(tensor.numpy() for tensor in kept),
             ctx.periodic,
-            SOFTNESS,
+            _softness(parameters.shape[1]),
             ctx.inverted or ctx.held,
             *(tensor.contiguous().numpy() for tensor in (by_value, by_slope)),
             by_parameters.numpy(),
@@ -116,7 +129,7 @@ def array_splines(values: Tensor, parameters: Tensor, periodic: bool, *, inverte
     circles = torch.tensor([True], device=values.device) if periodic else None
     layers = [layer.split([count, count, count + 1], dim=-1) for layer in parameters[:, :, None].unbind(dim=1)]
     for layer in reversed(layers) if inverted else layers:
-        made = BoundedSpline(*layer, circles)
+        made = BoundedSpline(*layer, circles, MINIMUM_SLOPE ** (1 / len(layers)))
         there = made.inv(values[:, None]) if inverted else values[:, None]
         out, log_slope = made.call_and_ladj(there)
         values, total = (there if inverted else out)[:, 0], total + log_slope[:, 0]
