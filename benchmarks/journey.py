@@ -117,7 +117,7 @@ def measured(root: Path, words: list[str | Path], here: Path, caches: Path) -> d
         if words[0] == "learn":
             shutil.rmtree(here, ignore_errors=True)
             here.mkdir(parents=True)
-        done = run_process([sys.executable, "-m", "lidardesign", *words, "--json"], environment)
+        done = run_process([sys.executable, "-P", "-m", "lidardesign", *words, "--json"], environment)
         document = done.document()
         if len([*caches.rglob("*.nbi")]) == before or cold_s is not None:
             found = {"wall_s": done.wall, "cpu_s": done.cpu, "mib": done.peak_mib, "cold_s": cold_s}

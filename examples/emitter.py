@@ -2,7 +2,7 @@
 
 python examples/emitter.py [--out FOLDER] [--set KEY=VALUE]...
 
-It learns a draft, so that all of it takes about two minutes; docs/emitter.md has the figures of a standard run.
+It learns a draft, so that all of it takes about a minute; docs/emitter.md has the figures of a standard run.
 """
 
 from __future__ import annotations

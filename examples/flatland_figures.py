@@ -1,6 +1,6 @@
 """Draws the paper's figures 2 and 3 for flatland, where a design point is only (x, azimuth, range).
 
-    python examples/flatland_figures.py                   # learns a draft run first, half a minute
+    python examples/flatland_figures.py                   # learns a draft run first, some seconds
     python examples/flatland_figures.py --run runs/flatland --out pictures
 
 Three pictures: the rays that observe one scene point, as a curve in design space weighted by visibility; the target

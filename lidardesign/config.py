@@ -110,7 +110,7 @@ class LearningSettings(BaseModel):
 
 
 PRESET_LEARNING: dict[str, dict[str, Any]] = {
-    "draft": {"misplaced": 0.25, "steps": 150, "samples": 40_000},
+    "draft": {"misplaced": 0.25, "steps": 200, "batch": 512, "samples": 40_000},
     "standard": {},
     "fine": {"misplaced": 0.05, "steps": 2000, "layers": 3, "hidden": 128, "bins": 24, "samples": 200_000},
 }

@@ -22,8 +22,8 @@ from lidardesign.space import FARTHEST_M
 Role = Literal["target", "occluder", "both"]
 Sign = Literal["auto", "solid", "winding", "unsigned"]
 ROLES = ("target", "occluder", "both")
-# How far a pose's rotation may be from orthogonal: poses are often written with seven digits.
-RIGID_TOLERANCE = COARSE_SLACK
+# How far the products of a pose's axes may be from those of a rotation: poses are often written with few digits.
+RIGID_TOLERANCE = COARSE_SLACK + 10 * COARSE_SLACK * np.eye(3)
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 # Light that fades over a nanometre has entered a solid.
 DENSEST = 1e9
@@ -301,8 +301,9 @@ class Body:
                 allowed=f"at most {FARTHEST_M:g} m from the origin",
             )
         rotation = poses[..., :3, :3]
-        orthogonal = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=RIGID_TOLERANCE)
-        if not orthogonal or (np.linalg.det(rotation) < 0).any() or (poses[..., 3, :] != (0, 0, 0, 1)).any():
+        apart = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3))
+        is_rigid = (apart <= RIGID_TOLERANCE).all() and (np.linalg.det(rotation) > 0).all()
+        if not is_rigid or (poses[..., 3, :] != (0, 0, 0, 1)).any():
             raise DataError(
                 f"body {self.name!r}: a pose is not rigid",
                 allowed="a rotation without scale or reflection, a translation, and 0 0 0 1 below",

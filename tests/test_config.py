@@ -82,7 +82,7 @@ def write(tmp_path):
 
 def test_later_layers_win_over_earlier_ones(write):
     assert resolve(TASK).learning.steps == LearningSettings().steps
-    assert resolve(TASK, preset="draft").learning.batch == 1024
+    assert resolve(TASK, preset="draft").learning.batch == 512
     assert resolve(TASK, preset="draft").learning.steps == 77
     assert resolve(TASK).density.sigma_m == 0.01
     file = write("preset: draft\nseed: 5\nlearning: {steps: 88}\ndensity: {sigma_m: 1e-3}\n")

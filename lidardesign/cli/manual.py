@@ -37,7 +37,7 @@ GOAL = {1: "a threshold was missed"}
 MANUALS: dict[str, Manual] = {
     "learn": Manual(
         {
-            "lidardesign learn face --preset draft --out runs/face": "half a minute, for trials",
+            "lidardesign learn face --preset draft --out runs/face": "ten seconds, for trials",
             "lidardesign learn meshes --set folder=scans --set scale=0.001 --out runs/scans": "meshes in mm",
             "lidardesign learn --config - < face.yaml": "a configuration from standard input",
             "lidardesign learn face --tolerance 0.15 --out runs/good_enough": "until it is good enough",

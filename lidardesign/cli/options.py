@@ -130,7 +130,7 @@ Preset = Annotated[
     typer.Option(
         "--preset",
         metavar="draft|standard|fine",
-        help="Effort: about half a minute, minutes, or tens of minutes.",
+        help="Effort: about ten seconds, half a minute, or minutes.",
         show_default="standard",
     ),
 ]

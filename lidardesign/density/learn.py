@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -175,7 +176,7 @@ def learn(
         DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
     """
     place = choose_device(device)
-    with running() as clock:
+    with running() as clock, one_thread():
         data = prepare_training_data(task, config, remark) if data is None else data
         trainer = make_trainer(data, config, run, place)
         trainer.is_over = is_over
@@ -191,7 +192,7 @@ def learn(
             probes = draw_probes(trainer.target, config.learning.coverage_proposals, generator)
         measured = measure(learned, probes, config.learning.samples)
         with phase("writing"):
-            save_flow(learned.flow, run, FLOW, **({} if measured.thinning is None else asdict(measured.thinning)))
+            save_flow(learned.flow, run, FLOW, **asdict(measured.thinning))
             save_samples(measured.samples, run)
             if (run / PROGRESS).exists():
                 record(run, [PROGRESS])
@@ -208,6 +209,17 @@ def learn(
     visibility = data.target.visibility.name
     note(run, learn=result.as_dict(), visibility=visibility, round_trip_nats=measured.round_trip_nats)
     return result
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch work on one thread: sums over several end in other bits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _notes(trainer: Trainer, place: torch.device) -> list[str]:

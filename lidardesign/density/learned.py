@@ -95,7 +95,7 @@ def remeasured(
     return qualities
 
 
-def load_flow(run: Path, name: str, config: RunConfig, target: Target | FlatTarget, seed: int) -> LearnedFlow:
+def load_flow(run: Path, name: str, config: RunConfig, target: Target, seed: int) -> LearnedFlow:
     """A flow of a run from its file, in double precision.
 
     Raises:
@@ -323,19 +323,13 @@ class LearnedDensity:
         self._run, self._task, self._config = run, task, config
 
     @cached_property
-    def _thinning(self) -> Thinning | None:
+    def _thinning(self) -> Thinning:
         _, state = load_arrays(self._run, FLOW)
-        # flows that are not thinned, as of older runs, have no such numbers
-        names = [field.name for field in fields(Thinning)]
-        if not all(name in state for name in names):
-            return None
-        return Thinning(*(tuple(state[name]) for name in names))
+        return Thinning(*(tuple(state[field.name]) for field in fields(Thinning)))
 
     @cached_property
     def _flow(self) -> LearnedFlow:
-        target = FlatTarget(Optics.of(self._config.density), self.space)
-        if self._thinning is not None:
-            target, _ = prepare_target(training_scenes(self._task, self._config), self._config)
+        target, _ = prepare_target(training_scenes(self._task, self._config), self._config)
         return load_flow(self._run, FLOW, self._config, target, self._config.seed)
 
     @property
@@ -350,8 +344,6 @@ class LearnedDensity:
             DataError: The task's scenes have changed so much that nothing is left of the density.
         """
         self._flow.generator.manual_seed(int(np.random.default_rng(seed).integers(2**63)))
-        if self._thinning is None:
-            return draw_samples(self._flow, count).points
         kept = np.empty((0, 6))
         while len(kept) < count:
             drawn = draw_samples(self._flow, math.ceil(KEPT_AT_ONCE * math.exp(-self._thinning.log_kept)))
@@ -372,7 +364,5 @@ class LearnedDensity:
         if points.ndim != 2 or points.shape[1] != 6:
             raise ConfigError(f"points of shape {points.shape}", where="log_prob", allowed="(N, 6)")
         log_prob = log_density_of(self._flow, points)
-        if self._thinning is None:
-            return log_prob
         groups = condition_groups(self.space, points)
         return self._thinning.log_prob(log_prob, self._flow.target.log_density(points), groups)

@@ -15,15 +15,16 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.primitives import BALL_SLACK, PrimitiveGroup
+from lidardesign.geometry.primitives import BALL_SLACK, KINDS, SIZES, bounding_radius_m
 from lidardesign.geometry.rays import Crossings, Hits
 from lidardesign.geometry.triangles import FARTHEST_M, SecondCasts, Triangles, advances_m, mesh_caster
 from lidardesign.numerics import COARSE_SLACK, SQUARABLE, unit_vectors
-from lidardesign.scene import Body, Mesh, Scene
+from lidardesign.scene import Body, Mesh, Scene, inverse_rigid
 
 # After a triangle the next one is looked for this share of the scene's reach further on.
 STEP_SHARE = COARSE_SLACK
 MAXIMUM_LAYERS = 16
+CROSSINGS_PER_RAY = 2  # of primitives, that there is room for at first
 
 Only = Literal["all", "targets", "occluders"]
 
@@ -45,16 +46,13 @@ class SceneCaster:
         moving = [(i, body) for i, body in meshes if body.poses.ndim == 3]
         self._resting = _shared_at_rest(resting) if resting else None
         self._moving = _Moving(moving, frame) if moving else None
-        kinds = {type(body.shape) for _, body in chosen} - {Mesh}
-        self._groups = [
-            PrimitiveGroup([(i, body) for i, body in chosen if isinstance(body.shape, kind)], frame)
-            for kind in sorted(kinds, key=lambda kind: kind.__name__)
-        ]
+        primitives = [(i, body) for i, body in chosen if not isinstance(body.shape, Mesh)]
+        self._primitives = Primitives(primitives, frame) if primitives else None
 
     @property
     def resting(self) -> _AtRest | None:
         """Its meshes at rest, where it casts at nothing else."""
-        return None if self._groups or self._moving else self._resting
+        return None if self._primitives or self._moving else self._resting
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """The nearest hit of every ray, shapes (N, 3) and (N, 3); directions are normalised here.
@@ -64,7 +62,10 @@ class SceneCaster:
         Raises:
             ConfigError: An origin or direction that is not finite, or a direction of zero length.
         """
-        origins, directions = _checked_rays(origins, directions)
+        return self.first_hit_of_checked(*checked_rays(origins, directions))
+
+    def first_hit_of_checked(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
+        """As `first_hit`, of what `checked_rays` returned: rays that are fired in many frames are checked once."""
         self.second_casts.rays += len(origins)
         return self._traced(origins, directions, np.full(len(origins), np.inf), self.second_casts)
 
@@ -76,8 +77,8 @@ class SceneCaster:
         self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
     ) -> Hits:
         hits = self._traced_meshes(origins, directions, limit_m, twice)
-        for group in self._groups:
-            group.keep_nearer(hits, origins, directions, limit_m)
+        if self._primitives:
+            self._primitives.keep_nearer(hits, origins, directions, limit_m)
         rows = np.flatnonzero(hits.body >= 0)
         hits.normal[rows] = _facing(hits.normal[rows], directions[rows])
         return hits
@@ -107,7 +108,8 @@ class SceneCaster:
                 cosine = np.abs(np.einsum("nk,nk->n", hits.normal[hit], toward[hit]))
                 parts.append(Crossings(alive, reached, cosine))
                 start[alive] = reached + step_m
-        parts += [group.crossings(origins, directions, start_m, limit_m) for group in self._groups]
+        if self._primitives:
+            parts.append(self._primitives.crossings(origins, directions, start_m, limit_m))
         return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _traced_meshes(
@@ -181,7 +183,12 @@ def shared_caster(scene: Scene, frame: int = 0, *, only: Only = "all") -> SceneC
     return known[key]
 
 
-def _checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of unit length, float64, shape (N, 3) each.
+
+    Raises:
+        ConfigError: One that is not finite, or a direction of zero length.
+    """
     directions = np.asarray(directions, dtype=np.float64)
     if directions.ndim != 2 or directions.shape[1] != 3:
         raise ConfigError(f"directions have shape {directions.shape}", where="rays", allowed="(N, 3)")
@@ -193,6 +200,48 @@ def _checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarr
     if extreme.any():
         directions = np.where(extreme[:, None], directions / largest[:, None], directions)
     return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+class Primitives:
+    """The primitives of a frame.
+
+    Arguments:
+        members: Their numbers among all bodies, and the bodies; at least one.
+        frame: The time frame.
+    """
+
+    def __init__(self, members: Sequence[tuple[int, Body]], frame: int) -> None:
+        shapes, poses = [body.shape for _, body in members], np.stack([body.pose(frame) for _, body in members])
+        radii_m = np.array([bounding_radius_m(shape) for shape in shapes])
+        self.radius_m = float(radii_m.max())  # of a ball around a member's origin that holds any of them
+        self._shapes = (
+            np.array([KINDS[type(shape)] for shape in shapes]),
+            np.array([SIZES[type(shape)](shape) for shape in shapes], dtype=np.float64),
+            np.ascontiguousarray(inverse_rigid(poses)[:, :3]),
+            np.ascontiguousarray(poses[:, :3, 3]),
+            radii_m,
+            np.array([number for number, _ in members]),
+        )
+
+    def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> None:
+        """Enter the hits that are nearer than what `hits` holds, with outward normals."""
+        from lidardesign.geometry import primitive_kernels
+
+        primitive_kernels.keep_nearer(self._shapes, origins, directions, limit_m, hits.range_m, hits.body, hits.normal)
+
+    def crossings(
+        self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
+    ) -> Crossings:
+        """See `SceneCaster.crossings`."""
+        from lidardesign.geometry import primitive_kernels
+
+        room = CROSSINGS_PER_RAY * len(origins)
+        while True:
+            found = np.empty(room, dtype=np.int64), np.empty(room), np.empty(room)
+            count = primitive_kernels.crossings(self._shapes, origins, directions, start_m, limit_m, *found)
+            if count <= room:
+                return Crossings(*(column[:count] for column in found))
+            room = count
 
 
 class _AtRest:

@@ -177,6 +177,7 @@ def choose_within(
     budget_mbps: float,
     *,
     full: bool = True,
+    passes: int = MOST_PASSES,
 ) -> Choice:
     """The best choice found that a bandwidth allows; as `choose`, with a budget [Mbit/s] for a price.
 
@@ -184,10 +185,10 @@ def choose_within(
     least price that keeps to the budget leaves over is spent at the next lower price, then at none.
     """
     budget_mbps *= 1 + SLACK  # the same bits added up in another order
-    free = choose(coverage, counts, full=full)
+    free = choose(coverage, counts, full=full, passes=passes)
     if free.bits <= budget_mbps:
         return free
-    low, high = 0.0, free.worth / free.bits
+    low, high = 0.0, (free.worth or 1.0) / free.bits  # a price has to rise from above 0
     for _ in range(BISECTIONS):
         tried = choose(coverage, counts, price=high, full=full, passes=0).bits
         if tried <= budget_mbps:
@@ -204,5 +205,5 @@ def choose_within(
             low = middle
     search = _Search(coverage, counts)
     for price in (high, low, 0.0):
-        search.improve(price, budget_mbps, full=full, passes=MOST_PASSES)
+        search.improve(price, budget_mbps, full=full, passes=passes)
     return search.choice(high)

@@ -79,9 +79,14 @@ class Coverage:
     @cached_property
     def by_item(self) -> kernels.ByItem:
         """The table in the order of items, each from what tells most of it."""
-        begin = _begins(self.item, len(self.weight))
-        order = kernels.order_by_item(self.item, self.worth, begin)
+        begin, order = self._order_by_item
         return kernels.ByItem(begin, self.ray[order], self.worth[order], self.gates[order], self.weight, self.table)
+
+    @cached_property
+    def _order_by_item(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the entries of each item begin, and their order."""
+        begin = _begins(self.item, len(self.weight))
+        return begin, kernels.order_by_item(self.item, self.worth, begin)
 
     def of_rays(self, rays: slice) -> Coverage:
         """The table of some rays, one after the other."""
@@ -101,12 +106,14 @@ class Coverage:
     def through(self, gate: np.ndarray) -> Coverage:
         """The table with one gate of each ray, (N,), and no other."""
         rays = np.arange(len(gate))
-        return replace(
+        narrowed = replace(
             self,
             gates=self.gates >> gate.astype(np.uint8)[self.ray] & 1,
             bits=self.bits[rays, gate][:, None],
             harm=self.harm[rays, gate][:, None],
         )
+        vars(narrowed).update(ray=self.ray, _order_by_item=self._order_by_item)  # the same entries in the same order
+        return narrowed
 
     def grouped(self, groups: Sequence[np.ndarray]) -> Coverage:
         """The table whose candidates are groups of rays that fire together, each through the gate of the same number.
@@ -239,7 +246,7 @@ def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndar
     harm, complete = np.zeros((rays, gates)), 0.0
     small = np.uint16 if rays <= np.iinfo(np.uint16).max else np.int32
     for scene in informed:
-        passes = _passes(scene.range_m, gates_m[scene.ray])
+        passes = _passes(scene.range_m, scene.ray, gates_m)
         if scene.is_repeated:
             passes = _largest_alone(scene, passes, gates)
         heard = passes > 0
@@ -247,7 +254,7 @@ def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndar
         found = (scene.ray.astype(small), np.int32(items) + scene.item, scene.worth, passes)
         for column, values in zip(columns, found, strict=True):
             column.append(values[heard])
-        spoils = _passes(scene.harm_range_m, gates_m[scene.spoiling])
+        spoils = _passes(scene.harm_range_m, scene.spoiling, gates_m)
         for gate in range(gates):
             harm[:, gate] += np.bincount(scene.spoiling, np.where(spoils >> gate & 1, scene.harm, 0.0), rays)
         weights.append(scene.weight)
@@ -287,10 +294,11 @@ def _begins(labels: np.ndarray, count: int) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(np.bincount(labels, minlength=count))])
 
 
-def _passes(range_m: np.ndarray, gates_m: np.ndarray) -> np.ndarray:
-    """One bit for each gate (K, G, 2) that lets a return at a range (K,) through, uint8 (K,)."""
-    opened = (range_m[:, None] >= gates_m[..., 0]) & (range_m[:, None] < gates_m[..., 1])
-    return np.packbits(opened, axis=1, bitorder="little")[:, 0]
+def _passes(range_m: np.ndarray, ray: np.ndarray, gates_m: np.ndarray) -> np.ndarray:
+    """One bit for each gate of the rays (N, G, 2) that lets the return of a ray (K,) at a range (K,) through, uint8."""
+    passed = np.empty(len(range_m), dtype=np.uint8)
+    kernels.gates_passed(range_m, ray, gates_m, passed)
+    return passed
 
 
 def _largest_alone(scene: InformedScene, passes: np.ndarray, gates: int) -> np.ndarray:

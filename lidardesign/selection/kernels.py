@@ -76,6 +76,16 @@ def order_by_item(item: np.ndarray, worth: np.ndarray, start: np.ndarray) -> np.
 
 
 @njit(cache=True, nogil=True)
+def gates_passed(range_m: np.ndarray, ray: np.ndarray, gates_m: np.ndarray, passed: np.ndarray) -> None:
+    """One bit for each gate of a ray, (N, G, 2) [m], that lets its return at a range through: fills `passed`, (K,)."""
+    for index in range(len(range_m)):
+        passed[index] = 0
+        for gate in range(gates_m.shape[1]):
+            if gates_m[ray[index], gate, 0] <= range_m[index] < gates_m[ray[index], gate, 1]:
+                passed[index] |= 1 << gate
+
+
+@njit(cache=True, nogil=True)
 def counted(known: float, table: np.ndarray) -> float:
     """What a known worth counts: itself, or the concave table of sums at it."""
     last = len(table) - 1

@@ -22,7 +22,7 @@ from lidardesign.scene import Scene
 from lidardesign.selection import information
 from lidardesign.selection.candidates import inform
 from lidardesign.selection.certificate import certificate_document, certify
-from lidardesign.selection.choice import Choice, RayCounts, choose, choose_within
+from lidardesign.selection.choice import MOST_PASSES, Choice, RayCounts, choose, choose_within
 from lidardesign.selection.coverage import Coverage, InformedScene, gather
 from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
@@ -87,8 +87,13 @@ class SelectionProblem:
         return gather(informed, gates_m, one_bin * self.bandwidth.bins(gates_m[..., 1] - gates_m[..., 0]))
 
     @phase("choice")
-    def choices(self, coverage: Coverage, count: int) -> list[Choice]:
+    def choices(self, coverage: Coverage, count: int, passes: int = MOST_PASSES) -> list[Choice]:
         """The choice of so many rays within the bandwidth, at each value of a condition.
+
+        Arguments:
+            coverage: What the candidates tell.
+            count: How many fire.
+            passes: How often each ray may be swapped.
 
         Raises:
             InfeasibleError: So many rays do not fit.
@@ -102,7 +107,10 @@ class SelectionProblem:
         choices = []
         for visit in self.visits:
             own, counts = coverage.of_rays(visit), self.counts(count, visit)
-            choice = choose(own, counts, price=price) if np.isinf(limit) else choose_within(own, counts, limit)
+            if np.isinf(limit):
+                choice = choose(own, counts, price=price, passes=passes)
+            else:
+                choice = choose_within(own, counts, limit, passes=passes)
             if len(choice.rays) < count:
                 raise InfeasibleError(
                     f"{len(choice.rays)} of {count} rays fit in {limit:g} Mbit/s",
@@ -209,7 +217,8 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
                 where=problem.name,
                 hint="let sensors look at the targets: constrain less, or learn longer",
             )
-        choices = problem.choices(coverage, middle)
+        # how many scenes are enough, and which gate sensors share, swaps hardly change
+        choices = problem.choices(coverage, middle, passes=0)
         judged = coverage if problem.is_trial else problem.coverage(held_back, gates_m)
         before, loss = loss, judged.loss_of(_gate_of(choices))
         is_large = 2 * wanted > problem.most_scenes or 2 * len(coverage.item) > MOST_ENTRIES

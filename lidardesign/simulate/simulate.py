@@ -19,7 +19,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.frames import path_windows, range_of_path
-from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.raycast import SceneCaster, checked_rays
 from lidardesign.geometry.rays import Hits, Outcome, Rays, Returns, gate_outcomes
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
@@ -96,8 +96,9 @@ def simulate_many(
         np.concatenate([getattr(rays, name) for rays in lists]) for name in ("origin_m", "direction", "gate_m")
     )
     found: list[list[Returns]] = [[] for _ in lists]
+    origins, directions = checked_rays(origins, directions)
     for frame, caster in enumerate(casters):
-        hits = caster.first_hit(origins, directions)
+        hits = caster.first_hit_of_checked(origins, directions)
         outcome = gate_outcomes(hits.range_m, gate_m)
         returned = outcome == Outcome.RETURN
         columns = (outcome, np.where(returned, hits.range_m, np.nan), np.where(returned, hits.body, -1))

@@ -19,7 +19,15 @@ from lidardesign.run.files import is_temporary, run_lock, writer
 from lidardesign.run.manifest import note, read_manifest, start_manifest
 from lidardesign.run.yaml import dump_yaml, leaves, load_yaml, parse_yaml
 from lidardesign.task import Task, notes_of
-from lidardesign.workflow.learning_budget import GOAL, SETS, Goal, Learner, checked_goal, resumed_goal
+from lidardesign.workflow.learning_budget import (
+    GOAL,
+    MISPLACED_KEY,
+    STEPS_KEY,
+    Goal,
+    Learner,
+    checked_goal,
+    resumed_goal,
+)
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
     DESIGN_FOLDER,
@@ -67,7 +75,7 @@ class LearnOptions:
         resume: Continue an interrupted run.
         overwrite: Replace a run that is in the folder, once the new one is learned.
         tolerance: Learn until at most this share of the density's mass is in the wrong place.
-        time_budget_s: Learn as many steps as end within this time [s].
+        time_budget_s: Learn as long as all of it ends within this time [s].
         command: What the manifest says that the run was made by.
     """
 
@@ -434,8 +442,11 @@ def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tu
         seed=stored.seed if choices["seed"] is None else choices["seed"],
     )
     old, new = dict(leaves(stored.as_document())), dict(leaves(wanted.as_document()))
-    for goal in read_manifest(run).get(GOAL) or {}:
-        new.update((path, old[path]) for path in (tuple(key.split(".")) for key in SETS.get(goal, ())))
+    if read_manifest(run).get(GOAL):
+        # what the goal set is not in the user's file; what the user sets now is compared
+        asked = {text.partition("=")[0].strip() for text in choices["overrides"]}
+        paths = [tuple(key.split(".")) for key in (MISPLACED_KEY, STEPS_KEY) if key not in asked]
+        new.update((path, old[path]) for path in paths)
     for path in [*old, *new]:
         if old.get(path) != new.get(path):
             raise ConfigError(

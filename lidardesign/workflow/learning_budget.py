@@ -95,9 +95,11 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
             "both set the number of steps", where=f"{TOLERANCE}, {TIME_BUDGET}", allowed="only one of them"
         )
     keys, path = {text.partition("=")[0].strip() for text in given["overrides"]}, given["config_file"]
-    goal = Goal(tolerance, time_budget_s, path is not None or FIELDS_KEY in keys, path is not None or STEPS_KEY in keys)
-    if goal.is_none:
-        return goal
+    if tolerance is None and time_budget_s is None:
+        return Goal()
+    document = None if path is None else load_yaml(path, empty_sections=True)
+    of_file = set() if document is None else {".".join(map(str, key)) for key in dict(leaves(document.value))}
+    goal = Goal(tolerance, time_budget_s, path is not None or FIELDS_KEY in keys, STEPS_KEY in keys | of_file)
     where, said, bounds = TOLERANCE, "the tolerance", TOLERANCES
     if tolerance is None:
         where, said, bounds = TIME_BUDGET, "the time budget", (SHORTEST_S, LONGEST_S)
@@ -106,11 +108,9 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
     for key in SETS[name]:
         if key in keys:
             raise ConfigError(f"{said} sets {key}", where=where, hint=f"leave out --set {key}")
-    if path is not None and time_budget_s is not None:
-        document, key = load_yaml(path, empty_sections=True), tuple(STEPS_KEY.split("."))
-        if key in dict(leaves(document.value)):
-            where = f"{TIME_BUDGET}, {document.locate(key)}"
-            raise ConfigError(f"the time budget sets {STEPS_KEY}", where=where, hint=f"leave out {STEPS_KEY} there")
+    if time_budget_s is not None and STEPS_KEY in of_file:
+        where = f"{TIME_BUDGET}, {document.locate(tuple(STEPS_KEY.split('.')))}"
+        raise ConfigError(f"the time budget sets {STEPS_KEY}", where=where, hint=f"leave out {STEPS_KEY} there")
     return goal
 
 
@@ -175,7 +175,9 @@ class Learner:
             note_in_manifest(self.run, **{GOAL: {**goal.as_dict(), FIELDS: of_fields}})
         result = train(config, resume=resume, remark=self.remark)
         error = result.error_estimates["misplaced"].error or 0.0
-        met = result.misplaced + of_fields <= goal.tolerance + STANDARD_ERRORS * error
+        # without coverage nothing knows what the density dropped
+        is_within = result.misplaced + of_fields <= goal.tolerance + STANDARD_ERRORS * error
+        met = is_within and result.coverage > 0
         reached = {**goal.as_dict(), FIELDS: of_fields, "met": met}
         note_in_manifest(self.run, **{GOAL: reached})
         return self._whole(result, note, reached)
@@ -200,13 +202,16 @@ class Learner:
     def _within(self, config: RunConfig, time_budget_s: float, resume: bool, train: Train) -> LearnResult:
         """Learn until the time is over; config.yaml then has the number of steps."""
         from lidardesign.density.learn import choose_device, prepare_training_data
+        from lidardesign.density.training.checkpoint import load_arrays
         from lidardesign.density.training.schedule import StepTimes, Timekeeper
+        from lidardesign.density.training.training import CHECKPOINT
 
         place, startup = choose_device(self.device), self._startup_s()
         keeper = Timekeeper(time_budget_s, lambda: self.clock.seconds + startup, config)
         data = prepare_training_data(self.task, config, self.remark)
         with phase("planning"):
-            keeper.check(StepTimes.measured(data, config, self.run, place))
+            done = int(load_arrays(self.run, CHECKPOINT)[1]["step"]) if resume else 0
+            keeper.check(StepTimes.measured(data, config, self.run, place), done)
         result = train(config, resume=resume, data=data, is_over=keeper.is_over)
         reached = config.learning.model_copy(update={"steps": result.steps})
         save_run_config(replace(config, learning=reached), self.run)

@@ -16,7 +16,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
-from lidardesign.scene import Body, Scene
+from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 from lidardesign.task import Information, Metric, Score
 
@@ -69,33 +69,30 @@ class PlaneCut:
 
 def cut_scene(scene: Scene, origin_m: np.ndarray, azimuth_rad: float) -> PlaneCut:
     """What the half plane from an origin (3,) towards an azimuth cuts out of a scene of upright boxes."""
-    forward = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
-    rows, low, high = [], [], []
-    for index, body in enumerate(scene.bodies):
-        interval = _crossed(body, origin_m, forward)
-        if interval is not None:
-            middle, half = body.pose()[2, 3] - origin_m[2], body.shape.half_extents_m[2]
-            rows.append(index)
-            low.append((interval[0], middle - half))
-            high.append((interval[1], middle + half))
-    is_box = np.array([scene.bodies[index].is_target for index in rows], dtype=bool)
-    return PlaneCut(np.array(rows, dtype=int), np.reshape(low, (-1, 2)), np.reshape(high, (-1, 2)), is_box)
+    poses = np.array([body.pose() for body in scene.bodies]).reshape(-1, 4, 4)
+    half = np.array([body.shape.half_extents_m for body in scene.bodies]).reshape(-1, 3)
+    near, far = _crossed(poses, half[:, :2], origin_m, np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0]))
+    rows = np.flatnonzero(near < far)
+    middle, reach = poses[rows, 2, 3] - origin_m[2], half[rows, 2]
+    low, high = np.stack([near[rows], middle - reach], axis=1), np.stack([far[rows], middle + reach], axis=1)
+    return PlaneCut(rows, low, high, np.array([scene.bodies[row].is_target for row in rows], dtype=bool))
 
 
-def _crossed(body: Body, origin_m: np.ndarray, forward: np.ndarray) -> tuple[float, float] | None:
-    """Where a horizontal line from the origin enters and leaves a box's footprint [m]; None where it does not."""
-    pose, half = body.pose(), np.array(body.shape.half_extents_m[:2])
-    start = (pose[:3, :3].T @ (origin_m - pose[:3, 3]))[:2]
-    along = (pose[:3, :3].T @ forward)[:2]
-    near, far = 0.0, math.inf
-    for place, step, reach in zip(start.tolist(), along.tolist(), half.tolist(), strict=True):
-        if step == 0.0:
-            if abs(place) > reach:
-                return None
-            continue
-        ends = sorted(((-reach - place) / step, (reach - place) / step))
-        near, far = max(near, ends[0]), min(far, ends[1])
-    return (near, far) if near < far else None
+def _crossed(
+    poses: np.ndarray, half_m: np.ndarray, origin_m: np.ndarray, forward: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where a horizontal line from the origin enters and leaves the footprints of boxes, (B,) each [m].
+
+    It leaves before it enters where it passes one by.
+    """
+    start = np.einsum("bji,bj->bi", poses[:, :3, :2], origin_m - poses[:, :3, 3])
+    along = np.einsum("bji,j->bi", poses[:, :3, :2], forward)
+    is_parallel, is_between = along == 0, np.abs(start) <= half_m
+    step = np.where(is_parallel, 1.0, along)
+    ends = np.sort([(-half_m - start) / step, (half_m - start) / step], axis=0)
+    enters = np.where(is_parallel, np.where(is_between, 0.0, np.inf), ends[0])
+    leaves = np.where(is_parallel, np.where(is_between, np.inf, -np.inf), ends[1])
+    return np.maximum(enters.max(axis=1, initial=0.0), 0.0), leaves.min(axis=1, initial=np.inf)
 
 
 def visible_boxes(cut: PlaneCut, space: DesignSpace) -> np.ndarray:

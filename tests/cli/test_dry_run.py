@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import time
 from pathlib import Path
@@ -12,7 +13,7 @@ from support.command_line import caller, files_under, make_run
 from support.tables import each_row
 
 from lidardesign.config import LearningSettings
-from lidardesign.density.training.training import STRETCH, Trainer
+from lidardesign.density.training.training import STRETCH, Trainer, least_balancing_steps
 from lidardesign.run.manifest import read_manifest, write_manifest
 
 TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverage_proposals=256", "hidden=4")
@@ -240,7 +241,8 @@ def test_learning_foresees_its_time_from_real_steps(foreseen, name):
     plan = foreseen(*FORECASTS[name].split()).json
     found, learning = plan["forecast"], LearningSettings(**plan["settings"]["learning"])
     most, pathwise = learning.steps, learning.pathwise_steps
-    first = min(pathwise + max(pathwise, STRETCH), most) if learning.misplaced else most
+    least = pathwise + STRETCH * math.ceil(least_balancing_steps(pathwise) / STRETCH)
+    first = min(least, most) if learning.misplaced else most
     assert found["pathwise_s"] > SLOW_S or pathwise == 0
     assert found["balancing_s"] > SLOW_S
     for steps, seconds in ((first, found["seconds"]), (most, found["longest_seconds"])):

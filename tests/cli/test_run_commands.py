@@ -50,6 +50,17 @@ def test_a_run_that_is_resumed_knows_its_task(lidardesign, flat):
     assert plan.json["settings"]["task_name"] == "flatland"
 
 
+def test_a_run_with_a_goal_is_resumed_with_its_own_options_and_refuses_other_values(lidardesign, tmp_path):
+    (tmp_path / "set.yaml").write_text("learning: {batch: 64}\n")
+    own = ("--config", "set.yaml", "--tolerance", "0.9")
+    assert learned(lidardesign, *own).code == 0
+    assert learned(lidardesign, *own, "--resume").code == 0
+    for key, value in (("misplaced", 0.45), ("steps", 7)):
+        refused = learned(lidardesign, "--resume", "--set", f"learning.{key}={value}")
+        assert refused.code == 2
+        assert f"learning.{key} = " in refused.err
+
+
 def test_hints_can_be_pasted_whatever_a_folder_is_called(lidardesign, flat):
     result = lidardesign("evaluate", flat)
     assert pasted(result.err) == ["fit", str(flat)]

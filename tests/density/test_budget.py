@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,12 +17,13 @@ from lidardesign.density.learn import learn, make_trainer, prepare_training_data
 from lidardesign.density.training import schedule as budget
 from lidardesign.density.training import training
 from lidardesign.density.training.checkpoint import load_arrays
+from lidardesign.density.training.quality import IndependentProbes
 from lidardesign.density.training.schedule import StepTimes, TimedProbes, Timekeeper
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.clock import Clock
 from lidardesign.run.manifest import note, start_manifest
 from lidardesign.run.yaml import load_yaml
-from lidardesign.workflow.learning_budget import GOAL, MOST_STEPS, Goal, Learner, resumed_goal
+from lidardesign.workflow.learning_budget import GOAL, MOST_STEPS, Goal, Learner, checked_goal, resumed_goal
 
 CPU = torch.device("cpu")
 STRETCH = 10
@@ -184,6 +186,30 @@ def test_a_goal_sets_what_a_new_run_begins_with():
     ):
         learning = goal.applied(config).learning
         assert (learning.misplaced, learning.steps) == (misplaced, steps)
+
+
+@each_row(
+    "settings, text, fixed",
+    [
+        ([], None, False),
+        ([], "learning: {batch: 64}", False),
+        ([], "learning: {steps: 64}", True),
+        (["learning.steps=64"], None, True),
+    ],
+)
+def test_a_tolerance_takes_more_steps_than_a_preset_unless_the_user_set_them(settings, text, fixed, tmp_path):
+    file = None if text is None else tmp_path / "settings.yaml"
+    if file is not None:
+        file.write_text(text, encoding="utf-8")
+    assert checked_goal(0.1, None, {"overrides": settings, "config_file": file}).fixed_steps is fixed
+
+
+def test_too_few_probes_stop_nothing(tmp_path):
+    config = config_of(**EARLY, misplaced=1.0, steps=60)
+    data = prepare_training_data(BallTask(), config)
+    few = IndependentProbes(*(values[:99] for values in vars(data.probes).values()))
+    assert learn(BallTask(), config, tmp_path, data=data).steps == 40
+    assert learn(BallTask(), config, tmp_path, data=replace(data, probes=few)).steps == 60
 
 
 def test_timing_steps_and_the_end_leaves_the_trainer_as_it_was(tmp_path):

@@ -6,13 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 from support import references
 from support.meshes import icosphere
+from support.tables import each_row
 
 from lidardesign.density.fields import grids
 from lidardesign.density.fields.distance import BodyField, UnionField, build_field
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.closest import TriangleTree
 from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Plane, Scene, Sphere, rigid
 
 pytestmark = pytest.mark.usefixtures("own_cache")
@@ -135,6 +138,37 @@ def test_meshes_and_primitives_of_one_scene_are_united():
     np.testing.assert_allclose(field.distances(np.array([[2.0, 0.0, 0.5]]))[:, 0], 0.3, atol=1e-6)
     gradient = field.gradient(np.array([[2.0, 0.0, 0.5]]), np.ones((1, 1)))
     np.testing.assert_allclose(gradient, [[0.0, 0.0, 1.0]], atol=1e-6)
+
+
+def ball(x_m=0.0, radius_m=0.3, *, inwards=False):
+    made = trimesh.creation.icosphere(2, radius_m)
+    made.apply_translation([x_m, 0.0, 0.0])
+    if inwards:
+        made.invert()
+    return made
+
+
+SOLIDS = {
+    "a ball": [ball()],
+    "a ball whose faces point inwards": [ball(inwards=True)],
+    "a ball with a cavity": [ball(), ball(radius_m=0.2, inwards=True)],
+    "two balls that overlap": [ball(), ball(0.2)],
+    "a plate thinner than a cell": [trimesh.creation.box((0.6, 0.6, 0.004))],
+    "a box on the grid's points": [trimesh.creation.box((0.4, 0.4, 0.4))],
+}
+
+
+@each_row("name", SOLIDS)
+def test_the_inside_of_a_solid_is_where_its_winding_number_says(name):
+    solid = trimesh.util.concatenate(SOLIDS[name])
+    grid = grids.Grid(np.full(3, -0.52), 0.04, np.array([27, 27, 27]))
+    vertices, faces, points = solid.vertices, solid.faces.astype(np.int64), grid.points()
+    distance = TriangleTree(solid.triangles).distance_m(points)
+    inside = grids.is_inside(points, distance, vertices, faces, grid)
+    # on the surface itself the number may be anything
+    off = distance > 1e-9
+    np.testing.assert_array_equal(inside[off], grids.is_wound(points, vertices, faces)[off])
+    assert inside.any() or name == "a plate thinner than a cell"
 
 
 def test_a_cached_grid_has_the_same_bytes_and_a_damaged_one_is_built_again(tmp_path):

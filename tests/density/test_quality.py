@@ -247,6 +247,26 @@ def test_along_conditions_every_group_is_thinned_by_its_own_mean_weight_and_stay
         assert quality(part.log_prob, part.log_target).log_z == pytest.approx(log_z, abs=0.05)
 
 
+@pytest.mark.parametrize("hopeless_nats", [9.0, np.inf])
+def test_a_badly_learned_condition_takes_no_samples_from_the_others(hopeless_nats):
+    generator = np.random.default_rng(12)
+    points = np.zeros((COUNT, 6))
+    points[:, 0], points[:, 5] = generator.uniform(size=COUNT), generator.normal(size=COUNT)
+    # in one group all but one sample in a hundred are worth next to nothing
+    x, groups = points[:, 5], (points[:, 0] * 32).astype(int)
+    depth = np.where((groups == 3) & (generator.uniform(size=COUNT) > 0.01), hopeless_nats, 0.0)
+    space = DesignSpace((0,) * 6, (1,) * 6, condition=("x_m",))
+    samples = Samples(points, gaussian(x), gaussian(x) - depth, space)
+    thinning = Thinning.of(samples.log_weights, condition_groups(space, points))
+    shares = np.exp(thinning.log_share)
+    np.testing.assert_allclose(np.delete(shares, 3), 1.0)
+    kept = thinning.thinned(samples, torch.Generator().manual_seed(0))
+    assert len(kept) / COUNT == pytest.approx(math.exp(thinning.log_kept), abs=0.02)
+    if np.isfinite(hopeless_nats):
+        assert shares[3] == pytest.approx(0.25)
+        assert (condition_groups(space, kept.points) == 3).mean() == pytest.approx(1 / 32, abs=0.01)
+
+
 def test_what_the_target_rules_out_is_never_kept():
     log_target = np.where(np.arange(1000) % 2, 0.0, -np.inf)
     samples = Samples(np.zeros((1000, 6)), np.zeros(1000), log_target, DesignSpace((0,) * 6, (1,) * 6))

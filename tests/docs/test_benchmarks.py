@@ -363,7 +363,7 @@ def test_learning_is_measured_with_fields_built_and_cached_and_up_to_a_divergenc
     found = run_script("learn", *words)
     presets, goals = found["tables"].values()
     assert [row["fields"] for row in presets] == ["built", "in the cache"]
-    assert [row["steps"] for row in goals] == [100]  # the first after which learning may stop
+    assert [row["steps"] for row in goals] == [150]  # the first after which learning may stop
     assert presets[0]["KL nats"] == presets[1]["KL nats"]
     assert any("the paper's code" in line for line in found["conclusions"])
 

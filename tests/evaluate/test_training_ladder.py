@@ -248,11 +248,11 @@ def test_a_failure_before_the_first_checkpoint_leaves_nothing_behind(lidardesign
 
 def test_a_time_budget_writes_its_steps_into_the_configuration(lidardesign, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr(budget.Timekeeper, "is_over", lambda self, trainer: trainer.step >= 45)
+        patched.setattr(budget.Timekeeper, "is_over", lambda self, trainer: trainer.step >= 130)
         done = flatland(lidardesign, "run", "--time-budget", "100000", "--json")
     assert done.code == 0
-    assert done.json["goal"] == {"time_budget_s": 100000.0, "steps": 45}
-    assert load_run_config(tmp_path / "run")[1].learning.steps == done.json["steps"] == 45
+    assert done.json["goal"] == {"time_budget_s": 100000.0, "steps": 130}
+    assert load_run_config(tmp_path / "run")[1].learning.steps == done.json["steps"] == 130
     soon = flatland(lidardesign, "soon", "--time-budget", "1")
     assert soon.code == 2
     assert "at least" in soon.err

@@ -141,6 +141,25 @@ def test_each_item_has_all_its_entries_from_what_tells_most_of_it(seed):
         assert sorted(found) == sorted(entries)
 
 
+@given(seed=seeds)
+def test_a_table_with_one_gate_of_each_ray_says_what_the_whole_says_of_these_gates(seed):
+    coverage, generator = small(seed), np.random.default_rng(seed)
+    gate = generator.integers(0, coverage.shape[1], coverage.shape[0])
+    narrowed = coverage.through(gate)
+    for kept, anew in zip(narrowed.by_item, replace(narrowed).by_item, strict=True):
+        np.testing.assert_array_equal(kept, anew)
+    fires = generator.random(len(gate)) < 0.5
+    assert narrowed.value_of(np.where(fires, 0, -1)) == coverage.value_of(np.where(fires, gate, -1))
+
+
+@given(seed=seeds, spare=st.floats(1.0, 1.3))
+def test_where_no_ray_tells_anything_as_many_fire_as_fit(seed, spare):
+    coverage = small(seed)
+    coverage = replace(coverage, worth=np.zeros_like(coverage.worth))
+    budget = spare * np.sort(coverage.bits.min(axis=1))[:3].sum()
+    assert len(choose_within(coverage, RayCounts.of_one(len(coverage.bits), 3), budget).rays) == 3
+
+
 @pytest.mark.parametrize("price", [0.0, 0.002])
 def test_certificates_are_near_the_linear_program_that_they_relax(price):
     coverage, counts = small(3, rays=40, items=30, scenes=4), RayCounts.of_one(40, 8)

@@ -135,7 +135,7 @@ BROKEN = {
     ],
     "nothing else is changed": [
         (VALUE, "        import os; os.environ['MINE'] = '1'\n" + VALUE, "the environment (MINE) in score"),
-        (VALUE, "        import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + VALUE, "who handles SIGINT"),
+        (VALUE, "        import signal; signal.signal(signal.SIGINT, lambda *_: None)\n" + VALUE, "who handles SIGINT"),
         (VALUE, "        import locale; locale.setlocale(locale.LC_ALL, 'C.UTF-8')\n" + VALUE, "the locale in score"),
         (VALUE, "        np.seterr(all='ignore')\n" + VALUE, "numpy's error settings in score"),
     ],

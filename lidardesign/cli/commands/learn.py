@@ -139,7 +139,7 @@ def learn(
 def _show_progress(progress: ProgressDisplay, now: LearnProgress) -> None:
     figures = (("loss {:.3f}", now.loss), ("ESS {:.2f}", now.ess))
     detail = ", ".join(text.format(value) for text, value in figures if value is not None)
-    progress.show(now.step, now.steps or 0, label=now.phase, detail=detail, left_s=now.seconds_left)
+    progress.show(now.step, now.steps or 0, label="learning", detail=detail, left_s=now.seconds_left)
 
 
 def _show(result: LearnResult, preset: str, rich: RichConsole) -> None:

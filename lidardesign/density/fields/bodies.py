@@ -14,15 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from lidardesign.density.fields.grids import Grid, cached_distance_grids, grid_around
-from lidardesign.geometry.primitives import SIZES, half_extents_m
+from lidardesign.geometry.primitives import GRID, KINDS, PLANE, SIZES, SPHERE, half_extents_m
 from lidardesign.numerics import EPSILON
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, inverse_rigid
+from lidardesign.scene import Body, Mesh, Scene, inverse_rigid
 
-# Kinds of bodies, as the compiled loops know them.
-SPHERE, BOX, CAPSULE, PLANE, GRID, CYLINDER, ELLIPSOID = range(7)
-KINDS: dict[type, int] = {
-    Sphere: SPHERE, Box: BOX, Capsule: CAPSULE, Plane: PLANE, Mesh: GRID, Cylinder: CYLINDER, Ellipsoid: ELLIPSOID,
-}  # fmt: skip
 # Frames of one motion are close together: so many of them are looked at, or passed over, at once.
 GROUP_COLUMNS = 16
 # Of the sides of bounding boxes.

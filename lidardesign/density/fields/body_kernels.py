@@ -15,49 +15,20 @@ import math
 import numpy as np
 from numba import njit
 
-from lidardesign.density.fields.bodies import GRID, GROUP_COLUMNS
-from lidardesign.density.fields.primitive_kernels import (
+from lidardesign.density.fields.bodies import GROUP_COLUMNS
+from lidardesign.density.fields.distance_kernels import primitive_distance, primitive_gradient
+from lidardesign.density.fields.table_kernels import along_axis
+from lidardesign.geometry.primitive_kernels import (
     box_roots,
-    primitive_distance,
-    primitive_gradient,
+    placed,
     primitive_normal,
     primitive_roots,
+    row,
+    turned,
+    turned_back,
 )
-from lidardesign.density.fields.table_kernels import along_axis
+from lidardesign.geometry.primitives import GRID
 from lidardesign.numerics import TINY
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _row(values, n):  # noqa: ANN001, ANN202
-    """Three numbers of a table as a tuple."""
-    return values[n, 0], values[n, 1], values[n, 2]
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _turned(to_body, b, v):  # noqa: ANN001, ANN202
-    """A world direction in the frame of body b."""
-    return (
-        to_body[b, 0, 0] * v[0] + to_body[b, 0, 1] * v[1] + to_body[b, 0, 2] * v[2],
-        to_body[b, 1, 0] * v[0] + to_body[b, 1, 1] * v[1] + to_body[b, 1, 2] * v[2],
-        to_body[b, 2, 0] * v[0] + to_body[b, 2, 1] * v[1] + to_body[b, 2, 2] * v[2],
-    )
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _placed(to_body, b, p):  # noqa: ANN001, ANN202
-    """A world point in the frame of body b."""
-    x, y, z = _turned(to_body, b, p)
-    return x + to_body[b, 0, 3], y + to_body[b, 1, 3], z + to_body[b, 2, 3]
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _turned_back(to_body, b, v):  # noqa: ANN001, ANN202
-    """A direction of the frame of body b in the world."""
-    return (
-        to_body[b, 0, 0] * v[0] + to_body[b, 1, 0] * v[1] + to_body[b, 2, 0] * v[2],
-        to_body[b, 0, 1] * v[0] + to_body[b, 1, 1] * v[1] + to_body[b, 2, 1] * v[2],
-        to_body[b, 0, 2] * v[0] + to_body[b, 1, 2] * v[1] + to_body[b, 2, 2] * v[2],
-    )
 
 
 @njit(cache=True, nogil=True)
@@ -167,7 +138,7 @@ def near_columns(bodies, group_edges, points, log_weights, group_weights, precis
     total = 0
     for n in range(points.shape[0]):
         row_starts[n] = total
-        p = _row(points, n)
+        p = row(points, n)
         _outside_squared(group_edges, 0, groups, p, hopes)
         leader = 0
         for g in range(groups):
@@ -195,11 +166,11 @@ def near_columns(bodies, group_edges, points, log_weights, group_weights, precis
                 near = b
                 others = first
                 while b < last:
-                    q = _placed(to_body, b, p)
+                    q = placed(to_body, b, p)
                     if kinds[b] == GRID:
                         value = _grid_distance(values, grids, grid[b], q)[0]
                     else:
-                        value = primitive_distance(kinds[b], _row(sizes, b), q)
+                        value = primitive_distance(kinds[b], row(sizes, b), q)
                     if value < distance:
                         distance, body, limit = value, b, max(value, 0.0) * max(value, 0.0)
                     if others == first:
@@ -234,17 +205,17 @@ def add_gradients(bodies, points, row_starts, nearest, weights, out):  # noqa: A
     """Gradients of sum_pairs weight * d(body, point): pairs as `near_columns` lists them, out (N, 3)."""
     kinds, sizes, to_body, grid, values, grids = bodies[:6]
     for n in range(points.shape[0]):
-        p, x, y, z = _row(points, n), 0.0, 0.0, 0.0
+        p, x, y, z = row(points, n), 0.0, 0.0, 0.0
         for pair in range(row_starts[n], row_starts[n + 1]):
             b = nearest[pair]
             if weights[pair] == 0.0:
                 continue
-            q = _placed(to_body, b, p)
+            q = placed(to_body, b, p)
             if kinds[b] == GRID:
                 own = _grid_distance(values, grids, grid[b], q)[1]
             else:
-                own = primitive_gradient(kinds[b], _row(sizes, b), q)
-            slope = _turned_back(to_body, b, own)
+                own = primitive_gradient(kinds[b], row(sizes, b), q)
+            slope = turned_back(to_body, b, own)
             x += weights[pair] * slope[0]
             y += weights[pair] * slope[1]
             z += weights[pair] * slope[2]
@@ -257,11 +228,11 @@ def distances_of(bodies, chosen, points, out):  # noqa: ANN001, ANN201
     kinds, sizes, to_body, grid, values, grids = bodies[:6]
     for n in range(points.shape[0]):
         b = chosen[n]
-        q = _placed(to_body, b, _row(points, n))
+        q = placed(to_body, b, row(points, n))
         if kinds[b] == GRID:
             out[n] = _grid_distance(values, grids, grid[b], q)[0]
         else:
-            out[n] = primitive_distance(kinds[b], _row(sizes, b), q)
+            out[n] = primitive_distance(kinds[b], row(sizes, b), q)
 
 
 @njit(cache=True, nogil=True)
@@ -271,14 +242,14 @@ def all_distances(bodies, points, out, nearest):  # noqa: ANN001, ANN201
     out[:] = np.inf
     nearest[:] = -1
     for n in range(points.shape[0]):
-        p = _row(points, n)
+        p = row(points, n)
         for c in range(starts.shape[0] - 1):
             for b in range(starts[c], starts[c + 1]):
-                q = _placed(to_body, b, p)
+                q = placed(to_body, b, p)
                 if kinds[b] == GRID:
                     value = _grid_distance(values, grids, grid[b], q)[0]
                 else:
-                    value = primitive_distance(kinds[b], _row(sizes, b), q)
+                    value = primitive_distance(kinds[b], row(sizes, b), q)
                 if value < out[n, c]:
                     out[n, c] = value
                     nearest[n, c] = b
@@ -297,12 +268,12 @@ def pair_log_weights(bodies, constants, values, points, row_starts, nearest, out
     """
     grid, to_body, grids = bodies.grid, bodies.to_body, bodies.grids
     for n in range(points.shape[0]):
-        p = _row(points, n)
+        p = row(points, n)
         for pair in range(row_starts[n], row_starts[n + 1]):
             b = nearest[pair]
             out[pair] = 0.0 if b < 0 else constants[b]
             if b >= 0 and grid[b] > 0:
-                corners, fraction, _ = _cell(values, grids, grid[b], _placed(to_body, b, p))
+                corners, fraction, _ = _cell(values, grids, grid[b], placed(to_body, b, p))
                 out[pair] += _trilinear(corners, fraction)[0]
 
 
@@ -311,18 +282,18 @@ def add_log_weight_gradients(bodies, values, points, row_starts, nearest, weight
     """Add the gradients of sum_pairs weight * log weight of its body at the point to out (N, 3)."""
     grid, to_body, grids = bodies.grid, bodies.to_body, bodies.grids
     for n in range(points.shape[0]):
-        p = _row(points, n)
+        p = row(points, n)
         for pair in range(row_starts[n], row_starts[n + 1]):
             b = nearest[pair]
             if b < 0 or weights[pair] == 0.0 or grid[b] == 0:
                 continue
-            corners, fraction, excess = _cell(values, grids, grid[b], _placed(to_body, b, p))
+            corners, fraction, excess = _cell(values, grids, grid[b], placed(to_body, b, p))
             slope, scale = _trilinear(corners, fraction)[1], weights[pair] * grids[grid[b], 6]
             # log weights stay the same beyond the faces of their grid
             x = scale * slope[0] if excess[0] == 0.0 else 0.0
             y = scale * slope[1] if excess[1] == 0.0 else 0.0
             z = scale * slope[2] if excess[2] == 0.0 else 0.0
-            found = _turned_back(to_body, b, (x, y, z))
+            found = turned_back(to_body, b, (x, y, z))
             for k in range(3):
                 out[n, k] += found[k]
 
@@ -366,7 +337,7 @@ def first_hits(bodies, mesh_bounds, row_starts, columns, rays, hits, normals, ou
     (origins, directions, limits), (mesh_low, mesh_high), (out_rows, out_pairs, out_bodies) = rays, mesh_bounds, out
     edges, entries, meshes, room = bodies.edges, np.empty(kinds.shape[0]), 0, out_pairs.shape[0]
     for n in range(origins.shape[0]):
-        origin, direction, seen = _row(origins, n), _row(directions, n), row_starts[n]
+        origin, direction, seen = row(origins, n), row(directions, n), row_starts[n]
         inverse = _inverse(direction[0]), _inverse(direction[1]), _inverse(direction[2])
         for pair in range(row_starts[n], row_starts[n + 1]):
             if pair == seen:
@@ -381,7 +352,7 @@ def first_hits(bodies, mesh_bounds, row_starts, columns, rays, hits, normals, ou
                 if entries[b] >= best or kinds[b] == GRID:
                     continue
                 near, far = primitive_roots(
-                    kinds[b], _row(sizes, b), _placed(to_body, b, origin), _turned(to_body, b, direction)
+                    kinds[b], row(sizes, b), placed(to_body, b, origin), turned(to_body, b, direction)
                 )
                 value = near if near >= 0.0 else far
                 if value >= 0.0 and value < best:
@@ -390,8 +361,8 @@ def first_hits(bodies, mesh_bounds, row_starts, columns, rays, hits, normals, ou
                 if entries[b] >= best or kinds[b] != GRID:
                     continue
                 near, far = box_roots(
-                    _row(mesh_low, grid[b]), _row(mesh_high, grid[b]),
-                    _placed(to_body, b, origin), _turned(to_body, b, direction),
+                    row(mesh_low, grid[b]), row(mesh_high, grid[b]),
+                    placed(to_body, b, origin), turned(to_body, b, direction),
                 )  # fmt: skip
                 if far >= 0.0 and near < best:
                     if meshes < room:
@@ -400,11 +371,11 @@ def first_hits(bodies, mesh_bounds, row_starts, columns, rays, hits, normals, ou
             x, y, z, hits[pair] = 0.0, 0.0, 0.0, np.inf
             if body >= 0:
                 hits[pair] = best
-                q, turned = _placed(to_body, body, origin), _turned(to_body, body, direction)
-                met = q[0] + best * turned[0], q[1] + best * turned[1], q[2] + best * turned[2]
-                own = primitive_normal(kinds[body], _row(sizes, body), met)
-                x, y, z = _turned_back(to_body, body, own)
-                if own[0] * turned[0] + own[1] * turned[1] + own[2] * turned[2] > 0.0:
+                q, ahead = placed(to_body, body, origin), turned(to_body, body, direction)
+                met = q[0] + best * ahead[0], q[1] + best * ahead[1], q[2] + best * ahead[2]
+                own = primitive_normal(kinds[body], row(sizes, body), met)
+                x, y, z = turned_back(to_body, body, own)
+                if own[0] * ahead[0] + own[1] * ahead[1] + own[2] * ahead[2] > 0.0:
                     x, y, z = -x, -y, -z
             normals[pair, 0], normals[pair, 1], normals[pair, 2] = x, y, z
     return meshes
@@ -414,7 +385,7 @@ def first_hits(bodies, mesh_bounds, row_starts, columns, rays, hits, normals, ou
 def rays_in_frames(to_body, chosen, rows, rays, out):  # noqa: ANN001, ANN201
     """Rays `rows` (K,) of origins and directions (N, 3) in the frames of the bodies `chosen` (K,): out (K, 3) each."""
     for k in range(rows.shape[0]):
-        origin = _placed(to_body, chosen[k], _row(rays[0], rows[k]))
-        direction = _turned(to_body, chosen[k], _row(rays[1], rows[k]))
+        origin = placed(to_body, chosen[k], row(rays[0], rows[k]))
+        direction = turned(to_body, chosen[k], row(rays[1], rows[k]))
         for axis in range(3):
             out[0][k, axis], out[1][k, axis] = origin[axis], direction[axis]

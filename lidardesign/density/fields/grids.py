@@ -103,12 +103,35 @@ def distance_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
     beyond = np.isnan(distance)
     if beyond.any():
         distance[beyond] = np.linalg.norm(points[beyond] - closest[nearest_known(beyond, grid)], axis=1)
-    if mesh.sign != "unsigned":
-        import igl
-
-        # -1 is the inside of a part whose faces all point inwards
-        distance = np.where(np.abs(igl.fast_winding_number(vertices, faces, points)) > 0.5, -distance, distance)
+    if mesh.sign == "winding":
+        distance = np.where(is_wound(points, vertices, faces), -distance, distance)
+    elif mesh.sign == "solid":
+        distance = np.where(is_inside(points, distance, vertices, faces, grid), -distance, distance)
     return distance.astype(np.float32)
+
+
+def is_wound(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Where a surface winds around points by more than half, shape (N,) bool."""
+    import igl
+
+    # -1 is the inside of a part whose faces all point inwards
+    return np.abs(igl.fast_winding_number(vertices, faces, points)) > 0.5
+
+
+def is_inside(
+    points: np.ndarray, distance: np.ndarray, vertices: np.ndarray, faces: np.ndarray, grid: Grid
+) -> np.ndarray:
+    """Which grid points a closed surface winds around, shape (size,) bool, by few winding numbers.
+
+    Neighbours that are both more than half a step away from the surface have none of it between them.
+    """
+    from scipy.ndimage import label
+
+    regions, _ = label((distance > grid.step / 2).reshape(grid.counts))
+    _, first, region = np.unique(regions, return_index=True, return_inverse=True)
+    inside, near = is_wound(points[first], vertices, faces)[region.reshape(-1)], regions.reshape(-1) == 0
+    inside[near] = is_wound(points[near], vertices, faces)
+    return inside
 
 
 def narrow_band(

@@ -20,7 +20,7 @@ from lidardesign.density.target.visibility import (
 )
 from lidardesign.numerics import EPSILON_FLOAT32
 
-# Beyond this many sharpness lengths from every surface, sigmoid(-k d) is below 2e-9, far less than the rounding of the
+# Beyond this many sharpness lengths from every surface, sigmoid(-k d) is about 2e-9, far less than the rounding of the
 # sum along a ray, and is not evaluated.
 CUTOFF_LENGTHS = 20.0
 CHUNK_BYTES = 64 * 2**20
@@ -75,8 +75,8 @@ class Quadrature(Visibility):
 
     @property
     def rows_at_once(self) -> int:
-        """Rays whose slopes at all midpoints and columns fill a chunk."""
-        return min(max(1, CHUNK_BYTES // (4 * self.points * self.field.columns)), ROWS_AT_ONCE)
+        """Rays whose midpoints, with slopes at all columns, fill a chunk."""
+        return min(max(1, CHUNK_BYTES // (self.points * (8 + 4 * self.field.columns))), ROWS_AT_ONCE)
 
     def transmittance(
         self, rays: RayBatch, columns: Columns, optics: Optics, *, differentiable: bool = True

@@ -295,7 +295,7 @@ class BodyRaycast(Visibility):
         from lidardesign.density.fields import body_kernels
 
         bodies, count, lines = self.bodies, len(pairs.columns), (rays.origins, rays.directions, limit_m)
-        hits, normals, room = np.empty(count), np.empty((count, 3)), MESHES_PER_PAIR * count
+        hits, normals, room = np.empty(count), np.empty((count, 3)), MESHES_PER_PAIR * count * bool(self._casters)
         while True:
             met = tuple(np.empty(room, dtype=np.int64) for _ in range(3))
             meshes = body_kernels.first_hits(
@@ -315,9 +315,10 @@ class BodyRaycast(Visibility):
         from lidardesign.density.fields import body_kernels
 
         bodies = self.bodies
-        # all of one mesh together
+        # all of one mesh together; small integers are sorted fast
         number = bodies.grid[met[2]]
-        order = np.argsort(number.astype(np.int16), kind="stable")
+        small = np.int16 if len(self._casters) < np.iinfo(np.int16).max else np.int64
+        order = np.argsort(number.astype(small), kind="stable")
         row, pair, body = (values[order] for values in met)
         starts = np.searchsorted(number[order], np.arange(1, len(self._casters) + 2))
         local = np.empty((len(row), 3)), np.empty((len(row), 3))

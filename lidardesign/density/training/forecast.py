@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from lidardesign.config import RunConfig
 from lidardesign.density.learn import TrainingData, choose_device
 from lidardesign.density.training.checkpoint import load_arrays
 from lidardesign.density.training.schedule import WRITING_S, StepTimes, Timekeeper
-from lidardesign.density.training.training import CHECKPOINT, STRETCH
+from lidardesign.density.training.training import CHECKPOINT, STRETCH, least_balancing_steps
 from lidardesign.run.clock import peak_memory_bytes, phase
 
 UNTRAINED = "how long balancing steps and the measurement take on a learned density; an untrained one was timed"
@@ -85,13 +86,15 @@ def forecast(
     state = load_arrays(run, CHECKPOINT)[1] if resume else {"step": 0}
     done = int(state["step"])
     begun, pathwise = max(done, learning.pathwise_steps), max(learning.pathwise_steps - done, 0)
+    # the first time that it is measured how good the density is: behind a whole number of stretches of balancing
+    least, balanced = least_balancing_steps(learning.pathwise_steps), begun - learning.pathwise_steps
+    stretches = max(math.ceil(least / STRETCH), balanced // STRETCH + 1)
     steps = done if state.get("stopped") else learning.steps
     if time_budget_s is not None and not state.get("stopped"):
         keeper = Timekeeper(time_budget_s, lambda: prepared, config)
         keeper.check(times)
         steps = begun + times.balancing_within(keeper.left_s, pathwise)
-    # the first time that it is measured how good the density is
-    fewest = min(begun + max(STRETCH, pathwise), steps) if learning.misplaced else steps
+    fewest = min(learning.pathwise_steps + STRETCH * stretches, steps) if learning.misplaced else steps
     # what a budget keeps in reserve for writing is more than writing takes
     times = replace(times, finishing_s=times.finishing_s - WRITING_S)
     taken = [times.of(pathwise, max(most - begun, 0)) for most in (fewest, steps)]

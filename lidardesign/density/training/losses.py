@@ -108,7 +108,7 @@ class Pool:
         """Unit points, shape (count, free), log p* at them and the weights that make them samples of p*, (count,)."""
         places = torch.rand(count, generator=generator, dtype=torch.float64).to(self.cumulated.device)
         chosen = torch.searchsorted(self.cumulated, places).clamp(max=len(self.unit) - 1)
-        weights = (self.weights @ self.emphasis) / self.emphasis[chosen]
+        weights = (self.weights * self.emphasis).sum() / self.emphasis[chosen]
         return self.unit[chosen].to(like), self.log_target[chosen].to(like), weights.to(like)
 
     def to(self, device: torch.device) -> Pool:

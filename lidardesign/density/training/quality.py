@@ -86,10 +86,7 @@ def quality(log_prob: np.ndarray, log_target: np.ndarray, groups: np.ndarray | N
     """
     log_weights = log_target - log_prob
     if not len(log_weights) or not np.isfinite(log_weights).all():
-        raise NumericalError(
-            f"{int((~np.isfinite(log_weights)).sum())} of {len(log_weights)} samples of the flow have no finite weight",
-            hint="a smaller learning.rate, or learning.dtype=float64",
-        )
+        raise _no_weights(log_weights)
     if groups is None:
         return _quality(log_weights)
     parts = list(quality_by_group(log_weights, groups).values())
@@ -97,6 +94,13 @@ def quality(log_prob: np.ndarray, log_target: np.ndarray, groups: np.ndarray | N
     # groups have samples of their own
     errors = ([getattr(part, name) for part in parts] for name in ("ess_error", "kl_error_nats", "log_z_error"))
     return Quality(*map(float, figures), *(float(np.linalg.norm(error)) / len(parts) for error in errors))
+
+
+def _no_weights(log_weights: np.ndarray) -> NumericalError:
+    return NumericalError(
+        f"{int((~np.isfinite(log_weights)).sum())} of {len(log_weights)} samples of the flow have no finite weight",
+        hint="a smaller learning.rate, or learning.dtype=float64",
+    )
 
 
 def quality_by_group(log_weights: np.ndarray, groups: np.ndarray) -> dict[int, Quality]:
@@ -303,14 +307,14 @@ class MeasuredFlow:
         estimates: ess, kl_nats, log_z, coverage, and misplaced: the share of the mass in the wrong place.
         round_trip_nats: See `round_trip`.
         notes: What the user should know.
-        thinning: What the flow was thinned by, if it was.
+        thinning: What the flow was thinned by.
     """
 
     samples: Samples
     estimates: dict[str, Estimate]
+    thinning: Thinning
     round_trip_nats: float = 0.0
     notes: tuple[str, ...] = ()
-    thinning: Thinning | None = None
 
 
 def draw_probes(target: Target, count: int, generator: np.random.Generator) -> IndependentProbes:
@@ -327,19 +331,18 @@ def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> Meas
     Raises:
         NumericalError: A sample has no finite weight.
     """
-    samples, thinning, notes = draw_samples(learned, count), None, []
-    space, log_weights = samples.space, samples.log_weights
-    # what is no number is refused with the figures
-    if np.isfinite(log_weights.max()):
-        thinning = Thinning.of(log_weights, condition_groups(space, samples.points))
-        samples = thinning.thinned(samples, learned.generator)
+    samples, notes = draw_samples(learned, count), []
+    space = samples.space
+    if not np.isfinite(samples.log_weights.max()):
+        raise _no_weights(samples.log_weights)
+    thinning = Thinning.of(samples.log_weights, condition_groups(space, samples.points))
+    samples = thinning.thinned(samples, learned.generator)
     groups = condition_groups(space, samples.points)
     figures, covered = quality(samples.log_prob, samples.log_target, groups), Estimate(0.0, None)
     sides = OverlapPoints(samples.log_weights, samples.log_weights, samples.log_weights, groups, groups)
     if len(probes.points):
-        log_prob, theirs = log_density_of(learned, probes.points), condition_groups(space, probes.points)
-        if thinning is not None:
-            log_prob = thinning.log_prob(log_prob, probes.log_target, theirs)
+        theirs = condition_groups(space, probes.points)
+        log_prob = thinning.log_prob(log_density_of(learned, probes.points), probes.log_target, theirs)
         log_z = _log_z_at(probes.points, samples, groups, figures.log_z)
         covered = coverage(log_prob, probes.log_target, probes.log_proposal, log_z)
         log_weights = probes.log_target - probes.log_proposal
@@ -354,7 +357,7 @@ def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> Meas
             f"log densities are off by up to {off:.2g} nats: the flow's splines are too steep to be inverted in "
             "float64; fewer learning.layers are easier to invert"
         )
-    return MeasuredFlow(samples, estimates, off, tuple(notes), thinning)
+    return MeasuredFlow(samples, estimates, thinning, off, tuple(notes))
 
 
 def _log_z_at(points: np.ndarray, samples: Samples, groups: np.ndarray | None, mean_log_z: float) -> np.ndarray | float:

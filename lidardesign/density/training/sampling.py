@@ -8,7 +8,8 @@ kept with the probability w / Z alone. What is kept has the density
     min(p, p* / Z) / A,    with A the share that is kept, which is 1 - TV(p, pi),
 
 and weights of max(w, Z) A. Nothing is lost: what is left out weighs little. Where rays are learned along conditions, Z
-and A are those of a condition's group, and of every group as many are kept as of the one that keeps fewest.
+and A are those of a condition's group, and of every group as many are kept as of the one that keeps fewest. So that a
+group which was learned badly takes no samples from the others, it is thinned at less than Z, to a quarter at most.
 
 References:
     Rejection control and sequential importance sampling, Liu, Chen and Wong 1998.
@@ -22,6 +23,7 @@ from typing import Self
 
 import numpy as np
 import torch
+from scipy.optimize import brentq
 
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
@@ -32,6 +34,8 @@ from lidardesign.space import DesignSpace
 
 POINTS_AT_ONCE = 16384
 CONDITION_GROUPS = 32
+# Of the samples of a condition group: what thinning leaves at least.
+LEAST_GROUP_SHARE = 0.25
 
 
 def condition_groups(space: DesignSpace, points: np.ndarray) -> np.ndarray | None:
@@ -75,10 +79,13 @@ class Thinning:
         """
         parts = [log_weights]
         if groups is not None:
-            # a group without samples is as all of them
-            parts = [log_weights[groups == n] if (groups == n).any() else log_weights for n in range(CONDITION_GROUPS)]
+            parts = [log_weights[groups == n] for n in range(CONDITION_GROUPS)]
+            # a group without samples that are worth anything is as all of them
+            parts = [part if np.isfinite(part).any() else log_weights for part in parts]
         log_least = [_log_mean(part) for part in parts]
-        log_share = [_log_mean(np.minimum(part - least, 0.0)) for part, least in zip(parts, log_least, strict=True)]
+        if groups is not None:
+            log_least = [_log_least(part, most) for part, most in zip(parts, log_least, strict=True)]
+        log_share = [_log_kept(part, least) for part, least in zip(parts, log_least, strict=True)]
         return cls(tuple(log_least), tuple(log_share))
 
     @property
@@ -109,6 +116,22 @@ class Thinning:
 
 def _log_mean(log_values: np.ndarray) -> float:
     return float(logsumexp(log_values)) - math.log(len(log_values))
+
+
+def _log_kept(log_weights: np.ndarray, log_least: float) -> float:
+    """log of the share of samples that is kept at a least weight."""
+    return _log_mean(np.minimum(log_weights - log_least, 0.0))
+
+
+def _log_least(log_weights: np.ndarray, most: float) -> float:
+    """log of the largest least weight, up to `most`, at which `LEAST_GROUP_SHARE` of samples is kept."""
+    def excess(log_least: float) -> float:
+        return _log_kept(log_weights, log_least) - math.log(LEAST_GROUP_SHARE)
+
+    least = float(log_weights[np.isfinite(log_weights)].min())
+    if excess(most) >= 0 or excess(least) <= 0:
+        return most if excess(most) >= 0 else least
+    return brentq(excess, least, most)
 
 
 def draw_samples(learned: LearnedFlow, count: int) -> Samples:

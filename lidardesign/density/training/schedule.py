@@ -23,7 +23,7 @@ from lidardesign.density.learn import TrainingData, make_trainer
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.quality import draw_probes
 from lidardesign.density.training.sampling import LearnedFlow, draw_samples, log_density_of
-from lidardesign.density.training.training import STRETCH, Trainer
+from lidardesign.density.training.training import Trainer, least_balancing_steps
 from lidardesign.errors import ConfigError
 from lidardesign.task import random_generator
 
@@ -114,18 +114,19 @@ class Timekeeper:
 
     @property
     def least_steps(self) -> int:
-        """Those before which learning does not end: as many of balancing as path-wise ones."""
-        return 2 * self.config.learning.pathwise_steps or STRETCH
+        """Those before which learning does not end."""
+        pathwise = self.config.learning.pathwise_steps
+        return pathwise + least_balancing_steps(pathwise)
 
-    def check(self, times: StepTimes) -> None:
+    def check(self, times: StepTimes, done: int = 0) -> None:
         """Take these times.
 
         Raises:
-            ConfigError: Not even the least steps fit; it says what would be enough.
+            ConfigError: Not even what is left of the least steps after those done fits; it says what would be enough.
         """
         self.times, pathwise = times, self.config.learning.pathwise_steps
-        needed = times.of(pathwise, self.least_steps - pathwise)
-        if needed > self.left_s:
+        needed = times.of(max(pathwise - done, 0), self.least_steps - max(pathwise, done))
+        if done < self.least_steps and needed > self.left_s:
             least = self.elapsed_s() + needed / (1 - RESERVE)
             raise ConfigError(
                 f"{self.time_budget_s:g} s are too short to learn anything useful",

@@ -24,8 +24,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lidardesign.geometry.primitives import BALL_SLACK, PrimitiveGroup, bounding_radius_m
-from lidardesign.geometry.raycast import SceneCaster, shared_caster
+from lidardesign.geometry.primitives import BALL_SLACK, bounding_radius_m
+from lidardesign.geometry.raycast import Primitives, SceneCaster, shared_caster
 from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.geometry.triangles import SecondCasts, mesh_caster
 from lidardesign.scene import Body, Mesh, Scene, Shape, inverse_rigid
@@ -161,7 +161,7 @@ def _local_tracer(shape: Shape) -> tuple[LocalTracer, np.ndarray, float]:
     if isinstance(shape, Mesh):
         caster, counted = mesh_caster(shape), SecondCasts()
         return partial(caster.first_hits, twice=counted), caster.centre_m, caster.radius_m
-    group = PrimitiveGroup([(0, Body(shape))], 0)
+    group = Primitives([(0, Body(shape))], 0)
 
     def trace(origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         hits = Hits.none(len(origins))

@@ -208,7 +208,7 @@ class Arm:
     def _check_state(self, data: Any) -> None:
         if not (np.isfinite(data.qpos).all() and np.isfinite(data.qacc).all() and np.isfinite(data.xpos).all()):
             raise RejectedError("diverged")
-        if sum(int(warning.number) for warning in data.warning):
+        if data.warning.number.any():
             raise RejectedError("MuJoCo warned")
         if data.ncon and data.contact.dist[: data.ncon].min() < -PENETRATION_M:
             raise RejectedError("links collide")

@@ -1,4 +1,4 @@
-"""Compiled closed forms of single primitives in their own frames: signed distances, crossings by lines, normals.
+"""Compiled loops of rays against primitives in closed form, each in its own frame.
 
 Points, directions and sizes are tuples of three numbers: compiled loops keep them in registers, where arrays would cost
 as much as the arithmetic.
@@ -11,118 +11,40 @@ import math
 import numpy as np
 from numba import njit
 
-from lidardesign.density.fields.bodies import BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, SPHERE
-from lidardesign.numerics import EPSILON
-
-# A point is taken to be at least so far from the middle plane of an ellipsoid, as a share of its smallest semi-axis:
-# below it the two nearest points, above and below the plane, are one.
-OFF_MIDDLE = EPSILON
-MOST_NEWTON_STEPS = 60
-
-
-@njit(cache=True, nogil=True)
-def _ellipsoid_distance(axes, q):  # noqa: ANN001, ANN202
-    """Signed distance of an ellipsoid at a point in its own frame, and its gradient.
-
-    The nearest point is e_i^2 q_i / (t + e_i^2), where t makes it lie on the surface (Eberly 2013, "Distance from a
-    point to an ellipse, an ellipsoid, or a hyperellipsoid"). With w = 1 + t / e^2 for the smallest semi-axis e, the
-    sum of squares is convex and falls in w > 0: Newton's steps from the left of its root never pass it.
-    """
-    least = min(axes[0], axes[1], axes[2])
-    ratio, place, share = np.empty(3), np.empty(3), np.empty(3)
-    w, inside = 0.0, 0.0
-    for k in range(3):
-        ratio[k] = (axes[k] / least) * (axes[k] / least)
-        place[k] = abs(q[k]) / axes[k]
-        inside += place[k] * place[k]
-        if axes[k] == least:
-            place[k] = max(place[k], OFF_MIDDLE)
-        w = max(w, ratio[k] * (place[k] - 1.0) + 1.0)
-    for _ in range(MOST_NEWTON_STEPS):
-        value, slope = -1.0, 0.0
-        for k in range(3):
-            below = w + (ratio[k] - 1.0)
-            part = ratio[k] * place[k] / below
-            value += part * part
-            slope += 2.0 * part * part / below
-        step = value / slope
-        w += step
-        if step <= EPSILON * w:
-            break
-    squared, length = 0.0, 0.0
-    for k in range(3):
-        # the nearest point as a share of the semi-axis
-        share[k] = ratio[k] * place[k] / (w + (ratio[k] - 1.0))
-        away = axes[k] * share[k] - abs(q[k])
-        squared += away * away
-        share[k] *= (1.0 if q[k] >= 0.0 else -1.0) / axes[k]
-        length += share[k] * share[k]
-    length = math.sqrt(length)
-    gradient = share[0] / length, share[1] / length, share[2] / length
-    return math.sqrt(squared) * (-1.0 if inside < 1.0 else 1.0), gradient
+from lidardesign.geometry.primitives import BALL_SLACK, BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, SPHERE
 
 
 @njit(cache=True, nogil=True, inline="always")
-def primitive_distance(kind, size, q):  # noqa: ANN001, ANN201
-    """Signed distance of any primitive at a point in its own frame."""
-    x, y, z = q
-    if kind in (SPHERE, CAPSULE):
-        if kind == CAPSULE:
-            z -= min(max(z, -size[1]), size[1])
-        return math.sqrt(x * x + y * y + z * z) - size[0]
-    if kind == BOX:
-        x, y, z = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
-        deepest = max(x, y, z)
-        if deepest <= 0.0:
-            return deepest
-        x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
-        return math.sqrt(x * x + y * y + z * z)
-    if kind == CYLINDER:
-        side, end = math.sqrt(x * x + y * y) - size[0], abs(z) - size[1]
-        if side <= 0.0 and end <= 0.0:
-            return max(side, end)
-        side, end = max(side, 0.0), max(end, 0.0)
-        return math.sqrt(side * side + end * end)
-    if kind == ELLIPSOID:
-        return _ellipsoid_distance(size, q)[0]
-    return z
+def row(values, n):  # noqa: ANN001, ANN201
+    """Three numbers of a table as a tuple."""
+    return values[n, 0], values[n, 1], values[n, 2]
 
 
-@njit(cache=True, nogil=True)
-def primitive_gradient(kind, size, q):  # noqa: ANN001, ANN201
-    """The gradient of the signed distance of any primitive at a point in its own frame."""
-    x, y, z = q
-    if kind in (SPHERE, CAPSULE):
-        if kind == CAPSULE:
-            z -= min(max(z, -size[1]), size[1])
-        length = math.sqrt(x * x + y * y + z * z)
-        scale = 1.0 / length if length > 0.0 else 0.0
-        return x * scale, y * scale, z * scale
-    if kind == CYLINDER:
-        radial = math.sqrt(x * x + y * y)
-        side, end = radial - size[0], abs(z) - size[1]
-        by_side, by_end = max(side, 0.0), max(end, 0.0)
-        distance = math.sqrt(by_side * by_side + by_end * by_end)
-        if distance > 0.0:
-            by_side, by_end = by_side / distance, by_end / distance
-        else:
-            by_side, by_end = (1.0, 0.0) if side > end else (0.0, 1.0)
-        outward = by_side / radial if radial > 0.0 else 0.0
-        return outward * x, outward * y, by_end if z >= 0.0 else -by_end
-    if kind == ELLIPSOID:
-        return _ellipsoid_distance(size, q)[1]
-    if kind == PLANE:
-        return 0.0, 0.0, 1.0
-    right, ahead, up = (1.0 if x >= 0.0 else -1.0), (1.0 if y >= 0.0 else -1.0), (1.0 if z >= 0.0 else -1.0)
-    x, y, z = abs(x) - size[0], abs(y) - size[1], abs(z) - size[2]
-    deepest = max(x, y, z)
-    if deepest > 0.0:
-        x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
-        distance = math.sqrt(x * x + y * y + z * z)
-        return x / distance * right, y / distance * ahead, z / distance * up
-    if x == deepest:
-        return right, 0.0, 0.0
-    return (0.0, ahead, 0.0) if y == deepest else (0.0, 0.0, up)
+@njit(cache=True, nogil=True, inline="always")
+def turned(to_body, b, v):  # noqa: ANN001, ANN201
+    """A world direction in the frame of body b."""
+    return (
+        to_body[b, 0, 0] * v[0] + to_body[b, 0, 1] * v[1] + to_body[b, 0, 2] * v[2],
+        to_body[b, 1, 0] * v[0] + to_body[b, 1, 1] * v[1] + to_body[b, 1, 2] * v[2],
+        to_body[b, 2, 0] * v[0] + to_body[b, 2, 1] * v[1] + to_body[b, 2, 2] * v[2],
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def placed(to_body, b, p):  # noqa: ANN001, ANN201
+    """A world point in the frame of body b."""
+    x, y, z = turned(to_body, b, p)
+    return x + to_body[b, 0, 3], y + to_body[b, 1, 3], z + to_body[b, 2, 3]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def turned_back(to_body, b, v):  # noqa: ANN001, ANN201
+    """A direction of the frame of body b in the world."""
+    return (
+        to_body[b, 0, 0] * v[0] + to_body[b, 1, 0] * v[1] + to_body[b, 2, 0] * v[2],
+        to_body[b, 0, 1] * v[0] + to_body[b, 1, 1] * v[1] + to_body[b, 2, 1] * v[2],
+        to_body[b, 0, 2] * v[0] + to_body[b, 1, 2] * v[1] + to_body[b, 2, 2] * v[2],
+    )
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -155,7 +77,10 @@ def box_roots(low, high, origin, direction):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def _capsule_roots(size, origin, direction):  # noqa: ANN001, ANN202
-    """A line meets the side, or the cap on whose side it meets the endless cylinder (as in `primitives`)."""
+    """A line meets the side, or the cap on whose side it meets the endless cylinder.
+
+    Choosing the cap that way leaves no seam between side and cap for a ray to slip through.
+    """
     radius, half_length = size[0], size[1]
     across = direction[0] * direction[0] + direction[1] * direction[1]
     near, far, half, along = np.nan, np.nan, 0.0, 0.0
@@ -183,7 +108,7 @@ def _capsule_roots(size, origin, direction):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _cylinder_roots(size, origin, direction):  # noqa: ANN001, ANN202
-    """Where a line is both between the planes of the ends and in the endless cylinder (as in `primitives`)."""
+    """Where a line is both between the planes of the ends and in the endless cylinder."""
     radius, half_length = size[0], size[1]
     near, far = -np.inf, np.inf
     across = direction[0] * direction[0] + direction[1] * direction[1]
@@ -205,7 +130,7 @@ def _cylinder_roots(size, origin, direction):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _ellipsoid_roots(axes, origin, direction):  # noqa: ANN001, ANN202
-    """Stretched along its axes it is a ball of radius 1 (as in `primitives`)."""
+    """Stretched along its axes it is a ball of radius 1."""
     x, y, z = direction[0] / axes[0], direction[1] / axes[1], direction[2] / axes[2]
     length = math.sqrt(x * x + y * y + z * z)
     start = origin[0] / axes[0], origin[1] / axes[1], origin[2] / axes[2]
@@ -256,3 +181,76 @@ def primitive_normal(kind, size, point):  # noqa: ANN001, ANN201
     length = math.sqrt(x * x + y * y + z * z)
     scale = 1.0 / length if length > 0.0 else 0.0
     return x * scale, y * scale, z * scale
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _passes(centre, radius, origin, direction, limit):  # noqa: ANN001, ANN202
+    """Whether a ray passes a ball before a limit."""
+    x, y, z = centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2]
+    along, squared = x * direction[0] + y * direction[1] + z * direction[2], x * x + y * y + z * z
+    slack = BALL_SLACK * squared
+    reach = radius + math.sqrt(slack)
+    return squared - along * along <= radius * radius + slack and along >= -reach and along - reach <= limit
+
+
+@njit(cache=True, nogil=True)
+def keep_nearer(shapes, origins, directions, limits, ranges, bodies, normals):  # noqa: ANN001, ANN201
+    """Enter the hits of rays on primitives that are nearer than what is known.
+
+    Arguments:
+        shapes: Kinds (B,), sizes (B, 3), world to body (B, 3, 4), centres (B, 3) and radii (B,) of balls around them,
+            and their numbers among all bodies (B,).
+        origins, directions: Of rays, directions of unit length, shape (N, 3).
+        limits: Where rays end, shape (N,) [m].
+        ranges, bodies, normals: Known hits, and out: shapes (N,), (N,) and (N, 3), normals outward in the world.
+    """
+    kinds, sizes, to_body, centres, radii, numbers = shapes
+    for n in range(origins.shape[0]):
+        origin, direction = row(origins, n), row(directions, n)
+        best, found = min(ranges[n], limits[n]), -1
+        for b in range(kinds.shape[0]):
+            if not _passes(row(centres, b), radii[b], origin, direction, best):
+                continue
+            near, far = primitive_roots(
+                kinds[b], row(sizes, b), placed(to_body, b, origin), turned(to_body, b, direction)
+            )
+            value = near if near >= 0.0 else far
+            if value >= 0.0 and value < best:
+                best, found = value, b
+        if found >= 0:
+            ranges[n], bodies[n] = best, numbers[found]
+            q, along = placed(to_body, found, origin), turned(to_body, found, direction)
+            met = q[0] + best * along[0], q[1] + best * along[1], q[2] + best * along[2]
+            own = primitive_normal(kinds[found], row(sizes, found), met)
+            normals[n, 0], normals[n, 1], normals[n, 2] = turned_back(to_body, found, own)
+
+
+@njit(cache=True, nogil=True)
+def crossings(shapes, origins, directions, starts, limits, rows, ranges, cosines):  # noqa: ANN001, ANN201
+    """Every crossing of rays with primitives from a start up to a limit, by ray; as many as there is room for.
+
+    Arguments:
+        shapes, origins, directions, limits: As in `keep_nearer`.
+        starts: Where rays begin, shape (N,) [m].
+        rows, ranges, cosines: Out: the ray, the range and the cosine between normal and ray, without its sign.
+
+    Returns:
+        The number of crossings; where it is above the room, the call has to be repeated.
+    """
+    kinds, sizes, to_body, centres, radii, _ = shapes
+    met, room = 0, rows.shape[0]
+    for n in range(origins.shape[0]):
+        origin, direction = row(origins, n), row(directions, n)
+        for b in range(kinds.shape[0]):
+            if not _passes(row(centres, b), radii[b], origin, direction, limits[n]):
+                continue
+            q, along = placed(to_body, b, origin), turned(to_body, b, direction)
+            for value in primitive_roots(kinds[b], row(sizes, b), q, along):
+                if value >= starts[n] and value < limits[n]:
+                    if met < room:
+                        point = q[0] + value * along[0], q[1] + value * along[1], q[2] + value * along[2]
+                        own = primitive_normal(kinds[b], row(sizes, b), point)
+                        cosine = own[0] * along[0] + own[1] * along[1] + own[2] * along[2]
+                        rows[met], ranges[met], cosines[met] = n, value, abs(cosine)
+                    met += 1
+    return met
