@@ -1,4 +1,4 @@
-# make demo   sets everything up in .venv and runs the whole chain on the built-in face task, a minute and a half
+# make demo   sets everything up in .venv and runs the whole chain on the built-in face task, three to four minutes
 # make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 2 GB there
 # make docs   writes the documentation with a search as pages of build/site, which load nothing from elsewhere
 # make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does

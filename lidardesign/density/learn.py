@@ -176,7 +176,7 @@ def learn(
         DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
     """
     place = choose_device(device)
-    with running() as clock, one_thread():
+    with running() as clock, on_one_thread():
         data = prepare_training_data(task, config, remark) if data is None else data
         trainer = make_trainer(data, config, run, place)
         trainer.is_over = is_over
@@ -212,7 +212,7 @@ def learn(
 
 
 @contextlib.contextmanager
-def one_thread() -> Iterator[None]:
+def on_one_thread() -> Iterator[None]:
     """Let torch work on one thread: sums over several end in other bits."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

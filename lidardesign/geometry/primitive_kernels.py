@@ -194,6 +194,16 @@ def _passes(centre, radius, origin, direction, limit):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
+def normal_at_range(kind, size, to_body, body, origin, direction, distance):  # noqa: ANN001, ANN201
+    """Outward normal in the world where a ray meets a primitive at a range, and its cosine to the ray."""
+    q, along = placed(to_body, body, origin), turned(to_body, body, direction)
+    met = q[0] + distance * along[0], q[1] + distance * along[1], q[2] + distance * along[2]
+    own = primitive_normal(kind, size, met)
+    cosine = own[0] * along[0] + own[1] * along[1] + own[2] * along[2]
+    return turned_back(to_body, body, own), cosine
+
+
+@njit(cache=True, nogil=True)
 def keep_nearer(shapes, origins, directions, limits, ranges, bodies, normals):  # noqa: ANN001, ANN201
     """Enter the hits of rays on primitives that are nearer than what is known.
 
@@ -219,10 +229,8 @@ def keep_nearer(shapes, origins, directions, limits, ranges, bodies, normals):  
                 best, found = value, b
         if found >= 0:
             ranges[n], bodies[n] = best, numbers[found]
-            q, along = placed(to_body, found, origin), turned(to_body, found, direction)
-            met = q[0] + best * along[0], q[1] + best * along[1], q[2] + best * along[2]
-            own = primitive_normal(kinds[found], row(sizes, found), met)
-            normals[n, 0], normals[n, 1], normals[n, 2] = turned_back(to_body, found, own)
+            normal, _ = normal_at_range(kinds[found], row(sizes, found), to_body, found, origin, direction, best)
+            normals[n, 0], normals[n, 1], normals[n, 2] = normal
 
 
 @njit(cache=True, nogil=True)

@@ -202,7 +202,7 @@ def wait_until(condition, seconds=60.0):
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_with_the_program_however_it_ends(run, number):
-    ended = program("evaluate", run, "--rays", 20_000, "--set", "test=50", "--workers", 2, text=True)
+    ended = program("evaluate", run, "--rays", 20_000, "--set", "test=1000", "--workers", 2, text=True)
     try:
         # two workers, and what keeps account of the semaphores that they share
         assert wait_until(lambda: len(children(ended.pid)) == 3 or ended.poll() is not None)

@@ -20,8 +20,8 @@ from lidardesign.density.fields.distance_kernels import primitive_distance, prim
 from lidardesign.density.fields.table_kernels import along_axis
 from lidardesign.geometry.primitive_kernels import (
     box_roots,
+    normal_at_range,
     placed,
-    primitive_normal,
     primitive_roots,
     row,
     turned,
@@ -371,11 +371,10 @@ def first_hits(bodies, mesh_bounds, row_starts, columns, rays, hits, normals, ou
             x, y, z, hits[pair] = 0.0, 0.0, 0.0, np.inf
             if body >= 0:
                 hits[pair] = best
-                q, ahead = placed(to_body, body, origin), turned(to_body, body, direction)
-                met = q[0] + best * ahead[0], q[1] + best * ahead[1], q[2] + best * ahead[2]
-                own = primitive_normal(kinds[body], row(sizes, body), met)
-                x, y, z = turned_back(to_body, body, own)
-                if own[0] * ahead[0] + own[1] * ahead[1] + own[2] * ahead[2] > 0.0:
+                (x, y, z), cosine = normal_at_range(
+                    kinds[body], row(sizes, body), to_body, body, origin, direction, best
+                )
+                if cosine > 0.0:
                     x, y, z = -x, -y, -z
             normals[pair, 0], normals[pair, 1], normals[pair, 2] = x, y, z
     return meshes
