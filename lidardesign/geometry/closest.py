@@ -35,14 +35,35 @@ class TriangleTree:
         leaves = _build_boxes(triangles, self._boxes, self._children, members)
         frames = np.empty((len(triangles), 17))
         _build_frames(triangles, frames)
-        self._frames = np.ascontiguousarray(frames[members[:leaves]].transpose(0, 2, 1))
+        self._members = members[:leaves]
+        self._frames = np.ascontiguousarray(frames[self._members].transpose(0, 2, 1))
 
     def distance_m(self, points: np.ndarray) -> np.ndarray:
         """The distance of each point to the nearest triangle [m], (N, 3) to (N,)."""
+        return self._nearest(points, math.inf)[0]
+
+    def closest(self, points: np.ndarray, within_m: float = math.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The distance of each point to the nearest triangle [m], the triangle, and the nearest place on it [m].
+
+        Arguments:
+            points: Any number [m], shape (N, 3).
+            within_m: What is further away is not looked for: its distance is infinite, its triangle -1.
+
+        Returns:
+            Shapes (N,), (N,) and (N, 3).
+        """
         points = np.ascontiguousarray(points, dtype=np.float64)
-        squared = np.empty(len(points))
-        _nearest(points, self._frames, self._boxes, self._children, squared)
-        return np.sqrt(squared)
+        distance, leaves = self._nearest(points, within_m)
+        triangles, places = np.full(len(points), -1), np.full((len(points), 3), np.nan)
+        _closest_on(points, self._frames, leaves, self._members, triangles, places)
+        return distance, triangles, places
+
+    def _nearest(self, points: np.ndarray, within_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Distances, and the leaves that hold the nearest triangles."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        squared, leaves = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
+        _nearest(points, self._frames, self._boxes, self._children, within_m * within_m, squared, leaves)
+        return np.sqrt(squared), leaves
 
 
 @njit(cache=True, nogil=True)
@@ -96,14 +117,20 @@ def _build_boxes(triangles: np.ndarray, boxes: np.ndarray, children: np.ndarray,
 
 @njit(cache=True, nogil=True)
 def _nearest(
-    points: np.ndarray, frames: np.ndarray, boxes: np.ndarray, children: np.ndarray, squared: np.ndarray
+    points: np.ndarray,
+    frames: np.ndarray,
+    boxes: np.ndarray,
+    children: np.ndarray,
+    limit: float,
+    squared: np.ndarray,
+    leaves: np.ndarray,
 ) -> None:
-    """Fills the squared distance of each point to the nearest triangle."""
+    """Fills the squared distance of each point to the nearest triangle, and its leaf: infinite, -1 from a limit on."""
     waiting, away = np.empty(DEEPEST, dtype=np.int64), np.empty(DEEPEST)
     apart = np.empty(WIDTH)
     for n in range(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        least = np.inf
+        least, leaf = limit, -1
         waiting[0], away[0], depth = 0, 0.0, 1
         while depth:
             depth -= 1
@@ -112,8 +139,11 @@ def _nearest(
                 continue
             if node < 0:
                 _triangles_squared(x, y, z, frames, ~node, apart)
-                for index in range(WIDTH):
-                    least = min(least, apart[index])
+                nearest = apart[0]
+                for index in range(1, WIDTH):
+                    nearest = min(nearest, apart[index])
+                if nearest < least:
+                    least, leaf = nearest, ~node
                 continue
             _boxes_squared(x, y, z, boxes, node, apart)
             before = depth
@@ -126,7 +156,7 @@ def _nearest(
                         waiting[depth], away[depth] = waiting[place], away[place]
                     waiting[place], away[place] = children[node, index], apart[index]
                     depth += 1
-        squared[n] = least
+        squared[n], leaves[n] = least if leaf >= 0 else np.inf, leaf
 
 
 # Indices, and no slices, are passed to what follows: loops over `apart` are then what the compiler makes vectors of.
@@ -203,3 +233,36 @@ def _segment_squared(x: float, y: float, end_x: float, end_y: float, inverse: fl
     share = min(max((x * end_x + y * end_y) * inverse, 0.0), 1.0)
     beyond_x, beyond_y = x - share * end_x, y - share * end_y
     return beyond_x * beyond_x + beyond_y * beyond_y
+
+
+@njit(cache=True, nogil=True)
+def _closest_on(
+    points: np.ndarray, frames: np.ndarray, leaves: np.ndarray, members: np.ndarray, found: np.ndarray, on: np.ndarray
+) -> None:
+    """Fills the nearest triangle of each point's leaf and the nearest place on it; nothing where a leaf is -1."""
+    apart = np.empty(WIDTH)
+    for n in range(len(points)):
+        leaf = leaves[n]
+        if leaf < 0:
+            continue
+        _triangles_squared(points[n, 0], points[n, 1], points[n, 2], frames, leaf, apart)
+        t = np.argmin(apart)
+        found[n] = members[leaf, t]
+        frame = frames[leaf, :, t]
+        offset = points[n] - frame[:3]
+        along, across = (offset * frame[3:6]).sum(), (offset * frame[6:9]).sum()
+        length, third, height = frame[12], frame[13], frame[14]
+        left, right = height * along - third * across, height * (length - along) - (length - third) * across
+        if not (across > 0.0 and left > 0.0 and right > 0.0):
+            x, y, least = along, across, np.inf
+            corners_x, corners_y = (0.0, length, third), (0.0, 0.0, height)
+            for k in range(3):
+                side_x, side_y = corners_x[(k + 1) % 3] - corners_x[k], corners_y[(k + 1) % 3] - corners_y[k]
+                square = side_x * side_x + side_y * side_y
+                ahead = (x - corners_x[k]) * side_x + (y - corners_y[k]) * side_y
+                share = min(max(ahead / square, 0.0), 1.0) if square > SQUARABLE**2 else 0.0
+                near_x, near_y = corners_x[k] + share * side_x, corners_y[k] + share * side_y
+                beyond = (x - near_x) ** 2 + (y - near_y) ** 2
+                if beyond < least:
+                    along, across, least = near_x, near_y, beyond
+        on[n] = frame[:3] + along * frame[3:6] + across * frame[6:9]

@@ -82,6 +82,32 @@ def test_the_distance_is_that_of_the_nearest_of_all_pairs(name):
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
+def test_the_nearest_place_is_on_its_triangle_and_as_far_away_as_is_said(name):
+    triangles = SUBJECTS[name]
+    points = places(triangles)
+    tree = TriangleTree(triangles)
+    distance, nearest, place = tree.closest(points)
+    np.testing.assert_array_equal(distance, tree.distance_m(points))
+    np.testing.assert_allclose(np.linalg.norm(points - place, axis=1), distance, rtol=0, atol=NANOMETRE)
+    for one, own in zip(place, triangles[nearest], strict=True):
+        assert naive_triangle_distance_m(one[None], own[None]) <= NANOMETRE
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_what_is_further_than_the_limit_is_not_found_and_the_rest_is_as_without(name):
+    triangles = SUBJECTS[name]
+    points = places(triangles)
+    tree = TriangleTree(triangles)
+    whole = tree.closest(points)
+    limit_m = float(np.median(whole[0]))
+    found = tree.closest(points, limit_m)
+    within = whole[0] < limit_m
+    for part, one, missing in zip(found, whole, (np.inf, -1, np.nan), strict=True):
+        np.testing.assert_array_equal(part[within], one[within])
+        np.testing.assert_array_equal(part[~within], np.full_like(part[~within], missing))
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_neither_the_order_of_triangles_corners_and_points_nor_rigid_motion_changes_a_distance(name):
     triangles, random = SUBJECTS[name], generator(3)
     points = places(triangles)

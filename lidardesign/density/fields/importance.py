@@ -38,7 +38,7 @@ from lidardesign.errors import BackgroundNote
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Body, Mesh, Scene
 
-ALGORITHM = "log importance at the nearest surface point, narrow band 3 cells, filled by distance transform, float32"
+ALGORITHM = "log importance at the nearest surface point, band of 3 cells by a tree, filled by distance transform"
 
 
 def log_weight_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
@@ -47,8 +47,8 @@ def log_weight_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
         return np.zeros(grid.size, dtype=np.float32)
     # relative to the grid's corner: squares of coordinates far from the origin would lose every digit
     points, vertices = Grid(np.zeros(3), grid.step, grid.counts).points(), mesh.vertices - grid.low
-    distance, face, closest = narrow_band(points, vertices, mesh.faces.astype(np.int64), grid)
-    known = ~np.isnan(distance)
+    distance, face, closest = narrow_band(points, vertices, mesh.faces, grid)
+    known = np.isfinite(distance)
     log_weights = np.zeros(grid.size)
     corners = mesh.faces[face[known]]
     at_corners = np.log(mesh.importance)[corners]
