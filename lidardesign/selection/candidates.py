@@ -63,10 +63,9 @@ def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[Informe
     """
     count = len(rays)
     ray, range_m = _telling_returns(informed)
-    own = rays.gate_m
-    gates = np.repeat(own[:, None], len(LEVELS), axis=1)
     if not len(ray):
-        return gates
+        return np.repeat(rays.gate_m[:, None], len(LEVELS), axis=1)
+    count = len(rays)
     seen = rays.origin_m + np.median(range_m) * rays.direction
     near = [
         visit.start + rows
@@ -78,39 +77,31 @@ def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[Informe
     parts = [range_m[order[start[n] : start[n + 1]]] for n in range(count)]
     shared = [np.concatenate([parts[n] for n in group]) for group in near]
     alone = [part if len(part) >= FEWEST_RETURNS else group for part, group in zip(parts, shared, strict=True)]
-    for place, level in enumerate(LEVELS):
-        source = shared if place == 0 else alone
+    ends = []
+    for source, levels in ((shared, LEVELS[:1]), (alone, LEVELS[1:])):
         label = np.repeat(np.arange(count), [len(part) for part in source])
-        ends, _ = central_intervals(np.concatenate(source), np.ones(len(label)), label, count, level)
-        gates[:, place] = _inside(rays, ends, margin_m if level == 1.0 else 0.0)
-    return gates
+        ends.append(central_intervals(np.concatenate(source), np.ones(len(label)), label, count, np.array(levels))[0])
+    return _inside(rays, np.concatenate(ends, axis=1), LEVELS, margin_m)
 
 
 def sensor_gates(rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
     """A few gates of each ray's sensor, each narrower than the one before, (N, G, 2) [m]; as `gate_choices`."""
     ray, range_m = _telling_returns(informed)
-    gates = np.repeat(rays.gate_m[:, None], 1 + len(SENSOR_LEVELS), axis=1)
-    for place, level in enumerate(SENSOR_LEVELS, start=1):
-        ends, _ = central_intervals(range_m, np.ones(len(ray)), rays.sensor[ray], int(rays.sensor.max()) + 1, level)
-        gates[:, place] = _inside(rays, ends[rays.sensor], margin_m if level == 1.0 else 0.0)
-    return gates
+    sensor, sensors = rays.sensor[ray], int(rays.sensor.max()) + 1
+    ends, _ = central_intervals(range_m, np.ones(len(ray)), sensor, sensors, np.array(SENSOR_LEVELS))
+    narrow = _inside(rays, ends[rays.sensor], SENSOR_LEVELS, margin_m)
+    return np.concatenate([rays.gate_m[:, None], narrow], axis=1)
 
 
-def _inside(rays: Rays, ends_m: np.ndarray, wider_m: float) -> np.ndarray:
-    """Gates (N, 2) that hold these ends, wider at both, inside the rays' own; their own where there are none [m]."""
-    own, wider = rays.gate_m, np.array([-wider_m, np.nextafter(wider_m, np.inf) if wider_m else 0.0])
-    held = np.clip(ends_m + wider, own[:, :1], own[:, 1:])
-    return np.where(np.isnan(ends_m), own, held)
+def _inside(rays: Rays, ends_m: np.ndarray, levels: Sequence[float], margin_m: float) -> np.ndarray:
+    """Gates (N, L, 2) that hold these ends inside the rays' own, those of all returns longer at both; or their own."""
+    wider = np.where(np.array(levels) == 1.0, margin_m, 0.0)
+    wider = np.stack([-wider, np.where(wider > 0, np.nextafter(wider, np.inf), 0.0)], axis=1)
+    own = rays.gate_m[:, None]
+    return np.where(np.isnan(ends_m), own, np.clip(ends_m + wider, own[..., :1], own[..., 1:]))
 
 
 def _telling_returns(informed: Sequence[InformedScene]) -> tuple[np.ndarray, np.ndarray]:
     """Every return that tells something: its ray (K,) and range (K,) [m]."""
-    rays, ranges = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
-    for scene in informed:
-        # a return tells of several items
-        order = np.lexsort((scene.range_m, scene.ray))
-        ray, range_m = scene.ray[order], scene.range_m[order]
-        is_first = np.append(True, (np.diff(ray) > 0) | (np.diff(range_m) > 0))[: len(ray)]
-        rays.append(ray[is_first].astype(np.intp))
-        ranges.append(range_m[is_first])
-    return np.concatenate(rays), np.concatenate(ranges)
+    returns = [scene.telling_returns for scene in informed]
+    return tuple(np.concatenate(column) for column in zip(*returns, strict=True))

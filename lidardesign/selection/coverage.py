@@ -226,6 +226,15 @@ class InformedScene:
             unit=information.unit,
         )
 
+    @cached_property
+    def telling_returns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Every return that tells something: its ray (K,) and range (K,) [m]."""
+        # a return tells of several items
+        order = np.lexsort((self.range_m, self.ray))
+        ray, range_m = self.ray[order], self.range_m[order]
+        is_first = np.append(True, (np.diff(ray) > 0) | (np.diff(range_m) > 0))[: len(ray)]
+        return ray[is_first].astype(np.intp), range_m[is_first]
+
 
 def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndarray) -> Coverage:
     """The table over scenes, each of which counts as much as any other; its items are in an order of its own.

@@ -41,7 +41,7 @@ THINNEST_GATE_M = 1.5e-5
 
 
 def central_intervals(
-    values: np.ndarray, weights: np.ndarray, labels: np.ndarray, count: int, level: float
+    values: np.ndarray, weights: np.ndarray, labels: np.ndarray, count: int, level: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The central `level` of weighted values in each cell, and how many equal weights each rests on.
 
@@ -50,12 +50,13 @@ def central_intervals(
         weights: Non-negative, shape (N,).
         labels: The cell of each value, shape (N,).
         count: Number of cells K.
-        level: The share that an interval holds.
+        level: The share that an interval holds, or several of any shape.
 
     Returns:
-        Ends, shape (K, 2), NaN for cells without weight; effective counts, shape (K,).
+        Ends, shape (K, ..., 2), NaN for cells without weight; effective counts, shape (K,).
     """
-    ends, effective = np.full((count, 2), np.nan), np.zeros(count)
+    shares = np.stack([(1 - np.asarray(level)) / 2, (1 + np.asarray(level)) / 2], axis=-1)
+    ends, effective = np.full((count, *shares.shape), np.nan), np.zeros(count)
     order = np.lexsort((values, labels))
     starts = np.searchsorted(labels[order], np.arange(count + 1))
     for cell in np.flatnonzero(np.diff(starts)):
@@ -64,7 +65,7 @@ def central_intervals(
         if mass <= 0:
             continue
         share = (np.cumsum(weights[part]) - weights[part] / 2) / mass
-        ends[cell] = np.interp([(1 - level) / 2, (1 + level) / 2], share, values[part])
+        ends[cell] = np.interp(shares, share, values[part])
         # shares first: squares of weights below 1e-160 are zero
         effective[cell] = 1 / np.square(weights[part] / mass).sum()
     return ends, effective
