@@ -38,7 +38,7 @@ from lidardesign.selection import information
 from lidardesign.selection.certificate import certificate_document
 from lidardesign.selection.coverage import Coverage, InformedScene
 from lidardesign.selection.parts import PartBundle, PlacedPart, part_table, parts_inform
-from lidardesign.selection.select import SMALLEST_GAIN
+from lidardesign.selection.select import are_enough
 from lidardesign.selection.sets import ChosenSet, SetLimits, choose_set
 from lidardesign.space import angles, observed_point
 from lidardesign.task import Information, random_generator
@@ -150,7 +150,7 @@ def _chosen_set(
     """
     inform = partial(parts_inform, bundle, informs=informs, count=limits.count, seed=seed)
     held_back = list(itertools.islice(scenes("held back"), information.FEW_SCENES))
-    training, wanted, loss = scenes("choice"), information.FEW_SCENES, np.inf
+    training, wanted, loss = scenes("choice"), information.FEW_SCENES, 0.0
     informed: list[InformedScene] = []
     while True:
         progress(f"choosing among {len(bundle.placed)} poses of parts on {wanted} training scenes")
@@ -167,7 +167,7 @@ def _chosen_set(
         judged = part_table(inform(held_back, among=chosen.members), len(chosen.members))
         before, loss = loss, judged.loss_of(np.zeros(len(chosen.members), dtype=np.intp))
         is_large = 2 * wanted > information.MOST_SCENES or 2 * wanted * len(bundle.placed) > MOST_TOLD
-        if is_large or loss > (1 - SMALLEST_GAIN) * before:
+        if is_large or are_enough(before, loss, coverage.complete - chosen.value):
             return chosen, coverage, loss, informed
         wanted *= 2
 

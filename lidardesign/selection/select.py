@@ -1,7 +1,8 @@
 """Rays chosen from candidates on as many training scenes as it takes, for several numbers of rays.
 
-Scenes cost a cast each, so choices rest on many more of them than a density is learned from: they are doubled until the
-loss on scenes held back gains little. Every number of rays is a choice of its own: swaps leave no prefixes.
+Scenes cost a cast each, so choices rest on many more of them than a density is learned from: they are doubled until a
+choice loses little more on scenes held back than on its own. Every number of rays is a choice of its own: swaps leave
+no prefixes.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
 
 LOSS_PER_BANDWIDTH = 0.2  # where bandwidth has no limit: ten percent more of it must bring two percent less loss
-SMALLEST_GAIN = 0.01  # of the held-back loss: what twice the scenes must gain
+# Of the loss on scenes held back: what twice the scenes must have gained, or a choice lose less on its own scenes, for
+# twice as many again to gain about a hundredth.
+SMALLEST_GAIN, SMALLEST_GAP = 0.02, 0.05
 MOST_ENTRIES = 10_000_000  # of the table, some 200 MB: scenes of few items may be more
 
 
@@ -205,7 +208,7 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
     middle = counts[len(counts) // 2]
     held_back = [] if problem.is_trial else problem.inform(problem.scenes("held back"), information.FEW_SCENES)
     informed: list[InformedScene] = []
-    scenes, wanted, loss = problem.scenes("choice"), information.FEW_SCENES, np.inf
+    scenes, wanted, loss = problem.scenes("choice"), information.FEW_SCENES * (1 if problem.is_trial else 2), 0.0
     while True:
         problem.progress(f"choosing rays on {wanted} training scenes")
         informed += problem.inform(scenes, wanted - len(informed))
@@ -222,7 +225,7 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
         judged = coverage if problem.is_trial else problem.coverage(held_back, gates_m)
         before, loss = loss, judged.loss_of(_gate_of(choices))
         is_large = 2 * wanted > problem.most_scenes or 2 * len(coverage.item) > MOST_ENTRIES
-        if problem.is_trial or is_large or loss > (1 - SMALLEST_GAIN) * before:
+        if problem.is_trial or is_large or are_enough(before, loss, coverage.loss_of(_gate_of(choices))):
             break
         wanted *= 2
     rays, shared = problem.rays, None
@@ -261,6 +264,17 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
                 document["gap_doubled"] = _gap_doubled(problem, problem.further, count, shared)
         selected[-1] = Selected(tables, document)
     return selected
+
+
+def are_enough(before: float, loss: float, own: float) -> bool:
+    """Whether a choice on twice the scenes would lose hardly less on others.
+
+    Arguments:
+        before: What the choice on half the scenes loses on scenes held back, 0 without one.
+        loss: What this one loses there.
+        own: What it loses on the scenes that it was chosen on.
+    """
+    return loss >= (1 - SMALLEST_GAIN) * before and loss - own <= SMALLEST_GAP * loss
 
 
 @phase("certificate")

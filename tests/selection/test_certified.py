@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.coverages import small
 
 from lidardesign.selection.choice import RayCounts, choose
-from lidardesign.selection.select import SelectionProblem
+from lidardesign.selection.select import SelectionProblem, are_enough
 
 fields = ("rays", "gates", "informs", "scenes", "bandwidth", "one_gate", "most_scenes")
 PROBLEM = SelectionProblem(**dict.fromkeys(fields), visits=[slice(0, 7)], shares=None, limit_mbps=np.inf, name="small")
@@ -24,3 +25,19 @@ def test_no_choice_loses_less_than_nothing_however_dear_bandwidth_is(seed, price
     coverage = replace(coverage, complete=choice.worth - choice.harm + left)
     loss, bound = PROBLEM.certified(coverage, [choice])
     assert 0 <= bound <= loss + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("before", "loss", "own", "enough"),
+    [
+        (0.0, 1.00, 0.97, True),  # the first choice has no other to gain on
+        (0.0, 1.00, 0.90, False),
+        (1.01, 1.00, 0.97, True),
+        (1.05, 1.00, 0.97, False),
+        (0.90, 1.00, 0.97, True),  # held-back scenes scatter
+        (1.01, 1.00, 1.20, True),
+        (0.0, 0.0, 0.0, True),
+    ],
+)
+def test_scenes_are_enough_where_twice_as_many_gained_little_and_others_lose_as_little(before, loss, own, enough):
+    assert are_enough(before, loss, own) is enough
