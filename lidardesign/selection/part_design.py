@@ -150,7 +150,7 @@ def _chosen_set(
     """
     inform = partial(parts_inform, bundle, informs=informs, count=limits.count, seed=seed)
     held_back = list(itertools.islice(scenes("held back"), information.FEW_SCENES))
-    training, wanted, loss = scenes("choice"), information.FEW_SCENES, 0.0
+    training, wanted, loss = scenes("choice"), information.FEW_SCENES, np.inf
     informed: list[InformedScene] = []
     while True:
         progress(f"choosing among {len(bundle.placed)} poses of parts on {wanted} training scenes")

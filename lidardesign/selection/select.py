@@ -208,7 +208,7 @@ def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
     middle = counts[len(counts) // 2]
     held_back = [] if problem.is_trial else problem.inform(problem.scenes("held back"), information.FEW_SCENES)
     informed: list[InformedScene] = []
-    scenes, wanted, loss = problem.scenes("choice"), information.FEW_SCENES * (1 if problem.is_trial else 2), 0.0
+    scenes, wanted, loss = problem.scenes("choice"), information.FEW_SCENES * (1 if problem.is_trial else 2), np.inf
     while True:
         problem.progress(f"choosing rays on {wanted} training scenes")
         informed += problem.inform(scenes, wanted - len(informed))
@@ -270,7 +270,7 @@ def are_enough(before: float, loss: float, own: float) -> bool:
     """Whether a choice on twice the scenes would lose hardly less on others.
 
     Arguments:
-        before: What the choice on half the scenes loses on scenes held back, 0 without one.
+        before: What the choice on half the scenes loses on scenes held back.
         loss: What this one loses there.
         own: What it loses on the scenes that it was chosen on.
     """

@@ -30,9 +30,9 @@ def test_no_choice_loses_less_than_nothing_however_dear_bandwidth_is(seed, price
 @pytest.mark.parametrize(
     ("before", "loss", "own", "enough"),
     [
-        (0.0, 1.00, 0.97, True),  # the first choice has no other to gain on
-        (0.0, 1.00, 0.90, False),
+        (np.inf, 1.00, 0.97, False),  # the first choice
         (1.01, 1.00, 0.97, True),
+        (1.01, 1.00, 0.90, False),
         (1.05, 1.00, 0.97, False),
         (0.90, 1.00, 0.97, True),  # held-back scenes scatter
         (1.01, 1.00, 1.20, True),
