@@ -105,6 +105,10 @@ def select_rays(
     fired = tables[-1][0]
     own = [np.flatnonzero(fired.sensor == index) for index in range(len(spec.sensors))]
     sensors = tuple(replace(sensor, rays=len(rows)) for sensor, rows in zip(spec.sensors, own, strict=True))
+    idle = [sensor.name for sensor in sensors if not sensor.rays]
+    if idle:
+        note = f"{', '.join(idle)} need not be built: none of the {counts[-1]} rays starts there"
+        result = replace(result, notes=(*result.notes, note))
     if spec.gates != "ray":
         sensors = tuple(
             _with_gate(sensor, fired.gate_m[rows[0]], spec.level) if len(rows) else sensor

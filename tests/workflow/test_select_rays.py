@@ -132,6 +132,14 @@ class TestDesignsWithChosenRays:
 
 
 class TestTheCommand:
+    def test_names_the_sensors_that_no_ray_starts_from(self, lidardesign, run):
+        fitted = lidardesign("fit", run, "--sensors", 6, "--rays", 6, "--name", "many", "--json")
+        idle = [sensor["name"] for sensor in fitted.json["sensors"] if sensor["rays"] == 0]
+        assert len(idle) >= 2
+        assert f"note: {', '.join(idle)} need not be built: none of the 6 rays starts there" in fitted.err
+        fitted = lidardesign("fit", run, "--sensors", 1, "--rays", 2, "--name", "one")
+        assert "need not be built" not in fitted.err
+
     def test_says_how_far_from_the_best_they_are(self, lidardesign, run):
         printed = lidardesign("fit", run, "--layout", "selected", "--sensors", 2, "--rays", 9, "--name", "a")
         words = r"^chosen among \d+ rays on \d+ training scenes; these 9 have a loss of"
