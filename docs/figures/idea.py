@@ -1,6 +1,6 @@
 """Draws the pictures of docs/concepts.md: docs/overview.png (from a scene to a score) and docs/idea-*.png.
 
-    python docs/figures/idea.py                 # learns a draft run on the embedded head model first
+    python docs/figures/idea.py                 # learns a run on the embedded head model first
     python docs/figures/idea.py --run RUN       # from a face run that is there
 
 Everything shown is computed: heads are held-out ones but for the outlines, which are those that are learned from;
@@ -65,7 +65,7 @@ GATES = LinearSegmentedColormap.from_list("gates", ["#f0a202", "#d5483c", "#8a2f
 def computed(run: Path, learn: bool) -> tuple[DesignSpec, dict[str, Any]]:
     """Ten sensors with rays laid out by the density, and their evaluation beside an even layout and the baselines."""
     if learn:
-        command("learn", "face", "--preset", "draft", "--out", run)
+        command("learn", "face", "--out", run)
     names = {"overview-density": "density", "overview-grid": "grid"}
     for name, layout in names.items():
         command("fit", run, "--sensors", "10", "--layout", layout, "--name", name)
@@ -312,7 +312,7 @@ def overview(
 def main() -> None:
     """Compute what is not there, and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--run", type=Path, help="a run of the face task (default: learn a draft)")
+    parser.add_argument("--run", type=Path, help="a run of the face task (default: learn one)")
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1], help="the folder of the pictures")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
