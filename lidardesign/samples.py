@@ -134,10 +134,11 @@ def load_samples(run: Path, expected: DesignSpace | None = None) -> Samples:
         name = next(name for name in own if own[name] != theirs[name])
         found = f"belong to another design space: {name} {own[name]}"
         raise DataError(found, where=str(path), allowed=f"{name} {theirs[name]}, as the run", hint=DAMAGED_HINT)
+    try:
+        samples = Samples(points, log_prob, log_target, space)
+    except DataError as error:
+        raise DataError(error.message, where=str(path), hint=error.hint) from None
     outside = int((~space.contains(points)).sum())
     if outside:
         raise DataError(f"has {outside} of {count} points outside its design space", where=str(path), hint=DAMAGED_HINT)
-    try:
-        return Samples(points, log_prob, log_target, space)
-    except DataError as error:
-        raise DataError(error.message, where=str(path), hint=error.hint) from None
+    return samples

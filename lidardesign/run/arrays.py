@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import sys
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -123,7 +124,12 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, kinds: str, where:
             raise DataError(f"{name!r} of shape {shape} has {data} bytes of data", where=where, hint=hint)
     # the size that the archive states is no more than a promise either: memory is used where there is data
     with archive.open(member) as file:
-        return np.lib.format.read_array(file, allow_pickle=False, max_header_size=LARGEST_HEADER_BYTES)
+        array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=LARGEST_HEADER_BYTES)
+    if array.dtype.kind == "U":
+        letters = np.frombuffer(array.tobytes(), dtype=f"{array.dtype.byteorder}u4")
+        if (letters > sys.maxunicode).any():
+            raise DataError(f"{name!r} holds letters that do not exist", where=where, hint=hint)
+    return array
 
 
 def csv_rows(path: Path, kind: Kind) -> list[tuple[int, list[str]]]:

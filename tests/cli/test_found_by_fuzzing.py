@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+import sys
 import zipfile
 
 import numpy as np
@@ -57,6 +58,7 @@ BAD_SAMPLES = {
     "no sample": ({"points": np.ones((0, 6)), "log_prob": np.zeros(0), "log_target": np.zeros(0)}, "shape \\(0, 6\\)"),
     "a number alone": ({"points": np.array(1.0)}, "shape \\(\\)"),
     "infinite targets": ({"log_target": np.full(9, np.inf)}, "not finite"),
+    "an infinite azimuth": ({"points": good_arrays()["points"] + [0, 0, 0, np.inf, 0, 0]}, "not finite"),
     "no space": ({"space": np.frombuffer(b"[1, 2]", np.uint8)}, "TypeError"),
     "a space of words": ({"space": np.frombuffer(b"{", np.uint8)}, "JSONDecodeError"),
 }
@@ -93,6 +95,13 @@ def test_no_room_is_made_for_what_a_header_only_promises(tmp_path, shape):
     for read in (ray_lists.read_npz, load_capture):
         with pytest.raises(DataError, match="80 bytes of data"):
             read(tmp_path / "rays.npz")
+
+
+def test_letters_that_do_not_exist_are_refused_where_names_are_read(tmp_path):
+    names = np.array([sys.maxunicode + 1], dtype=np.uint32).view("<U1")
+    np.savez(tmp_path / "rays.npz", azimuth_rad=[0.0], elevation_rad=[0.0], gate_end_m=[1.0], sensor_names=names)
+    with pytest.raises(DataError, match="'sensor_names' holds letters that do not exist"):
+        load_design(tmp_path / "rays.npz")
 
 
 BAD_PROGRESS = {

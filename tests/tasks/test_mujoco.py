@@ -119,7 +119,7 @@ def test_a_csv_and_an_npz_of_one_motion_are_one_motion(folder):
 
 def test_a_quaternion_is_unit_between_rows_whatever_its_sign_and_length(folder):
     model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
-    signs = np.where(np.arange(20) % 2, -3.0, 2.0)
+    signs = np.where(np.arange(20) % 2, -3e-200, 2e300)
     angle = np.linspace(0, 3, 20)
     turned = {"parcel.qw": signs * np.cos(angle / 2), "parcel.qz": signs * np.sin(angle / 2)}
     (one,) = read_recordings(model, write_csv(folder / "turn.csv", table(np.zeros(20), **turned)))
@@ -158,6 +158,15 @@ def test_a_motion_that_cannot_be_used_is_refused_with_its_file(folder, configure
         TASK.scenes(configured(motion=path), "train", 0)
     assert said in str(error.value).replace("\n  ", "; ")
     assert "walk.csv" in str(error.value)
+
+
+def test_an_archive_whose_time_is_one_number_is_refused(folder):
+    model = mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    np.savez(folder / "walk.npz", time_s=0.5, qpos=np.zeros((12, model.nq)))
+    np.savez(folder / "point.npz", **{name: 0.5 for name in ("time_s", *columns(model))})
+    for name, said in (("walk.npz", "'qpos' is not a joint"), ("point.npz", "less than 2 rows")):
+        with pytest.raises(DataError, match=said):
+            read_recordings(model, folder / name)
 
 
 def test_several_recordings_are_split_by_file_and_one_in_its_middle():

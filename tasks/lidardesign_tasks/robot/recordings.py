@@ -12,6 +12,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.mujoco_model import import_mujoco
+from lidardesign.numerics import unit_vectors
 from lidardesign.run.arrays import csv_rows, read_npz
 from lidardesign.run.inputs import TABLE
 from lidardesign.run.validation import suggest
@@ -96,7 +97,7 @@ def _checked(model: mujoco.MjModel, path: Path) -> Recording:
     time_s = table.pop(TIME, None)
     if time_s is None:
         raise DataError(f"has no column {TIME}", where=str(path), allowed=listed([TIME, *names]))
-    if set(table) == {ALL} and np.shape(table[ALL]) == (len(time_s), model.nq):
+    if set(table) == {ALL} and np.shape(table[ALL]) == (np.size(time_s), model.nq):
         table = dict(zip(names, np.asarray(table[ALL]).T, strict=True))
     unknown, missing = [name for name in table if name not in names], [name for name in names if name not in table]
     if unknown:
@@ -110,7 +111,7 @@ def _checked(model: mujoco.MjModel, path: Path) -> Recording:
             hint="of a joint that rests, the value at which it rests in every row",
         )
     shapes = {np.shape(column) for column in (time_s, *table.values())}
-    if len(shapes) > 1 or len(time_s) < 2 or np.ndim(time_s) != 1:
+    if len(shapes) > 1 or np.ndim(time_s) != 1 or len(time_s) < 2:
         raise DataError("columns differ in length, or have less than 2 rows", where=str(path), allowed="2 rows or more")
     qpos = np.stack([np.asarray(table[name], dtype=np.float64) for name in names], axis=1)
     time_s = np.asarray(time_s, dtype=np.float64)
@@ -144,10 +145,10 @@ def _check_limits(model: mujoco.MjModel, qpos: np.ndarray, time_s: np.ndarray, p
 
 def _continuous(quaternions: np.ndarray, name: str, path: Path) -> np.ndarray:
     """Unit quaternions (T, 4) of which each has the sign that is nearer to the one before."""
-    length = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    if not length.all():
+    largest = np.abs(quaternions).max(axis=1, keepdims=True)
+    if not largest.all():
         raise DataError(f"a quaternion of {name.rpartition('.')[0]!r} is 0", where=str(path), allowed="other lengths")
-    unit = quaternions / length
+    unit = unit_vectors(quaternions / largest)  # of any length that a number has
     turned = np.einsum("ij,ij->i", unit[1:], unit[:-1]) < 0
     return unit * np.where(np.cumsum([False, *turned]) % 2, -1.0, 1.0)[:, None]
 
