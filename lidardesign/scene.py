@@ -22,8 +22,9 @@ from lidardesign.space import FARTHEST_M
 Role = Literal["target", "occluder", "both"]
 Sign = Literal["auto", "solid", "winding", "unsigned"]
 ROLES = ("target", "occluder", "both")
+IDENTITY = np.eye(3)
 # How far the products of a pose's axes may be from those of a rotation: poses are often written with few digits.
-RIGID_TOLERANCE = COARSE_SLACK + 10 * COARSE_SLACK * np.eye(3)
+RIGID_TOLERANCE = COARSE_SLACK + 10 * COARSE_SLACK * IDENTITY
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 # Light that fades over a nanometre has entered a solid.
 DENSEST = 1e9
@@ -301,7 +302,7 @@ class Body:
                 allowed=f"at most {FARTHEST_M:g} m from the origin",
             )
         rotation = poses[..., :3, :3]
-        apart = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3))
+        apart = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - IDENTITY)
         is_rigid = (apart <= RIGID_TOLERANCE).all() and (np.linalg.det(rotation) > 0).all()
         if not is_rigid or (poses[..., 3, :] != (0, 0, 0, 1)).any():
             raise DataError(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -28,7 +27,7 @@ from lidardesign_tasks.basel import MorphableModel, Unit, load_model
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_informs, surface_score, with_visible_truth
-from lidardesign_tasks.surroundings import any_direction, moving
+from lidardesign_tasks.surroundings import any_direction
 
 # columns: the world's x, y, z are the model's z (out of the face), x (to the head's left) and y (up)
 WORLD_AXES = [2, 0, 1]
@@ -206,7 +205,7 @@ class HeadFamily:
         generator = random_generator(seed, "face", split, index, "truth")
         judged = with_visible_truth(scene, space, config.truth_points, generator)
         direction = any_direction(random_generator(seed, "face", split, index, "velocity"))
-        return config.around(replace(judged, bodies=(moving(head, config.speed_m_s * direction),)))
+        return config.around(judged, config.speed_m_s * direction)
 
 
 @lru_cache(maxsize=1)

@@ -38,7 +38,7 @@ from lidardesign_tasks.surface import (
     surface_score,
     with_visible_truth,
 )
-from lidardesign_tasks.surroundings import any_direction, moving
+from lidardesign_tasks.surroundings import any_direction
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 from lidardesign_tasks.view import space_around, space_around_box
 
@@ -190,7 +190,7 @@ class MeshesTask:
             judge = with_visible_truth if motion is None else with_moving_truth
             judged = judge(scene, space, config.truth_points, generator, **further)
             if config.speed_m_s:
-                moves = moving(placed[0], config.speed_m_s * any_direction(velocity))
+                moves = replace(placed[0], velocity_m_s=config.speed_m_s * any_direction(velocity))
                 judged = replace(judged, bodies=(moves, *around))
             scenes.append(config.around(judged))
         return scenes

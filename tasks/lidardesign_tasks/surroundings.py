@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lidardesign.scene import Ambient, Body, Medium, Scene
+from lidardesign.scene import Ambient, Medium, Scene
 from lidardesign.space import FARTHEST_M
 from lidardesign.task import TaskConfig
 
@@ -40,18 +40,23 @@ class Surroundings(TaskConfig):
     reflectance: float = Field(MATT_GREY, ge=0, le=1, description="share of the light that surfaces reflect diffusely")
     gloss: float = Field(0.0, ge=0, le=1, description="share of the light that surfaces mirror instead")
 
-    def around(self, scene: Scene) -> Scene:
-        """The scene in these surroundings; its truth stays."""
+    def around(self, scene: Scene, velocity_m_s: Any = None) -> Scene:
+        """The scene in these surroundings; its truth stays.
+
+        Arguments:
+            scene: The scene.
+            velocity_m_s: At which all its bodies, which rest in all frames, move within one, (3,); None: as they do.
+        """
+        # what is mirrored is missing from what is matt
+        changed: dict[str, Any] = {"reflectance": (1 - self.gloss) * self.reflectance, "specular": self.gloss}
+        if velocity_m_s is not None:
+            changed["velocity_m_s"] = velocity_m_s
         return replace(
             scene,
-            bodies=tuple(self._surfaced(body) for body in scene.bodies),
+            bodies=tuple(replace(body, **changed) for body in scene.bodies),
             ambient=Ambient(self.illuminance_lux, self.light) if self.illuminance_lux else None,
             medium=None if self.visibility_m is None else fog(self.visibility_m),
         )
-
-    def _surfaced(self, body: Body) -> Body:
-        """A body with these surfaces: what is mirrored is missing from what is matt."""
-        return replace(body, reflectance=(1 - self.gloss) * self.reflectance, specular=self.gloss)
 
 
 class MovingSurroundings(Surroundings):
@@ -70,11 +75,6 @@ def fog(visibility_m: float) -> Medium:
     """Fog of droplets that are large against the wavelength, so that infrared light fades as visible light does."""
     extinction_per_m = -math.log(VISIBLE_CONTRAST) / visibility_m
     return Medium(extinction_per_m, extinction_per_m / DROPLET_LIDAR_RATIO_SR)
-
-
-def moving(body: Body, velocity_m_s: Any) -> Body:
-    """A body at rest in all frames that moves within one, at a velocity (3,) [m/s]."""
-    return replace(body, velocity_m_s=tuple(np.asarray(velocity_m_s, dtype=np.float64).tolist()))
 
 
 def any_direction(generator: np.random.Generator) -> np.ndarray:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -20,7 +19,7 @@ from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
 from lidardesign.space import DIMENSIONS, DesignSpace, X
 from lidardesign.task import Defaults, Information, Interval, Metric, Score, Split, conditions_of, random_generator
-from lidardesign_tasks.surroundings import Surroundings, moving
+from lidardesign_tasks.surroundings import Surroundings
 from lidardesign_tasks.warehouse_shelf import ShelfPlan, build_shelf
 from lidardesign_tasks.warehouse_truth import BoxTruth, box_information, miss_score
 
@@ -134,7 +133,8 @@ class WarehouseTask:
             _visible_shelf(config.plan, space, np.array(origins), split, seed, index)
             for index in range(config.count(split))
         ]
-        return [config.around(_driven_past(shelf, config.speed_m_s)) for shelf in shelves]
+        # the shelf stands still, and comes towards a robot that drives past
+        return [config.around(shelf, (-config.speed_m_s, 0.0, 0.0)) for shelf in shelves]
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """The share [%] of boxes in the sensor's plane that no ray returned on; one `Returns` per position."""
@@ -165,11 +165,6 @@ def _check_space(space: DesignSpace) -> None:
             where="space.x_m",
             allowed=f"{AISLE_M[0]:g} to {AISLE_M[1]:g} m, where designs are evaluated, or one number between them",
         )
-
-
-def _driven_past(shelf: Scene, speed_m_s: float) -> Scene:
-    """The shelf as a robot sees it within a frame: it stands still, and the shelf comes towards -x."""
-    return replace(shelf, bodies=tuple(moving(body, (-speed_m_s, 0.0, 0.0)) for body in shelf.bodies))
 
 
 def _visible_shelf(

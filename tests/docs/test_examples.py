@@ -22,7 +22,10 @@ SETTINGS = {
         "learning.samples=80000", QUICK[1], "learning.steps=80", "density.sigma_m=0.04",
         "train=4", "test=2", "truth_points=1000",
     ),
-    "warehouse": ("learning.samples=5000", QUICK[1], "learning.steps=80", "train=8", "test=4", "density.sigma_m=0.2"),
+    "warehouse": (
+        "learning.samples=5000", QUICK[1], "learning.steps=80", "density.sigma_m=0.2",
+        "train=8", "test=4", "positions=0", "bays=1", "box_width_m=[0.5, 0.6]",
+    ),
     "capture": (*QUICK, "learning.steps=80", "density.sigma_m=0.02", "train=8", "test=4"),
 }  # fmt: skip
 

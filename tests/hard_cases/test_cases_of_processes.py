@@ -280,7 +280,7 @@ class TestKillsFullDisksAndTwoWriters:
         tests = str(Path(__file__).parents[1])
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([tests, os.environ.get("PYTHONPATH", "")])}
         environment["LONG_RUNS"] = str(tmp_path)  # what was done before does not count
-        command = [sys.executable, "-m", "faults.kills", "--kills", "0", "--terms", "0", "--steps", "1", "--pairs", "1"]
+        command = [sys.executable, "-m", "faults.kills", "--kills", "0", "--terms", "0", "--steps", "1", "--pairs", "0"]
         ended = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
         assert ended.returncode == 0, ended.stdout + ended.stderr
         assert "- not recovered: 0" in ended.stdout
