@@ -120,6 +120,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
             if name != CMA or entry.name == request.designs[0].name
             if name != GREEDY or entry.rays in choosable
         ]
+    wanted = [one for one in wanted if one[1]]
     chosen = baselines.best([(name, options) for name, options, _ in wanted])
     return designs + [
         _entry(baselines, name, option, matched) for (name, _, matched), option in zip(wanted, chosen, strict=True)

@@ -17,10 +17,12 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.compare import outside_notes
+from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import BackgroundNote
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.baselines.catalog import part_notes
 from lidardesign.evaluate.baselines.greedy import GREEDY, greedy_rays
+from lidardesign.evaluate.baselines.simple import CMA
 from lidardesign.evaluate.effects import effect_notes, effect_summaries
 from lidardesign.evaluate.entries import Entry, entries_of
 from lidardesign.evaluate.mounting import MountError
@@ -245,6 +247,19 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
     # of each design the most rays, which come last
     fired = {f"{entry.name!r}": entry.positions for entry in own}
     notes += silent_notes(request.test, fired)
+    found = {(row.matched_to, row.matched_rays, row.design) for row in matched}
+    beyond = {
+        (entry.name, name)
+        for entry in own
+        for name in request.baselines
+        if request.equal_bandwidth and name not in (CMA, GREEDY) and (entry.name, entry.rays, name) not in found
+    }
+    if beyond:
+        designs, names = (", ".join(sorted(set(column))) for column in zip(*beyond, strict=True))
+        notes.append(
+            f"more than {MOST_RAYS:,} rays of {names} fit in the bandwidth of {designs}: they are not compared at "
+            "equal bandwidth; the gates are far longer than what scenes return"
+        )
     empty = [row for row in matched if row.rays == 0]
     if empty:
         names = ", ".join(sorted({row.design for row in empty}))

@@ -12,6 +12,7 @@ from support.tables import each_row
 from lidardesign.cli.tables.scores import show_evaluation
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError, DataError, PluginError
+from lidardesign.evaluate.baselines import candidates
 from lidardesign.evaluate.figures.scores import curve_picture, differences_picture
 from lidardesign.evaluate.gates import worse_than_threshold
 from lidardesign.evaluate.report.figures import scores_figure
@@ -99,6 +100,22 @@ def test_every_design_is_paired_with_every_baseline_and_every_later_design():
         difference = rows[a, n].per_scene - rows[b, n].per_scene
         assert pair.difference == pytest.approx(difference.mean())
         assert pair.ci_low <= pair.difference <= pair.ci_high
+
+
+def test_a_baseline_of_which_more_rays_fit_than_any_sensor_fires_is_left_out_at_equal_bandwidth_and_named(monkeypatch):
+    request = make_request([design("wide", range_m=2.0, spread=0.1)])
+    whole = evaluate(request)
+    most = sorted({row.rays for row in whole.equal_bandwidth})[1]
+    monkeypatch.setattr(candidates, "MOST_RAYS", most)
+    found = evaluate(request)
+    assert [row.design for row in found.equal_bandwidth] != [row.design for row in whole.equal_bandwidth]
+    assert {(row.design, row.rays) for row in found.equal_bandwidth} <= {
+        (row.design, row.rays) for row in whole.equal_bandwidth if row.rays <= most
+    }
+    assert [row.rays for row in found.rows] == [row.rays for row in whole.rows]
+    assert len(found.paired_bandwidth) == len(found.equal_bandwidth)
+    (note,) = (note for note in found.notes if "not compared at equal bandwidth" in note)
+    assert "fit in the bandwidth of wide" in note
 
 
 def test_baselines_at_equal_bandwidth_never_exceed_the_design_and_one_more_ray_would():

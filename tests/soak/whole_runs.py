@@ -30,11 +30,11 @@ from soak.scaled_flatland import NAME
 
 # Exit codes (docs): a design was made; the density is too rough to fit to; no design keeps the constraints.
 DONE, TOO_ROUGH, INFEASIBLE = 0, 3, 4
-# Where constraints leave few samples, a scan cannot have as many rays as asked for.
+# Where a density or constraints leave few different samples, a scan cannot have as many rays as asked for.
 USAGE, TOO_FEW_SAMPLES = 2, re.compile(r"^\d+ rays from \d+ samples$")
 # It was the soak that somebody wanted to end.
 INTERRUPTED = (130, 143)
-TOO_ROUGH_WORDS = re.compile("the density is too rough|nearest samples count as only")
+TOO_ROUGH_WORDS = re.compile("the density is too rough|samples count as only")
 NOTHING_SEEN_WORDS = "no ray of the design space reaches a target surface"
 # Outcomes: all four commands did their work; the two refusals that learning may end with.
 WHOLE, ROUGH, BLIND = "whole", "density too rough", "nothing in sight"
@@ -83,7 +83,7 @@ class Record:
             return "fault"
         if self.ess is None:
             return BLIND
-        if any(command == "fit" and code == TOO_ROUGH for command, _, code, _ in self.steps):
+        if any(command == "fit" and code != DONE for command, _, code, _ in self.steps):
             return ROUGH
         return WHOLE
 
@@ -150,7 +150,7 @@ class _Doing:
 
     def _fit(self) -> None:
         code, found = self._call("fit", "", "run", *self.plan.fit)
-        if code == TOO_ROUGH and TOO_ROUGH_WORDS.search(_message(found)):
+        if code in (TOO_ROUGH, INFEASIBLE) and TOO_ROUGH_WORDS.search(_message(found)):
             raise StoppedError
         self._expect(code == DONE, f"fit ended with {code}: {_message(found)}", stop=True)
         self._check_design("fit", {})
@@ -168,7 +168,8 @@ class _Doing:
             self._check_design("held", rules)
             return
         self._check_refusal(code, found, "held")
-        self._expect(not kept, f"constrain: bounds that the fit keeps were refused: {_message(found)}; {rules}")
+        excused = not kept or _has_too_few(code, found)
+        self._expect(excused, f"constrain: bounds that the fit keeps were refused: {_message(found)}; {rules}")
 
     def _contradict(self) -> None:
         options = contradictions(self.bounds, self.plan.sensors, is_scan=self.record.layout == "scan")
@@ -188,7 +189,7 @@ class _Doing:
 
     def _check_refusal(self, code: int, found: dict[str, Any], name: str) -> None:
         error = found.get("error", {})
-        if code == USAGE and TOO_FEW_SAMPLES.search(_message(found)):
+        if _has_too_few(code, found):
             return
         self._expect(code == INFEASIBLE, f"constrain ended with {code}: {_message(found)}")
         # a pinned origin has no mass: then the samples that are left are told
@@ -210,6 +211,8 @@ class _Doing:
 
     def _evaluate(self) -> None:
         code, found = self._call("evaluate", "", "run", *self.plan.evaluate)
+        if _has_too_few(code, found):
+            return
         self._expect(code == DONE, f"evaluate ended with {code}: {_message(found)}", stop=True)
         for row in found["rows"] + found["equal_bandwidth"]:
             # a single group of scenes has no interval, and that of a few is not cut at the worst value
@@ -273,6 +276,10 @@ def _exit_code(arguments: list[str]) -> int:
 
 def _not_json(name: str) -> float:
     raise ValueError(f"{name} is no JSON")
+
+
+def _has_too_few(code: int, found: Mapping[str, Any]) -> bool:
+    return code == USAGE and bool(TOO_FEW_SAMPLES.search(_message(found)))
 
 
 def _message(found: Mapping[str, Any]) -> str:

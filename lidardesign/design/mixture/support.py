@@ -192,13 +192,14 @@ def check_support(support: Support, group: Group, *, mass: float | None, several
             hint="widen the origin box, the gate or the field of view, exclude less, or learn inside the smaller space",
         )
     if support.effective < needed:
-        raise InfeasibleError(
-            f"the constraints of {which} leave {support.effective:.0f} effective samples"
-            + ("" if mass is None else f" and {mass:.3g} of the density"),
-            admissible_mass=mass,
-            allowed=f"at least {needed}",
-            hint="learn with more samples or inside the smaller space",
-        )
+        found = f"the constraints of {which} leave {support.effective:.0f} effective samples"
+        hint = "learn with more samples or inside the smaller space"
+        if mass is not None and mass >= 1 - TOLERANCE:
+            found = f"the samples count as only {support.effective:.0f}, too few for {len(group.sensors)} sensors"
+            hint = "fewer sensors, or learn longer (--preset standard or fine) or with more learning.samples"
+        elif mass is not None:
+            found += f" and {mass:.3g} of the density"
+        raise InfeasibleError(found, admissible_mass=mass, allowed=f"at least {needed}", hint=hint)
 
 
 # As many as a fit works on.

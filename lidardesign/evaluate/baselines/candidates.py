@@ -15,7 +15,6 @@ import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import MOST_RAYS
-from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays, fire_times
 from lidardesign.numerics import EPSILON
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
@@ -77,11 +76,11 @@ class Candidate(Protocol):
 
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition:
-        """As many rays as fit in a bandwidth [Mbit/s], the same number in each space; none where not one fits."""
+    ) -> RaysPerCondition | None:
+        """As many rays as fit in a bandwidth [Mbit/s], the same number in each space; none where not one fits.
 
-
-BEFORE, NARROWER = "baselines of ", "narrow the design's gates: they are far longer than the task's ranges"
+        None where more fit than any sensor fires.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,20 +106,10 @@ class BaselineLayout:
 
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition:
-        """See `Candidate`.
-
-        Raises:
-            ConfigError: More rays than any sensor fires fit in.
-        """
-        count = rays_within(
-            limit_mbps,
-            bandwidth,
-            self.gate_m,
-            before=BEFORE,
-            hint=NARROWER,
-        )
-        return self.positions(spaces, count)
+    ) -> RaysPerCondition | None:
+        """See `Candidate`."""
+        count = rays_within(limit_mbps, bandwidth, self.gate_m)
+        return self.positions(spaces, count) if count <= MOST_RAYS else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +136,8 @@ class GatedLayout:
 
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition:
-        """See `Candidate`.
-
-        Raises:
-            ConfigError: More rays than any sensor fires fit in.
-        """
+    ) -> RaysPerCondition | None:
+        """See `Candidate`."""
         return most_within(lambda count: self.positions(spaces, count), limit_mbps, bandwidth, FIRST_GUESS)
 
 
@@ -168,8 +153,10 @@ def most_within(
     count: int,
     *,
     close_enough: float = 1.0,
-) -> RaysPerCondition:
+) -> RaysPerCondition | None:
     """The most rays that a few steps in proportion to the bandwidth find; never more than fit.
+
+    None where they are more than any sensor fires.
 
     Arguments:
         lay_out: The rays of any number.
@@ -177,9 +164,6 @@ def most_within(
         bandwidth: The read-out model.
         count: The number to begin with.
         close_enough: The share of the bandwidth that ends the search.
-
-    Raises:
-        ConfigError: They are more than any sensor fires.
     """
     low, high = 0, math.inf
     for _ in range(MOST_STEPS):
@@ -189,40 +173,16 @@ def most_within(
             break
         guess = math.floor(count * limit_mbps / cost) if cost > 0 else 2 * count
         if guess > MOST_RAYS:
-            raise too_many_rays(limit_mbps, f"{BEFORE}{guess:.3g} rays", NARROWER)
+            return None
         count = int(min(max(guess, low + 1), high - 1))
     return lay_out(low)
 
 
-def too_many_rays(limit_mbps: float, what: str, hint: str | None) -> ConfigError:
-    """The error where a bandwidth [Mbit/s] holds more rays than any sensor fires."""
-    return ConfigError(
-        f"a design of {limit_mbps:.3g} Mbit/s compares with {what}",
-        where="bandwidth",
-        allowed=f"at most {MOST_RAYS:,} rays",
-        hint=hint,
-    )
-
-
-def rays_within(
-    limit_mbps: float,
-    bandwidth: Bandwidth,
-    gate_m: np.ndarray,
-    *,
-    before: str = "",
-    after: str = "",
-    hint: str | None = None,
-) -> int:
-    """The number of rays with one gate (2,) [m] that fit in a bandwidth [Mbit/s].
-
-    Raises:
-        ConfigError: They are more than any sensor fires; the words before and after their number say whose they are.
-    """
+def rays_within(limit_mbps: float, bandwidth: Bandwidth, gate_m: np.ndarray) -> int:
+    """The number of rays with one gate (2,) [m] that fit in a bandwidth [Mbit/s], however many."""
     width_m = np.diff(gate_m)
     # the ratio of two multiples of one bin may lie an ulp below a whole number
     count = math.floor(limit_mbps / bandwidth.mbps_of_widths(width_m) * (1 + EPSILON))
-    if count > MOST_RAYS:
-        raise too_many_rays(limit_mbps, f"{before}{count:.3g} rays{after}", hint)
     while count and bandwidth.mbps_of_widths(width_m, count) > limit_mbps:
         count -= 1
     return count

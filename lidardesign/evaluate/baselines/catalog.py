@@ -43,7 +43,7 @@ from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import Mixture
-from lidardesign.design.sensor import DEFAULT_LEVEL, interval_factor
+from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, interval_factor
 from lidardesign.errors import BackgroundNote, ConfigError
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition, rays_within, whole_range
 from lidardesign.evaluate.baselines.views import TrainingViews, dense_points
@@ -391,14 +391,10 @@ class PartCandidate:
 
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition:
-        """See `lidardesign.evaluate.baselines.candidates.Candidate`.
-
-        Raises:
-            ConfigError: More rays than any sensor fires fit in.
-        """
-        count = rays_within(limit_mbps, bandwidth, self.gate_m, after=f" of {self.part.name}")
-        return self.positions(spaces, count)
+    ) -> RaysPerCondition | None:
+        """See `lidardesign.evaluate.baselines.candidates.Candidate`."""
+        count = rays_within(limit_mbps, bandwidth, self.gate_m)
+        return self.positions(spaces, count) if count <= MOST_RAYS else None
 
     @property
     def gate_m(self) -> np.ndarray:

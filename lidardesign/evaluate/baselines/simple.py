@@ -129,8 +129,17 @@ class Baselines:
         return [Option(one, one.positions(self.spaces, count)) for one in self.candidates(name)]
 
     def options_within(self, name: str, limit_mbps: float, bandwidth: Bandwidth) -> list[Option]:
-        """All candidates of a baseline with as many rays as fit in a bandwidth [Mbit/s]."""
-        return [Option(one, one.positions_within(self.spaces, limit_mbps, bandwidth)) for one in self.candidates(name)]
+        """All candidates of a baseline with as many rays as fit in a bandwidth [Mbit/s].
+
+        None where more fit than any sensor fires: without them the baseline would not be what it can be.
+        """
+        options = []
+        for one in self.candidates(name):
+            positions = one.positions_within(self.spaces, limit_mbps, bandwidth)
+            if positions is None:
+                return []
+            options.append(Option(one, positions))
+        return options
 
     def candidates(self, name: str) -> list[Candidate]:
         """The layouts that a baseline chooses from.
@@ -348,8 +357,8 @@ class TwinCandidate:
 
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition:
-        """The most rays that a few steps in proportion to the bandwidth find; never more than fit."""
+    ) -> RaysPerCondition | None:
+        """See `lidardesign.evaluate.baselines.candidates.Candidate`."""
         return most_within(
             lambda count: self.positions(spaces, count),
             limit_mbps,
