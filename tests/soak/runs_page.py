@@ -58,7 +58,7 @@ def _outcomes(records: Sequence[dict[str, Any]]) -> list[tuple[str, int]]:
     counts = Counter(r["outcome"] for r in records)
     meaning = {
         WHOLE: "learned, fitted, constrained, evaluated",
-        ROUGH: "learned; `fit` refuses the density as too rough (exit 3)",
+        ROUGH: "learned; `fit` refuses the density as too rough (exit 3, or 4 for so many sensors)",
         BLIND: "`learn` says that the design space sees no target (exit 3)",
         "fault": "a fault",
     }
