@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -100,3 +101,11 @@ def test_changes_that_tests_can_see_are_killed_inside_and_outside_of_functions(f
     assert alive == {"return one if one >= other else other", "", "return value"}
     assert {outcome for *_, outcome in found} == {"killed", "survived"}
     assert len(found) > 15
+
+
+def test_every_module_that_is_changed_and_its_tests_are_there(monkeypatch):
+    monkeypatch.syspath_prepend(TOOLS)
+    tests = importlib.import_module("mutation").TESTS
+    root = TOOLS.parent
+    assert [str(path) for path in map(root.joinpath, tests) if not path.exists()] == []
+    assert [name for names in tests.values() for name in names if not (root / "tests" / name).exists()] == []

@@ -28,9 +28,7 @@ ROOT = Path(__file__).resolve().parent.parent
 TESTS = {
     "lidardesign/numerics.py": ("test_numerics.py",),
     "lidardesign/design/mixture/mixture.py": ("design/test_mixture.py",),
-    "lidardesign/design/constraints/document.py": (
-        "design/test_constraints.py", "design/test_check.py", "design/test_snap.py",
-    ),
+    "lidardesign/design/constraints/document.py": ("design/test_constraints.py", "design/test_check.py"),
     "lidardesign/design/layouts/rays.py": (
         "design/test_rays.py", "design/test_catalog.py", "design/test_track.py", "workflow/test_select_rays.py",
     ),
