@@ -3,7 +3,7 @@
 Each task is learned for a few steps and to ever smaller shares of misplaced mass, from several seeds. To every density
 the same number of sensors is fitted from three seeds, for fits differ too, and the mean loss of the rays that are
 chosen is measured on training scenes that the choice did not see, the same ones for all. It stands beside the least
-loss of the task. What was measured is kept.
+loss of the task; a density that is refused as too rough by one of the fits costs +inf. What was measured is kept.
 
     python benchmarks/verdicts.py --folder verdicts
 """
@@ -11,6 +11,7 @@ loss of the task. What was measured is kept.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ MANY = 5000
 LENGTHS = ((0.0, 10), (0.0, 30), (0.25, MANY), (0.15, MANY), (0.1, MANY), (0.05, MANY))
 FIGURES = ("misplaced", "kl_nats", "ess")
 FITS = 3
+REFUSED = (3, 4)  # samples that count as too few, or as too few for the sensors
 
 
 def measured(folder: Path, label: str, length: tuple[float, int], seed: int) -> dict[str, Any]:
@@ -40,17 +42,20 @@ def measured(folder: Path, label: str, length: tuple[float, int], seed: int) -> 
     (task, *settings), sensors, rays = TASKS[label]
     goal, steps = length
     run = folder / f"{label.replace(', ', '-').replace(' ', '-')}-{goal}-{steps}-{seed}"
-    path = run.with_suffix(".json")
+    path = folder / f"{run.name}.json"
     if not path.exists():
         settings += [f"learning.misplaced={goal}", f"learning.steps={steps}"]
         words = [word for setting in settings for word in ("--set", setting)]
-        learn = ("learn", task, "--seed", str(seed), "--out", run, *words)
+        learn = ("learn", task, "--seed", str(seed), "--out", run, "--overwrite", *words)
         learned = run_process(lidardesign(*learn, "--json")).document()
         losses = []
         for number in range(FITS):
             fit = ("fit", run, "--seed", number, "--sensors", sensors, "--rays", rays, "--name", f"fit{number}")
-            chosen = run_process(lidardesign(*fit, "--json")).document()["certificates"][0]
-            losses.append(chosen["held_back_value"])
+            fitted = run_process(lidardesign(*fit, "--json"))
+            if fitted.code in REFUSED:
+                losses.append(math.inf)
+            else:
+                losses.append(fitted.document()["certificates"][0]["held_back_value"])
         found = {**{name: learned[name] for name in ("steps", *FIGURES, "verdict")}, "loss": sum(losses) / FITS}
         path.write_text(json.dumps(found) + "\n", encoding="utf-8")
     return json.loads(path.read_text(encoding="utf-8"))

@@ -263,9 +263,7 @@ def test_a_page_takes_what_was_measured_between_its_marks_and_keeps_the_rest(scr
         script("rivals").write_page(page, {"arm": found})
 
 
-def test_a_journey_is_compared_command_by_command_and_what_is_kept_is_not_measured_again(
-    script, monkeypatch, tmp_path
-):
+def test_a_journey_is_compared_command_by_command_and_what_is_kept_is_not_measured_again(script, monkeypatch, tmp_path):
     journey, ran = script("journey"), []
 
     def measured(root, words, here, caches):
@@ -324,9 +322,28 @@ def test_frames_are_measured_and_culling_keeps_its_bound(run_script):
 @pytest.mark.slow
 def test_growth_is_measured(run_script):
     words = ["--of", "rays", "--of", "sensors", "--of", "dimensions", "--rays", "100", "200", "--sensors", "1", "2"]
-    found = run_script("growth", "--model", "embedded", *words, "--samples", "2000", "--heads", "2", "--batch", "64"
-    )
+    found = run_script("growth", "--model", "embedded", *words, "--samples", "2000", "--heads", "2", "--batch", "64")
     assert [len(rows) for rows in found["tables"].values()] == [2, 2, 6]
+
+
+def test_every_density_has_its_own_loss_and_one_that_is_refused_an_infinite_one(script, monkeypatch, tmp_path):
+    verdicts, common = script("verdicts"), script("common")
+    numbers = iter(range(1, 1000))
+
+    def answer(command):
+        kind, run = command[1], str(command[command.index("--out") + 1] if "--out" in command else command[2])
+        loss = {"certificates": [{"held_back_value": float(next(numbers))}]}
+        learned = {"steps": 10, "misplaced": 0.1, "kl_nats": 0.2, "ess": 0.3, "verdict": "good"}
+        code = 3 if kind == "fit" and "-10-0" in run else 0
+        return common.ProcessResult(code, json.dumps(learned if kind == "learn" else loss), "", 1.0, 1.0, 1.0)
+
+    monkeypatch.setattr(verdicts, "run_process", answer)
+    rows = verdicts.rows_of(tmp_path, "flatland", ((0.0, 10), (0.0, 30), (0.25, 30)), 2)
+    increases = [row[-1] for row in rows]
+    assert increases[0] == "+0.0%"
+    assert increases[-1] == "+inf%"
+    assert len(set(increases)) == len(rows) == 6
+    assert verdicts.rows_of(tmp_path, "flatland", ((0.0, 10), (0.0, 30), (0.25, 30)), 2) == rows  # what was kept
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 QUICK = ("learning.samples=10000", "learning.coverage_proposals=1024")
 # What is blurred is learned at once, and well enough on any processor: see `small_runs`.
 SETTINGS = {
-    "arm": (*QUICK, "learning.steps=80", "density.sigma_m=0.15", "train=10", "test=5", "frames=20"),
+    "arm": (*QUICK, "learning.steps=80", "density.sigma_m=0.15", "train=6", "test=3", "frames=8"),
     # a hundredth of the density lies where the flood may be: with few samples nothing could be fitted there
     "emitter": (
         "learning.samples=80000", QUICK[1], "learning.steps=80", "density.sigma_m=0.04",
@@ -24,7 +24,7 @@ SETTINGS = {
     ),
     "warehouse": (
         "learning.samples=5000", QUICK[1], "learning.steps=80", "density.sigma_m=0.2",
-        "train=8", "test=4", "positions=0", "bays=1", "box_width_m=[0.5, 0.6]",
+        "train=4", "test=2", "positions=0", "bays=1", "box_width_m=[0.5, 0.6]",
     ),
     "capture": (*QUICK, "learning.steps=80", "density.sigma_m=0.02", "train=8", "test=4"),
 }  # fmt: skip
