@@ -438,6 +438,19 @@ def tracked():
     return DesignSpec("t", (sensor(),), layout="scan", rays=3, track=track)
 
 
+def test_a_design_of_several_tracks_gives_the_rays_of_the_one_with_so_many():
+    design = tracked()
+    fewer = replace(
+        design.track, elevation_rad=design.track.elevation_rad[:, :2] + 0.3,
+        azimuth_rad=design.track.azimuth_rad[:, :2], gate_m=design.track.gate_m[:, :2], sensor=np.zeros(2, dtype=int),
+    )  # fmt: skip
+    both = replace(design, further_tracks=(fewer,))
+    for count, alone in ((3, design), (2, replace(design, rays=2, track=fewer))):
+        found, wanted = (lay_out(one, count, at={"x_m": 0.25}) for one in (both, alone))
+        np.testing.assert_array_equal(found.direction, wanted.direction)
+        np.testing.assert_array_equal(found.gate_m, wanted.gate_m)
+
+
 def test_a_track_gives_its_own_number_of_rays_at_a_place_and_others_by_samples_alone():
     design, at = tracked(), {"x_m": 0.25}
     rays = lay_out(design, at=at)
@@ -448,6 +461,52 @@ def test_a_track_gives_its_own_number_of_rays_at_a_place_and_others_by_samples_a
     for count in (1, 2, 4):
         with pytest.raises(ConfigError, match=f"{count} rays in the layout `scan` need samples"):
             lay_out(design, count, at=at)
+
+
+# --- fixed patterns
+
+
+def fixed_pattern(count=60):
+    """A design of a table alone, as real parts fire it."""
+    design = DesignSpec("d", three_sensors())
+    return replace(design, layout="fixed", rays=count, ray_table=table_of(design, count))
+
+
+@pytest.mark.parametrize("count", [1, 7, 30, 59, 60])
+def test_fewer_rays_of_a_fixed_pattern_are_some_of_its_own_in_each_sensors_proportion(count):
+    design = fixed_pattern()
+    rays, table = lay_out(design, count), design.ray_table
+    own = np.bincount(table.sensor, minlength=3)
+    np.testing.assert_array_equal(np.bincount(rays.sensor, minlength=3), split_budget(own, count))
+    fired = {(int(s), *d) for s, d in zip(table.sensor, table.direction, strict=True)}
+    kept = {(int(s), *d) for s, d in zip(rays.sensor, rays.direction, strict=True)}
+    assert len(kept) == count
+    assert kept <= fired
+    np.testing.assert_allclose(rays.time_s, np.arange(count) / count / 10)
+
+
+def test_half_of_a_fixed_pattern_is_spread_over_all_of_it():
+    design = fixed_pattern()
+    rays, table = lay_out(design, 30), design.ray_table
+    for index in range(3):
+        whole, half = table.direction[table.sensor == index], rays.direction[rays.sensor == index]
+        steps = np.linalg.norm(whole[:, None] - whole, axis=2)
+        neighbour = np.where(steps > 0, steps, np.inf).min(axis=1).max()
+        assert np.linalg.norm(whole[:, None] - half, axis=2).min(axis=1).max() < 2 * neighbour
+
+
+def test_a_fixed_pattern_has_no_further_rays():
+    design = fixed_pattern()
+    fixed = LAYOUTS["fixed"]
+    assert fixed.most_count(design) == 60
+    with pytest.raises(ConfigError, match="61 rays, but the design's fixed pattern has 60") as refused:
+        fixed.lay_out(design, 61, None, "sensor", 0)
+    assert refused.value.allowed == "at most 60"
+    bare = replace(design, ray_table=None)
+    assert fixed.most_count(bare) is None
+    with pytest.raises(ConfigError, match="1 rays, but the design's fixed pattern has 0") as refused:
+        fixed.lay_out(bare, 1, None, "sensor", 0)
+    assert refused.value.allowed is None
 
 
 # --- gates
