@@ -68,7 +68,7 @@ LIMITS = {
     "budget.bin_ps": ([0.001, 1e9], [0, 0.0009, 1e9 + 0.5]),
     "budget.bits_per_bin": ([0.001, 1e9], [0, 0.0009, 1e9 + 0.5]),
     "budget.rate_hz": ([0.001, 1e12], [0, 0.0009, 1e12 + 0.5]),
-    "boresight.azimuth_deg.min": ([-36000.0, 0, 36000.0], [math.inf, math.nan, "0", 36001.0, 1e300]),
+    "boresight.azimuth_deg.min": ([-36000.0, 0, 36000.0], [math.inf, math.nan, "0", -36001.0, 36001.0]),
     "boresight.elevation_deg.min": ([-90, 0.5, 90], [-90.5, 90.5]),
     "boresight.elevation_deg.max": ([-90, 0.5, 90], [-90.5, 90.5]),
     "field_of_view.horizontal_deg.min": ([0, 0.5, 360], [-0.5, 360.5]),
@@ -81,6 +81,7 @@ LIMITS = {
     "origin.spread_m.max": ([1e-9, 0.5], [0, -0.5, 1e-300]),
     "origin.low_m": ([[0, 0, 0], [-1e9, 0, 1e9]], [[0, 0], [0, 0, 0, 0], [0, 0, "0"], [0, 0, 1e300]]),
     "origin.mounts_m": ([[[0, 0, 0]], [[0, 0, 0], [0, 0, 1]]], [[], [[0, 0]]]),
+    "parts.names": ([["a"], ["a", "b"], "catalog"], [[], [""], "a"]),
     "origin.exclude": ([[], [BOX] * 32], [[BOX] * 33, [{"low_m": [0, 0, 0]}]]),
 }
 
@@ -154,10 +155,10 @@ def test_positions_of_errors_come_from_the_file():
 
 
 def test_entries_of_each_lie_over_the_common_keys():
-    values = {"gate": {"width_m": {"min": 0.1, "max": 0.5}}, "each": [{"gate": {"width_m": {"max": 0.2}}}, {}]}
+    values = {"gate": {"width_m": {"min": 0.1, "max": 0.5}}, "each": [{}, {"gate": {"width_m": {"max": 0.2}}}]}
     constraints = Constraints.from_mapping(values)
-    assert rules_of(constraints.rules, 0).gate.width_m.min == 0.1
-    assert [rules_of(constraints.rules, sensor).gate.width_m.max for sensor in (0, 1, 7)] == [0.2, 0.5, 0.5]
+    assert rules_of(constraints.rules, 1).gate.width_m.min == 0.1
+    assert [rules_of(constraints.rules, sensor).gate.width_m.max for sensor in (0, 1, 2, 7)] == [0.5, 0.2, 0.5, 0.5]
     assert constraints.as_document() == values
 
 
