@@ -12,10 +12,11 @@ import math
 import numpy as np
 from numba import njit
 
-from lidardesign.numerics import SQUARABLE
+from lidardesign.numerics import EPSILON, SQUARABLE
 
 HALVINGS = 3  # of the triangles of a box, to those of its children
 WIDTH = 2**HALVINGS  # children of a box, and triangles of a leaf
+FLAT = 8 * EPSILON  # of the longest side: what is left of a lower height is rounding, and may point anywhere
 DEEPEST = 128  # boxes that wait at once: seven more with each level, so a tree of 2^50 triangles would fit
 
 
@@ -191,7 +192,7 @@ def _build_frames(triangles: np.ndarray, frames: np.ndarray) -> None:
         across = third - (third * along).sum() * along
         across -= (across * along).sum() * along
         height = math.sqrt((across * across).sum())
-        if height <= SQUARABLE:
+        if height <= max(SQUARABLE, FLAT * length):
             height, across = 0.0, np.zeros(3)
             across[np.argmin(np.abs(along))] = 1.0
             across -= (across * along).sum() * along

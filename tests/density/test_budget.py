@@ -226,6 +226,24 @@ def test_timing_steps_and_the_end_leaves_the_trainer_as_it_was(tmp_path):
         np.testing.assert_array_equal(value, after[key], err_msg=key)
 
 
+def test_steps_are_timed_on_the_one_thread_that_learning_takes(tmp_path, monkeypatch):
+    config, threads, timed = config_of(), [], budget._seconds_per_step
+
+    def counted(*arguments):
+        threads.append(torch.get_num_threads())
+        return timed(*arguments)
+
+    monkeypatch.setattr(budget, "_seconds_per_step", counted)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        StepTimes.measured(prepare_training_data(BallTask(), config), config, tmp_path, CPU)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert set(threads) == {1}
+
+
 def test_what_is_only_compiled_once_is_not_planned_for_every_point(tmp_path, monkeypatch):
     config = config_of(samples=100_000)
     data = prepare_training_data(BallTask(), config)

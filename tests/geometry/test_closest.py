@@ -28,6 +28,12 @@ def flattened(share):
     return np.stack([a, b, along + share * (c - along)], axis=1)
 
 
+def diagonal_segments():
+    """Three corners on one line, along which what is left of a height is rounding that points along it."""
+    lines = np.repeat([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [1.0, 2.0, 0.0], [1.0, 2.0, 4.0]], 40, axis=0)
+    return lines[:, None] * np.round(generator(7).uniform(size=(160, 3, 1)), 2)
+
+
 def sheet():
     """Triangles that share corners and edges, as those of a reconstruction do."""
     steps = np.linspace(0, 1, 9)
@@ -50,6 +56,7 @@ SUBJECTS = {
     "points": np.repeat(generator(1).uniform(size=(100, 1, 3)), 3, axis=1),
     "segments": corners(60, 0.3)[:, [0, 1, 1]],
     "segments of three corners": flattened(0.0),
+    "segments along diagonals": diagonal_segments(),
     "needles": flattened(1e-6),
     "needles of a nanometre": flattened(1e-9),
     "needles below rounding": flattened(1e-13),

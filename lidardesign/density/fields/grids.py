@@ -28,7 +28,7 @@ from lidardesign.numerics import SLACK
 from lidardesign.run.inputs import MESH, read_file
 from lidardesign.scene import Mesh
 
-ALGORITHM = "band of 3 cells by a tree, sign by the absolute winding number, filled by distance transform, float32"
+ALGORITHM = "3 cells by a tree, flat triangles as segments; sign by winding number; distance transform; float32"
 BAND_CELLS = 3.0
 MAXIMUM_CELLS = 40_000_000
 DIGEST_BYTES = 32

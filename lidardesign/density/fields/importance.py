@@ -38,7 +38,7 @@ from lidardesign.errors import BackgroundNote
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Body, Mesh, Scene
 
-ALGORITHM = "log importance at the nearest surface point, band of 3 cells by a tree, filled by distance transform"
+ALGORITHM = "log importance at the nearest surface point, flat triangles as segments, 3 cells; distance transform"
 
 
 def log_weight_grid(mesh: Mesh, grid: Grid) -> np.ndarray:

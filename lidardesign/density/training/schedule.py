@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from lidardesign.config import RunConfig
-from lidardesign.density.learn import TrainingData, make_trainer
+from lidardesign.density.learn import TrainingData, make_trainer, on_one_thread
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.quality import draw_probes
 from lidardesign.density.training.sampling import LearnedFlow, draw_samples, log_density_of
@@ -72,6 +72,7 @@ class StepTimes:
     probes: TimedProbes
 
     @classmethod
+    @on_one_thread()
     def measured(cls, data: TrainingData, config: RunConfig, run: Path, device: torch.device) -> StepTimes:
         """Take a few steps of each phase, draw a few samples; nothing is written."""
         trainer = make_trainer(data, config, run, device)
