@@ -509,6 +509,13 @@ def test_a_fixed_pattern_has_no_further_rays():
     assert refused.value.allowed is None
 
 
+@pytest.mark.parametrize("gates", ["sensor", "ray"])
+def test_chosen_and_fixed_rays_ask_for_no_samples(gates):
+    design = fixed_pattern()
+    for name in ("selected", "spinning", "fixed"):
+        assert not LAYOUTS[name].needs_samples(design, 30, gates)
+
+
 # --- gates
 
 
