@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import pytest
 import torch
 from support.tables import each_row
@@ -75,8 +76,9 @@ def test_float32_parameters_cost_only_the_rounding_of_the_parameters():
     values, parameters = values_of(dtype=torch.float32), parameters_of(1.0, dtype=torch.float32)
     found, exact = splines(values, parameters, True), splines(values.double(), parameters.double(), True)
     for single, double in zip(found, exact, strict=True):
-        # twice as much where no compiler fuses products and sums
-        assert (single.double() - double).abs().max() <= 128 * torch.finfo(torch.float32).eps * (1 + double.abs().max())
+        # twice as much where no compiler fuses products and sums: `make coverage`
+        most = (128 if numba.config.DISABLE_JIT else 64) * torch.finfo(torch.float32).eps
+        assert (single.double() - double).abs().max() <= most * (1 + double.abs().max())
 
 
 @each_row("inverted", [False, True])

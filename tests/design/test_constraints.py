@@ -68,7 +68,7 @@ LIMITS = {
     "budget.bin_ps": ([0.001, 1e9], [0, 0.0009, 1e9 + 0.5]),
     "budget.bits_per_bin": ([0.001, 1e9], [0, 0.0009, 1e9 + 0.5]),
     "budget.rate_hz": ([0.001, 1e12], [0, 0.0009, 1e12 + 0.5]),
-    "boresight.azimuth_deg.min": ([-36000.0, 0, 36000.0], [math.inf, math.nan, "0", -36001.0, 36001.0]),
+    "boresight.azimuth_deg.min": ([-36000.0, 0, 36000.0], [math.inf, math.nan, "0", -36001.0, 36001.0, 1e300]),
     "boresight.elevation_deg.min": ([-90, 0.5, 90], [-90.5, 90.5]),
     "boresight.elevation_deg.max": ([-90, 0.5, 90], [-90.5, 90.5]),
     "field_of_view.horizontal_deg.min": ([0, 0.5, 360], [-0.5, 360.5]),
