@@ -163,7 +163,9 @@ WRONG = {
 BY_MATLAB = ("NaN counts", "complex counts", "no bin width", "flat origin")
 
 
-@pytest.mark.parametrize(("kind", "name"), [*(("npz", name) for name in WRONG), *(("mat 5", name) for name in BY_MATLAB)])
+@pytest.mark.parametrize(
+    ("kind", "name"), [*(("npz", name) for name in WRONG), *(("mat 5", name) for name in BY_MATLAB)]
+)
 def test_what_cannot_be_is_refused(tmp_path, kind, name):
     change, message = WRONG[name]
     # MATLAB knows no list of three, only a row
