@@ -92,7 +92,10 @@ def _show_run(folder: Path, given: Mapping[str, Any], output: Output) -> None:
 
     for option in (option for option, value in given.items() if value):
         raise ConfigError("is for a design", where=option, hint="give a design of the run, or leave it out")
-    document = open_run(folder).summary()
+    run = open_run(folder)
+    for line in run.input_notes():
+        output.remark(line)
+    document = run.summary()
     output.result(document, lambda rich: _show_summary(document, rich), show_costs=False)
 
 
