@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -95,6 +96,12 @@ def test_scenes_are_those_that_were_learned_and_newcomers_are_named(place, chang
     notes = run.input_notes()
     assert len(notes) == (named is not None)
     assert named is None or notes[0].startswith(f"{named} came since")
+
+
+def test_as_long_as_nothing_changed_scenes_are_those_of_the_folder(place):
+    run = RunFolder.open(place / "run")
+    plain = replace(run, config=replace(run.config, task=run.config.task.model_copy(update={"inputs": {}})))
+    assert (splits(plain), plain.metric) == (splits(run), run.metric)
 
 
 def test_what_went_or_changed_moves_no_other_mesh(place):
