@@ -9,13 +9,16 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from lidardesign.errors import ConfigError, PluginError
+from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.geometry.rays import Returns
+from lidardesign.run.files import sha256_file
 from lidardesign.scene import Scene
 from lidardesign.space import DIMENSIONS, FARTHEST_M, DesignSpace
 
@@ -33,6 +36,59 @@ class TaskConfig(BaseModel):
     """The base of a task's configuration: unknown keys are errors, values are frozen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class FolderConfig(TaskConfig):
+    """The base of the configuration of a task that reads all files of a folder: a run keeps which there were.
+
+    `folders` has the keys that name folders, each with the endings, in small letters, of the files that are read there.
+    """
+
+    folders: ClassVar[Mapping[str, Sequence[str]]]
+
+    inputs: dict[str, str] = Field({}, description="set by learn: SHA-256 of each file that was there, by its path")
+
+    def reads(self, path: Path) -> bool:
+        """Whether a file is one of those that are read in the folders."""
+        keys = [key for key, endings in self.folders.items() if path.suffix.lower() in endings]
+        return not path.name.startswith(".") and any(path.parent == getattr(self, key) for key in keys)
+
+    def learned_files(self, files: Sequence[Path]) -> dict[str, Path | None]:
+        """Files of a folder by the names that they had when the run was learned, in that order; None for those gone.
+
+        Splits and random streams follow these names, so that a file that came since moves no other to another split:
+        it is left out. A file is known by its content wherever it is called otherwise now, and by its name where it
+        was changed. All files are known as long as nothing was learned.
+
+        Arguments:
+            files: Those of one of the folders now.
+
+        Raises:
+            DataError: Nothing is left of what was learned from.
+        """
+        folder = files[0].parent
+        recorded = {Path(path): digest for path, digest in self.inputs.items()}
+        before = {path: recorded[path] for path in sorted(recorded) if path.parent == folder and self.reads(path)}
+        if not before:
+            return {path.name: path for path in files}
+        now = {path: _digest(path, path.stat().st_mtime_ns, path.stat().st_size) for path in files}
+        by_content = {digest: path for path, digest in reversed(now.items())}
+        found = {
+            path.name: path
+            if now.get(path) == digest
+            else by_content.get(digest, path if path in now and now[path] not in before.values() else None)
+            for path, digest in before.items()
+        }
+        if not any(found.values()):
+            hint = "put them back, or learn again"
+            raise DataError("holds none of the files that the run was learned from", where=str(folder), hint=hint)
+        return found
+
+
+@lru_cache(maxsize=4096)
+def _digest(path: Path, changed_ns: int, size: int) -> str:
+    """SHA-256 of a file; the same file unchanged is read once per process."""
+    return sha256_file(path)
 
 
 @dataclass(frozen=True)

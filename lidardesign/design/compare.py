@@ -48,6 +48,7 @@ class SensorPair:
             "difference": {
                 "place_m": float(np.linalg.norm(second.origin_m - first.origin_m)),
                 "boresight_deg": math.degrees(angle_between(first.boresight, second.boresight)),
+                "roll_deg": math.degrees(math.remainder(second.roll_rad - first.roll_rad, math.tau)),
                 "horizontal_deg": float(fields[0]),
                 "vertical_deg": float(fields[1]),
                 "gate_start_m": float(gates[0]),

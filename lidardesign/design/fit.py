@@ -78,6 +78,7 @@ class FitResult:
         """The contract's JSON keys; the path of the design is for the caller to fill."""
         return {
             "design": self.design.name,
+            "frame": self.design.mount or "world",
             "sensors": [sensor.as_dict() for sensor in self.design.sensors],
             "log_likelihood": self.log_likelihood,
             "admissible_mass": self.admissible_mass,

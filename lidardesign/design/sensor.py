@@ -174,6 +174,20 @@ class Sensor:
         """The unit vector that it points along, shape (3,)."""
         return direction(self.azimuth_rad, self.elevation_rad)
 
+    def as_text(self) -> dict[str, str]:
+        """Cells of a table for people, by heading: part, place, pose in degrees, field of view and gate."""
+        turned = {"azimuth": self.azimuth_rad, "elevation": self.elevation_rad, "roll": self.roll_rad}
+        travel_m, _ = self.travel_m
+        # adding zero takes the sign from a rounded -0
+        place = " ".join(f"{round(float(value), 3) + 0.0:.3f}" for value in self.origin_m)
+        return {
+            "sensor": self.name if self.part is None else f"{self.name} {self.part}",
+            "origin [m]": f"{place}, travel {travel_m:.3f}" if travel_m > 0 else place,
+            **{f"{name} [deg]": f"{round(math.degrees(angle), 2) + 0.0:.2f}" for name, angle in turned.items()},
+            "field of view [deg]": " x ".join(f"{math.degrees(angle):.2f}" for angle in self.field_of_view_rad),
+            "gate [m]": " - ".join(f"{end:.3f}" for end in self.gate_m),
+        }
+
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON and YAML form of a sensor."""
         horizontal, vertical = self.field_of_view_rad
@@ -263,6 +277,11 @@ class DesignSpec:
     mount: str | None = None
     further_tables: tuple[Rays, ...] = ()
     further_tracks: tuple[Track, ...] = ()
+
+    @property
+    def frame(self) -> str:
+        """The frame of its places and directions, in words: the world's, or that of a robot's body."""
+        return "the world's frame" if self.mount is None else f"the frame of the robot's body {self.mount!r}"
 
     @property
     def weights(self) -> np.ndarray:

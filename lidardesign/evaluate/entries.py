@@ -23,7 +23,7 @@ from lidardesign.evaluate.baselines.simple import CMA, Baselines, Option, TwinCa
 from lidardesign.evaluate.baselines.views import TrainingViews
 from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
 from lidardesign.evaluate.cma.search import TrainingObjective
-from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers
+from lidardesign.evaluate.request import EvaluationRequest, fired_numbers, numbers_fired
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.selection.candidates import CANDIDATES_PER_RAY
@@ -90,10 +90,10 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     designs = [
         Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
         for design in request.designs
-        for count in counts
-        if can_fire(design, count)
+        for count in numbers_fired(design, counts, request.alone)
     ]
-    choosable = [] if request.greedy is None else greedy_rays(request.task, len(conditions), counts)[0]
+    shared = [count for count in counts if count not in request.alone]
+    choosable = [] if request.greedy is None else greedy_rays(request.task, len(conditions), shared)[0]
     baselines = Baselines(
         request.space,
         request.train,
@@ -109,13 +109,14 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     wanted: list[tuple[str, list[Option], Entry | None]] = [
         (name, baselines.options(name, count), None)
         for name in request.baselines
-        for count in counts
+        for count in shared
         if name != GREEDY or count in choosable
     ]
     if request.equal_bandwidth:
         wanted += [
             (name, baselines.options_within(name, entry.mbps(request.bandwidth), request.bandwidth), entry)
             for entry in designs
+            if entry.rays in shared
             for name in request.baselines
             if name != CMA or entry.name == request.designs[0].name
             if name != GREEDY or entry.rays in choosable

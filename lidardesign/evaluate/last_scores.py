@@ -19,7 +19,7 @@ SCORES = "scores"
 
 @dataclass(frozen=True)
 class LastScore:
-    """What a design scored the last time, at the middle number of rays of its evaluation.
+    """What a design scored the last time, at one number of rays: see `Evaluation.headline_rows`.
 
     Arguments:
         sha256: Of the design's file as it was scored.
@@ -59,9 +59,9 @@ def last_scores_of(
     if evaluation.seeds:  # means over several runs are of none of them
         return {}
     pairs, kept = evaluation.headline_pairs, {}
-    for row in evaluation.rows:
-        path, pair = paths.get(row.design), pairs.get(row.design)
-        if row.baseline or path is None or row.rays != evaluation.middle_rays or not path.is_file():
+    for name, row in evaluation.headline_rows.items():
+        path, pair = paths.get(name), pairs.get(name)
+        if path is None or not path.is_file():
             continue
         ends = () if pair is None else (pair.b, pair.difference, pair.ci_low, pair.ci_high)
         score = LastScore(

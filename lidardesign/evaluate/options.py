@@ -28,7 +28,7 @@ class ScoreOptions:
     """What a user may choose for an evaluation.
 
     Arguments:
-        rays: Numbers of rays per frame; the task's by default, and those of smaller fixed patterns.
+        rays: Numbers of rays per frame; the task's by default, and those of fixed patterns.
         baselines: Further baselines beside uniform, random, bounding, silhouette and greedy, by name.
         seed: Seed of all random numbers; the run's by default.
         effects: auto, all, none, audit, or names of effects between commas.

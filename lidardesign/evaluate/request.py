@@ -1,6 +1,7 @@
 """What an evaluation is asked for.
 
-At which numbers of rays which designs are evaluated: a fixed pattern fires no more rays than it has.
+At which numbers of rays which designs are evaluated: a fixed pattern fires all its rays, or where only fewer are asked
+for an even subset of them.
 """
 
 from __future__ import annotations
@@ -30,6 +31,9 @@ from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Task, metric_of, mount_of
 
+# Fixed patterns of more rays are scored without baselines, unless their number is asked for: scans have 100,000.
+MOST_SHARED = 2000
+
 
 @dataclass(frozen=True, eq=False)
 class EvaluationRequest:
@@ -41,8 +45,7 @@ class EvaluationRequest:
         space: The design space that baselines fill.
         seed: Root of the drawn baselines and the bootstrap.
         designs: The designs, by distinct names that are no baseline's.
-        rays: Numbers of rays per frame; with conditions, per condition value. A design of a fixed pattern has no row
-            at more rays than it has.
+        rays: Numbers of rays per frame; with conditions, per condition value. See `numbers_fired`.
         baselines: Names of baselines.
         bandwidth: The read-out model.
         samples: Samples of the learned density by design name, for layouts that need them.
@@ -59,6 +62,7 @@ class EvaluationRequest:
         mount_error: How carelessly sensors are mounted in rows beside the exact ones; None: there are none.
         scorer: What scores the held-out scenes: this process, or workers (`evaluate.workers`) to the same numbers.
         scenes_seed: Root of the held-out scenes; None: `seed`.
+        alone: Those numbers of rays at which fixed patterns are evaluated without baselines and other designs.
     """
 
     task: Task
@@ -83,6 +87,7 @@ class EvaluationRequest:
     mount_error: MountError | None = None
     scorer: Scorer = score_here
     scenes_seed: int | None = None
+    alone: Sequence[int] = ()
 
     @property
     def held_out_seed(self) -> int:
@@ -135,17 +140,30 @@ def pattern_size(design: DesignSpec) -> int | None:
     return layout_of(design).most_count(design)
 
 
-def can_fire(design: DesignSpec, count: int) -> bool:
-    """Whether a design has so many rays."""
-    size, counts = pattern_size(design), layout_of(design).counts(design)
-    return (size is None or count <= size) and (counts is None or count in counts)
+def numbers_fired(design: DesignSpec, asked: Iterable[int], alone: Sequence[int] = ()) -> list[int]:
+    """Those of some numbers of rays at which a design is evaluated: a fixed pattern at its own only, where asked for.
+
+    What is bought fires all its rays; subsets of them may rank designs of several sizes in another order.
+    """
+    size, chosen, asked = pattern_size(design), layout_of(design).counts(design), list(asked)
+    if size in asked:
+        return [size]
+    if chosen is not None:
+        return [count for count in asked if count in chosen]
+    return [count for count in asked if count not in alone and (size is None or count <= size)]
+
+
+def numbers_alone(counts: Iterable[int], budgets: Iterable[int]) -> list[int]:
+    """Those of the usual numbers of rays that only fixed patterns have and that take baselines minutes."""
+    return [count for count in counts if count > max(MOST_SHARED, *budgets)]
 
 
 def usual_numbers(designs: Iterable[DesignSpec], budgets: Iterable[int]) -> list[int]:
-    """The numbers to evaluate at where none is asked for: the task's, and those that smaller fixed patterns have."""
-    designs, usual = list(designs), set(budgets)
-    smaller = {size for size in map(pattern_size, designs) if size is not None and size < max(usual)}
-    return sorted(usual.union(smaller, *(layout_of(design).counts(design) or () for design in designs)))
+    """The numbers to evaluate at where none is asked for: the task's, those of fixed patterns, and of chosen rays."""
+    designs = list(designs)
+    sizes = {size for size in map(pattern_size, designs) if size is not None}
+    chosen = (layout_of(design).counts(design) or () for design in designs)
+    return fired_numbers(designs, sorted(sizes.union(budgets, *chosen)))
 
 
 def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[int]:
@@ -155,7 +173,8 @@ def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[
         ConfigError: No design can fire any of them.
     """
     asked = list(dict.fromkeys(counts))
-    kept = [count for count in asked if not designs or any(can_fire(design, count) for design in designs)]
+    fired = {count for design in designs for count in numbers_fired(design, asked)}
+    kept = [count for count in asked if not designs or count in fired]
     if asked and not kept:
         chosen = sorted({count for design in designs for count in layout_of(design).counts(design) or ()})
         sizes = [size for size in map(pattern_size, designs) if size is not None]
@@ -176,18 +195,25 @@ def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[
     return kept
 
 
-def left_out(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[str]:
+def left_out(designs: Sequence[DesignSpec], counts: Iterable[int], alone: Sequence[int] = ()) -> list[str]:
     """Which designs have no row at which numbers of rays, one line each, for people."""
     asked = sorted(set(counts))
     lines = []
     for design in designs:
-        beyond = [count for count in asked if not can_fire(design, count)]
+        size, fired = pattern_size(design), numbers_fired(design, asked)
+        beyond = [count for count in asked if count not in fired]
+        if size is not None and fired and size not in fired:
+            some = _listed(fired, "and")
+            lines.append(f"{design.name} fires {size} rays, its fixed pattern: at {some} rays an even subset of them")
         if beyond:
             counts = layout_of(design).counts(design)
-            fires = f"{pattern_size(design)} rays, its fixed pattern"
+            fires = f"{size} rays, its fixed pattern"
             fires = fires if counts is None else f"{_listed(counts, 'or')} rays, at which they were chosen"
             lines.append(f"{design.name} fires {fires}: it is left out at {_listed(beyond, 'and')} rays")
-    empty = [count for count in asked if designs and not any(can_fire(design, count) for design in designs)]
+    fired = {count for design in designs for count in numbers_fired(design, asked)}
+    empty = [count for count in asked if designs and count not in fired]
+    if alone:
+        lines.append(f"at {_listed(alone, 'and')} rays fixed patterns are scored alone; --rays adds baselines there")
     if empty:
         lines.append(f"no design fires {_listed(empty, 'or')} rays: nothing is evaluated there")
     return lines

@@ -222,15 +222,16 @@ class Evaluation:
 
     @property
     def headline_pairs(self) -> dict[str, Paired]:
-        """Every design against the strongest rival, by the design's name, at the rival's number of rays."""
-        rival = self.strongest_rival
-        return {pair.a: pair for pair in self.paired if rival and (pair.b, pair.rays) == (rival.name, rival.rays)}
+        """Every design against the strongest rival, by the design's name, at its number of rays in `headline_rows`."""
+        rival, counts = self.strongest_rival, {name: row.rays for name, row in self.headline_rows.items()}
+        against = [pair for pair in self.paired if rival and pair.b == rival.name]
+        return {pair.a: pair for pair in against if pair.rays == counts[pair.a]}
 
     @property
     def rival_rows(self) -> list[Row]:
-        """The strongest rival's row; none where no rival was scored."""
-        rival = self.strongest_rival
-        return [row for row in self.rows if rival and (row.design, row.rays) == (rival.name, rival.rays)]
+        """The strongest rival's rows at the numbers of rays of `headline_rows`; none where no rival was scored."""
+        rival, counts = self.strongest_rival, {row.rays for row in self.headline_rows.values()}
+        return [row for row in self.rows if rival and row.design == rival.name and row.rays in counts]
 
     @property
     def groups(self) -> int:

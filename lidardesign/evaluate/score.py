@@ -232,25 +232,27 @@ def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], seed: int) -> 
 
 
 def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequence[Row]) -> list[str]:
-    notes, positions = left_out(request.designs, request.rays), max(len(entry.positions) for entry in entries)
+    positions = max(len(entry.positions) for entry in entries)
+    notes = left_out(request.designs, request.rays, request.alone)
     if positions > 1:
         counted = f"rays and bandwidth count per position; every scene is seen from {positions} positions"
         notes.append(BackgroundNote(counted))
     notes += group_notes(request.test)
     if GREEDY in request.baselines and request.greedy is not None:
-        notes += greedy_rays(request.task, positions, request.rays)[1]
+        notes += greedy_rays(request.task, positions, set(request.rays).difference(request.alone))[1]
     with plugin_guard(request.task.name):
         notes += notes_of(request.task, request.config, request.space)
     for design in request.designs:
         notes += outside_notes(design, request.space)
     own = sorted((entry for entry in entries if not entry.baseline), key=lambda entry: entry.rays)
+    shared = [entry for entry in own if entry.rays not in request.alone]
     # of each design the most rays, which come last
     fired = {f"{entry.name!r}": entry.positions for entry in own}
     notes += silent_notes(request.test, fired)
     found = {(row.matched_to, row.matched_rays, row.design) for row in matched}
     beyond = {
         (entry.name, name)
-        for entry in own
+        for entry in shared
         for name in request.baselines
         if request.equal_bandwidth and name not in (CMA, GREEDY) and (entry.name, entry.rays, name) not in found
     }

@@ -20,7 +20,7 @@ from lidardesign.design.catalog.library import named_parts, part_rays, part_sens
 from lidardesign.design.catalog.part import Part
 from lidardesign.design.catalog.shapes import broken_keys, shapes_of
 from lidardesign.design.constraints.document import Constraints, SensorRules
-from lidardesign.design.constraints.feasibility import BandwidthBudget
+from lidardesign.design.constraints.feasibility import BandwidthBudget, check_feasible
 from lidardesign.design.constraints.origins import inside_excluded, mounts_of, origin_box
 from lidardesign.design.files import MOST_TABLE_RAYS
 from lidardesign.design.fit import FitResult
@@ -77,10 +77,11 @@ def choose_parts(
 
     Raises:
         ConfigError: A part that is not there; a density with conditions.
-        InfeasibleError: No part keeps the constraints.
+        InfeasibleError: Constraints that contradict each other, or that no part keeps; fewer rays than parts.
         DataError: No part tells anything about the scenes.
     """
     started, space, wanted = perf_counter(), samples.space, constraints.parts
+    check_feasible(constraints, space, sensors=count, rays=rays)
     if space.conditioned:
         raise ConfigError(
             "the density has conditions",

@@ -28,7 +28,8 @@ from lidardesign.selection.coverage import Coverage, InformedScene, gather
 from lidardesign.selection.curve import gap_among_more, price_curve
 from lidardesign.task import Information
 
-LOSS_PER_BANDWIDTH = 0.2  # where bandwidth has no limit: ten percent more of it must bring two percent less loss
+# Where bandwidth has no limit ten percent more of it must bring two percent less loss, or so much more worth
+SHARE_PER_BANDWIDTH = 0.2
 # Of the loss on scenes held back: what twice the scenes must have gained, or a choice lose less on its own scenes, for
 # twice as many again to gain about a hundredth.
 SMALLEST_GAIN, SMALLEST_GAP = 0.02, 0.05
@@ -124,10 +125,16 @@ class SelectionProblem:
         return choices
 
     def _price(self, coverage: Coverage, count: int) -> float:
-        """The price at which more bandwidth has to bring so much less loss."""
+        """The price at which more bandwidth has to bring so much of the loss left, or of the worth gained if less.
+
+        Worth is what the rays of a free choice gain, less their harm: all that there is to pay with. Where little can
+        be known, nearly everything is left to lose, and a share of that would price out the rays that see something;
+        at a share of the worth no best choice gives up more than this share.
+        """
         free = choose(coverage, self.counts(count), passes=0)
-        loss = coverage.complete - (free.worth - free.harm)
-        return LOSS_PER_BANDWIDTH * max(loss, 0.0) / free.bits if free.bits > 0 else 0.0
+        gained = free.worth - free.harm
+        smaller = max(min(coverage.complete - gained, gained), 0.0)
+        return SHARE_PER_BANDWIDTH * smaller / free.bits if free.bits > 0 else 0.0
 
     @phase("certificate")
     def certified(self, coverage: Coverage, choices: Sequence[Choice]) -> tuple[float, float]:

@@ -189,7 +189,8 @@ class Design(DesignSource):
         certificates = certificates_of(self.specification)
         further = {CERTIFICATES: certificates} if certificates else {}
         if self.result is None:
-            return {"design": place, "sensors": [sensor.as_dict() for sensor in self.specification.sensors]}
+            sensors = [sensor.as_dict() for sensor in self.specification.sensors]
+            return {"design": place, "frame": self.specification.mount or "world", "sensors": sensors}
         return {**self.result.as_dict(), "design": place, **further}
 
     def __repr__(self) -> str:
@@ -198,19 +199,9 @@ class Design(DesignSource):
         return f"<Design {self.name}: {len(spec.sensors)} sensors, layout {spec.layout}, {rays}>"
 
     def _repr_html_(self) -> str:
-        headings = ("sensor", "weight", "origin [m]", "azimuth [rad]", "elevation [rad]", "gate [m]")
-        rows = [
-            (
-                sensor.name,
-                f"{sensor.weight:.3f}",
-                " ".join(f"{value:.3f}" for value in sensor.origin_m),
-                f"{sensor.azimuth_rad:.3f}",
-                f"{sensor.elevation_rad:.3f}",
-                " - ".join(f"{value:.3f}" for value in sensor.gate_m),
-            )
-            for sensor in self.specification.sensors
-        ]
-        return html_table(repr(self)[1:-1], headings, rows)
+        spec = self.specification
+        rows = [{**sensor.as_text(), "weight": f"{sensor.weight:.3f}"} for sensor in spec.sensors]
+        return html_table(f"{repr(self)[1:-1]}, in {spec.frame}", list(rows[0]), [list(row.values()) for row in rows])
 
 
 @phase("designs")

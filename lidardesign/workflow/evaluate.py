@@ -20,7 +20,14 @@ from lidardesign.evaluate.cma.search import SearchBudget
 from lidardesign.evaluate.gates import check_audit, check_better, check_limit
 from lidardesign.evaluate.last_scores import SCORES, last_scores_of
 from lidardesign.evaluate.options import ScoreOptions
-from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
+from lidardesign.evaluate.request import (
+    EvaluationRequest,
+    fired_numbers,
+    left_out,
+    numbers_alone,
+    numbers_fired,
+    usual_numbers,
+)
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
 from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.score import evaluate as score_designs
@@ -143,10 +150,12 @@ class ScoreRequest:
         run, options = self.run, self.options
         specifications = [design.specification for design in self.designs]
         counts = fired_numbers(specifications, self.rays)
-        scored = sum(can_fire(design, count) for design in specifications for count in counts)
-        choosable, notes = greedy_rays(run.task, len(run.conditions()), counts)
+        shared = [count for count in counts if count not in self.alone]
+        fired = [count for design in specifications for count in numbers_fired(design, counts, self.alone)]
+        choosable, notes = greedy_rays(run.task, len(run.conditions()), shared)
         baselines = [name for name in self.baselines if name != GREEDY or choosable]
-        rows, matched = scored + len(baselines) * len(counts), scored * len(baselines)
+        rows = len(fired) + len(baselines) * len(shared)
+        matched = sum(count in shared for count in fired) * len(baselines)
         names = [design.name for design in specifications]
         listed = ", ".join(names[:MOST_NAMED])
         listed += f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
@@ -168,7 +177,7 @@ class ScoreRequest:
                 f"score {listed} in the held-out scenes of task {run.task.name}, with {', '.join(map(str, counts))} "
                 "rays per frame",
                 f"against {', '.join(baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
-                *left_out(specifications, self.rays),
+                *left_out(specifications, self.rays, self.alone),
                 *notes,
                 *(line for design in specifications for line in outside_notes(design, run.config.space)),
                 *([f"with {', '.join(given)}"] if given else []),
@@ -181,6 +190,11 @@ class ScoreRequest:
             {"designs": names, "rays": counts, "baselines": list(self.baselines), **settings},
             last_time(run.folder, COMMAND),
         )
+
+    @property
+    def alone(self) -> list[int]:
+        """See `EvaluationRequest`."""
+        return [] if self.options.rays else numbers_alone(self.rays, self.run.task.defaults.rays)
 
     @property
     def cma_seconds(self) -> float:
@@ -198,7 +212,9 @@ class ScoreRequest:
         )
         cma = CmaSettings(SearchBudget(self.cma_seconds), searching)
         misplaced = self.options.misplacement()
-        return replace(request, planner=self.planner, audit=self.audit, cma=cma, mount_error=misplaced)
+        return replace(
+            request, planner=self.planner, audit=self.audit, cma=cma, mount_error=misplaced, alone=self.alone
+        )
 
     def score(self, progress: Progress | None = None, searching: Show | None = None) -> Scores:
         """Score every design and baseline on every held-out scene.

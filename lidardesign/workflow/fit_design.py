@@ -158,10 +158,10 @@ def _silent_notes(fitter: Fitter, request: FitRequest, design: DesignSpec) -> li
     scenes = vars(fitter).get("first_scenes", {}).get("held back")
     if not scenes:
         return []
-    from lidardesign.evaluate.request import can_fire
+    from lidardesign.evaluate.request import numbers_fired
     from lidardesign.evaluate.scene_scores import silent_notes
 
-    if not can_fire(design, count):
+    if not numbers_fired(design, [count]):
         return []
     conditions = [request.at] if request.at else run.conditions()
     fired = tuple(rays_at(design, count, fitter.samples, at=at or None) for at in conditions)

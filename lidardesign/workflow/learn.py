@@ -18,7 +18,7 @@ from lidardesign.run.clock import WAIT_S, Clock, outermost_clock, phase
 from lidardesign.run.files import is_temporary, run_lock, writer
 from lidardesign.run.manifest import note, read_manifest, start_manifest
 from lidardesign.run.yaml import dump_yaml, leaves, load_yaml, parse_yaml
-from lidardesign.task import Task, notes_of
+from lidardesign.task import FolderConfig, Task, notes_of
 from lidardesign.workflow.learning_budget import (
     GOAL,
     MISPLACED_KEY,
@@ -37,6 +37,7 @@ from lidardesign.workflow.run_folder import (
     EarlierRun,
     Notes,
     RequestPlan,
+    RunFolder,
     files_of,
     input_hashes,
     input_paths,
@@ -150,10 +151,12 @@ class LearnRequest:
             if options.resume:
                 notes("the run has nothing to resume from yet; it starts from the beginning")
             check_can_start(place)
-            settings = goal.applied(resolve(plugin, **choices))
+            settings = _with_inputs(goal.applied(resolve(plugin, **choices)))
         request = cls(plugin, folder, settings, goal, options.device, begun, replaces, config_file, options.command)
         if replaces:
             notes(f"once it is learned it replaces the run {folder}{request._lost_designs()}")
+        for line in RunFolder(place, plugin, settings).input_notes() if begun else ():
+            notes(line)
         if begun and not request.has_checkpoint:
             notes("the run has no checkpoint yet; it starts from the beginning")
         return request
@@ -431,6 +434,13 @@ def _was_killed_before_it_began(run: Path) -> bool:
     )
 
 
+def _with_inputs(settings: RunConfig) -> RunConfig:
+    """The configuration of a new run with the files that are there now, where its task keeps them."""
+    if not isinstance(settings.task, FolderConfig):
+        return settings
+    return replace(settings, task=settings.task.model_copy(update={INPUTS: input_hashes(settings.task)}))
+
+
 def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tuple[Task, RunConfig]:
     """The task and configuration of a run; another configuration is refused, repeating its own options is fine."""
     task, stored = load_run_config(run)
@@ -448,7 +458,8 @@ def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tu
         paths = [tuple(key.split(".")) for key in (MISPLACED_KEY, STEPS_KEY) if key not in asked]
         new.update((path, old[path]) for path in paths)
     for path in [*old, *new]:
-        if old.get(path) != new.get(path):
+        # what was there at first is no setting of a user's
+        if path[:2] != ("task", INPUTS) and old.get(path) != new.get(path):
             raise ConfigError(
                 f"the run was started with {'.'.join(map(str, path))} = {old.get(path)!r}, not {new.get(path)!r}",
                 where=str(run / CONFIGURATION),

@@ -26,7 +26,7 @@ from lidardesign.run.manifest import changed_since_recorded, read_manifest
 from lidardesign.run.outputs import check_writable
 from lidardesign.scene import Scene
 from lidardesign.space import RANGE, DesignSpace
-from lidardesign.task import Metric, Split, Task, conditions_of, metric_of, scenes_of
+from lidardesign.task import FolderConfig, Metric, Split, Task, conditions_of, metric_of, scenes_of
 
 if TYPE_CHECKING:
     from typing import Self
@@ -37,6 +37,7 @@ DESIGN_FOLDER = "designs"
 CONFIGURATION, MANIFEST, SAMPLES = "config.yaml", "manifest.json", "samples.npz"
 # Where the manifest has what a task read, with its SHA-256.
 INPUTS = "inputs"
+MOST_NAMED = 6
 
 Notes = Callable[[str], None]
 
@@ -98,14 +99,31 @@ class RunFolder:
             return list(scenes_of(self.task, self.config.task, split, seed, self.config.space))
 
     def input_notes(self) -> list[str]:
-        """One line on what the task reads, where it is no longer as it was when the run was learned."""
-        before = read_manifest(self.folder).get(INPUTS) or {}
-        now = input_hashes(self.config.task) if before else {}
-        changed = [name for name, digest in before.items() if now.get(name) != digest]
-        if not changed:
-            return []
-        more = "" if len(changed) == 1 else f" and {len(changed) - 1} more"
-        return [f"{changed[0]}{more} changed since {self.folder} was learned: its scenes are different now"]
+        """Lines on what the task reads, where it is no longer as it was when the run was learned."""
+        task, before = self.config.task, read_manifest(self.folder).get(INPUTS) or {}
+        now = input_hashes(task) if before else {}
+        moved = {name: digest for name, digest in before.items() if now.get(name) != digest}
+
+        def is_kept(name: str) -> bool:
+            return isinstance(task, FolderConfig) and task.reads(Path(name))
+
+        # files of folders are known by their content, whatever they are called now
+        renamed = {digest for name, digest in moved.items() if is_kept(name)} & {*now.values()}
+        changed = [name for name, digest in moved.items() if digest not in renamed]
+        notes = []
+        if changed:
+            more = "" if len(changed) == 1 else f" and {len(changed) - 1} more"
+            notes.append(f"{changed[0]}{more} changed since {self.folder} was learned: its scenes are different now")
+        came = [
+            Path(name).name
+            for name, digest in now.items()
+            if is_kept(name) and before.get(name) != digest and name not in changed and digest not in renamed
+        ]
+        if came:
+            more = f" and {len(came) - MOST_NAMED} more" if len(came) > MOST_NAMED else ""
+            named = ", ".join(came[:MOST_NAMED]) + more
+            notes.append(f"{named} came since {self.folder} was learned: left out; learn again to take in what is new")
+        return notes
 
     def design_paths(self) -> list[Path]:
         """The files of this run's designs by name."""

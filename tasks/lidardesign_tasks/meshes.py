@@ -20,12 +20,12 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Returns
-from lidardesign.meshio import COLOURS, Painted, list_mesh_files, load_mesh
+from lidardesign.meshio import COLOURS, SUFFIXES, Painted, list_mesh_files, load_mesh
 from lidardesign.scene import Body, Mesh, Scene, Sign
 from lidardesign.space import FARTHEST_M, DesignSpace
-from lidardesign.task import Defaults, Information, Metres, Metric, Score, Split, Vector, random_generator
+from lidardesign.task import Defaults, FolderConfig, Information, Metres, Metric, Score, Split, Vector, random_generator
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth
@@ -57,8 +57,10 @@ KNOWN = "known"  # what of a scene is removed before scoring
 ALONE = ("motion", "speed_m_s", "jitter_rotation_deg", "jitter_translation_m", "area_exponent")
 
 
-class MeshesConfig(Importance):
+class MeshesConfig(FolderConfig, Importance):
     """Where meshes are, how they are read, split and moved, what counts, what is around, and where the sensor is."""
+
+    folders: ClassVar[dict[str, tuple[str, ...]]] = {"folder": SUFFIXES, "occluders": SUFFIXES}
 
     folder: Path | None = Field(None, description="folder of mesh files (glb, gltf, obj, off, ply, stl)")
     scale: float = Field(1.0, gt=0, le=FARTHEST_M, description="factor from the files' unit to metres (0.001 for mm)")
@@ -327,10 +329,11 @@ def _load(
     folder: str, config: MeshesConfig, sign: Sign, centre: bool, painted: Painted | None = None
 ) -> list[tuple[str, Mesh]]:
     meshes = []
-    for path in list_mesh_files(folder):
-        state = path.stat()
-        mesh = _load_file(path, state.st_mtime_ns, state.st_size, sign, config.scale, config.up, centre, painted)
-        meshes.append((path.name, mesh))
+    for name, path in config.learned_files(list_mesh_files(folder)).items():
+        if path is not None:
+            state = path.stat()
+            mesh = _load_file(path, state.st_mtime_ns, state.st_size, sign, config.scale, config.up, centre, painted)
+            meshes.append((name, mesh))
     return meshes
 
 
@@ -349,14 +352,23 @@ def _load_file(
 def split_meshes(meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split: Split) -> list[tuple[str, Mesh]]:
     """The meshes of a split, each in exactly one; a single mesh is in both, told apart by its poses.
 
-    The seed moves poses alone: what is held out stays held out where scenes of another seed are trained on.
+    The seed moves poses alone: what is held out stays held out where scenes of another seed are trained on. So it does
+    where files came or went since a run was learned: its own, also those that are gone, are what is split.
+
+    Raises:
+        DataError: No mesh of the split is left.
     """
-    if len(meshes) == 1:
+    names = list(config.learned_files(list_mesh_files(config.folder)))
+    if len(names) == 1:
         return list(meshes)
-    order = random_generator(SPLIT_SEED, "meshes", "split").permutation(len(meshes))
-    held_out = min(max(round(config.test_share * len(meshes)), 1), len(meshes) - 1)
-    chosen = order[:held_out] if split == "test" else order[held_out:]
-    return [meshes[i] for i in np.sort(chosen)]
+    order = random_generator(SPLIT_SEED, "meshes", "split").permutation(len(names))
+    held_out = min(max(round(config.test_share * len(names)), 1), len(names) - 1)
+    chosen = {names[i] for i in (order[:held_out] if split == "test" else order[held_out:])}
+    kept = [(name, mesh) for name, mesh in meshes if name in chosen]
+    if not kept:
+        which, hint = "held-out" if split == "test" else "training", "put them back, or learn again"
+        raise DataError(f"holds none of the {which} meshes of the run", where=str(config.folder), hint=hint)
+    return kept
 
 
 def extent_m(meshes: Sequence[Mesh]) -> float:

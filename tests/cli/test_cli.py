@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import html
+import io
 import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from support.command_line import make_run
 
 import lidardesign as package
 from lidardesign import __version__
 from lidardesign.cli import output as console_module
 from lidardesign.cli.output import command, plain_json
+from lidardesign.cli.tables.designs import show_fit
+from lidardesign.design.catalog.library import Pose, find_part, part_design
+from lidardesign.design.compare import paired_sensors
+from lidardesign.design.files import save_design
 from lidardesign.errors import InfeasibleError
+from lidardesign.evaluate.report.tables import sensors_table
 from lidardesign.run.files import run_lock
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples, load_samples, save_samples
+from lidardesign.workflow.designs import Design
 
+PART = "vl53l8cx:4x4"
 COMMANDS = ["learn", "fit", "constrain", "evaluate", "export", "show", "tasks", "tasks list", "tasks show"]
 
 
@@ -259,6 +270,26 @@ def test_a_design_fits_a_terminal_of_80_columns(lidardesign, flat, monkeypatch):
     assert max(map(len, lines)) <= 80
     assert any("nose" in line and "0.250 - 0.400" in line for line in lines)
     assert "all at 0.400 0.000 0.000 m" in "".join(lines)
+
+
+@pytest.mark.parametrize(("mount", "frame"), [(None, "the world's frame"), ("torso", "the robot's body 'torso'")])
+def test_wherever_a_sensor_looks_its_roll_part_and_frame_are_said(lidardesign, tmp_path, mount, frame):
+    turned = Pose(np.zeros(3), azimuth_rad=0.5, elevation_rad=0.2, roll_rad=np.pi / 2)
+    part = find_part(PART)
+    design = replace(part_design(part, turned, name="turned"), mount=mount)
+    save_design(design, tmp_path / "turned.yaml")
+    console = Console(file=io.StringIO(), width=120)
+    show_fit({"error_estimates": {}}, design, [], console, verbose=False)
+    shown = lidardesign("show", tmp_path / "turned.yaml").out
+    pages = [html.unescape(page) for page in (sensors_table(design), Design(design)._repr_html_())]
+    for text in (shown, console.file.getvalue(), *pages):
+        for word in ("roll", "90.00", PART, frame):
+            assert word in text
+    for found in (lidardesign("show", tmp_path / "turned.yaml", "--json").json, Design(design).as_dict()):
+        assert (found["frame"], found["sensors"][0]["part"]) == (mount or "world", PART)
+        assert found["sensors"][0]["boresight"]["roll_rad"] == pytest.approx(np.pi / 2)
+    upright = replace(design, sensors=(replace(design.sensors[0], roll_rad=0.0),))
+    assert paired_sensors(upright, design)[0].as_dict()["difference"]["roll_deg"] == pytest.approx(90)
 
 
 def test_a_task_lists_the_keys_of_every_section_in_words(lidardesign):

@@ -39,12 +39,13 @@ def test_a_fit_prints_a_line_per_sensor_and_what_limits_it(lidardesign, flat):
     fit = f"constrain {flat} --layout grid --sensors 3 --rays 30 --set gate.width_m.max=0.2 --name thin"
     lines = lidardesign(fit).out.splitlines()
     assert lines[0] == "thin: 3 sensors, 30 rays per frame (layout grid)"
-    assert lines[1].split()[0] == "sensor"
-    assert [line.split()[0] for line in lines[2:5]] == ["s0", "s1", "s2"]
-    assert any(line.startswith("tight: gate.width_m.max") for line in lines[5:])
+    assert lines[1] == "in the world's frame"
+    assert lines[2].split()[0] == "sensor"
+    assert [line.split()[0] for line in lines[3:6]] == ["s0", "s1", "s2"]
+    assert any(line.startswith("tight: gate.width_m.max") for line in lines[6:])
     assert lines[-2].startswith("took ")
     assert lines[-1] == f"design: {flat}/designs/thin.yaml"
-    assert len(lines) <= 6 + 3
+    assert len(lines) <= 7 + 3
     assert lidardesign(f"{fit} --quiet").out == f"{flat}/designs/thin.yaml\n"
     loud = lidardesign(f"{fit} -v").out
     assert all(words in loud for words in ("bound", "log-likelihood", "where the time went"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from support.command_line import make_run
 from lidardesign.design.files import save_design
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.request import fired_numbers, left_out, usual_numbers
+from lidardesign.evaluate.request import fired_numbers, left_out, numbers_alone, numbers_fired, usual_numbers
 from lidardesign.geometry.rays import Rays
 
 FAR_M = 0.9
@@ -33,17 +34,38 @@ def test_a_pattern_is_left_out_beyond_its_rays_and_the_others_are_not():
     designs = [pattern("few", 7), pattern("more", 20), pattern("any", 1, "grid")]
     assert usual_numbers(designs, (10, 30)) == [7, 10, 20, 30]
     assert usual_numbers(designs[2:], (10, 30)) == [10, 30]
-    assert usual_numbers([pattern("large", 500)], (10, 30)) == [10, 30]
+    assert usual_numbers([pattern("large", 500)], (10, 30)) == [500]
+    assert usual_numbers([pattern("large", 500), designs[2]], (10, 30)) == [10, 30, 500]
     assert fired_numbers(designs, (30, 7, 30)) == [30, 7]
     assert fired_numbers(designs[:2], (7, 30)) == [7]
     assert fired_numbers([], (7, 30)) == [7, 30]
     assert left_out(designs, (7, 10, 30)) == [
         "few fires 7 rays, its fixed pattern: it is left out at 10 and 30 rays",
+        "more fires 20 rays, its fixed pattern: at 7 and 10 rays an even subset of them",
         "more fires 20 rays, its fixed pattern: it is left out at 30 rays",
     ]
     assert left_out(designs[:1], (7, 10, 30))[-1] == "no design fires 10 or 30 rays: nothing is evaluated there"
     with pytest.raises(ConfigError, match="no design fires 21 or 30 rays"):
         fired_numbers(designs[:2], (21, 30))
+
+
+@pytest.mark.parametrize(
+    ("count", "layout", "asked", "fired"),
+    [
+        (7, "fixed", (5, 7, 10), [7]),  # all its rays where they are asked for, never some of them beside
+        (7, "fixed", (5, 6, 10), [5, 6]),
+        (7, "fixed", (8, 10), []),
+        (3000, "fixed", (5, 3000), [3000]),
+        (1, "grid", (5, 7, 10), [5, 7, 10]),
+        (1, "grid", (5, 3000), [5]),
+    ],
+)
+def test_a_pattern_fires_all_its_rays_and_a_huge_one_nobody_elses(count, layout, asked, fired):
+    alone = numbers_alone(asked, (10, 30))
+    assert alone == [number for number in asked if number == 3000]
+    assert numbers_fired(pattern("one", count, layout), asked, alone) == fired
+    cut = [line for line in left_out([pattern("one", count, layout)], asked) if "subset" in line]
+    assert bool(cut) == (layout == "fixed" and bool(fired) and count not in asked)
 
 
 @pytest.fixture(scope="module")
@@ -90,11 +112,30 @@ def test_without_numbers_all_of_the_task_are_evaluated_and_a_smaller_pattern_at_
     planned = call("evaluate", run, "--dry-run", "--json").json
     found = call("evaluate", run, "--json").json
     assert numbers_of(found, "any") == numbers_of(found, "uniform") == sorted({7, *usual})
-    assert numbers_of(found, "few") == [count for count in sorted({7, *usual}) if count <= 7]
+    assert numbers_of(found, "few") == [7]
     assert planned["settings"]["rays"] == numbers_of(found, "any")
     assert set(planned["steps"]) >= {note for note in found["notes"] if note.startswith("few fires")} != set()
     told = f"{len(found['rows'])} rows at equal rays, up to {len(found['equal_bandwidth'])} at equal bandwidth"
     assert any(told in step for step in planned["steps"])
+
+
+def test_patterns_of_several_sizes_are_ranked_with_all_their_rays(call, run, tmp_path):
+    folder = shutil.copytree(run, tmp_path / "run")
+    save_design(pattern("some", 5), folder / "designs" / "some.yaml")
+    save_design(pattern("scanner", 3000), folder / "designs" / "scanner.yaml")
+    names = ("few", "some", "scanner")
+    report = tmp_path / "report.html"
+    told = call("evaluate", folder, *[word for name in names for word in ("--designs", name)], "--report", report)
+    assert told.code == 0, told.err
+    own = {"few": "7", "some": "5", "scanner": "3000"}
+    lines = [line.split() for line in told.out.splitlines() if line.split()[:1] and line.split()[0] in own]
+    assert {words[0]: words[1] for words in lines if words[1].isdigit()} == own
+    page = report.read_text()
+    assert all(f"{name}</th><td>{rays}</td>" in page for name, rays in own.items())
+    kept = {entry["name"]: entry["score"] for entry in call("show", folder, "--json").json["designs"]}
+    assert {name: str(kept[name]["rays"]) for name in names} == own
+    assert kept["few"]["rival"] == kept["some"]["rival"] is not None
+    assert kept["scanner"]["rival"] is None
 
 
 def test_numbers_that_no_design_fires_are_refused_alike_with_and_without_dry_run(call, run):

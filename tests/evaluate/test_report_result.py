@@ -51,7 +51,7 @@ def test_a_pair_is_told_in_a_sentence(better, found, sentence):
     assert headline(evaluation_of(pair(*found), better=better), pair(*found)) == sentence
 
 
-def test_only_pairs_at_the_rivals_number_of_rays_are_told():
+def test_only_pairs_at_the_number_of_rays_of_its_row_are_told():
     told = pair(-0.6, -0.9, -0.3)
     evaluation = evaluation_of(pair(1.0, 0.5, 1.5, rays=9), told, Paired("f", "uniform", 25, -9.0, -9.0, -9.0))
     assert evaluation.headline_pairs == {"f": told}

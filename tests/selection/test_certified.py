@@ -41,3 +41,21 @@ def test_no_choice_loses_less_than_nothing_however_dear_bandwidth_is(seed, price
 )
 def test_scenes_are_enough_where_twice_as_many_gained_little_and_others_lose_as_little(before, loss, own, enough):
     assert are_enough(before, loss, own) is enough
+
+
+@given(st.integers(0, 1000), st.floats(1, 1e6), st.booleans())
+def test_the_price_of_bandwidth_leaves_what_little_can_be_known(seed, unknown, one_gate):
+    coverage = small(seed, gates=3)
+    if one_gate:
+        coverage = coverage.through(np.zeros(7, dtype=np.intp))
+    free = choose(coverage, RayCounts.of_one(7, 3))
+    (choice,) = PROBLEM.choices(replace(coverage, complete=unknown * free.worth), 3)
+    assert choice.worth >= 0.8 * free.worth - 1e-9
+
+
+@given(st.integers(0, 1000), st.floats(0, 0.4))
+def test_the_price_of_bandwidth_follows_the_loss_where_little_is_left(seed, left):
+    coverage = small(seed, gates=3)
+    free = choose(coverage, RayCounts.of_one(7, 3), passes=0)
+    (choice,) = PROBLEM.choices(replace(coverage, complete=free.worth * (1 + left)), 3)
+    assert choice.price == pytest.approx(0.2 * left * free.worth / free.bits)

@@ -124,6 +124,24 @@ def test_bounds_that_no_part_keeps_are_named(run):
         bought(run, field_of_view={"horizontal_deg": {"max": 1.0}})
 
 
+@pytest.mark.parametrize(
+    ("options", "conflicts"),
+    [
+        ({"sensors": 2, "rays": 1}, ["--rays", "--sensors"]),
+        ({"constraints": {"parts": {"count": 2}, "budget": {"rays": 1}}}, ["budget.rays", "parts.count"]),
+        ({"constraints": {"parts": {"count": 1}, "sensors": {"count": 2}}}, ["sensors.count", "parts.count"]),
+        ({"constraints": {"parts": {"count": 1}, "sensors": {"min": 2}}}, ["sensors.min", "parts.count"]),
+    ],
+)
+def test_fewer_rays_or_parts_than_are_asked_for_are_refused_before_anything_is_cast(
+    run, monkeypatch, options, conflicts
+):
+    monkeypatch.setattr(part_design, "proposed", None)
+    with pytest.raises(InfeasibleError) as refusal:
+        open_run(run).fit(parts=THREE, name="none", **options)
+    assert list(refusal.value.conflicts) == conflicts
+
+
 def test_a_bandwidth_that_no_part_keeps_is_named(run):
     with pytest.raises(InfeasibleError, match=r"budget\.bandwidth_mbps"):
         bought(run, budget={"bandwidth_mbps": 0.001})

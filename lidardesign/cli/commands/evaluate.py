@@ -60,8 +60,9 @@ def evaluate(
             metavar="N",
             min=1,
             max=1_000_000,
-            help="Rays per frame and position; repeatable. A fixed pattern has no row above its own number.",
-            show_default="the task's and those of smaller fixed patterns",
+            help="Rays per frame and position; repeatable. Fixed patterns fire their own number, or where only fewer "
+            "are asked for an even subset.",
+            show_default="the task's and those of fixed patterns",
         ),
     ] = None,
     baseline: Annotated[

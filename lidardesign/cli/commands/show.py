@@ -56,8 +56,6 @@ def show(
             checks = check_design(design_document(specification), specification.constraints, space)
         for line in () if space is None else outside_notes(specification, space):
             output.remark(line)
-        if specification.mount is not None:
-            output.remark(f"places and directions are in the frame of the robot's body {specification.mount!r}")
         specification = placed(specification, condition) if condition else specification
         readout = readout_of(specification)
         document = {
@@ -67,6 +65,7 @@ def show(
             "rays": specification.rays,
             "level": specification.level,
             "at": dict(specification.at),
+            "frame": specification.mount or "world",
             "sensors": [sensor.as_dict() for sensor in specification.sensors],
             "track": track_document(specification.track) if specification.track is not None else None,
             "constraints": specification.constraints,
@@ -92,7 +91,10 @@ def _show_run(folder: Path, given: Mapping[str, Any], output: Output) -> None:
 
     for option in (option for option, value in given.items() if value):
         raise ConfigError("is for a design", where=option, hint="give a design of the run, or leave it out")
-    document = open_run(folder).summary()
+    run = open_run(folder)
+    for line in run.input_notes():
+        output.remark(line)
+    document = run.summary()
     output.result(document, lambda rich: _show_summary(document, rich), show_costs=False)
 
 
@@ -155,7 +157,8 @@ IDEAL = "ideal"
 DECIMALS = 6
 SCORE_COLUMNS = ("design", "rays", "value", "95 % interval", "failures", "Mbit/s")
 SENSOR_COLUMNS = (
-    "first", "second", "place [m]", "looks [deg]", "field of view [deg]", "gate start [m]", "gate end [m]", "weight",
+    "first", "second", "place [m]", "looks [deg]", "roll [deg]", "field of view [deg]", "gate start [m]",
+    "gate end [m]", "weight",
 )  # fmt: skip
 
 
@@ -203,6 +206,7 @@ def _show(document: dict[str, Any], rich: RichConsole) -> None:
             pair["a"],
             pair["b"],
             *(number(round(apart[name], DECIMALS), 3) for name in ("place_m", "boresight_deg")),
+            _signed(apart["roll_deg"]),
             f"{_signed(apart['horizontal_deg'])} x {_signed(apart['vertical_deg'])}",
             *(_signed(apart[name], 3) for name in ("gate_start_m", "gate_end_m", "weight")),
         ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.cli.tables.grids import RichConsole, number, print_table, text_table
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from lidardesign.design.constraints.check import ConstraintCheck
-    from lidardesign.design.sensor import DesignSpec, Sensor, Track
+    from lidardesign.design.sensor import DesignSpec, Track
 
 MOST_ROWS = 20
 MOST_NAMED = 4
@@ -43,26 +43,14 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
     rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
     sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
     title = f"{design.name}: {sensors}, layout {design.layout}, {rays}{_condition(design)}"
-    places = [_place(sensor) for sensor in design.sensors]
-    together = len(set(places)) == 1
-    if together:
-        title += f"\nall at {places[0]} m"
-    origin = () if together else ("origin [m]",)
-    figures = ("weight", "rays", *origin, "azimuth\n[deg]", "elevation\n[deg]", "field of view\n[deg]", "gate [m]")
-    rows = [
-        (
-            sensor.name if sensor.part is None else f"{sensor.name} {sensor.part}",
-            f"{sensor.weight:.3f}",
-            number(sensor.rays),
-            *(() if together else (place,)),
-            f"{math.degrees(sensor.azimuth_rad):.2f}",
-            f"{math.degrees(sensor.elevation_rad):.2f}",
-            " x ".join(f"{math.degrees(angle):.2f}" for angle in sensor.field_of_view_rad),
-            " - ".join(f"{end:.3f}" for end in sensor.gate_m),
-        )
-        for sensor, place in list(zip(design.sensors, places, strict=True))[:MOST_ROWS]
+    where, poses = _poses(design)
+    cells = [
+        {"sensor": pose["sensor"], "weight": f"{sensor.weight:.3f}", "rays": number(sensor.rays), **pose}
+        for sensor, pose in list(zip(design.sensors, poses, strict=True))[:MOST_ROWS]
     ]
-    rich.print(text_table(("sensor", *figures), rows, title, figures, overflow="fold"))
+    headings = [name.replace(" [deg]", "\n[deg]") for name in cells[0]]
+    rows = [list(row.values()) for row in cells]
+    rich.print(text_table(headings, rows, f"{title}\n{where}", headings[1:], overflow="fold"))
     if len(design.sensors) > MOST_ROWS:
         rich.print(f"... and {len(design.sensors) - MOST_ROWS} more sensors; --json lists all")
     _show_certificates(design, rich)
@@ -97,7 +85,7 @@ def _show_track(design: DesignSpec, track: Track, rich: RichConsole) -> None:
     first, last = travels(track)
     title = f"{design.name}: {len(track.sensor)} rays at every {track.dimension} from {first:g} to {last:g}"
     title += f" (travel {last - first:g} m, {len(track.knots)} knots)\nsensors in the middle of their travel"
-    title += f", at {_place(design.sensors[0])} m"
+    title += f", at {design.sensors[0].as_text()['origin [m]']} m in {design.frame}"
     figures = ("azimuth\n[deg]", "elevation\n[deg]", "gate start\n[m]", "gate end\n[m]", "gate width\n[m]")
     rows = [
         (
@@ -125,11 +113,13 @@ def _condition(design: DesignSpec) -> str:
     return "".join(f", at {name}={value:g}" for name, value in design.at.items())
 
 
-def _place(sensor: Sensor) -> str:
-    # -0.0 is the same place as 0.0
-    place = " ".join(f"{round(value, 3) + 0.0:.3f}" for value in sensor.origin_m)
-    travel, _ = sensor.travel_m
-    return f"{place}, travel {travel:.3f}" if travel > 0 else place
+def _poses(design: DesignSpec) -> tuple[str, list[dict[str, str]]]:
+    """Where a design is, in words, and the cells of its sensors; a place that all share is in the words alone."""
+    cells = [sensor.as_text() for sensor in design.sensors]
+    if len({cell["origin [m]"] for cell in cells}) > 1:
+        return f"in {design.frame}", cells
+    rest = [{name: text for name, text in cell.items() if name != "origin [m]"} for cell in cells]
+    return f"all at {cells[0]['origin [m]']} m in {design.frame}", rest
 
 
 def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> None:
@@ -197,23 +187,14 @@ def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:
     rays = f"{several}{counts[-1]} rays {_frames(design)}" if counts else "any number of rays"
     sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
     rich.print(f"{design.name}: {sensors}, {rays} (layout {design.layout}){_condition(design)}", soft_wrap=True)
-    columns: dict[str, Callable[[Sensor], str]] = {
-        "origin [m]": _place,
-        f"rays of {counts[-1]}" if several else "rays": lambda sensor: number(sensor.rays),
-        "azimuth [deg]": lambda sensor: f"{math.degrees(sensor.azimuth_rad):.2f}",
-        "elevation [deg]": lambda sensor: f"{math.degrees(sensor.elevation_rad):.2f}",
-        "field of view [deg]": lambda sensor: " x ".join(f"{math.degrees(a):.2f}" for a in sensor.field_of_view_rad),
-        "gate [m]": lambda sensor: " - ".join(f"{end:.3f}" for end in sensor.gate_m),
-    }
-    if len(set(map(_place, design.sensors))) == 1:
-        del columns["origin [m]"]
-    if all(sensor.rays is None for sensor in design.sensors):
-        columns.pop("rays", None)
-    shown = design.sensors[:MOST_ROWS]
-    names = [sensor.name if sensor.part is None else f"{sensor.name} {sensor.part}" for sensor in shown]
-    lines = [[name, *(cell(sensor) for cell in columns.values())] for name, sensor in zip(names, shown, strict=True)]
-    print_table(None, ("sensor", *columns), lines, rich, text=("sensor",))
-    if len(shown) < len(design.sensors):
+    where, cells = _poses(design)
+    rich.print(where, soft_wrap=True)
+    if any(sensor.rays is not None for sensor in design.sensors):
+        heading = f"rays of {counts[-1]}" if several else "rays"
+        rayed = zip(design.sensors, cells, strict=True)
+        cells = [{"sensor": cell["sensor"], heading: number(sensor.rays), **cell} for sensor, cell in rayed]
+    print_table(None, list(cells[0]), [list(cell.values()) for cell in cells[:MOST_ROWS]], rich, text=("sensor",))
+    if len(cells) > MOST_ROWS:
         rich.print(f"... and {len(design.sensors) - MOST_ROWS} more sensors; --json lists all")
 
 

@@ -23,7 +23,7 @@ DECIMALS = 4
 
 
 def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, *, verbose: bool) -> None:
-    """Print an evaluation for people: a row per design at one number of rays, with a verdict; or all tables.
+    """Print an evaluation for people: a row per design, with a verdict; or all tables.
 
     Its JSON form holds more (all pairs, all intervals).
     """
@@ -36,8 +36,8 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
-    """Every design at one number of rays, against the strongest rival there; what else was asked for in a line each."""
-    rows, pairs, count = evaluation.headline_rows, evaluation.headline_pairs, evaluation.middle_rays
+    """A row of every design, against the strongest rival; what else was asked for in a line each."""
+    rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
     rival = evaluation.strongest_rival
     shown = [row.as_dict() for row in (*rows.values(), *evaluation.rival_rows)]
     values, intervals = zip(*map(value_cells, shown), strict=True)
@@ -48,7 +48,8 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
         "failures": [str(row["failures"]) for row in shown],
         "Mbit/s": [number(row["bandwidth_mbps"], 3) for row in shown],
     }
-    if all(row["rays"] == count for row in shown):
+    counts = {row.rays for row in rows.values()}
+    if len(counts) == 1:
         del columns["rays"]
     if not any(row["failures"] for row in shown):
         del columns["failures"]
@@ -56,8 +57,9 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
         apart = {name: difference_cell(pair.as_dict(), sign="+") for name, pair in pairs.items()}
         columns[f"difference to {rival.name}"] = [apart.get(row["design"], "-") for row in shown]
     metric, names = evaluation.metric, [row["design"] for row in shown]
-    title = f"{metric.name} [{metric.unit}] at {count} rays, {_scenes(document)} ({metric.better} is better)"
-    others = sorted({row.rays for row in evaluation.rows} - {count})
+    rays = f" at {shown[0]['rays']} rays" if len(counts) == 1 else ""
+    title = f"{metric.name} [{metric.unit}]{rays}, {_scenes(document)} ({metric.better} is better)"
+    others = sorted({row.rays for row in evaluation.rows} - counts)
     rich.print(f"{title}; -v: {', '.join(map(str, others))} rays too" if others else title, soft_wrap=True)
     print_table(None, ("design", *columns), list(zip(names, *columns.values(), strict=True)), rich)
     if pairs:

@@ -58,9 +58,10 @@ def check_feasible(
     count = constraints.sensors
     if count.min is not None and count.max is not None and count.min > count.max:
         _refuse(f"at least {count.min} and at most {count.max} sensors", ["sensors.min", "sensors.max"])
+    asked = "--sensors" if constraints.parts is None or constraints.parts.count != sensors else "parts.count"
     named = [
         ("sensors.count", count.count, count.count),
-        ("--sensors", sensors, sensors),
+        (asked, sensors, sensors),
         ("sensors.min", count.min, None),
         ("sensors.max", None, count.max),
         ("each", len(constraints.each) or None, None),

@@ -20,7 +20,7 @@ from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.entries import ordered_conditions
 from lidardesign.evaluate.figures.density_views import DensityView, density_view
-from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, pattern_size
+from lidardesign.evaluate.request import EvaluationRequest, numbers_fired, pattern_size
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays, gate_outcomes
@@ -191,10 +191,9 @@ def figure_data(
     evaluation: Evaluation, request: EvaluationRequest, times: Mapping[str, Mapping[str, float]]
 ) -> FigureData:
     """Everything that can be drawn of an evaluation's designs, in its first held-out scene."""
-    counts = fired_numbers(request.designs, request.rays)
 
     def laid_out(design: DesignSpec, at: Conditions) -> Rays:
-        count = design.rays or pattern_size(design) or max(n for n in counts if can_fire(design, n))
+        count = design.rays or pattern_size(design) or max(numbers_fired(design, request.rays, request.alone))
         return request.lay_out(design, count, request.samples.get(design.name), at=at)
 
     # with the physics that the scenes call for, or by geometry alone

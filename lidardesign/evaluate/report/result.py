@@ -1,4 +1,4 @@
-"""The report's first section: every design at one number of rays, against the strongest rival on training scenes."""
+"""The report's first section: a row of every design, against the strongest rival on training scenes."""
 
 from __future__ import annotations
 
@@ -78,16 +78,16 @@ def _about(evaluation: Evaluation) -> list[str]:
 
 def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list[str]:
     """How far chosen rays are from the best, in one sentence for all designs; none where no rays were chosen."""
-    count = evaluation.middle_rays
+    rows = evaluation.headline_rows
     gaps = [
         f"{100 * entry['gap']:.1f} % ({design.name})"
         for design in designs
         for entry in certificates_of(design)
-        if entry["rays"] == count
+        if design.name in rows and entry["rays"] == rows[design.name].rays
     ]
     if not gaps:
         return []
-    said = f"Certificate: no other choice of {count} of the same candidates lowers the loss on training scenes by more"
+    said = "Certificate: no other choice of as many of the same candidates lowers the loss on training scenes by more"
     return [f"{said} than {', '.join(gaps)}."]
 
 

@@ -132,26 +132,14 @@ def bandwidth_table(evaluation: Evaluation) -> str:
 
 def sensors_table(design: DesignSpec) -> str:
     """A design's sensors in degrees and metres."""
-    headings = ["sensor", "share", "origin [m]", "azimuth, elevation [deg]", "field of view [deg]", "gate [m]"]
-    lines = []
-    for sensor, weight in zip(design.sensors[:MOST_SENSORS], design.weights, strict=False):
-        horizontal, vertical = (math.degrees(angle) for angle in sensor.field_of_view_rad)
-        start, end = sensor.gate_m
-        # adding zero takes the sign from a rounded -0
-        looks = [round(math.degrees(angle), 1) + 0.0 for angle in (sensor.azimuth_rad, sensor.elevation_rad)]
-        cells = [
-            sensor.name,
-            f"{weight:.3f}",
-            " ".join(f"{round(value, 3) + 0.0:.3f}" for value in sensor.origin_m),
-            ", ".join(f"{angle:.1f}" for angle in looks),
-            f"{horizontal:.1f} x {vertical:.1f}",
-            f"{start:.3f} to {end:.3f}",
-        ]
-        lines.append((cells, "", False))
+    shown = zip(design.sensors[:MOST_SENSORS], design.weights, strict=False)
+    rows = [{**sensor.as_text(), "share": f"{weight:.3f}"} for sensor, weight in shown]
+    lines = [(list(row.values()), "", False) for row in rows]
     rest = len(design.sensors) - MOST_SENSORS
-    caption = f"Sensors of {design.name}: shares of the rays, and intervals that hold {100 * design.level:g} % of each."
+    held = f"shares of the rays, and intervals that hold {100 * design.level:g} % of each"
+    caption = f"Sensors of {design.name} in {design.frame}: {held}."
     more = f"<p>and {rest} more.</p>" if rest > 0 else ""
-    return table(headings, lines, text_columns=1, caption=caption) + more
+    return table(list(rows[0]), lines, text_columns=1, caption=caption) + more
 
 
 def interval(item: Row | Paired) -> str:

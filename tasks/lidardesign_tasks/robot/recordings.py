@@ -17,6 +17,7 @@ from lidardesign.run.arrays import csv_rows, read_npz
 from lidardesign.run.inputs import TABLE
 from lidardesign.run.validation import suggest
 from lidardesign.run.yaml import plain_number
+from lidardesign.task import FolderConfig
 
 if TYPE_CHECKING:
     import mujoco
@@ -75,16 +76,25 @@ def turns(model: mujoco.MjModel) -> list[int]:
     return [start + shift[kind] for kind, start in pairs if kind in shift]
 
 
-def read_recordings(model: mujoco.MjModel, path: Path) -> list[Recording]:
-    """The recordings of a file, or of all files of a folder by name.
+def read_recordings(model: mujoco.MjModel, path: Path, config: FolderConfig | None = None) -> list[Recording]:
+    """The recordings of a file, or of all files of a folder by name; of a configuration that keeps them, these.
 
     Raises:
-        DataError: There is none, or one cannot be used: with file, column and what is allowed.
+        DataError: There is none, one is gone, or one cannot be used: with file, column and what is allowed.
     """
     allowed = f"a file {' or '.join(ENDINGS)} or a folder of them"
-    files = sorted(file for file in path.iterdir() if file.suffix in ENDINGS) if path.is_dir() else [path]
-    if not files or any(file.suffix not in ENDINGS for file in files):
+    files = [path]
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.suffix.lower() in ENDINGS and file.name[0] != ".")
+    if not files or files[0].suffix.lower() not in ENDINGS:
         raise DataError("holds no motion", where=str(path), allowed=allowed, hint="or motion=keyframes, motion=random")
+    if path.is_dir() and config is not None:
+        known = config.learned_files(files)
+        gone = [name for name, file in known.items() if file is None]
+        if gone:
+            hint = "put it back, or learn again"
+            raise DataError("is gone, and the run was learned from it", where=str(path / gone[0]), hint=hint)
+        files = [file for file in known.values() if file is not None]
     return [_checked(model, file) for file in files]
 
 
@@ -156,7 +166,7 @@ def _continuous(quaternions: np.ndarray, name: str, path: Path) -> np.ndarray:
 @lru_cache(maxsize=256)
 def _read(path: Path, changed_ns: int, size: int) -> Mapping[str, np.ndarray]:
     """The columns of one file by name; space and both splits need it."""
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         return read_npz(path)
     (_, header), *rows = csv_rows(path, TABLE) or [(1, [])]
     names = [name.strip() for name in header]

@@ -19,7 +19,18 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Interval, Metres, Metric, Score, Split, Vector, random_generator
+from lidardesign.task import (
+    Defaults,
+    FolderConfig,
+    Information,
+    Interval,
+    Metres,
+    Metric,
+    Score,
+    Split,
+    Vector,
+    random_generator,
+)
 from lidardesign_tasks.robot.measures import METRICS, TOLERATED_SHARE, Measure, informs, score, with_truth
 from lidardesign_tasks.robot.motion import (
     Trajectory,
@@ -28,7 +39,7 @@ from lidardesign_tasks.robot.motion import (
     window_frames,
     windows,
 )
-from lidardesign_tasks.robot.recordings import Recording, read_recordings
+from lidardesign_tasks.robot.recordings import ENDINGS, Recording, read_recordings
 from lidardesign_tasks.robot.targets import Model, read_model, refuse_sensors_inside
 from lidardesign_tasks.surface import MILLIMETRES
 from lidardesign_tasks.surroundings import MovingSurroundings
@@ -47,8 +58,10 @@ SPACE_MOTIONS, SPACE_MOMENTS = 12, 200
 TOUCHING_M = 1e-3  # what moves less, rests
 
 
-class MujocoConfig(MovingSurroundings):
+class MujocoConfig(FolderConfig, MovingSurroundings):
     """The model and its motion, what is to be found of it, where sensors are, and the surroundings."""
+
+    folders: ClassVar[dict[str, tuple[str, ...]]] = {"motion": ENDINGS}
 
     model: Path | None = Field(None, description="MJCF or URDF file of the robot and what stands around it")
     folder: Path | None = Field(None, description="folder that holds all files of the model; its own if empty")
@@ -186,7 +199,7 @@ def _recordings(config: MujocoConfig) -> list[Recording]:
     model = model_of(config).model
     if config.motion == "keyframes":
         return [keyframes(model, str(config.model))]
-    return read_recordings(model, Path(config.motion))
+    return read_recordings(model, Path(config.motion), config)
 
 
 def _trajectories(config: MujocoConfig, model: Model, split: Split, seed: int) -> list[Trajectory]:

@@ -1,0 +1,182 @@
+"""Files that come to a folder, go, change or are renamed after a run was learned: what is held out stays held out."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lidardesign_tasks.robot.recordings import read_recordings
+from lidardesign_tasks.robot.task import MujocoConfig
+from support.command_line import caller
+from support.meshes import write_ball
+
+import lidardesign as ld
+from lidardesign.config import with_task_settings
+from lidardesign.errors import DataError
+from lidardesign.run.manifest import read_manifest
+from lidardesign.workflow.learn import LearnOptions, LearnRequest
+from lidardesign.workflow.run_folder import RunFolder, input_hashes
+
+NAMES = [f"{letter}.stl" for letter in "cdefgh"]
+SMALL = {
+    "learning.steps": 4, "learning.batch": 64, "learning.samples": 2000, "density.sigma_m": 0.05, "truth_points": 100,
+    "poses": 1,
+}  # fmt: skip
+
+
+def ball(path, number):
+    write_ball(path, (0.1 + 0.01 * number, 0.08, 0.06))
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    place = tmp_path_factory.mktemp("kept")
+    for number, name in enumerate(NAMES):
+        ball(place / "meshes" / name, number)
+    (place / "meshes" / "readme.txt").write_text("balls")
+    ld.learn("meshes", preset="draft", out=place / "run", settings={**SMALL, "folder": place / "meshes"})
+    shutil.copytree(place / "meshes", place / "as learned")
+    return place
+
+
+@pytest.fixture
+def place(learned):
+    shutil.rmtree(learned / "meshes")
+    shutil.copytree(learned / "as learned", learned / "meshes")
+    return learned
+
+
+def splits(run, seed=0):
+    """The mesh of each scene of both splits, by its name, and where its points are."""
+    return {
+        split: {scene.group: scene.bodies[0].shape.vertices.mean() + scene.bodies[0].poses.sum() for scene in scenes}
+        for split in ("train", "test")
+        for scenes in [run.scenes(split, seed)]
+    }
+
+
+def come(folder):
+    for number, name in enumerate(["a.stl", "dd.stl", "z.stl"]):
+        ball(folder / name, 20 + number)
+
+
+def renumber(folder):
+    for name in reversed(NAMES):
+        (folder / name).rename(folder / f"{chr(ord(name[0]) + 1)}.stl")
+    ball(folder / "c.stl", 20)
+
+
+def swap(folder):
+    first, second = (folder / name for name in ("c.stl", "h.stl"))
+    content = first.read_bytes(), second.read_bytes()
+    first.write_bytes(content[1])
+    second.write_bytes(content[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda folder: None, None),
+        (lambda folder: (folder / "notes.txt").write_text("no mesh"), None),
+        (come, "a.stl, dd.stl, z.stl"),
+        (renumber, "c.stl"),
+        (swap, None),
+        (lambda folder: shutil.copy(folder / "c.stl", folder / "copy.stl"), "copy.stl"),
+    ],
+    ids=["nothing", "other files", "new ones", "renumbered", "swapped", "a copy"],
+)
+def test_scenes_are_those_that_were_learned_and_newcomers_are_named(place, change, named):
+    run = ld.open_run(place / "run")
+    before, metric = splits(run), run.metric
+    change(place / "meshes")
+    run = ld.open_run(place / "run")
+    assert (splits(run), run.metric) == (before, metric)
+    notes = run.input_notes()
+    assert len(notes) == (named is not None)
+    assert named is None or notes[0].startswith(f"{named} came since")
+
+
+def test_as_long_as_nothing_changed_scenes_are_those_of_the_folder(place):
+    run = RunFolder.open(place / "run")
+    plain = replace(run, config=replace(run.config, task=run.config.task.model_copy(update={"inputs": {}})))
+    assert (splits(plain), plain.metric) == (splits(run), run.metric)
+
+
+def test_what_went_or_changed_moves_no_other_mesh(place):
+    before = splits(ld.open_run(place / "run"))
+    gone, changed = (next(iter(before[split])) for split in ("train", "test"))
+    (place / "meshes" / gone).unlink()
+    ball(place / "meshes" / changed, 30)
+    come(place / "meshes")
+    run = ld.open_run(place / "run")
+    assert {split: list(scenes) for split, scenes in splits(run).items()} == {
+        split: [name for name in scenes if name != gone] for split, scenes in before.items()
+    }
+    said = " ".join(run.input_notes())
+    assert all(words in said for words in (gone if gone < changed else changed, "and 1 more changed since", "z.stl"))
+
+
+@pytest.mark.parametrize(("kept", "words"), [("test", "training"), ("train", "held-out"), (None, "none of the files")])
+def test_a_split_of_which_nothing_is_left_is_refused(place, kept, words):
+    run = ld.open_run(place / "run")
+    keep = [] if kept is None else splits(run)[kept]
+    come(place / "meshes")
+    for name in NAMES:
+        if name not in keep:
+            (place / "meshes" / name).unlink()
+    with pytest.raises(DataError, match=words):
+        splits(run)
+
+
+def test_every_command_keeps_them_and_learning_again_takes_newcomers_in(place, capsys, tmp_path, monkeypatch):
+    lidardesign = caller(capsys, tmp_path, monkeypatch)
+    come(place / "meshes")
+    run = place / "run"
+    for command in (
+        ["show", run],
+        ["fit", run, "--sensors", 1, "--rays", 4, "--layout", "grid"],
+        ["constrain", run, "--sensors", 1, "--layout", "grid", "--set", "budget.rays=4"],
+        ["evaluate", run / "designs" / "fit.yaml", "--rays", 4],
+    ):
+        result = lidardesign(*command)
+        assert (result.code, "z.stl came since" in result.err) == (0, True), result.err
+    opened = RunFolder.open(run)
+    judged = with_task_settings(opened.task, opened.config, ["truth_points=200"])
+    assert judged.task.inputs == opened.config.task.inputs
+    again = LearnRequest.resolve("meshes", LearnOptions(out=tmp_path / "again", config=run / "config.yaml"))
+    assert len(again.settings.task.inputs) == len(judged.task.inputs) + 3
+
+
+def test_a_run_that_is_resumed_keeps_them_too(place, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(place / "run", run)
+    come(place / "meshes")
+    notes = []
+    request = LearnRequest.resolve("meshes", LearnOptions(out=run, resume=True), notes.append)
+    assert request.settings.task.inputs == read_manifest(run)["inputs"]
+    assert any("z.stl came since" in note for note in notes)
+
+
+def test_recordings_stay_on_their_side_too(tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint name='turn'/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    folder = tmp_path / "walks"
+    folder.mkdir()
+
+    def record(name, seconds):
+        np.savetxt(folder / name, [[0, 0], [seconds, 1]], delimiter=",", header="time_s,turn", comments="")
+
+    record("b.csv", 1)
+    record("d.csv", 2)
+    config = MujocoConfig(motion=folder)
+    config = config.model_copy(update={"inputs": input_hashes(config)})
+    record("a.csv", 3)
+    assert [one.name for one in read_recordings(model, folder, config)] == ["b.csv", "d.csv"]
+    assert len(read_recordings(model, folder)) == 3
+    (folder / "b.csv").unlink()
+    with pytest.raises(DataError, match="is gone"):
+        read_recordings(model, folder, config)
