@@ -161,7 +161,7 @@ SOLIDS = {
 @each_row("name", SOLIDS)
 def test_the_inside_of_a_solid_is_where_its_winding_number_says(name):
     solid = trimesh.util.concatenate(SOLIDS[name])
-    grid = grids.Grid(np.full(3, -0.52), 0.04, np.array([27, 27, 27]))
+    grid = grids.Grid(np.full(3, -0.52), 0.08, np.array([14, 14, 14]))
     vertices, faces, points = solid.vertices, solid.faces.astype(np.int64), grid.points()
     distance = TriangleTree(solid.triangles).distance_m(points)
     inside = grids.is_inside(points, distance, vertices, faces, grid)

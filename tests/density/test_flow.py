@@ -25,29 +25,6 @@ def test_the_density_is_the_jacobian_of_sampling(name):
         assert float(log_prob[row].detach()) == pytest.approx(float(expected.detach()), abs=1e-8)
 
 
-@pytest.mark.parametrize(("name", "dimensions"), [("one dimension", 1), ("one on a circle", 1), ("two dimensions", 2)])
-def test_the_density_integrates_to_one(name, dimensions):
-    flow = flow_of(name, scale=1.5)
-    count = 20_000 if dimensions == 1 else 160
-    axis = (torch.arange(count, dtype=torch.float64) + 0.5) / count * 2 - 1
-    points = torch.cartesian_prod(*[axis] * dimensions).reshape(-1, dimensions)
-    with torch.no_grad():
-        total = flow.log_prob(points).exp().mean() * 2**dimensions
-    assert float(total) == pytest.approx(1.0, abs=5e-3)  # midpoints of a density with kinks at the knots
-
-
-def test_a_conditional_density_integrates_to_one_for_every_condition_and_depends_on_it():
-    flow = flow_of("one, given one", scale=1.5)
-    axis = ((torch.arange(5000, dtype=torch.float64) + 0.5) / 5000 * 2 - 1)[:, None]
-    curves = []
-    with torch.no_grad():
-        for value in (-1.0, 0.0, 1.0):
-            curves.append(flow.log_prob(axis, torch.full_like(axis, value)).exp())
-    for curve in curves:
-        assert float(curve.mean() * 2) == pytest.approx(1.0, abs=2e-3)
-    assert (curves[0] - curves[2]).abs().max() > 0.05
-
-
 @each_row("name", FLOWS)
 def test_every_parameter_gets_a_finite_gradient(name):
     flow = flow_of(name, scale=1.0)
@@ -107,9 +84,3 @@ def test_a_fresh_flow_is_near_the_identity_and_its_seed_is_all_that_matters():
     with torch.no_grad():
         _, log_prob = first(base)
     assert (log_prob - first.log_base).abs().max() < 2.0
-
-
-def test_building_a_flow_leaves_the_global_random_state_alone():
-    before = torch.get_rng_state()
-    flow_of("all six")
-    assert torch.equal(torch.get_rng_state(), before)

@@ -20,6 +20,7 @@ def learn(lidardesign, out, *further):
     return lidardesign("learn", "arm", "--preset", "draft", "--out", out, *options, *further, "--json")
 
 
+@pytest.mark.hard_case("P1")
 @pytest.mark.slow
 def test_an_interrupted_run_over_moving_frames_is_resumed_to_the_bytes_of_a_straight_one(
     lidardesign, tmp_path, monkeypatch

@@ -17,7 +17,6 @@ from support.tables import each_row
 from lidardesign.config import LearningSettings
 from lidardesign.density import learn as learning
 from lidardesign.density.learn import learn, prepare_training_data
-from lidardesign.density.target.prepare import prepare_target
 from lidardesign.density.training.checkpoint import (
     FOLDER,
     clear_snapshots,
@@ -51,7 +50,7 @@ def test_another_seed_gives_other_bytes(finished, tmp_path):
     assert result_bytes(tmp_path)[0] != result_bytes(finished[0])[0]
 
 
-@pytest.mark.parametrize("step", [10, 50, 90, 110])
+@pytest.mark.parametrize("step", [10, 50, 110])
 def test_a_resumed_run_is_an_uninterrupted_run_bit_for_bit(finished, tmp_path, step):
     with pytest.raises(KeyboardInterrupt):
         learn(BallTask(), config_of(), tmp_path, progress=Interrupter(step))
@@ -131,22 +130,6 @@ def test_progress_rows_are_valid_and_complete(finished):
     sigmas = [row["sigma_m"] for row in rows]
     assert sigmas == sorted(sigmas, reverse=True)
     assert sigmas[-1] == pytest.approx(0.05)
-
-
-def test_an_analytic_scene_is_learned_well(tmp_path):
-    settings = {"steps": 600, "batch": 512, "layers": 3, "hidden": 32, "samples": 10_000, "checkpoint_seconds": 100.0}
-    # the ball fills the space: with an angle fixed, no proposal meets the rim of a silhouette
-    space = replace(SPACE, low=(0, 0, 0, -0.25, 0, 0.2), high=(0, 0, 0, 0.25, 0, 2.5))
-    config = config_of(space, **settings)
-    result = learn(BallTask(), config, tmp_path)
-    assert result.ess > 0.4
-    assert result.kl_nats < 1.0  # leaked samples of so short a training make most of it
-    assert result.coverage > 0.9
-    # log Z by plain Monte Carlo over the box
-    points = space.sample(100_000, np.random.default_rng(0))
-    target, _ = prepare_target(BallTask().scenes(None, "train", 0), config)
-    plain = math.log(np.exp(target.log_density(points)).mean()) + space.log_volume
-    assert result.log_z == pytest.approx(plain, abs=0.1)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

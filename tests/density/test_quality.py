@@ -35,12 +35,6 @@ def test_a_shifted_gaussian_has_its_closed_form_figures():
     assert found.ess == pytest.approx(math.exp(-(shift**2)), abs=0.02)
 
 
-def test_the_target_itself_is_perfect():
-    x = np.random.default_rng(1).normal(size=1000)
-    found = quality(gaussian(x, 0, 1), gaussian(x, 0, 1) + LOG_Z)
-    assert (found.ess, found.kl_nats, found.log_z) == pytest.approx((1.0, 0.0, LOG_Z))
-
-
 @pytest.mark.parametrize("offset", [-1e6, 1e6])
 def test_figures_are_computed_in_log_space(offset):
     x = np.random.default_rng(2).normal(size=1000)
@@ -285,22 +279,6 @@ def test_its_standard_error_is_the_scatter_over_other_samples():
         errors.append(found.error)
     # the scatter of 200 estimates is known to 5 %
     assert np.mean(errors) == pytest.approx(np.std(estimates), rel=0.2)
-
-
-def test_a_dropped_mode_is_misplaced_mass_although_no_sample_ever_sees_it():
-    generator = np.random.default_rng(4)
-    samples = generator.normal(6.0, size=FEW)
-    found = overlap(sides_of(samples, lambda x: gaussian(x, 6), lambda x: mixture(x, (0.3, 0.7), (-6, 6)), generator))
-    assert found.misplaced == pytest.approx(0.3, abs=references.STANDARD_ERRORS * found.error)
-
-
-def test_mass_that_leaked_where_no_proposal_goes_is_misplaced_too():
-    generator = np.random.default_rng(5)
-    leaked = generator.uniform(size=FEW) < 0.1
-    samples = np.where(leaked, 40.0, 0.0) + generator.normal(size=FEW)
-    sides = sides_of(samples, lambda x: mixture(x, (0.9, 0.1), (0, 40)), gaussian, generator)
-    found = overlap(sides)
-    assert found.misplaced == pytest.approx(0.1, abs=references.STANDARD_ERRORS * found.error)
 
 
 @pytest.mark.parametrize("at_proposals", [np.inf, 900.0])

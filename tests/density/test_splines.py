@@ -81,6 +81,7 @@ def test_float32_parameters_cost_only_the_rounding_of_the_parameters():
         assert (single.double() - double).abs().max() <= most * (1 + double.abs().max())
 
 
+@pytest.mark.hard_case("24")
 @each_row("inverted", [False, True])
 @each_row("scale", [10.0, 1000.0])
 @each_row("dtype", [torch.float32, torch.float64])

@@ -338,12 +338,6 @@ def test_a_quarter_of_the_zones_is_one_of_every_block_of_four():
     assert len(blocks) == 16
 
 
-def test_one_ray_of_each_quarter_stands_in_its_middle():
-    kept = even_subset(PARTS["vl53l5cx"].directions, 4)
-    assert {(index // 8 // 4, index % 8 // 4) for index in kept} == {(0, 0), (0, 1), (1, 0), (1, 1)}
-    assert all(index // 8 % 4 in (1, 2) and index % 4 in (1, 2) for index in kept)
-
-
 def test_a_subset_leaves_smaller_gaps_than_one_drawn_at_random():
     everything = PARTS["vlp-16"].directions
     kept = everything[even_subset(everything, 300)]
@@ -404,21 +398,6 @@ def test_spinning_scanners_stand_above_each_other_and_line_scanners_are_rolled()
 
 
 # designs
-
-
-def test_a_fixed_design_at_fewer_rays_fires_a_subset_of_its_own_each_sensor_in_proportion():
-    part = PARTS["vl53l8cx"]
-    design = part_design(part, side_by_side(part, Pose(), 3))
-    everything, few = lay_out(design), lay_out(design, 60)
-    assert np.bincount(few.sensor).tolist() == [20, 20, 20]
-    mine = {tuple(row) for row in np.column_stack([everything.direction, everything.gate_m, everything.sensor])}
-    assert all(tuple(row) in mine for row in np.column_stack([few.direction, few.gate_m, few.sensor]))
-    assert len(lay_out(design, 0)) == 0
-
-
-def test_a_fixed_design_has_no_more_rays_than_its_pattern():
-    with pytest.raises(ConfigError, match="65 rays, but the design's fixed pattern has 64"):
-        lay_out(part_design(PARTS["vl53l8cx"], Pose()), 65)
 
 
 def test_a_fixed_layout_needs_its_rays_and_is_fitted_anew_as_a_grid():

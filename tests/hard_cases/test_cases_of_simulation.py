@@ -18,7 +18,6 @@ from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.warehouse import WarehouseTask
-from support.command_line import caller, make_run
 from support.hard_cases import hard_case
 from support.heads import EVERYTHING, face_rays, heads
 from support.scoring import design, make_request, rows_by_key
@@ -40,7 +39,7 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays, gate_outcomes
 from lidardesign.geometry.surface import sample_triangles
 from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import EFFECTS, IDEAL, Detector, Physics
+from lidardesign.simulate.detector.detector import IDEAL, Detector, Physics
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import simulate
@@ -240,13 +239,6 @@ class TestEffectsNotCalledFor:
         (measured,) = simulate(head, face_rays(), physics=Physics(thin, frozenset({effect})))
         for name in ("outcome", "range_m", "body"):
             assert getattr(alone, name).tobytes() == getattr(measured, name).tobytes()
-
-    def test_the_command_line_lists_them_too(self, capsys, tmp_path, monkeypatch):
-        make_run(tmp_path / "run", 200)
-        result = caller(capsys, tmp_path, monkeypatch)("evaluate", "run", "--effects", "fog")
-        assert result.code == 2
-        assert all(name in result.err for name in EFFECTS)
-
 
 def looking_away(place, **changes):
     """A receiver that looks along -x, where nothing is."""

@@ -22,7 +22,6 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from support.command_line import files_under
 from support.hard_cases import hard_case
-from support.learning import interrupt_after_a_checkpoint
 from support.small_runs import shifted
 from support.tables import each_row
 
@@ -117,16 +116,6 @@ class TestTheSameBytes:
         subprocess.run(command, env=environment, check=True, capture_output=True)
         here, there = ((flat / "designs" / f"{name}.yaml").read_text() for name in ("here", "there"))
         assert here.replace("here", "there") == there
-
-    def test_a_resumed_run_is_a_straight_one(self, lidardesign, tmp_path, monkeypatch):
-        assert lidardesign(*FLATLAND, "--out", "straight").code == 0
-        with monkeypatch.context() as patched:
-            interrupt_after_a_checkpoint(patched, tmp_path / "stopped")
-            assert lidardesign(*FLATLAND, "--out", "stopped").code == 130
-        assert lidardesign(*FLATLAND, "--out", "stopped", "--resume").code == 0
-        for name in BYTES:
-            assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "straight" / name).read_bytes()
-
 
 BALL = Scene((Body(Sphere(0.5), poses=rigid(translation_m=(1.5, 0, 0))),))
 SPACE = DesignSpace((0, 0, 0, -0.4, -0.4, 0.2), (0, 0, 0, 0.4, 0.4, 2.5))
@@ -276,28 +265,6 @@ class TestKilledAtAnyTime:
         save_arrays(tmp_path, "checkpoint.safetensors", {"weights": np.ones(3)}, {"step": 1})
         left = {path.name for path in tmp_path.iterdir()}
         assert left == {"manifest.json", "checkpoint.safetensors"}
-
-    @pytest.mark.parametrize("stopped_at", ["announce", "write_atomic", "record"])
-    def test_a_stop_between_any_two_writes_leaves_a_checkpoint_that_loads(self, tmp_path, monkeypatch, stopped_at):
-        from lidardesign.run import manifest
-
-        start_manifest(tmp_path, command=["test"], seed=0)
-        save_arrays(tmp_path, "state.safetensors", {"step": np.arange(3)}, {"step": 1})
-        names = ("announce", "write_atomic", "record")
-        with monkeypatch.context() as patched:
-
-            def killed(*_):
-                raise KeyboardInterrupt
-
-            for name in names[names.index(stopped_at) :]:
-                patched.setattr(manifest, name, killed)
-            with pytest.raises(KeyboardInterrupt):
-                save_arrays(tmp_path, "state.safetensors", {"step": np.arange(4)}, {"step": 2})
-        arrays, state = load_arrays(tmp_path, "state.safetensors")
-        assert len(arrays["step"]) == state["step"] + 2
-        save_arrays(tmp_path, "state.safetensors", {"step": np.arange(5)}, {"step": 3})
-        assert load_arrays(tmp_path, "state.safetensors")[1] == {"step": 3}
-
 
 class Payload:
     """What runs when it is unpickled."""

@@ -281,6 +281,7 @@ def test_a_file_that_somebody_is_still_making_says_to_wait(run):
         verify(run, "samples.npz")
 
 
+@pytest.mark.hard_case("P3")
 @each_row("stopped_at", ["announce", "write_atomic", "record"])
 def test_a_kill_while_a_run_s_file_is_written_anew_leaves_one_that_verifies(tmp_path, monkeypatch, stopped_at):
     run = recorded(tmp_path)

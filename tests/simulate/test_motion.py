@@ -109,15 +109,6 @@ def test_tiny_turns_lose_no_digits():
         assert translation[0] == pytest.approx([1.0 + 5e-10, 2.0, 3.0], abs=2e-15)
 
 
-def test_a_link_on_a_hinge_stays_on_its_circle():
-    hinge = np.array([0.7, -0.4, 0.2])
-    turns = [Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() for angle in (0.2, 1.1)]
-    poses = np.stack([rigid(turn, hinge + turn @ [0.5, 0.0, 0.0]) for turn in turns])
-    rotation, translation = path_of(Body(Sphere(0.1), poses=poses), 0, RATE_HZ).at(np.linspace(0, 0.1, 11))
-    assert np.linalg.norm(translation - hinge, axis=1) == pytest.approx(np.full(11, 0.5), abs=1e-13)
-    assert Rotation.from_matrix(rotation).as_rotvec()[:, 2] == pytest.approx(np.linspace(0.2, 1.1, 11), abs=1e-12)
-
-
 def test_after_its_last_pose_a_body_goes_on_as_it_came():
     poses = np.stack([rigid(translation_m=(x, 0.0, 0.0)) for x in (2.0, 3.0, 3.5)])
     paths = [path_of(Body(Sphere(0.1), poses=poses), frame, RATE_HZ) for frame in range(3)]
@@ -140,16 +131,6 @@ def test_rays_sent_after_a_frame_meet_a_body_on_its_further_way():
     assert len(earlier(origins[:0], looking[:0], time_s[:0]).range_m) == 0
 
 
-def test_frames_meet_without_a_jump():
-    generator = np.random.default_rng(8)
-    poses = np.stack([random_pose(generator) for _ in range(4)])
-    body = Body(Box((0.1, 0.2, 0.3)), poses=poses)
-    for frame in range(3):
-        rotation, translation = path_of(body, frame, RATE_HZ).at(np.array([0.0, 1 / RATE_HZ]))
-        assert rigid(rotation[0], translation[0]) == pytest.approx(poses[frame], abs=1e-13)
-        assert rigid(rotation[1], translation[1]) == pytest.approx(poses[frame + 1], abs=1e-12)
-
-
 def test_a_scene_at_rest_gives_the_same_bits_as_its_caster():
     generator = np.random.default_rng(11)
     bodies = tuple(
@@ -161,20 +142,6 @@ def test_a_scene_at_rest_gives_the_same_bits_as_its_caster():
     moving, still = moving_tracer(scene, 0)(origins, looking, time_s), SceneCaster(scene).first_hit(origins, looking)
     for name in ("range_m", "body", "normal"):
         assert np.array_equal(getattr(moving, name), getattr(still, name))
-
-
-def test_at_the_start_of_a_frame_bodies_are_where_the_frame_has_them():
-    generator = np.random.default_rng(12)
-    poses = [
-        np.stack([rigid(translation_m=(2.5, 0, 0)) @ random_pose(generator, 0.8) for _ in range(3)]) for _ in SHAPES
-    ]
-    scene = Scene(tuple(Body(shape, poses=pose) for shape, pose in zip(SHAPES.values(), poses, strict=True)))
-    origins, looking, _ = fan(400)
-    for frame in range(3):
-        hits = moving_tracer(scene, frame)(origins, looking, np.zeros(400))
-        still = SceneCaster(scene, frame).first_hit(origins, looking)
-        assert np.array_equal(hits.body, still.body)
-        assert hits.range_m == pytest.approx(still.range_m, abs=1e-6)
 
 
 def test_turning_the_world_and_its_motion_changes_nothing():

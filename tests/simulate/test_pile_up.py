@@ -14,7 +14,6 @@ from lidardesign.simulate.detector.dead_time import (
     DRAWS_PER_BIN,
     _across_pulses,
     _hit_pulses,
-    _share_of_counts,
     _within_pulses,
 )
 from lidardesign.simulate.detector.detection import coates
@@ -171,13 +170,6 @@ def test_the_last_pulses_are_hit_as_often_as_they_should(alive, pulses, photons)
 def test_light_that_hits_every_pulse_is_counted_in_every_pulse_that_is_alive(alive, pulses, photons):
     for z in (-3.0, 0.0, 3.0):
         assert _hit_pulses(photons, alive, pulses, z) == alive
-
-
-def test_shares_of_photons_are_even_and_lose_less_than_one_share():
-    arrived = np.array([5, 0, 7, 100, 3])
-    share = _share_of_counts(arrived, 4)
-    assert share.sum() == arrived.sum() // 4
-    assert (np.abs(share - arrived / 4) < 1).all()
 
 
 def test_endless_light_is_counted_in_a_share_of_the_pulses():

@@ -55,17 +55,6 @@ def test_ranges_on_a_sphere_are_the_closed_form():
     assert (returns.body[hit] == 0).all()
 
 
-def test_whatever_stands_before_the_gate_hides_what_is_in_it():
-    plate = Body(Box((0.01, 0.2, 0.2)), "plate", "occluder", rigid(translation_m=(1.0, 0.0, 0.0)))
-    rays = make_rays((0, 0, 0), [[1.0, 0.0, 0.0]], gate=(2.0, 4.0))
-    (alone,) = simulate(Scene((ball(),)), rays)
-    (hidden,) = simulate(Scene((ball(), plate)), rays)
-    assert alone.outcome.tolist() == [Outcome.RETURN]
-    assert hidden.outcome.tolist() == [Outcome.OCCLUDED]
-    assert np.isnan(hidden.range_m).all()
-    assert len(hidden.points_m) == 0
-
-
 def test_a_moving_body_gives_one_set_of_returns_per_frame():
     poses = np.stack([rigid(translation_m=(x, 0.0, 0.0)) for x in (2.0, 3.0, 4.0)])
     scene = Scene((Body(Sphere(0.5), "ball", "both", poses),))
@@ -78,15 +67,6 @@ def test_a_wrong_number_of_casters_is_refused():
     scene = Scene((ball(),))
     with pytest.raises(ConfigError, match="2 casters"):
         simulate(scene, make_rays((0, 0, 0), fan(3)), casters=[SceneCaster(scene)] * 2)
-
-
-@each_row("with_mesh", [False, True])
-def test_no_rays_give_no_returns(with_mesh):
-    triangle = Mesh(np.eye(3), np.array([[0, 1, 2]]), "unsigned")
-    scene = Scene((Body(triangle),) if with_mesh else (ball(),))
-    (returns,) = simulate(scene, rays_along(np.zeros((0, 3))))
-    assert len(returns.outcome) == 0
-    assert len(returns.points_m) == 0
 
 
 def moving_scene(generator, frames=4):
