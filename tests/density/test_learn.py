@@ -285,14 +285,6 @@ def test_the_average_is_the_mean_whose_weights_rise_with_a_power_of_the_step(tmp
             np.testing.assert_allclose(value.numpy(), mean, rtol=1e-12, atol=1e-13)
 
 
-def test_the_average_of_equal_weights_is_them(tmp_path):
-    trainer = a_trainer(tmp_path)
-    weights = [value.float() for value in like(trainer, torch.Generator().manual_seed(1))]
-    for done in range(1, 200):
-        found = moved(trainer, done, weights)
-    assert all(map(torch.equal, found, weights))
-
-
 def test_what_is_learned_is_the_average(tmp_path):
     learn(BallTask(), config_of(), tmp_path)
     arrays, _ = load_arrays(tmp_path, "checkpoint.safetensors")

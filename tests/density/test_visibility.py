@@ -90,13 +90,6 @@ def test_only_active_pairs_are_computed_and_the_rest_is_clear():
         assert log_values[1, 0] == 0.0
 
 
-def test_slopes_are_only_kept_when_asked_for():
-    visibility = both_ways(Scene((wall(),)))["quadrature"]
-    rays, active = along_axis([1.0, 2.0, 2.5]), np.ones((3, 1), bool)
-    assert visibility.transmittance(rays, active, OPTICS, differentiable=False).slopes == []
-    assert visibility.transmittance(rays, active, OPTICS).slopes != []
-
-
 def test_widening_keeps_the_optics_in_proportion():
     wide = OPTICS.widened(10 * OPTICS.sigma_m)
     assert wide.margin_m == pytest.approx(10 * OPTICS.margin_m)

@@ -70,21 +70,6 @@ def test_moments_at_a_value_are_those_of_the_conditional_density_and_the_mean_we
     assert abs(weights.mean() - math.exp(LOG_MASS)) < 4 * weights.std() / math.sqrt(len(weights))
 
 
-@pytest.mark.parametrize("value", [0.0, 2.0, 4.0])
-def test_a_window_of_the_same_samples_is_biased_where_exact_weights_are_not(value):
-    count = 20_000
-    exact = at_condition(SAMPLES, {"x_m": value}, log_target, count, np.random.default_rng(1))
-    nearest = np.argsort(np.abs(SAMPLES.points[:, 0] - value))[:count]
-    window = SAMPLES.subset(nearest)
-    # in the middle the window's bias is in the spread, at the ends in the mean
-    centre = means(value)[0]
-    for power, truth in ((1, 0.0), (2, TARGET[0] ** 2)):
-        mean, error = estimate(exact, (exact.points[:, AZIMUTH] - centre) ** power)
-        assert abs(mean - truth) < 4 * error
-    mean, error = estimate(window, np.square(window.points[:, AZIMUTH] - centre))
-    assert abs(mean - TARGET[0] ** 2) > 20 * error
-
-
 def test_samples_so_far_that_they_would_spoil_the_rest_are_left_away():
     worth = []
     for count in (1000, 4000, 16_000, 40_000):

@@ -11,7 +11,6 @@ from scipy.special import chdtri
 from support.rings import CEILING, RING
 from support.tables import each_row
 
-from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts import distributed as lines
 from lidardesign.design.layouts.distributed import in_region, normal_ball
@@ -120,17 +119,6 @@ def test_rays_start_and_look_inside_the_design_space():
     azimuth, elevation = angles(rays.direction)
     points = np.column_stack([rays.origin_m, azimuth, elevation, np.full(300, 0.5)])
     assert CEILING.contains(points).all()
-
-
-def test_a_distributed_design_is_read_back_to_the_last_bit():
-    document = design_document(FITTED.design)
-    again = design_from_document(json.loads(json.dumps(document)))
-    assert design_document(again) == document
-    first, second = lay_out(again), lay_out(FITTED.design)
-    np.testing.assert_array_equal(first.origin_m, second.origin_m)
-    np.testing.assert_array_equal(first.direction, second.direction)
-    for one, other in zip(again.sensors, FITTED.design.sensors, strict=True):
-        np.testing.assert_array_equal(one.coupling.direction_per_m, other.coupling.direction_per_m)
 
 
 def test_no_ray_of_a_blocked_cone_is_fired():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import itertools
 import json
 import math
 from dataclasses import replace
@@ -110,8 +109,8 @@ def test_boxes_beyond_the_space_change_nothing():
 def test_the_order_of_the_boxes_does_not_matter():
     right = {"low_m": [0.6, 0.2, 0], "high_m": [0.8, 0.9, 1]}
     left = {"low_m": [-0.8, -0.9, 0], "high_m": [-0.6, -0.2, 1]}
-    orders = itertools.permutations([PILLAR, right, left])
-    first, *others = [places(fitted(origin={"exclude": list(boxes)})) for boxes in orders]
+    orders = ([PILLAR, right, left], [left, right, PILLAR], [right, left, PILLAR])
+    first, *others = [places(fitted(origin={"exclude": boxes})) for boxes in orders]
     assert all(other == first for other in others)
 
 

@@ -10,7 +10,6 @@ import pytest
 from support.command_line import make_run
 
 from lidardesign.design.files import load_design, save_design
-from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.run.xml import read_xml
 
@@ -142,13 +141,3 @@ def test_files_that_only_their_endings_tell_apart_are_called_by_them(call, tmp_p
     names = planned.json["settings"]["designs"]
     assert len(set(names)) == 3
     assert names[2] == "other/rig"
-
-
-def test_a_sensor_table_of_the_research_code_may_still_lack_its_header(tmp_path):
-    from lidardesign.design.rigs.ray_lists import write_sensor_csv
-
-    sensor = Sensor("s", 1.0, np.zeros(3), np.zeros((3, 3)), 1.0, 0.0, 0.0, 0.1, 0.1, 0.5, 0.1)
-    write_sensor_csv(DesignSpec("d", (sensor,)), tmp_path / "table.csv")
-    lines = (tmp_path / "table.csv").read_text().splitlines()
-    (tmp_path / "bare.csv").write_text(lines[1] + "\n")
-    assert load_design(tmp_path / "bare.csv").sensors[0].azimuth_rad == 1.0

@@ -227,21 +227,6 @@ def test_a_design_without_a_number_of_rays_asks_for_one():
 # --- density
 
 
-def test_more_rays_stand_where_the_density_is():
-    generator = np.random.default_rng(0)
-    wide = sensor(**AHEAD, spread_horizontal_rad=0.3)
-    dense = generator.normal(0.25, 0.05, 9000)
-    thin = generator.uniform(-0.5, 0.5, 1000)
-    azimuth = np.concatenate([dense, thin])
-    elevation = generator.normal(0, 0.05, 10000)
-    origin = np.tile(wide.origin_m, (10000, 1))
-    samples = evenly(np.column_stack([origin, azimuth, elevation, np.full(10000, 1.0)]))
-    tangent = coordinates(DesignSpec("d", (wide,)), lay_out(DesignSpec("d", (wide,), layout="density"), 100, samples))
-    near = np.abs(tangent[:, 0] - 0.25) < 0.1
-    assert near.sum() > 55
-    assert (tangent[:, 0] < 0).sum() > 5
-
-
 def test_a_density_layout_needs_samples_unless_its_table_has_that_many_rays():
     design = DesignSpec("d", three_sensors(), layout="density", rays=40)
     samples = drawn_from(design)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from dataclasses import replace
@@ -23,7 +22,7 @@ from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_d
 from lidardesign.design.fit import fit, rays_at
 from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.layouts.track import TrackSamples, aimed_rays, interpolated, placed, track_of, travels
+from lidardesign.design.layouts.track import interpolated, placed, track_of, travels
 from lidardesign.design.sensor import DesignSpec, Sensor, Track
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.geometry.rays import Rays
@@ -179,26 +178,6 @@ def test_places_where_a_ray_sees_nothing_are_bridged():
         here, there = interpolated(track, x), interpolated(whole, x)
         np.testing.assert_allclose(here[1], there[1], atol=0.03)
         np.testing.assert_allclose(here[2], there[2], atol=0.08)
-
-
-def test_every_update_of_the_cells_lowers_their_cost(monkeypatch):
-    from lidardesign.design.layouts import track as module
-
-    costs = []
-    cost = module._cost
-
-    def watched(*arguments):
-        costs.append(cost(*arguments))
-        return costs[-1]
-
-    monkeypatch.setattr(module, "_cost", watched)
-    knots = np.linspace(-0.5, 4.0, 10)
-    samples = TrackSamples.of(SAMPLES.points, SAMPLES.weights, knots, 0, AISLE)
-    aimed_rays(samples, 5, np.random.default_rng(0))
-    assert len(costs) > 3
-    # nearer than a hundredth of the mean distance squares are minimised instead
-    assert all(after <= before * (1 + 1e-6) for before, after in itertools.pairwise(costs))
-    assert costs[-1] < costs[0]
 
 
 def test_lloyd_continues_from_where_it_is_told_to_and_keeps_the_order_of_centres():

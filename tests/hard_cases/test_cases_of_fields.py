@@ -415,19 +415,6 @@ class TestQueriesAtSpecialPlaces:
         gradient = field.gradient(field.grid.points(), np.ones((field.grid.size, 1)))
         assert np.isfinite(gradient).all()
 
-    def test_outside_the_grid_the_distance_is_a_lower_bound_that_grows(self):
-        field = field_of(Scene((Body(mesh_of(FINE_BALL)),)))
-        directions = np.random.default_rng(4).normal(size=(200, 3))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        previous = np.zeros(200)
-        for radius in (1.2, 2.0, 5.0, 1000.0):
-            found = field.distances(radius * directions)[:, 0]
-            assert (found <= radius - 0.5 + 1e-3).all()
-            assert (found > previous).all()
-            previous = found
-        # from far away the bound is off by no more than the grid's own size
-        assert (previous > 1000 - 0.5 - 1.5).all()
-
     def test_outside_the_grid_it_is_the_closed_form_of_the_nearest_grid_place(self):
         field = field_of(Scene((Body(mesh_of(BALL)),)), resolution=16)
         high = field.grid.low + (field.grid.counts - 1) * field.grid.step
@@ -437,13 +424,6 @@ class TestQueriesAtSpecialPlaces:
         inner = np.maximum(field.distances(nearest)[:, 0], 0)
         expected = np.hypot(np.linalg.norm(points - nearest, axis=1), inner)
         np.testing.assert_allclose(field.distances(points)[outside, 0], expected[outside], rtol=1e-5, atol=1e-6)
-
-    def test_distances_are_continuous_across_the_faces_of_the_grid(self):
-        field = field_of(Scene((Body(mesh_of(FINE_BALL)),)))
-        points = np.random.default_rng(5).uniform(-0.4, 0.4, (100, 3))
-        inner, outer = points.copy(), points.copy()
-        inner[:, 0], outer[:, 0] = field.grid.low[0] + 1e-9, field.grid.low[0] - 1e-9
-        np.testing.assert_allclose(field.distances(inner), field.distances(outer), atol=1e-6)
 
     @given(st.lists(st.floats(-1e9, 1e9), min_size=3, max_size=3), st.integers(0, 2**20))
     def test_distances_never_change_by_more_than_the_way_between_two_queries(self, place, seed):
@@ -477,19 +457,6 @@ def many_columns(count=200):
     "a field of and asked 10 million times: 5.0 GiB at most)",
 )
 class TestManyFacesAndManyQueries:
-    @pytest.mark.parametrize("kind", ["table", "moving", "sphere"])
-    def test_chunks_do_not_change_the_bits_of_distances(self, kind):
-        body = {
-            "table": Body(mesh_of(BALL)),
-            "moving": Body(mesh_of(BALL), poses=np.stack([np.eye(4)] * 3)),
-            "sphere": Body(Sphere(0.5)),
-        }[kind]
-        field = field_of(Scene((body,)))
-        points = np.random.default_rng(9).normal(size=(257, 3))
-        whole = field.distances(points)
-        parts = np.concatenate([field.distances(points[:100]), field.distances(points[100:])])
-        assert whole.tobytes() == parts.tobytes()
-
     @each_row("way", ["off", "quadrature", "raycast"])
     @each_row("kind", ["mesh", "primitives"])
     def test_densities_have_the_same_bits_for_any_chunk_size_and_order(self, monkeypatch, kind, way):
@@ -514,12 +481,11 @@ class TestManyFacesAndManyQueries:
     def test_threads_that_ask_at_the_same_time_get_the_same_bits(self, way):
         settings = DensitySettings(sigma_m=0.05, field_resolution=16, quadrature_points=16)
         target = build_target([Scene((Body(mesh_of(BALL)),))], AROUND, settings, way)
-        points = AROUND.sample(800, np.random.default_rng(12))
+        points = AROUND.sample(200, np.random.default_rng(12))
         expected = target.log_density(points)
-        for count in (2, 4):
-            with ThreadPoolExecutor(count) as pool:
-                parts = list(pool.map(target.log_density, np.array_split(points, count)))
-            assert np.concatenate(parts).tobytes() == expected.tobytes()
+        with ThreadPoolExecutor(4) as pool:
+            parts = list(pool.map(target.log_density, np.array_split(points, 4)))
+        assert np.concatenate(parts).tobytes() == expected.tobytes()
 
     def test_fields_have_the_same_bytes_with_any_number_of_threads(self, tmp_path, monkeypatch):
         meshes = [Mesh(BALL.vertices * scale, BALL.faces) for scale in (0.8, 0.9, 1.0, 1.1)]

@@ -20,43 +20,27 @@ from lidardesign.density.training.training import CHECKPOINT
 from lidardesign.design.files import load_design
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.registry import load_task
-from lidardesign.run.inputs import YAML
 from lidardesign.run.manifest import record, start_manifest
-from lidardesign.run.yaml import MAX_DEPTH, parse_yaml
+from lidardesign.run.yaml import parse_yaml
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.workflow.fit import load_constraints
 
 BOMB_LEVELS = 7
-# name: text, position of the mistake, words of the reason
 REFUSED = {
-    "an alias bomb": (
-        "\n".join(
-            ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
-            + [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, BOMB_LEVELS)]
-        ),
-        ":6:",
-        "too many values",
+    "an alias bomb": "\n".join(
+        ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+        + [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, BOMB_LEVELS)]
     ),
-    "an alias of itself": ("a: &x [*x]\n", ":1:8", "alias"),
-    "a key twice": ("density:\n  sigma_m: 0.1\n  sigma_m: 0.2\n", ":3:3", "given before, in line 2"),
-    "deep lists": ("[" * 5000 + "]" * 5000, f":1:{MAX_DEPTH + 1}", "deeply"),
-    "deep mappings": ("{a: " * 5000, f":1:{1 + 4 * MAX_DEPTH}", "deeply"),
-    "a tag that runs code": ("density: !!python/object/apply:os.system ['touch executed']\n", ":1:10", "tag"),
-    "a tag of its own": ("density: !thing {sigma_m: 1}\n", ":1:10", "tag"),
-    "a merge key": ("a: &a {sigma_m: 1}\ndensity:\n  <<: *a\n", ":3:3", "merge"),
-    "no instead of a number": ("density: {sigma_m: no}\n", ":1:20", "found 'no'"),
-    "a time instead of a number": ("density: {sigma_m: 1:30}\n", ":1:20", "found '1:30'"),
-    "a date instead of a number": ("density: {sigma_m: 2020-01-01}\n", ":1:20", "found '2020-01-01'"),
-    "true instead of a number": ("density: {sigma_m: true}\n", ":1:20", "found True"),
-    "text instead of a number": ("density: {sigma_m: '0.1'}\n", ":1:20", "found '0.1'"),
-    "a list instead of a number": ("density: {sigma_m: [0.1]}\n", ":1:20", "valid number"),
-    "an unknown key": ("density:\n  sigma: 0.1\n", ":2:3", "did you mean 'sigma_m'"),
-    "an unknown section": ("densty: {}\n", ":1:1", "did you mean 'density'"),
-    "infinity": ("density: {sigma_m: .inf}\n", ":1:20", "finite"),
-    "a number beyond all": ("density: {sigma_m: 1e999}\n", ":1:20", "too large"),
-    "a number of ten thousand digits": ("seed: " + "9" * 10_000 + "\n", ":1:7", "digits"),
-    "two documents": ("seed: 1\n---\nseed: 2\n", ":2:1", "second document"),
-    "control characters": ("seed: \x00\n", "", "not YAML"),
+    "an alias of itself": "a: &x [*x]\n",
+    "a key twice": "density:\n  sigma_m: 0.1\n  sigma_m: 0.2\n",
+    "deep lists": "[" * 5000 + "]" * 5000,
+    "deep mappings": "{a: " * 5000,
+    "a tag that runs code": "density: !!python/object/apply:os.system ['touch executed']\n",
+    "a tag of its own": "density: !thing {sigma_m: 1}\n",
+    "a merge key": "a: &a {sigma_m: 1}\ndensity:\n  <<: *a\n",
+    "infinity": "density: {sigma_m: .inf}\n",
+    "two documents": "seed: 1\n---\nseed: 2\n",
+    "control characters": "seed: \x00\n",
 }
 
 
@@ -78,21 +62,15 @@ def readers(folder):
     "file:line:column; words and dates stay text, true and quoted text are no numbers; nothing is ever executed",
 )
 class TestYaml:
-    @each_row("case", [name for name in REFUSED if "number" not in name and "unknown" not in name])
-    @each_row("reader", ["constraints", "design", "detector"])
+    @each_row("case", REFUSED)
+    @each_row("reader", ["configuration", "constraints", "design", "detector"])
     def test_every_reader_of_yaml_refuses_it(self, tmp_path, monkeypatch, reader, case):
         monkeypatch.chdir(tmp_path)
-        (tmp_path / "input.yaml").write_bytes(REFUSED[case][0].encode())
+        (tmp_path / "input.yaml").write_bytes(REFUSED[case].encode())
         with pytest.raises(LidardesignError) as refused:
             readers(tmp_path)[reader]()
         assert "input.yaml" in str(refused.value)
         assert [path.name for path in tmp_path.iterdir()] == ["input.yaml"]
-
-    def test_more_than_a_megabyte_is_refused_before_it_is_parsed(self, tmp_path):
-        (tmp_path / "input.yaml").write_bytes(b"a: '" + b"x" * YAML.most_bytes + b"'")
-        for reader in ("configuration", "constraints", "detector"):
-            with pytest.raises(ConfigError, match="too large"):
-                readers(tmp_path)[reader]()
 
     def test_a_small_number_in_scientific_notation_is_a_number_of_the_configuration(self, tmp_path):
         (tmp_path / "input.yaml").write_text("density: {sigma_m: 1e-3}\n")

@@ -377,12 +377,6 @@ class TestTargetsWithoutShape:
         assert any("flat" in note for note in result.notes)
         assert samples.space.log_volume >= -samples.log_prob.mean()  # no density has more entropy
 
-    def test_a_single_scene_of_a_single_frame_is_enough(self, tmp_path):
-        assert len(BallTask().scenes(None, "train", 0)) == 1
-        result, _ = self.learned(tmp_path, SPACE, 0.05)
-        assert result.ess > 0.1
-
-
 TINY = (
     "train=4", "learning.steps=200", "learning.batch=64", "learning.layers=1", "learning.hidden=16",
     "learning.samples=2000", "learning.balance_proposals=512", "learning.coverage_proposals=256",

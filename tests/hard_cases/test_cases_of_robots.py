@@ -181,15 +181,6 @@ class TestNoLogFile:
             raise RejectedError("out of reach")
         assert mujoco.get_mju_user_warning() is before
 
-    def test_an_unstable_motion_leaves_no_file(self, arm):
-        def rejected():
-            joints = np.full((3, 7), 1e200)
-            joints[1] = -1e200
-            with pytest.raises(RejectedError), mujoco_warnings():
-                arm._forward(joints, 1e-200)
-
-        assert in_a_folder_of_its_own(rejected)[1] == []
-
     def test_a_robot_that_cannot_be_read_leaves_no_file(self):
         def refused():
             with pytest.raises(DataError):

@@ -8,7 +8,6 @@ from itertools import product
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -17,8 +16,6 @@ from support.hard_cases import hard_case
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings, resolve
-from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.target.target import MINIMUM_POLE_COSINE, build_target
 from lidardesign.design.files import load_design, save_design
 from lidardesign.design.fit import fit
@@ -26,7 +23,6 @@ from lidardesign.design.rigs.ray_lists import SENSOR_COLUMNS
 from lidardesign.design.sensor import boresight_frame, tangent_directions
 from lidardesign.errors import ConfigError, DataError, NumericalError
 from lidardesign.registry import load_task
-from lidardesign.run.yaml import dump_yaml
 from lidardesign.samples import Samples
 from lidardesign.scene import Body, Plane, Scene, Sphere, rigid
 from lidardesign.space import (
@@ -99,15 +95,6 @@ class TestAzimuthAcrossTheSeam:
         np.testing.assert_allclose(target.log_density(last), target.log_density(first), atol=1e-9)
         step = np.abs(target.log_density(before) - target.log_density(after))
         assert (step <= 2e-9 * (2 * slopes + 1) + 1e-8).all()
-
-    def test_unit_coordinates_of_negative_and_positive_azimuths_agree(self):
-        space = DesignSpace((0, 0, 0, -math.pi / 2, -1, 0), (0, 0, 0, math.pi / 2, 1, 1))
-        points = space.sample(200, np.random.default_rng(3))
-        positive = points.copy()
-        positive[:, AZIMUTH] = np.mod(positive[:, AZIMUTH], TURN)
-        assert (positive[:, AZIMUTH] >= 0).all()
-        assert space.contains(positive).all()
-        np.testing.assert_allclose(space.to_unit(positive), space.to_unit(points), atol=1e-14)
 
     def test_a_sensor_that_looks_across_the_seam_is_the_one_that_looks_elsewhere(self):
         tangent = np.random.default_rng(5).normal(0, [0.1, 0.05], (4000, 2))
@@ -183,14 +170,6 @@ class TestElevationAtThePoles:
         middle, spread = (1 + math.cos(0.3)) / 2, (1 - math.cos(0.3)) / math.sqrt(12)
         assert abs(height.mean() - middle) < references.STANDARD_ERRORS * spread / math.sqrt(20_000)
 
-    def test_the_flow_has_a_finite_density_at_the_poles(self):
-        circular, generator = [False] * 3 + [True, False, False], torch.Generator().manual_seed(0)
-        flow = DesignFlow(6, layers=1, hidden=8, bins=4, periodic=circular, generator=generator).double()
-        points = AROUND.sample(50, np.random.default_rng(8))
-        points[:, ELEVATION] = np.repeat([-math.pi / 2, math.pi / 2], 25)
-        unit = torch.as_tensor(AROUND.to_unit(points))
-        assert torch.isfinite(flow.log_prob(unit, None)).all()
-
     @given(st.integers(0, 2**20))
     def test_a_field_of_view_does_not_change_when_the_world_turns_its_sensor_to_a_pole(self, seed):
         generator = np.random.default_rng(seed)
@@ -228,10 +207,6 @@ class TestRangesThatAreNone:
         distance = np.linalg.norm(points[:, :3] - [1.2, 0.05, 0.1], axis=1) - 0.3
         np.testing.assert_allclose(values, -np.square(distance / 0.05) / 2, rtol=1e-12, atol=1e-12)
         assert np.isfinite(gradient).all()
-
-    def test_a_space_may_fix_the_range_at_zero(self):
-        space = DesignSpace(AROUND.low, (*AROUND.high[:5], 0.0))
-        assert (space.sample(10, np.random.default_rng(10))[:, RANGE] == 0.0).all()
 
     @each_row("text", ["[-0.1, 1]", "[0, .inf]", "[.nan, 1]", "-0.1", ".nan", "-.inf"])
     def test_configurations_are_refused_by_name_and_place(self, tmp_path, text):
@@ -315,17 +290,6 @@ class TestFixedDimensions:
         expected, whole = all_free.log_density_and_gradient(points)
         np.testing.assert_array_equal(values, expected)
         np.testing.assert_array_equal(gradient[:, list(space.free)], whole[:, list(space.free)])
-
-    def test_samples_of_a_flow_under_a_ceiling_are_all_on_it(self):
-        space = DesignSpace((*AROUND.low[:2], 1.0, *AROUND.low[3:]), (*AROUND.high[:2], 1.0, *AROUND.high[3:]))
-        coordinates = Coordinates(space)
-        generator = torch.Generator().manual_seed(1)
-        circular = [False, False, True, False, False]
-        flow = DesignFlow(5, layers=1, hidden=8, bins=4, periodic=circular, generator=generator)
-        assert flow.features == 5
-        learned, _ = flow(*flow.draw(200, generator))
-        points = space.from_unit(coordinates.join(learned, None).detach().double().numpy())
-        assert (points[:, 2] == 1.0).all()
 
     def test_a_design_under_a_ceiling_hangs_on_it_exactly_also_in_its_file(self, tmp_path):
         space = DesignSpace((-1, -1, 1.1, 0, -math.pi / 2, 0.2), (1, 1, 1.1, TURN, 0, 2))
@@ -413,9 +377,3 @@ class TestBoundsThatCannotBe:
         points = space.sample(5, np.random.default_rng(0))
         assert space.contains(points).all()
         assert np.isfinite(points).all()
-
-    def test_what_is_written_of_a_space_reads_back_as_it(self, tmp_path):
-        task, file = load_task("flatland"), tmp_path / "config.yaml"
-        space = DesignSpace((-1 / 3, 0.1, 2, -math.pi, -0.3, 0), (1e5 / 7, 0.1, 2, math.pi, math.pi / 2, 1e-9))
-        file.write_text(dump_yaml({"space": space.as_dict()}), encoding="utf-8")
-        assert resolve(task, config_file=file).space == space

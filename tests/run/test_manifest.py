@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import os
 import socket
@@ -19,7 +18,7 @@ from support.tables import each_row
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run import files
 from lidardesign.run import manifest as manifest_module
-from lidardesign.run.files import remove_stray_temporaries, run_lock, sha256_file, write_atomic
+from lidardesign.run.files import remove_stray_temporaries, run_lock, write_atomic
 from lidardesign.run.manifest import (
     announce,
     note,
@@ -93,13 +92,6 @@ def test_a_device_is_written_straight():
     assert stat.S_ISCHR(os.stat("/dev/null").st_mode), "a rename over it would have left a file"
 
 
-def test_stray_temporaries_of_killed_writers_are_removed(tmp_path):
-    (tmp_path / ".samples.npz.123.abcdef12.tmp").write_bytes(b"half")
-    (tmp_path / "samples.npz").write_bytes(b"whole")
-    assert len(remove_stray_temporaries(tmp_path)) == 1
-    assert os.listdir(tmp_path) == ["samples.npz"]
-
-
 @pytest.mark.hard_case("38")
 @each_row("name", ["samples.npz", "größe " * 14 + ".npz"])
 def test_the_next_writer_of_a_file_removes_what_a_killed_one_left(tmp_path, name):
@@ -125,12 +117,6 @@ def test_the_run_s_next_writer_cleans_its_folders_but_not_what_is_at_work_or_not
     assert remove_stray_temporaries(tmp_path) == [abandoned]
     assert at_work.exists()
     assert foreign.exists()
-
-
-def test_the_hash_is_sha256(tmp_path):
-    content = os.urandom(3_000_000)
-    (tmp_path / "file").write_bytes(content)
-    assert sha256_file(tmp_path / "file") == hashlib.sha256(content).hexdigest()
 
 
 def test_a_recorded_file_verifies_and_the_manifest_says_what_made_it(run):
@@ -192,14 +178,6 @@ def test_every_damage_has_its_own_message(tmp_path, how):
 def test_a_run_that_is_not_there_says_so(tmp_path):
     with pytest.raises(DataError, match="no such run"):
         verify(tmp_path / "nowhere", "data.bin")
-
-
-def test_a_second_writer_is_told_who_holds_the_run(tmp_path):
-    with run_lock(tmp_path):
-        with pytest.raises(ConfigError, match=f"process {os.getpid()}"), run_lock(tmp_path):
-            pass
-        assert (tmp_path / files.FILE_NAME).exists()
-    assert not (tmp_path / files.FILE_NAME).exists()
 
 
 HOLDER = """

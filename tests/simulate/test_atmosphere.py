@@ -141,16 +141,6 @@ def test_a_receiver_elsewhere_hears_the_haze_in_its_view_by_the_whole_path():
     assert background.edges_m[0, [0, -1]] == pytest.approx([(r + math.hypot(r, 1)) / 2 for r in (0.5, 5.0)])
 
 
-def test_a_receiver_at_the_emitter_hears_the_same_haze():
-    here = Receiver((0.0, 0.0, 0.0), 0.0, 0.0, 3.0, 3.0, (0.0, 99.0))
-    rays = rays_along([[1.0, 0, 0], [0.8, 0.6, 0]], GATE_M)
-    _, alone, mono = in_air(Scene((WALL,), medium=FOG), rays)
-    _, both, bistatic = in_air(Scene((WALL,), medium=FOG, receiver=here), rays)
-    assert np.array_equal(mono.edges_m, bistatic.edges_m)
-    assert bistatic.counts == pytest.approx(mono.counts, rel=1e-12)
-    assert both.gain == pytest.approx(alone.gain, rel=1e-12)
-
-
 def test_a_rays_haze_depends_on_no_other_ray_but_for_the_shared_energy():
     many = rays_along([[1.0, 0, 0], [0.8, 0.6, 0], [0.0, 0.0, 1.0]], GATE_M)
     _, _, together = in_air(Scene((WALL,), medium=FOG), many)

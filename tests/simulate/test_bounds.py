@@ -152,18 +152,6 @@ def test_estimated_ranges_stray_no_further_than_bounded(estimator, signal, bins_
     assert rms * (1 - 4 / math.sqrt(2 * draws)) <= bounded + rounding
 
 
-@each_row("mean", [1e-3, 0.1, 1.0, 5.0, 40.0])
-def test_first_photons_are_early_by_no_more_than_bounded(mean):
-    """E max of K normals for K Poisson and at least 1, by quadrature of the distribution of the first."""
-    x = np.linspace(-9, 9, 20_001)
-    # P(first <= x | K >= 1) = (1 - exp(-mean cdf)) / (1 - exp(-mean))
-    first = -np.expm1(-mean * norm.cdf(x)) / -np.expm1(-mean)
-    early = -float(np.sum((x[1:] + x[:-1]) / 2 * np.diff(first)))
-    several = mean / -math.expm1(-mean)
-    bounded = min(math.sqrt(2 * math.log(several)), (several - 1) / math.sqrt(math.pi))
-    assert 0 < early <= bounded
-
-
 def growing(name, cases):
     found = [bound(name, *case) for case in cases]
     ranges, lost = [one.range_m for one in found], [one.lost for one in found]

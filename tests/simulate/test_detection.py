@@ -358,13 +358,6 @@ def test_no_light_is_not_detected():
         assert (found.body == -1).all()
 
 
-def test_few_photons_are_lost_as_often_as_none_comes():
-    detector = counting_detector(RAYS, bin_s=BIN_S)
-    found = detected(GATE, single_echoes(PATHS, 1.5), NO_LIGHT, detector, {"photon_noise"})
-    lost = np.isnan(found.path_m).mean()
-    assert abs(lost - np.exp(-1.5)) < STANDARD_ERRORS * np.sqrt(np.exp(-1.5) / RAYS)
-
-
 @each_row("estimator", ["peak", "matched"])
 @each_row("effects", [ALL, {"photon_noise"}, {"quantisation"}, {"jitter"}, {"pile_up"}, {"ambient"}])
 def test_ranges_lie_inside_their_gates_whatever_the_light(effects, estimator):

@@ -39,7 +39,6 @@ from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
 from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import ELEVATION, aim
-from lidardesign.task import Task
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "iiwa14" / "iiwa14.xml"
 needs_real = pytest.mark.skipif(not REAL.exists(), reason="the real arm's model is not at ../shared/data/iiwa14")
@@ -72,20 +71,6 @@ def exact_returns(scene, places, frames=None, target=0):
         range_m = np.array([0.5 - 2 / 3 * radius])
         returns.append(Returns(rays, np.array([Outcome.RETURN]), range_m, np.array([target]), frame))
     return returns
-
-
-def test_the_task_keeps_the_contract(config, scenes):
-    assert isinstance(TASK, Task)
-    assert TASK.metric.unit == "m"
-    assert TASK.metric.better == "lower"
-    for split, one in scenes.items():
-        assert len(one) == 4
-        for scene in one:
-            assert scene.frames == 12
-            assert scene.frame_rate_hz == pytest.approx(12 / 8)
-            assert [body.role for body in scene.bodies].count("target") == 1
-            assert all(body.role == "occluder" for body in scene.bodies if body.name != "ball")
-            assert scene.name.startswith(split)
 
 
 def test_a_small_size_sets_only_what_was_not_set():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
@@ -138,13 +137,6 @@ def test_a_model_that_cannot_be_used_is_refused_with_its_path(tmp_path, monkeypa
     assert message in str(error.value)
     assert "arm.xml" in str(error.value.where)
     assert {file.name for file in folder.iterdir()} <= {"arm.xml"}
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_a_pipe_is_no_robot_and_is_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "robot.xml")
-    with pytest.raises(DataError, match="not a regular file"):
-        load_robot(tmp_path / "robot.xml", TOOL_M)
 
 
 def test_a_mesh_of_garbage_is_refused(tmp_path):

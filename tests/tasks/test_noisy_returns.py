@@ -74,15 +74,6 @@ def turned(returns, chosen, outcome, range_m):
 
 
 @each_row("name", TASKS)
-def test_without_a_single_detection_a_design_fails_at_the_worst_value(name, tmp_path):
-    task, scene, returns = measure(name, tmp_path)
-    blind = [turned(one, True, Outcome.NOT_DETECTED, np.nan) for one in returns]
-    score = checked_score(task, task.metric, scene, blind)
-    assert score.failed
-    assert score.value == task.metric.worst
-
-
-@each_row("name", TASKS)
 def test_invented_returns_are_scored_as_returns_of_no_body(name, tmp_path):
     task, scene, returns = measure(name, tmp_path)
     generator = np.random.default_rng(2)

@@ -12,10 +12,10 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from lidardesign_tasks.meshes import MeshesTask
-from lidardesign_tasks.motion import load_motion, moved_bounds_m
+from lidardesign_tasks.motion import moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES
 from lidardesign_tasks.pose import rotation_matrix
-from lidardesign_tasks.poses_csv import COLUMNS, interpolated, read_poses, rotation_vector
+from lidardesign_tasks.poses_csv import interpolated, read_poses, rotation_vector
 from lidardesign_tasks.surface import METRIC
 from pydantic import ValidationError
 from support.rays import rays_of_points
@@ -248,20 +248,6 @@ def test_a_motion_that_fits_no_mesh_is_refused(folder, rows, message):
     way = write(folder / "wrong.csv", f"{HEADER}\n{rows}")
     with pytest.raises((DataError, ConfigError), match=message):
         MeshesTask().space(configured(folder, motion=way))
-
-
-def test_the_description_of_a_motion_names_the_columns_that_are_taken():
-    told = MeshesTask.Config.model_fields["motion"].description
-    assert [name for name in COLUMNS if name not in told.replace(",", " ").split()] == []
-
-
-@each_row(("count", "cut"), [(11, False), (12, True), (30, True)])
-def test_a_list_of_bodies_that_is_cut_ends_in_dots(tmp_path, count, cut):
-    way = write(tmp_path / "wrong.csv", f"{HEADER}\n0,cup,0,0,0\n")
-    with pytest.raises(DataError) as refused:
-        load_motion(way, 10.0, [f"part{index:02}.stl" for index in range(count)], [])
-    assert refused.value.allowed.endswith(", ...") == cut
-    assert refused.value.allowed.count("part") == min(count, 11)
 
 
 def test_there_is_one_way_to_move(folder):
