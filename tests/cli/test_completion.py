@@ -163,7 +163,7 @@ def test_runs_and_designs_are_completed_and_other_folders_lead_on(root, place, m
     assert completed(root, "show flat/") == ["flat/designs/free.yaml"]
     inside = "show 'more runs/"
     assert completed(root, inside) == ["more runs/second", "more runs/second/designs/free.yaml"]
-    assert completed(root, f"show {place}/mi") == [f"{place}/mine.csv"]
+    assert completed(root, f"show '{place}/mi") == [f"{place}/mine.csv"]
     assert completed(root, "fit absent/") == []
 
 
