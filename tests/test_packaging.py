@@ -220,7 +220,7 @@ def environment_without_the_program(folder: Path) -> Path:
             link = shared / entry.name
             if "lidardesign" not in entry.name and not link.exists():
                 link.symlink_to(entry)
-    (own / "needed.pth").write_text(f"{shared}\n")
+    (own / "needed.pth").write_text(f"import sys; sys.path.append({str(shared)!a})\n")
     (Path(places["scripts"]) / "pip").write_text(f'#!/bin/sh\nexec "{places["scripts"]}/python" -m pip "$@"\n')
     (Path(places["scripts"]) / "pip").chmod(0o755)
     return Path(places["scripts"]) / "python"
