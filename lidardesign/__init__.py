@@ -10,6 +10,9 @@
 Importing this package loads nothing heavy: every name is imported when it is first used.
 """
 
+import contextlib
+import os
+import stat
 from importlib import import_module
 from typing import Any
 
@@ -39,3 +42,32 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+def _is_cache(folder: str) -> bool:
+    """Whether numba can keep compiled code in a user's cache folder, which may still have to be made."""
+    place = os.path.abspath(os.path.join(folder, "numba"))
+    while not os.path.lexists(place):
+        place = os.path.dirname(place)
+    return not folder.startswith("~") and os.path.isdir(place) and os.access(place, os.W_OK | os.X_OK)
+
+
+def _make_cache() -> str:
+    """Path of a cache folder below the temporary files, the same for all processes of one user.
+
+    Its name is no secret and a cache holds code: what others made, or can open, is not used.
+    """
+    import tempfile
+
+    folder = os.path.join(tempfile.gettempdir(), f"lidardesign-{os.getuid()}")
+    with contextlib.suppress(FileExistsError):
+        os.mkdir(folder, 0o700)
+    found = os.lstat(folder)
+    own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077
+    return folder if own else tempfile.mkdtemp(prefix="lidardesign-")
+
+
+# numba refuses to import where neither the package's folder nor the user's cache can be written
+if not _is_cache(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")):
+    with contextlib.suppress(OSError):
+        os.environ["XDG_CACHE_HOME"] = _make_cache()

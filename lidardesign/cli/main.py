@@ -22,7 +22,7 @@ from lidardesign.cli.commands.fit import constrain, fit
 from lidardesign.cli.commands.learn import learn
 from lidardesign.cli.commands.show import compare, show
 from lidardesign.cli.commands.tasks import tasks_app
-from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
+from lidardesign.cli.environment import make_streams_tolerant, set_thread_defaults, terminate_cleanly
 from lidardesign.cli.help import WIDEST, ManualCommand, ManualGroup
 from lidardesign.cli.output import (
     EXIT_BROKEN_PIPE,
@@ -94,7 +94,6 @@ def run(arguments: list[str] | None = None) -> None:
     set_thread_defaults()
     if VARIABLE in os.environ:
         sys.exit(answer_shell(app))
-    set_cache_default()
     make_streams_tolerant()
     terminate_cleanly()
     arguments = sys.argv[1:] if arguments is None else arguments

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import io
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -362,34 +361,6 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
     target = RunTarget(open_run(flat))
     assert [target(np.zeros((3, 6))).shape for _ in range(2)] == [(3,), (3,)]
     assert asked == [(20, decided)]
-
-
-def test_compiled_code_has_a_folder_where_nothing_else_can_be_written(monkeypatch):
-    from lidardesign.cli import environment
-
-    removed = []
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setattr(environment.atexit, "register", lambda call, folder, **_: removed.append(folder))
-    environment.set_cache_default()
-    assert not removed
-    assert "NUMBA_CACHE_DIR" not in os.environ
-    monkeypatch.setattr(environment, "_can_be_written", lambda folder: False)
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "chosen")
-    environment.set_cache_default()
-    assert os.environ["NUMBA_CACHE_DIR"] == "chosen"
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
-    environment.set_cache_default()
-    assert [os.environ["NUMBA_CACHE_DIR"]] == removed
-    assert os.listdir(removed[0]) == []
-    os.rmdir(removed[0])
-
-
-def test_a_folder_that_cannot_be_made_cannot_be_written(tmp_path):
-    from lidardesign.cli.environment import _can_be_written
-
-    (tmp_path / "file").write_text("")
-    assert _can_be_written(tmp_path / "new" / "deep")
-    assert not _can_be_written(tmp_path / "file" / "below")
 
 
 def test_a_density_that_is_too_rough_is_no_fault_of_constraints(lidardesign, flat):

@@ -163,7 +163,7 @@ def test_runs_and_designs_are_completed_and_other_folders_lead_on(root, place, m
     assert completed(root, "show flat/") == ["flat/designs/free.yaml"]
     inside = "show 'more runs/"
     assert completed(root, inside) == ["more runs/second", "more runs/second/designs/free.yaml"]
-    assert completed(root, f"show {place}/mi") == [f"{place}/mine.csv"]
+    assert completed(root, f"show '{place}/mi") == [f"{place}/mine.csv"]
     assert completed(root, "fit absent/") == []
 
 
@@ -239,7 +239,9 @@ def shell_place(place):
     script = folder / "lidardesign"
     script.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m lidardesign "$@"\n')
     script.chmod(0o755)
-    return {**os.environ, "PATH": f"{folder}{os.pathsep}{os.environ['PATH']}", "HOME": str(place)}
+    paths = f"{folder}{os.pathsep}{os.environ['PATH']}"
+    # in a plain locale fish finds no program in a folder with other letters
+    return {**os.environ, "PATH": paths, "HOME": str(place), "LC_ALL": "C.UTF-8"}
 
 
 def run_shell(name, script, environment, folder, *options):

@@ -196,13 +196,13 @@ def test_files_that_were_given_are_among_those_that_are_read(lidardesign, given_
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("evaluate flat --plots flat/config.yaml", "run/config.yaml: is a file"),
-        ("export flat/designs/fit.yaml --format csv --rate-hz 5", "csv cannot hold a frame rate"),
-        ("fit flat --at y_m=1", "--at"),
+        ("evaluate run --plots run/config.yaml", "run/config.yaml: is a file"),
+        ("export run/designs/fit.yaml --format csv --rate-hz 5", "csv cannot hold a frame rate"),
+        ("fit run --at y_m=1", "--at"),
     ],
 )
-def test_what_would_be_refused_is_refused_at_once(lidardesign, flat, given_files, line, words):
-    result = lidardesign(*line.replace("flat/", f"{flat}/").replace("flat ", f"{flat} ").split(), "--dry-run")
+def test_what_would_be_refused_is_refused_at_once(lidardesign, given_files, line, words):
+    result = lidardesign(*line.split(), "--dry-run")
     assert result.code in (2, 3), result.out
     assert words in result.err
 

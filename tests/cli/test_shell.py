@@ -102,7 +102,7 @@ def test_mistakes_on_standard_input_are_named_by_place(lidardesign, given, flat)
         result = lidardesign("show", "-")
         assert result.code == 2
         assert result.err.startswith(f"config error: {words}")
-        assert "/tmp" not in result.err
+        assert "/stdin" not in result.err
     given("budget: {rays: 40}\n")
     result = lidardesign("constrain", "-", "--constraints", "-")
     assert result.code == 2

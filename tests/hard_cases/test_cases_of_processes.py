@@ -582,6 +582,9 @@ class TestStreamsLocalesAndSignals:
         name = os.fsdecode("with spaces, größe 測 and no UTF-8 ".encode() + b"\xff")
         run = make_run(tmp_path / "made", count=1000).rename(tmp_path / name)
         environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+        # an editable installation, in such a locale, is found in a folder of plain letters only
+        folders = [str(Path(sys.modules[name].__file__).parents[1]) for name in ("lidardesign", "lidardesign_tasks")]
+        environment["PYTHONPATH"] = os.pathsep.join(folders)
         command = [sys.executable, "-m", "lidardesign", "fit", name, "--layout", "grid", "--sensors", "1", "--json"]
         ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=False)
         assert ended.returncode == 0, ended.stderr
