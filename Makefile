@@ -20,7 +20,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: demo test docs consumers setup system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills soak-promise clean
+.PHONY: demo test docs consumers setup system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-benchmarks soak-runs soak-seeds soak-kills soak-promise clean
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): once, a minute or more"
@@ -104,7 +104,11 @@ fuzz: $(BIN)/.dev
 
 # JOBS=N does so many runs at once
 JOBS ?= 2
-soak: soak-runs soak-seeds soak-kills fuzz mutation
+soak: soak-benchmarks soak-runs soak-seeds soak-kills fuzz mutation
+
+# Every benchmark once, as small as it can be
+soak-benchmarks: $(BIN)/.dev
+	$(BIN)/python -m pytest -m long tests/docs
 
 # 200 whole runs of random configurations: no fault, every constraint kept, the same bytes when done again
 soak-runs: $(BIN)/.dev

@@ -3,7 +3,8 @@
 Every command is a process of its own, and is timed from outside. Distance fields are always built. A command that had
 to compile loops is run again: the first time is the cold one, the second counts. With `--before`, another checkout does
 the same, command by command in turn, so that a machine that slows down slows both; ratios are medians over seeds, and
-beside them stands how good densities and designs are. What is in the folder is not measured again.
+beside them stands how good densities and designs are, and what of it is the same bit by bit. What is in the folder is
+not measured again.
 
     python benchmarks/journey.py --folder journey                              # some 20 minutes
     python benchmarks/journey.py --folder journey --before ../before --seeds 5
@@ -11,6 +12,7 @@ beside them stands how good densities and designs are. What is in the folder is 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -23,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from common import ARM_MODEL, FACE_MODEL, ROOT, parser, report, run_process, verdict
 
 NOW, BEFORE = "now", "before"
@@ -121,8 +124,22 @@ def measured(root: Path, words: list[str | Path], here: Path, caches: Path) -> d
         document = done.document()
         if len([*caches.rglob("*.nbi")]) == before or cold_s is not None:
             found = {"wall_s": done.wall, "cpu_s": done.cpu, "mib": done.peak_mib, "cold_s": cold_s}
-            return found | figures(document)
+            return found | figures(document) | {"digest": digest(words, document)}
         cold_s = done.wall
+
+
+def digest(words: list[str | Path], document: dict[str, Any]) -> str | None:
+    """A hash of the design, the scores or the rays that a command made, without times, paths and versions."""
+    if words[0] in ("fit", "constrain"):
+        design = yaml.safe_load(Path(document["design"]).read_text(encoding="utf-8"))
+        made: object = {key: value for key, value in design.items() if key != "provenance"}
+    elif words[0] == "evaluate":
+        made = [{key: value for key, value in row.items() if key != "seconds"} for row in document["rows"]]
+    elif words[0] == "export":
+        made = Path(words[-1]).read_text(encoding="utf-8")
+    else:
+        return None
+    return hashlib.sha256(json.dumps(made, sort_keys=True).encode()).hexdigest()
 
 
 def figures(document: dict[str, Any]) -> dict[str, float]:
@@ -158,6 +175,15 @@ def median(values: list[Any]) -> Any:
     """The median of what is there; nothing where nothing is."""
     there = [value for value in values if value is not None]
     return statistics.median(there) if there else ""
+
+
+def same_bits(found: dict[tuple[str, str], dict[str, list[dict[str, Any]]]]) -> dict[str, bool]:
+    """Commands of each journey, and whether both checkouts made the same with every seed."""
+    return {
+        f"{title}, {command}": [one["digest"] for one in taken[NOW]] == [one["digest"] for one in taken[BEFORE]]
+        for (title, command), taken in found.items()
+        if taken[NOW][0]["digest"] is not None
+    }
 
 
 def time_rows(found: dict[tuple[str, str], dict[str, list[dict[str, Any]]]], pairs: bool) -> list[list[object]]:
@@ -229,6 +255,7 @@ def main() -> None:
             verdict("at most half the time", {title: row[-1] <= 0.5 for title, row in whole.items()}),
             verdict("no more memory", {title: row[4] <= TOLERATED_MEMORY * row[7] for title, row in whole.items()}),
             verdict("scores within 1 %", {str(row[0]): row[-1] <= TOLERATED_SCORE for row in quality}),
+            verdict("the same bits", same_bits(found)),
         ]
     taken = ["journey", "command", "wall s", "CPU s", "peak MiB", "cold s"]
     judged = ["journey", "misplaced", "score"]

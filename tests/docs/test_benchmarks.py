@@ -271,7 +271,8 @@ def test_a_journey_is_compared_command_by_command_and_what_is_kept_is_not_measur
         ran.append(words[0])
         half = 0.5 if root == ROOT else 1.0
         took = {"wall_s": 9.0, "cpu_s": 8 * half, "mib": 100.0, "cold_s": None, "misplaced": 0.1}
-        return took | {"score": 5.0 if half < 1 else 4.0, "better": -1}
+        digest = None if words[0] == "learn" else words[0]
+        return took | {"score": 5.0 if half < 1 else 4.0, "better": -1, "digest": digest}
 
     monkeypatch.setattr(journey, "measured", measured)
     words = ["--folder", tmp_path, "--before", tmp_path, "--only", "aisle", "--seeds", "2", "--json", tmp_path / "out"]
@@ -288,18 +289,6 @@ def test_a_journey_is_compared_command_by_command_and_what_is_kept_is_not_measur
     assert ran[:4] == ["learn", "learn", "fit", "fit"]
 
 
-@pytest.fixture
-def run_script(run_here, tmp_path):
-    """What a script writes as JSON."""
-
-    def run(name, *words):
-        file = tmp_path / "found.json"
-        assert "| ---" in run_here(name, "--rounds", "1", "--json", file, *words)
-        return json.loads(file.read_text(encoding="utf-8"))
-
-    return run
-
-
 def settings(*pairs):
     """Words that make `learn` small; a blurred density is learned well enough on any processor: see `small_runs`."""
     learning = ("steps=80", "samples=4000", "balance_proposals=2048", "coverage_proposals=512")
@@ -310,20 +299,32 @@ SMALL_ARM = settings("size=small", "train=2", "test=2", "density.sigma_m=0.2")
 SMALL_WAREHOUSE = settings("size=small", "train=3", "test=2", "positions=1", "density.sigma_m=0.25")
 
 
-@pytest.mark.slow
-def test_frames_are_measured_and_culling_keeps_its_bound(run_script):
-    words = ["--trajectories", "2", "--frames", "12", "--points", "64", "--casters", "6", "--growth", "24"]
-    found = run_script("frames", "--robot", "embedded", *words)
-    errors = next(rows for caption, rows in found["tables"].items() if caption.startswith("Culled"))
-    assert all(0 <= row["error, max"] <= row["bound"] for row in errors)
-    assert {row["way"] for row in found["tables"]["Time per evaluation"]} >= {"full sum", "caster per frame"}
+FACE = ("--model", "embedded")
+ROUGH = settings("train=3", "density.sigma_m=0.04")
+# Every benchmark at its smallest that runs for a minute at most, and how many tables it prints.
+SMALLEST = [
+    ("arm", ["--preset", "draft", *SMALL_ARM, "--sensors", "2", "--rays", "40"]),
+    ("constrain", [*FACE, *ROUGH, "--only", "none"]),
+    ("fields", [*FACE, "--scenes", "2", "--resolution", "24", "--trimesh-points", "50"]),
+    ("flow", ["--batch", "64", "--layers", "2", "--bins", "4", "--hidden", "8"]),
+    ("frames", ["--robot", "embedded", "--trajectories", "2", "--frames", "12", "--points", "64", "--casters", "6"]),
+    ("growth", [*FACE, "--of", "rays", "--rays", "100", "200", "--samples", "2000", "--heads", "2", "--batch", "64"]),
+    ("learn", [*FACE, "--preset", "draft", *ROUGH, "--goals", "0.95", "--kl", "1000"]),
+    ("occlusion", [*SMALL_ARM, "--preset", "draft", "--rays", "40", "80", "--further-rays", "120"]),
+    ("raycasting", [*FACE, "--rays", "2000", "--checked", "100"]),
+    ("rivals", ["--folder", "kept", "--task", "warehouse", "--preset", "draft", *SMALL_WAREHOUSE, "--rays", "6"]),
+    ("selection", [*FACE, "--scenes", "4", "8", "--candidates", "100", "200", "--count", "25", "--problems", "2"]),
+    ("target", [*FACE, "--scenes", "2", "--batch", "128", "--points", "8", "--resolution", "24"]),
+    ("warehouse", ["--preset", "draft", *SMALL_WAREHOUSE, "--rays", "4", "--fit-rays", "4", "--at", "0", "0.37"]),
+]
 
 
-@pytest.mark.slow
-def test_growth_is_measured(run_script):
-    words = ["--of", "rays", "--of", "sensors", "--of", "dimensions", "--rays", "100", "200", "--sensors", "1", "2"]
-    found = run_script("growth", "--model", "embedded", *words, "--samples", "2000", "--heads", "2", "--batch", "64")
-    assert [len(rows) for rows in found["tables"].values()] == [2, 2, 6]
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "words"), SMALLEST, ids=[name for name, _ in SMALLEST])
+def test_a_benchmark_runs_at_its_smallest(run_here, tmp_path, monkeypatch, name, words):
+    monkeypatch.chdir(tmp_path)
+    assert "| ---" in run_here(name, "--rounds", "1", "--json", "found.json", *words)
+    assert all(json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["tables"].values())
 
 
 def test_every_density_has_its_own_loss_and_one_that_is_refused_an_infinite_one(script, monkeypatch, tmp_path):
@@ -346,112 +347,7 @@ def test_every_density_has_its_own_loss_and_one_that_is_refused_an_infinite_one(
     assert verdicts.rows_of(tmp_path, "flatland", ((0.0, 10), (0.0, 30), (0.25, 30)), 2) == rows  # what was kept
 
 
-@pytest.mark.slow
-def test_choosing_rays_is_measured_and_no_choice_exceeds_its_bound(run_script):
-    words = ["--scenes", "4", "8", "--candidates", "100", "200", "--count", "25", "--problems", "2"]
-    found = run_script("selection", "--model", "embedded", *words, "--proxy", "100", "4", "2")
-    growth, _, (small, *_), proxy = found["tables"].values()
-    assert [row["scenes"] for row in growth] == [4, 8]
-    assert small["value / best"] <= 1 + 1e-6
-    assert small["bound / best, most"] >= 1 - 1e-6
-    assert len(proxy) == 9
-
-
-@pytest.mark.slow
-def test_ray_casting_is_measured_and_stays_exact_far_from_the_origin(run_script):
-    found = run_script("raycasting", "--model", "embedded", "--rays", "2000", "--checked", "100")
-    ours = [row for row in found["tables"]["100 rays against float64"] if row["way"] == "lidardesign"]
-    assert {row["offset m"] for row in ours} == {0.0, 1000.0}
-    assert all(row["hit or miss differs"] == 0 and row["99 % um"] < 1 for row in ours)
-
-
-@pytest.mark.slow
-def test_a_field_is_measured_and_exact_near_its_surface(run_script):
-    words = ["--scenes", "2", "--resolution", "24", "--trimesh-points", "50"]
-    found = run_script("fields", "--model", "embedded", *words)
-    ours = list(found["tables"].values())[1][0]
-    assert ours["error near mm"] < 1e-4
-
-
-@pytest.mark.slow
-def test_learning_is_measured_with_fields_built_and_cached_and_up_to_a_divergence(run_script):
-    words = ["--model", "embedded", "--preset", "draft", *settings("train=3", "density.sigma_m=0.04")]
-    words += ["--goals", "0.95", "--kl", "1000"]
-    found = run_script("learn", *words)
-    presets, goals = found["tables"].values()
-    assert [row["fields"] for row in presets] == ["built", "in the cache"]
-    assert [row["steps"] for row in goals] == [150]  # the first after which learning may stop
-    assert presets[0]["KL nats"] == presets[1]["KL nats"]
-    assert any("the paper's code" in line for line in found["conclusions"])
-
-
-@pytest.mark.slow
-def test_constraining_is_measured_against_learning_again(run_script):
-    words = ["--model", "embedded", *settings("train=3", "density.sigma_m=0.04"), "--only", "none"]
-    found = run_script("constrain", *words)
-    (rows,) = found["tables"].values()
-    assert [row["constraints"] for row in rows] == ["none", "learn again", "fit"]
-
-
-@pytest.mark.slow
-def test_the_flow_is_measured_beside_what_is_installed(run_script):
-    found = run_script("flow", "--batch", "64", "--layers", "2", "--bins", "4", "--hidden", "8")
-    (rows,) = found["tables"].values()
-    assert all(row["log q error, nats"] < 1e-9 for row in rows if not row["flow"].startswith("floor"))
-
-
-@pytest.mark.slow
-def test_the_target_is_measured_and_agrees_with_the_plain_way(run_script):
-    words = ["--model", "embedded", "--scenes", "2", "--batch", "128", "--points", "8", "--resolution", "24"]
-    agreement = list(run_script("target", *words)["tables"].values())[1]
-    assert all(row["value, max nats"] < 1e-4 for row in agreement)
-
-
-@pytest.mark.slow
-def test_the_arm_is_measured(run_script):
-    found = run_script("arm", "--preset", "draft", *SMALL_ARM, "--sensors", "2", "--rays", "40")
-    rows = next(rows for caption, rows in found["tables"].items() if caption.startswith("Scores"))
-    assert {row["design"] for row in rows} == {
-        "benchmark-2", "uniform", "random", "bounding", "silhouette", "greedy", "occupancy", "no-visibility",
-    }  # fmt: skip
-    assert len(found["conclusions"]) == 4
-
-
-@pytest.mark.slow
-def test_the_worth_of_knowing_about_occlusion_is_measured(run_script):
-    words = ["--preset", "draft", "--rays", "40", "80", "--further-rays", "120", "--layout", "density"]
-    found = run_script("occlusion", *SMALL_ARM, *words)
-    (rows,) = found["tables"].values()
-    assert [row["rays"] for row in rows] == [40, 80]
-
-
-@pytest.mark.slow
-def test_the_warehouse_is_measured(run_script):
-    words = ["--preset", "draft", *SMALL_WAREHOUSE, "--rays", "4", "--fit-rays", "4", "--at", "0", "0.37"]
-    found = run_script("warehouse", *words)
-    rows = next(rows for caption, rows in found["tables"].items() if caption.startswith("Fits"))
-    assert [row["x m"] for row in rows] == [0.0, 0.37]
-    assert any("exit code 2" in line for line in found["conclusions"])
-
-
-@pytest.mark.slow
-def test_rivals_are_measured_drawn_and_put_on_their_page(run_script, tmp_path):
-    page, picture = tmp_path / "page.md", tmp_path / "picture.png"
-    page.write_text("before\n\n<!-- warehouse -->\n\n<!-- warehouse -->\n\nafter\n")
-    words = ["--folder", tmp_path / "kept", "--task", "warehouse", "--preset", "draft", *SMALL_WAREHOUSE]
-    words += ["--set", "learning.steps=200", "--set", "learning.samples=20000", "--seeds", "2"]
-    words += ["--rays", "6", "--page", page, "--picture", picture]
-    found = run_script("rivals", *words)
-    rows = next(rows for caption, rows in found["tables"].items() if "equal rays" in caption)
-    assert [row["design"] for row in rows][:2] == ["fit", "uniform"]
-    assert picture.stat().st_size > 10_000
-    text = page.read_text()
-    assert "| `fit` " in text
-    assert text.startswith("before")
-    assert text.endswith("after\n")
-
-
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_flatland_pictures_are_drawn(tmp_path):
     settings = ["learning.steps=3", "learning.samples=1000", "learning.balance_proposals=256", "train=3"]
     words = [word for setting in settings for word in ("--set", setting)]

@@ -19,7 +19,7 @@ from fuzz.fuzz_targets import NAMES, TARGETS, target_of
 from fuzz.mutators import mutate_bytes
 from lidardesign.errors import ConfigError, DataError
 
-INPUTS = 40
+INPUTS = 12
 FOUND = Path(__file__).parent / "found"
 
 

@@ -169,15 +169,6 @@ BUDGETS = {
     done="refused before anything is sampled with the smallest conflicting set by name, exit 4",
 )
 class TestContradictions:
-    @staticmethod
-    def broke():
-        low, high = 0.5, 0.4
-        clamped = float(np.clip(0.7, low, high))
-        return (
-            f"a gate start clamped to [{low}, {high}] is {clamped}: it keeps the last bound, breaks the first and says "
-            "nothing; a sampler that rejects would never return"
-        )
-
     @each_row("name", CONTRADICTIONS)
     def test_what_is_named_conflicts_and_without_any_one_of_it_does_not(self, name):
         values, expected = CONTRADICTIONS[name]
@@ -245,13 +236,6 @@ NEAR = {"gate": {"end_m": {"max": 0.5}}}
     "would do, exit 4; it is measured on samples that exist, once",
 )
 class TestAlmostNothingLeft:
-    @staticmethod
-    def broke():
-        return (
-            f"where 1e-7 of the mass is left a sampler that rejects draws {1 / 1e-7:,.0f} times for each sample, and "
-            "where nothing is left it never ends"
-        )
-
     @pytest.mark.parametrize("share", [1e-4, 1e-7, 1e-12, 1e-300])
     def test_it_is_refused_with_the_measured_mass(self, share):
         with pytest.raises(InfeasibleError) as caught:
@@ -397,14 +381,6 @@ def clamp_and_mstep():
     "that shares no code with the fit",
 )
 class TestBoundsHoldOnTheWrittenFile:
-    @staticmethod
-    def broke():
-        free, after, within = clamp_and_mstep()
-        return (
-            f"gates clamped to 0.2 m after the fit take the log-likelihood from {free:.2f} to {after:.2f} nats, "
-            f"bounded in the M-step it is {within:.2f}"
-        )
-
     def test_bounds_in_the_m_step_lose_less_than_clamping_after_the_fit(self):
         free, after, within = clamp_and_mstep()
         assert free >= within > after + 0.1
@@ -466,11 +442,6 @@ weights = st.lists(st.floats(0, 1e12), min_size=1, max_size=40).filter(lambda va
     "every sensor a ray or is refused",
 )
 class TestBudgetsThatDoNotDivide:
-    @staticmethod
-    def broke():
-        shares = [int(weight * 100) for weight in [1 / 7] * 7]
-        return f"int(w n) splits 100 rays among 7 equal sensors into {shares[0]} each, {sum(shares)} in all"
-
     @given(st.permutations(range(6)), st.integers(0, 400))
     def test_the_order_of_sensors_matters_only_between_equal_ones(self, order, rays):
         weights = np.array([0.31, 0.05, 0.17, 0.23, 0.11, 0.13])

@@ -172,16 +172,6 @@ def learned_at_home(tmp_path_factory):
     "designs are those of the same scene at home in metres, and turn with it",
 )
 class TestScenesOfAnyScale:
-    @staticmethod
-    def broke() -> str:
-        place, away = np.float32(1.0), np.float32(1e7)
-        # a point 3 m from a sphere's centre, by |p|^2 - 2 p.c + |c|^2 far from the origin
-        squared = (away + 3) ** 2 - 2 * (away + 3) * away + away**2
-        return (
-            f"in float32 1e7 + 0.3 - 1e7 is {np.float32(1e7 + 0.3) - away:g} m, and the square of 3 m by expanded "
-            f"products there is {squared * place:g} m^2"
-        )
-
     @each_row("way", WAYS)
     @each_row(("scale", "offset"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e7)])
     def test_densities_over_meshes_scale_and_shift_with_the_scene(self, way, scale, offset):
@@ -272,13 +262,6 @@ FAR_AWAY = {
     "scene",
 )
 class TestScenesFarAway:
-    @staticmethod
-    def broke() -> str:
-        distance = torch.tensor(450.0, requires_grad=True)
-        value = torch.log(torch.exp(-(distance**2) / 2) + 1e-10)
-        value.backward()
-        return f"log(p* + 1e-10) is {value:.1f} from 7 sigma on, at 450 sigma with a gradient of {abs(distance.grad):g}"
-
     @each_row("way", WAYS)
     @each_row("kind", FAR_AWAY)
     def test_values_are_finite_and_the_gradient_leads_to_the_scene(self, kind, way):
@@ -357,17 +340,6 @@ LIMITS = {
     "density is noted with the nats that are left; what would overflow is refused by name",
 )
 class TestSigmaAtBothEnds:
-    @staticmethod
-    def broke() -> str:
-        step, radius = 0.02, 0.31
-        error = step**2 / (8 * radius)
-        with np.errstate(over="ignore"):
-            far = -np.square(np.float64(1.0) / np.float64(1e-160)) / 2
-        return (
-            f"trilinear distances of a ball of {radius} m are off by {error:.1g} m at a step of {step} m, which sigma "
-            f"1e-8 m turns into {(error / 1e-8) ** 2 / 2:.1g} nats; with sigma 1e-160 m the exponent is {far}"
-        )
-
     @pytest.mark.parametrize("kind", MESHES)
     def test_sigma_below_the_field_resolution_is_an_error_that_says_both(self, kind):
         with pytest.raises(ConfigError, match=r"sigma 1e-08 m is far below the grid step 0\.02 m") as caught:
@@ -460,17 +432,6 @@ ALL_KINDS = (
     "are dark, or says which thickness it resolves; T is in [0, 1] and never rises with range",
 )
 class TestThinOccludersAndAnyBeta:
-    @staticmethod
-    def broke() -> str:
-        points, thickness, beta = 64, 0.005, 1000.0
-        middle = (np.arange(points) + 0.5) / points * 2.0
-        hits = int((np.abs(middle - 1.0) < thickness / 2).sum())
-        passed = math.exp(-beta * hits * 2.0 / points)
-        return (
-            f"64 midpoints over 2 m take {hits} samples inside a plate of 5 mm: T behind it is {passed:g} instead of "
-            f"{math.exp(-beta * thickness):.2g}"
-        )
-
     def test_behind_a_thin_plate_ray_casting_sees_nothing_however_thin(self):
         for thickness in (0.005, 0.0002, 1e-9):
             scene = Scene((wall(), plate(thickness)))
@@ -567,13 +528,6 @@ def cast(scene, rays, optics=OPTICS):
     "at once; the quadrature fades from the start; grazing hits move without a jump, their derivatives are capped",
 )
 class TestRaysThatStartInsideOrGraze:
-    @staticmethod
-    def broke() -> str:
-        cosine = np.float32(1.0) - np.float32(1.0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            slope, distance = np.float32(1.0) / cosine, np.float32(0.0) / cosine
-        return f"along a plane the hit's distance h / cos is {distance} on it, and its derivative 1 / cos is {slope}"
-
     @pytest.mark.parametrize("name", SOLIDS)
     def test_from_inside_a_solid_it_is_dark_behind_the_way_out(self, name):
         scene, ranges = Scene((Body(SOLIDS[name]),)), np.linspace(0, 2, 201)

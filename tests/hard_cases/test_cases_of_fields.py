@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import io
 import math
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
@@ -66,11 +65,6 @@ def mesh_of(shape):
     done="an error that names the file and why (exit 3), for every format; a file that loads as no faces is one",
 )
 class TestFilesWithoutAMesh:
-    @staticmethod
-    def broke() -> str:
-        loaded = trimesh.load(io.BytesIO(bytes(84)), file_type="stl")
-        return f"trimesh loads an STL file of no triangles without an error, as a {type(loaded).__name__} of 0 faces"
-
     @each_row("suffix", SUFFIXES)
     @each_row("content", GARBAGE.values(), ids=GARBAGE)
     def test_garbage_is_refused_with_the_name_of_the_file(self, tmp_path, suffix, content):
@@ -104,15 +98,6 @@ class TestFilesWithoutAMesh:
     "their counts, and what is left is the mesh without them",
 )
 class TestPartsOfMeshesThatAreNone:
-    @staticmethod
-    def broke() -> str:
-        corners = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-        with np.errstate(invalid="ignore"):
-            unit = normal / np.linalg.norm(normal)
-        wrong = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, np.nan]], [[0, 1, 2]], process=False)
-        return f"the unit normal of three points on a line is {unit}; trimesh gives a NaN vertex the area {wrong.area}"
-
     @each_row(
         ("vertices", "faces", "words"),
         [
@@ -208,21 +193,6 @@ def probes_of(vertices, seed=0, count=150):
     "with a note; signs agree with the parity of ray crossings",
 )
 class TestMeshesWithoutAnInside:
-    @staticmethod
-    def broke() -> str:
-        import igl
-
-        generator = np.random.default_rng(0)
-        faces = BALL.faces.copy()
-        turned = generator.random(len(faces)) < 0.3
-        faces[turned] = faces[turned, ::-1]
-        points = generator.uniform(-0.5, 0.5, (400, 3))
-        kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-        found = igl.signed_distance(points, np.asarray(BALL.vertices), faces.astype(np.int64), sign_type=kind)[0]
-        right = igl.signed_distance(points, np.asarray(BALL.vertices), BALL.faces.astype(np.int64), sign_type=kind)[0]
-        share = (np.sign(found) != np.sign(right)).mean()
-        return f"with 30 % of a ball's faces turned, libigl gives {share:.0%} of the distances the wrong sign"
-
     def test_an_open_mesh_is_unsigned_with_a_note_and_no_solid(self):
         mesh = check_mesh(BOX_VERTICES, BOX_FACES[:-2])
         assert mesh.sign == "unsigned"
@@ -358,18 +328,6 @@ WAYS = ("primitive", "table", "table without kernels", "moving", "frames", "exac
     "once; every way to ask is held to a sphere, on both sides",
 )
 class TestSignConventions:
-    @staticmethod
-    def broke() -> str:
-        import igl
-
-        turned = BALL.faces[:, ::-1].astype(np.int64)
-        kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-        found = igl.signed_distance(np.zeros((1, 3)), np.asarray(BALL.vertices), turned, sign_type=kind)[0][0]
-        return (
-            "trimesh's signed distance is positive inside (99.8 % of the points of a scan flipped), and libigl's at "
-            f"the centre of a ball of 0.5 m is {found:+.2f} m where its faces are wound the other way"
-        )
-
     @each_row("way", WAYS)
     def test_a_sphere_is_positive_outside_and_negative_inside(self, way):
         generator = np.random.default_rng(3)
@@ -425,21 +383,6 @@ SPECIAL = {
     "sqrt(|p - q|^2 + d(q)^2) from the nearest grid point q, continuous at the faces and growing without end",
 )
 class TestQueriesAtSpecialPlaces:
-    @staticmethod
-    def broke() -> str:
-        from scipy.ndimage import map_coordinates
-
-        table = coarse_field()
-        place = ((np.array([[1000.0, 0, 0]]) - table.grid.low) / table.grid.step).T
-        clamped = map_coordinates(table.table[:, 0].reshape(table.grid.counts), place, order=1, mode="nearest")[0]
-        norm = np.float64(0.0)
-        with np.errstate(invalid="ignore"):
-            slope = np.float64(0.0) / norm
-        return (
-            f"a grid read with its border values says {clamped:.2g} m at 1000 m from a ball, with gradient 0; "
-            f"p / |p| at the centre is {slope}"
-        )
-
     @each_row("places", SPECIAL)
     @each_row("shape", ["sphere", "table", "moving"])
     def test_values_and_gradients_are_finite(self, shape, places):
@@ -534,14 +477,6 @@ def many_columns(count=200):
     "a field of and asked 10 million times: 5.0 GiB at most)",
 )
 class TestManyFacesAndManyQueries:
-    @staticmethod
-    def broke() -> str:
-        queries, columns, points = 10**7, 200, 64
-        return (
-            f"distances of 1e7 queries to 200 scenes at once are {queries * columns * 8 / 2**30:.0f} GiB, with the "
-            f"slopes of 64 midpoints {queries * columns * points * 4 / 2**40:.1f} TiB"
-        )
-
     @pytest.mark.parametrize("kind", ["table", "moving", "sphere"])
     def test_chunks_do_not_change_the_bits_of_distances(self, kind):
         body = {

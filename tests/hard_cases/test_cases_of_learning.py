@@ -17,8 +17,6 @@ from support.flows import FLOWS, draw, flow_of
 from support.hard_cases import hard_case
 from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
 from support.tables import each_row
-from zuko.distributions import BoxUniform
-from zuko.transforms import MonotonicRQSTransform
 
 from lidardesign.cli.main import run as run_program
 from lidardesign.config import DensitySettings
@@ -35,14 +33,6 @@ from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 
 
-def plain_spline(scale, dtype, count=20_000):
-    """zuko's spline of random parameters, and points of the box."""
-    generator = torch.Generator().manual_seed(0)
-    sizes = [torch.randn(count, 1, n, generator=generator, dtype=torch.float64) for n in (8, 8, 7)]
-    made = MonotonicRQSTransform(*((scale * size).to(dtype) for size in sizes), bound=1.0, slope=1e-4)
-    return made, (2 * torch.rand(count, 1, generator=generator, dtype=torch.float64) - 1).to(dtype)
-
-
 def interrupted(run, step, **settings):
     with pytest.raises(KeyboardInterrupt):
         learn(BallTask(), config_of(**settings), run, progress=Interrupter(step))
@@ -54,16 +44,6 @@ def interrupted(run, step, **settings):
     done="points are kept inside, where densities are finite; the density is 0 outside the box and nowhere else",
 )
 class TestEdgesOfTheBox:
-    @staticmethod
-    def broke():
-        """zuko's spline and box in float32."""
-        made, points = plain_spline(3.0, torch.float32)
-        over = float((made.horizontal[..., -1] - 1).max())
-        log_slope = made.call_and_ladj(torch.full_like(points, math.inf))[1]
-        edge = float(BoxUniform(torch.tensor([-1.0]), torch.tensor([1.0])).log_prob(torch.tensor([1.0])))
-        lost = "NaN" if torch.isnan(log_slope).all() else "finite"
-        return f"a last knot is {over:.0e} beyond the bound, the slope at inf is {lost}, log p at the upper edge {edge}"
-
     @each_row("name", FLOWS)
     def test_edges_are_finite_and_only_the_outside_has_no_density(self, name):
         flow = flow_of(name)
@@ -116,17 +96,6 @@ class TestEdgesOfTheBox:
     "is measured: above 0.01 nats the steps go on in float64, and the run notes it",
 )
 class TestSteepSplines:
-    @staticmethod
-    def broke():
-        """zuko's spline in float32, with parameters of standard deviation 10 and 100."""
-        said = []
-        for scale in (10.0, 100.0):
-            made, points = plain_spline(scale, torch.float32)
-            off = (made.inv(made(points)) - points).abs()
-            wrong, lost = float((off > 1e-3).float().mean()), float(torch.isnan(off).float().mean())
-            said.append(f"at a spread of {scale:g} {wrong:.0%} of inverses are off by over 1e-3 and {lost:.1%} NaN")
-        return "; ".join(said)
-
     @pytest.mark.parametrize("scale", [3.0, 10.0, 100.0])
     def test_extreme_splines_stay_finite_inside_and_invertible_in_float32(self, scale):
         generator = torch.Generator().manual_seed(2)
@@ -233,18 +202,6 @@ class TestSteepSplines:
     "after six halvings learning ends with exit 5 and a checkpoint that can be read",
 )
 class TestStepsThatAreNotFinite:
-    @staticmethod
-    def broke():
-        """One step of plain Adam with one NaN in its gradient."""
-        weights = torch.nn.Parameter(torch.zeros(1000))
-        optimiser = torch.optim.Adam([weights])
-        gradient = torch.ones(1000)
-        gradient[0] = math.nan
-        weights.grad = gradient / gradient.norm()  # clipping by the norm
-        optimiser.step()
-        lost = int(torch.isnan(weights).sum())
-        return f"one NaN among 1000 gradients, clipped by their norm, makes {lost} weights NaN for good"
-
     @staticmethod
     def broken_between(monkeypatch, first, last, factor=math.nan):
         """Gradients of the target that are no numbers at some of its evaluations, which are counted."""
@@ -363,15 +320,6 @@ def trainer_of(task, space, run, **settings):
     "measured on proposals that know nothing of the flow, tells what the ESS of its own samples cannot",
 )
 class TestModesFarApart:
-    @staticmethod
-    def broke():
-        """A Gaussian fitted to one of two modes by the reverse KL, judged by its own weights."""
-        x = np.random.default_rng(0).normal(-5, 1, 10_000)
-        log_target = np.logaddexp(-np.square(x + 5) / 2, -np.square(x - 5) / 2)
-        weights = np.exp(log_target + np.square(x + 5) / 2)
-        ess = weights.sum() ** 2 / np.square(weights).sum() / len(x)
-        return f"a density that holds one of two equal modes has an ESS of {ess:.3f} by its own samples"
-
     def test_both_modes_are_learned_with_the_settings_that_stand(self, tmp_path):
         result = learn(BallsTask(LEFT, RIGHT), config_of(WIDE, **LONGER), tmp_path)
         left = load_samples(tmp_path)
@@ -411,15 +359,6 @@ class TestModesFarApart:
 )
 class TestTargetsWithoutShape:
     ONE = DesignSpace((0, 0, 0, 0, 0, 0.2), (0, 0, 0, 0, 0, 2.5))
-
-    @staticmethod
-    def broke():
-        """The density of a target of 0.1 mm on a grid of 64 steps over 2.3 m, as a linear sum."""
-        edges = np.linspace(0.2, 2.5, 65)
-        with np.errstate(under="ignore"):
-            total = float(np.exp(-np.square(((edges[1:] + edges[:-1]) / 2 - 1.0001) / 1e-4) / 2).sum())
-        log_z = math.log(total) if total > 0 else -math.inf
-        return f"summed on 64 steps the log of a shell of 0.1 mm is {log_z}, and every weight 0 / 0"
 
     @staticmethod
     def learned(run, space, sigma_m, **settings):

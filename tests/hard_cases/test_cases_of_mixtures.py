@@ -75,17 +75,6 @@ def assert_finite(mixture):
     "gains and are named; fewer different samples than sensors are named; the log-likelihood never decreases",
 )
 class TestSamplesThatDoNotFillTheirSpace:
-    @staticmethod
-    def broke():
-        # short binary numbers: their mean is exact on every machine
-        covariance = np.cov(np.tile([0.25, -1.5], (20, 1)).T)
-        with np.errstate(divide="ignore"):
-            determinant = float(np.log(np.linalg.det(covariance)))
-        return (
-            "a component on 20 copies of one sample has a covariance whose log-determinant is "
-            f"{determinant:g} and a log-likelihood of {-determinant / 2:g}; scikit-learn keeps dead ones of weight 0"
-        )
-
     @each_row("count", [1, 2, 5, 9])
     @each_row("kind", KINDS)
     def test_components_stay_finite_and_positive_definite(self, kind, count):
@@ -207,14 +196,6 @@ def far_away(mixture, sigmas, generator):
     "component takes the sample",
 )
 class TestSamplesFarFromEveryComponent:
-    @staticmethod
-    def broke():
-        density = math.exp(-0.5 * 60**2)
-        return (
-            f"exp(-60^2 / 2) is {density:g}: linear responsibilities are 0 / 0, and where the paper's code adds 1e-10 "
-            f"the log-likelihood of such a sample is {math.log(density + 1e-10):.1f} instead of {-0.5 * 60**2:g}"
-        )
-
     @each_row("sigmas", [60, 1e4, 1e8])
     @each_row("count", [1, 2, 7])
     def test_responsibilities_are_finite_and_rows_sum_to_one(self, sigmas, count):
@@ -281,14 +262,6 @@ def narrow_samples(place, count=2000):
     "dimensions only, wherever the others stand, and covariances of fixed axes are exactly 0",
 )
 class TestDimensionsThatAreFixed:
-    @staticmethod
-    def broke():
-        gains = [-3 * math.log(epsilon * math.sqrt(2 * math.pi)) for epsilon in (1e-6, 1e-12)]
-        return (
-            f"a standard deviation of 1e-6 m for a fixed origin adds {gains[0]:.1f} nats to the log-likelihood, one of "
-            f"1e-12 m {gains[1]:.1f}: the figure tells the guard and not the fit"
-        )
-
     @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (1e-3, 0.0, -7.0), (1e7, -3e5, 12.0)])
     def test_the_log_likelihood_does_not_know_where_the_origin_is_fixed(self, place):
         here = features_of(narrow_samples((0.0, 0.0, 0.0)), POINT)

@@ -16,7 +16,6 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -125,18 +124,6 @@ def open_folder():
     "what a kill left is removed by the next writer",
 )
 class TestKillsFullDisksAndTwoWriters:
-    @staticmethod
-    def broke() -> str:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "file"
-            path.write_bytes(OLD)
-            with path.open("wb"):
-                left = path.stat().st_size
-        return (
-            f"a plain write empties the file first: killed then, {left} of {len(OLD)} bytes are left; of 12 kills in "
-            "the middle of plain writes 8 left a broken file, and 12 of atomic ones left 9 stray temporary files"
-        )
-
     def test_a_kill_before_any_step_of_a_write_leaves_the_old_file_or_the_new_one(self, tmp_path):
         ended = script(KILLED_WRITERS, tmp_path / "file")
         assert ended.returncode == 0, ended.stderr
@@ -354,16 +341,6 @@ def install(tmp_path, monkeypatch):
         del sys.modules[name]
 
 
-def plain_loop(offers: list[EntryPoint]) -> tuple[int, str]:
-    """How far `for plugin in plugins: plugin.load()` comes, and what ends it."""
-    for number, offer in enumerate(offers):
-        try:
-            offer.load()
-        except BaseException as error:
-            return number, type(error).__name__
-    return len(offers), "nothing"
-
-
 @hard_case(
     "39",
     "A plugin that raises, leaves, hangs or crashes when it is imported, has another's name or version, or scores NaN",
@@ -371,16 +348,6 @@ def plain_loop(offers: list[EntryPoint]) -> tuple[int, str]:
     "with its reason, the others work, and using it exits 6",
 )
 class TestBrokenPlugins:
-    @staticmethod
-    def broke() -> str:
-        values = ("json:dumps", "a_module_that_is_not_there:Task", "os:path")
-        done, ended_by = plain_loop([EntryPoint("plugin", value, "") for value in values])
-        hard = subprocess.run([sys.executable, "-S", "-c", "import os; os._exit(7)"], capture_output=True, check=False)
-        return (
-            f"a plain loop over 3 plugins loads {done}, then ends with {ended_by}; one that calls os._exit ends the "
-            f"program with {len(hard.stderr)} words; SIGALRM never reaches Python where one hangs in compiled code"
-        )
-
     @pytest.mark.hard_case("P5")
     def test_all_are_listed_with_their_reasons_and_the_others_still_list_and_run(self, install, lidardesign):
         install({"good": GOOD, **{name: source for name, (source, _) in {**BROKEN, **FATAL}.items()}})
@@ -509,21 +476,6 @@ def on_a_terminal(*arguments, **environment) -> bytes:
     "cannot be shown, signals leave a checkpoint, one JSON document and exit 130 or 143",
 )
 class TestStreamsLocalesAndSignals:
-    @staticmethod
-    def broke() -> str:
-        name = os.fsdecode(b"run\xff")
-        try:
-            name.encode()
-            broken = "nothing"
-        except UnicodeEncodeError as error:
-            broken = type(error).__name__
-        plain = "import os, sys; os.close(1); sys.stdout = os.fdopen(os.dup(2), 'w'); print(os.open(os.devnull, 1))"
-        taken = subprocess.run([sys.executable, "-S", "-c", plain], capture_output=True, text=True, check=False)
-        return (
-            f"a page that names a folder whose bytes are no UTF-8 ends in {broken}; with stdout closed the next file "
-            f"that is opened is number {taken.stderr.strip()}, where libraries print; SIGTERM ends Python at once"
-        )
-
     def test_a_closed_pipe_ends_quietly(self, tmp_path):
         for arguments in (["tasks", "show", "flatland", "--json"], ["tasks", "show", "flatland"], ["--help"]):
             process = program(*arguments, cwd=tmp_path)

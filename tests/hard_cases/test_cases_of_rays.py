@@ -91,13 +91,6 @@ class CountingTask:
     "or a triangle's back; how many that found is counted and noted in the evaluation",
 )
 class TestRaysThroughEdgesAndVertices:
-    @staticmethod
-    def broke():
-        return (
-            f"of rays at the {len(BALL.vertices):,} vertices of a closed ball Embree loses {lost_by_embree(False):.0%} "
-            f"without its robust mode and {lost_by_embree(True):.1%} with it: a silent miss, or the far side"
-        )
-
     def test_embree_runs_in_its_robust_mode(self):
         assert lost_by_embree(False) > 0.1
         triangles = Triangles([mesh_of(BALL)])
@@ -221,22 +214,6 @@ def document(**boresight):
     "ray lists take unit vectors only",
 )
 class TestDirectionsThatAreNone:
-    @staticmethod
-    def broke():
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        scene = EmbreeScene()
-        geometry = TriangleMesh(scene, np.asarray(BALL.vertices, dtype=np.float32), np.asarray(BALL.faces))
-        rays = np.array([[0, 0, 0], [np.nan, 0, 1], [2.0, 0.3, 0.1]], dtype=np.float32)
-        found = scene.run(np.zeros_like(rays), rays, output=True)
-        assert geometry is not None
-        assert (found["primID"][:2] < 0).all()
-        return (
-            "Embree reports a miss for a zero and for a NaN direction without a word, and the surface 1 m away at "
-            f"{found['tfar'][2]:.2f} for a direction of length 2.02"
-        )
-
     @each_row("case", BAD_DIRECTIONS)
     @each_row("shape", ONE_OF_EACH)
     def test_it_is_an_error_and_never_a_silent_miss(self, case, shape):

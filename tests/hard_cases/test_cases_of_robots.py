@@ -10,7 +10,6 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-import mink
 import mujoco
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from lidardesign_tasks.robot.arm_motion import (
     RejectedError,
     draw_waypoints,
 )
-from lidardesign_tasks.robot.arm_robot import BALL, load_robot
+from lidardesign_tasks.robot.arm_robot import load_robot
 from support.hard_cases import hard_case
 from support.robots import TOOL_M, mjcf, written
 from support.tables import each_row
@@ -69,24 +68,6 @@ def step_with_nan():
     "why is kept with the scene and noted; where none can be done learning is refused with the reasons",
 )
 class TestUnstableRollouts:
-    @staticmethod
-    def broke():
-        """A NaN velocity, and a box that falls on a plane in steps of half a second."""
-        with mujoco_warnings() as warnings:
-            time_s, velocity = step_with_nan()
-            falling = FREE.replace(
-                "<worldbody>", "<option timestep='0.5'/><worldbody><geom type='plane' size='9 9 1'/>"
-            )
-            model = mujoco.MjModel.from_xml_string(falling.replace("<body>", "<body pos='0 0 1'>"))
-            data, lowest, said = mujoco.MjData(model), 1.0, len(warnings)
-            for _ in range(40):
-                mujoco.mj_step(model, data)
-                lowest = min(lowest, float(data.qpos[2]))
-        return (
-            f"after a NaN velocity MuJoCo puts the body back to {time_s:g} s and velocity {velocity:g} and goes on; in "
-            f"steps of 0.5 s a ball on the floor sinks {1 - lowest:.1g} m into it, with {len(warnings) - said} warnings"
-        )
-
     @each_row("warning", WARNINGS, ids=lambda w: w.name)
     def test_any_warning_of_mujoco_rejects_the_motion(self, arm, warning):
         data = mujoco.MjData(arm.robot.model)
@@ -158,21 +139,6 @@ class TestUnstableRollouts:
     "and an arm that reaches nothing is refused with the reasons",
 )
 class TestPosesOutOfReach:
-    @staticmethod
-    def broke():
-        """mink, asked for a place 3 m away."""
-        robot = load_robot(None, TOOL_M)
-        configuration = mink.Configuration(robot.model)
-        configuration.update(robot.home_rad)
-        task = mink.FrameTask(BALL, "site", position_cost=1.0, orientation_cost=0.0)
-        target = np.array([3.0, 0.0, 0.5])
-        task.set_target(mink.SE3.from_translation(target))
-        for _ in range(60):
-            velocity = mink.solve_ik(configuration, [task], 1.0, "daqp", limits=[mink.ConfigurationLimit(robot.model)])
-            configuration.integrate_inplace(velocity, 1.0)
-        off = float(np.linalg.norm(configuration.data.site_xpos[robot.model.site(BALL).id] - target))
-        return f"mink raises nothing for a place out of reach: after 60 steps the ball is {off:.1f} m away from it"
-
     @pytest.mark.parametrize("away", [(1.0, 0, 0), (0, 0, 1.5), (0, -2.0, 0), (1e6, 0, 0)])
     def test_a_place_out_of_reach_is_rejected(self, arm, away):
         far = draw_waypoints(0.1, np.random.default_rng(0)) + np.array(away)
@@ -203,12 +169,6 @@ class TestPosesOutOfReach:
     done="warnings are collected while robots are read and moved, become notes or reasons, and no file is written",
 )
 class TestNoLogFile:
-    @staticmethod
-    def broke():
-        """A step with a NaN velocity, outside of the program."""
-        _, left = in_a_folder_of_its_own(step_with_nan)
-        return f"one step with a NaN velocity leaves {', '.join(left) or 'nothing'} in the working folder"
-
     def test_warnings_are_collected_and_the_handler_is_put_back(self):
         before = mujoco.get_mju_user_warning()
 
@@ -275,18 +235,6 @@ OUTSIDE = {
     "model's folder is refused with its name",
 )
 class TestFilesOutsideTheFolder:
-    @staticmethod
-    def broke():
-        """MuJoCo itself, with an include of a file beside the model's folder."""
-        with tempfile.TemporaryDirectory() as folder:
-            model = Path(folder) / "model"
-            model.mkdir()
-            written(Path(folder), "<mujoco><worldbody><body name='secret'/></worldbody></mujoco>", "other.xml")
-            path = written(model, OUTSIDE["an include of the folder above"])
-            with mujoco_warnings():
-                read = mujoco.MjModel.from_xml_path(str(path))
-        return f"MuJoCo reads {read.nbody - 1} body out of a file beside the model's folder without a word"
-
     @each_row("case", OUTSIDE)
     def test_what_leads_out_of_the_folder_is_refused(self, tmp_path, case):
         (tmp_path / "model").mkdir()

@@ -79,13 +79,6 @@ def random_rays(count=300, seed=3):
     "exactly one outcome, and gates side by side share no surface and lose none",
 )
 class TestHitsAtTheEdgesOfGates:
-    @staticmethod
-    def broke():
-        depth, edges = 2.0, ((1.0, 2.0), (2.0, 3.0))
-        closed = sum(start <= depth <= end for start, end in edges)
-        opened = sum(start < depth < end for start, end in edges)
-        return f"of two gates that meet at a wall, {closed} return it if both ends count and {opened} if none does"
-
     def test_each_kind_of_hit_has_its_outcome(self):
         scene = Scene((BALL, PLATE))
         gates = {(2.0, 4.0): Outcome.OCCLUDED, (0.5, 0.9): Outcome.AFTER_GATE, (0.9, 4.0): Outcome.RETURN}
@@ -168,14 +161,6 @@ SHUT = rays_of((500.0, 500.0, 500.0), direction(np.linspace(0, 6, 9), np.full(9,
     "them, and stays finite",
 )
 class TestEmptyReturns:
-    @staticmethod
-    def broke():
-        with np.errstate(invalid="ignore"):
-            mean = np.divide(np.float64(0.0), np.float64(0.0))
-        return (
-            f"the mean distance of no points is {mean:g}, which a mean over scenes hands on to every only one of them"
-        )
-
     @pytest.mark.parametrize("rays", [NO_RAYS, LOST, SHUT], ids=["no rays", "all miss", "gates without width"])
     def test_every_task_gives_the_worst_value_and_says_that_it_failed(self, one_scene, rays):
         task, scene, often = one_scene
@@ -237,15 +222,6 @@ class TestEmptyReturns:
     done="not imported and not a bit of the returns changed; an unknown name is an error that lists all names",
 )
 class TestEffectsNotCalledFor:
-    @staticmethod
-    def broke():
-        shared, noisy = np.random.default_rng(1), np.random.default_rng(1)
-        noisy.poisson(3.0)
-        return (
-            "with one generator for all effects, switching one on moves the random numbers of the next: its first "
-            f"normal number turns from {shared.normal():.2f} to {noisy.normal():.2f}"
-        )
-
     def test_what_a_scene_does_not_call_for_changes_not_a_bit(self):
         (head,) = heads()[:1]
         rays, detector = face_rays(), load_detector("single-photon")
@@ -284,16 +260,6 @@ def looking_away(place, **changes):
     "scores as failed, and learning is refused before it starts",
 )
 class TestEmitterAndDetectorTogetherOrBlind:
-    @staticmethod
-    def broke():
-        ranges = np.random.default_rng(0).uniform(1.0, 5.0, 1000)
-        # the whole path, r + |o + r v - x|, solved for r at a baseline of zero
-        v = np.array([0.36, 0.48, 0.8])
-        back = np.linalg.norm(0.1 + ranges[:, None] * v - 0.1, axis=1)
-        solved = ((ranges + back) ** 2) / (2 * (ranges + back))
-        changed = float((solved != ranges).mean())
-        return f"solved from the whole path at a baseline of 0, {changed:.0%} of ranges differ in their last bits"
-
     @pytest.mark.parametrize("detector", ["single-photon", "consumer-8x8"])
     def test_a_receiver_at_the_emitter_measures_to_the_bit_what_an_emitter_without_one_does(self, detector):
         harsh = {"visibility_m": 20, "gloss": 0.3, "speed_m_s": 1, "illuminance_lux": 100_000, "light": "sun"}

@@ -63,14 +63,6 @@ elevations = st.floats(-math.pi / 2, math.pi / 2)
     "seam, means taken of directions, boresights in tangent planes",
 )
 class TestAzimuthAcrossTheSeam:
-    @staticmethod
-    def broke() -> str:
-        angle = np.mod(np.random.default_rng(0).normal(0, 0.1, 2000), TURN)
-        return (
-            f"the plain mean of a cluster at azimuth 0 of 0.1 rad is {angle.mean():.2g} rad and its spread "
-            f"{angle.std():.2g} rad"
-        )
-
     @given(azimuths, elevations, st.floats(-7.0, 7.0), st.floats(0.1, TURN))
     def test_wrapping_turns_no_ray_and_ends_inside_any_interval_that_holds_it(self, azimuth, elevation, start, width):
         space = DesignSpace((0, 0, 0, start, -math.pi / 2, 0), (0, 0, 0, start + width, math.pi / 2, 1))
@@ -137,16 +129,6 @@ class TestAzimuthAcrossTheSeam:
     "field of view is two physical angles around its boresight, the same at a pole as on the horizon",
 )
 class TestElevationAtThePoles:
-    @staticmethod
-    def broke() -> str:
-        with np.errstate(divide="ignore"):
-            slope = np.float64(1.0) / np.sqrt(1.0 - np.square(np.float64(1.0)))
-        cosine = np.log(np.cos(np.float32(math.pi / 2)).astype(np.float64) ** 2) / 2
-        return (
-            f"d elevation / d sin(elevation) is {slope} at a pole, and log cos(elevation), -inf there, is {cosine:.3g} "
-            "in float32"
-        )
-
     @each_row("way", WAYS)
     @each_row("measure", MEASURES)
     def test_values_and_gradients_are_finite_at_both_poles_in_both_charts(self, measure, way):
@@ -237,12 +219,6 @@ TAUS = {"negative": -0.1, "infinite": math.inf, "not a number": math.nan}
     "bounds, configurations, design files, sensor tables and by the target density",
 )
 class TestRangesThatAreNone:
-    @staticmethod
-    def broke() -> str:
-        tau = -0.1
-        passed = math.exp(-1000.0 * tau)
-        return f"exp(-beta tau) is {passed:.2g} for tau = -0.1 m and beta = 1000: a ray brighter than its light"
-
     @pytest.mark.parametrize("way", WAYS)
     def test_at_range_zero_the_density_is_that_of_the_origin_and_nothing_is_in_the_way(self, way):
         target = build_target([BALLS], AROUND, SETTINGS, way)
@@ -312,13 +288,6 @@ class TestRangesThatAreNone:
     "space is one design point, and learning it is refused, since there is nothing to learn",
 )
 class TestFixedDimensions:
-    @staticmethod
-    def broke() -> str:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            unit = np.float64(2 * 1.0 - 1.0 - 1.0) / np.float64(1.0 - 1.0)
-            volume = np.log(np.float64(1.0 - 1.0))
-        return f"scaling a ceiling z = 1 to [-1, 1] gives {unit}, and the log volume of its box is {volume}"
-
     @given(st.sets(st.integers(0, 5)), st.integers(0, 2**20), st.sampled_from(MEASURES))
     def test_fixed_dimensions_leave_the_unit_box_and_come_back_bit_for_bit(self, fixed, seed, measure):
         generator = np.random.default_rng(seed)
@@ -400,13 +369,6 @@ BAD_BOUNDS = {
     done="a configuration error (exit 2) that names file, line and column, the dimension, and what is allowed",
 )
 class TestBoundsThatCannotBe:
-    @staticmethod
-    def broke() -> str:
-        with np.errstate(invalid="ignore"):
-            volume = np.log(np.float64(1.0 - 2.0))
-            inside = bool(np.nan <= 0.5 <= np.nan)
-        return f"the log volume of [2, 1] is {volume}, and 'nan <= x <= nan' is {inside} for every x: an empty space"
-
     @each_row("dimension", DIMENSIONS)
     @each_row("case", BAD_BOUNDS)
     def test_the_error_names_the_line_and_the_dimension(self, tmp_path, dimension, case):

@@ -17,7 +17,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -91,21 +90,6 @@ def numbers_of(document, path=""):
     done="the same bytes of flow, samples, designs and exports, in any process; a resumed run is the straight one",
 )
 class TestTheSameBytes:
-    @staticmethod
-    def broke():
-        """The order of a set of names in two processes."""
-        code = "print(list({'face', 'arm', 'warehouse', 'flatland', 'emitter'}))"
-        orders = {
-            subprocess.run(
-                [sys.executable, "-S", "-c", code],
-                env={**os.environ, "PYTHONHASHSEED": seed},
-                capture_output=True,
-                check=True,
-            ).stdout
-            for seed in "1234"
-        }
-        return f"a loop over a set of five names runs in {len(orders)} orders in four processes, and with it every draw"
-
     @staticmethod
     def chain(lidardesign, run):
         """All files of learning, fitting, constraining and exporting but times, and the scores."""
@@ -219,13 +203,6 @@ GIVEN = {
     done="it raises an error that says where, or gives a defined value with a status; NaN and infinity leave nowhere",
 )
 class TestNoNaNLeaves:
-    @staticmethod
-    def broke():
-        """numpy and JSON left to themselves."""
-        with np.errstate(invalid="ignore"):
-            mean = float(np.mean([1.0, math.nan]))
-        return f"a NaN among scores makes their mean {mean}, and json.dumps writes {json.dumps(mean)}, which is no JSON"
-
     @each_row("value", NOT_NUMBERS, ids=str)
     @each_row("name", GIVEN)
     def test_what_is_no_number_is_refused_by_name(self, name, value):
@@ -282,19 +259,6 @@ KILLS = 6
     done="the last complete checkpoint is there and verifies; the next writer removes what the killed one left",
 )
 class TestKilledAtAnyTime:
-    @staticmethod
-    def broke():
-        """A file that is written in place, cut in half."""
-        from safetensors import SafetensorError
-        from safetensors.numpy import load, save
-
-        content = save({"weights": np.zeros(1000)})
-        try:
-            load(content[: len(content) // 2])
-        except SafetensorError as error:
-            said = str(error).split(":")[-1].strip()
-        return f"a checkpoint written in place and cut in half is lost ({said}): of 12 kills, 8 did"
-
     def test_the_last_complete_checkpoint_is_readable_after_every_kill(self, tmp_path):
         start_manifest(tmp_path, command=["test"], seed=0)
         save_arrays(tmp_path, "checkpoint.safetensors", {"weights": np.zeros(20_000)}, {"step": 0})
@@ -362,19 +326,6 @@ YAML_THAT_RUNS = (
 )
 class TestNoFileRunsCode:
     @staticmethod
-    def broke():
-        """pickle, and torch.load without flags as the paper's code calls it."""
-        import tempfile
-
-        with tempfile.TemporaryDirectory() as folder:
-            first, second = Path(folder) / "first", Path(folder) / "second"
-            pickle.loads(pickle.dumps(Payload(first)))
-            torch.save(Payload(second), Path(folder) / "weights.pt")
-            torch.load(Path(folder) / "weights.pt", weights_only=False)
-            ran = int(first.is_dir()) + int(second.is_dir())
-        return f"pickle.load and torch.load of a weights file run what it says: {ran} of 2 commands were run"
-
-    @staticmethod
     def refused(done, mark):
         assert done.code in (2, 3), (done.out, done.err)
         assert "internal error" not in done.err
@@ -429,17 +380,7 @@ class TestNoFileRunsCode:
     done="it is listed with the reason and using it exits 6; every other task lists and runs as if it were not there",
 )
 class TestABrokenPluginAffectsOnlyItself:
-    @staticmethod
-    def broke():
-        """A plain loop over three entry points, of which the second leaves the program."""
-        loaded = []
-        try:
-            for load in (lambda: loaded.append("first"), lambda: sys.exit(3), lambda: loaded.append("third")):
-                load()
-        except SystemExit as left:
-            return (
-                f"a loop over entry points that loads them ends with exit {left.code} after {len(loaded)} of 3 plugins"
-            )
+    """Its tests stand with what they test, under the mark `hard_case`."""
 
 
 # figures that are exact by what they are: counts, bounds and settings that were asked for, times that were measured
@@ -456,13 +397,6 @@ KINDS = {"standard error", "half of the 95 % interval", "rounding"}
     done="every estimate has its unit, its method and its error in `error_estimates`; tables print them",
 )
 class TestEveryFigureHasItsError:
-    @staticmethod
-    def broke():
-        """The same figure from other samples: an ESS of 20 samples."""
-        generator = np.random.default_rng(0)
-        found = [quality(np.zeros(20), generator.normal(0, 1, 20)).ess for _ in range(200)]
-        return f"an ESS of {np.mean(found):.2f} without its error: of 20 samples it strays by {np.std(found):.2f}"
-
     @staticmethod
     def complete(estimate):
         assert set(estimate) == {"value", "error", "unit", "kind"}
@@ -562,15 +496,6 @@ def longer_gates(document):
     "written and the command exits 4",
 )
 class TestDesignsKeepTheirConstraints:
-    @staticmethod
-    def broke():
-        """Gates and budgets met after the fit, by clipping and by rounding."""
-        weights = np.full(7, 1 / 7)
-        return (
-            f"int(w * n) gives 7 equal sensors {int((weights * 100).astype(int).sum())} of 100 rays; a spread clipped "
-            "after EM (the paper's code: SigmaClamp) is not the best fit that keeps it"
-        )
-
     @settings(max_examples=12)
     @given(RULES, st.sampled_from(["grid", "density"]))
     def test_the_written_design_satisfies_them_all_or_the_command_exits_4(self, made, rules, layout):

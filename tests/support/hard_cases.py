@@ -25,7 +25,7 @@ class HardCase:
         key: "1" to "40", "M1" to "M4" or "P1" to "P7".
         title: What comes in.
         done: What the program does then.
-        tests: The class; its `broke()` says what the plain formula does, measured at that moment.
+        tests: The class.
     """
 
     key: str
@@ -42,10 +42,6 @@ class HardCase:
     def elsewhere(self) -> dict[str, int]:
         """How many tests stand with what they test, under the mark `hard_case`, by their file in tests/."""
         return marked()[self.key]
-
-    def broke(self) -> str:
-        """What used to break, in one sentence."""
-        return self.tests.broke()
 
 
 @lru_cache
@@ -67,7 +63,7 @@ def hard_case(key: str, title: str, *, done: str) -> Callable[[type], type]:
     """Register a class of tests as the one of a case.
 
     Raises:
-        ValueError: There is no such case, another class has it, or it does not say what broke.
+        ValueError: There is no such case, or another class has it.
     """
 
     def register(tests: type) -> type:
@@ -76,8 +72,6 @@ def hard_case(key: str, title: str, *, done: str) -> Callable[[type], type]:
         other = CASES.get(key)
         if other is not None and other.tests.__qualname__ != tests.__qualname__:
             raise ValueError(f"{tests.__name__}: hard case {key} is that of {other.tests.__name__}")
-        if not callable(getattr(tests, "broke", None)):
-            raise ValueError(f"{tests.__name__} has no broke(): what does the plain formula do?")
         CASES[key] = HardCase(key, title, done, tests)
         return tests
 
