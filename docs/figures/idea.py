@@ -32,9 +32,9 @@ from lidardesign.design.files import load_design
 from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
-from lidardesign.evaluate.figures.canvas import picture, picture_style
+from lidardesign.evaluate.report.series import picture, picture_style
 from lidardesign.evaluate.figures.density import field_picture, marginals_picture
-from lidardesign.evaluate.figures.density_views import density_view
+from lidardesign.evaluate.report.density_views import density_view
 from lidardesign.evaluate.figures.scene import OUTCOME_LOOKS, View, shaded, view_of
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays, Returns

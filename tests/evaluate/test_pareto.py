@@ -9,10 +9,10 @@ from support.evaluations import make_evaluation
 from support.tables import each_row
 
 from lidardesign.evaluate.accuracy.settings import Accuracy, Measurement, Sweep
-from lidardesign.evaluate.figures.canvas import picture, picture_style
-from lidardesign.evaluate.figures.pareto import label_places, panels, pareto_picture
+from lidardesign.evaluate.report.series import picture, picture_style
+from lidardesign.evaluate.report.pareto import label_places, panels, pareto_picture
 from lidardesign.evaluate.figures.plots import pictures
-from lidardesign.evaluate.figures.scene_figure import FigureData
+from lidardesign.evaluate.report.scene_figure import FigureData
 from lidardesign.evaluate.report.figures import accuracy_tables, pareto_figures
 
 NASTY = "</script><img src=x onerror=alert(1)>$x^2"

@@ -18,7 +18,7 @@ from support.tables import each_row
 from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.evaluate.effects import EffectSummary
-from lidardesign.evaluate.figures.canvas import (
+from lidardesign.evaluate.report.series import (
     COLOURS,
     COLUMN_INCHES,
     DOTS_PER_INCH,
@@ -34,10 +34,10 @@ from lidardesign.evaluate.figures.canvas import (
     series,
     write_pictures,
 )
-from lidardesign.evaluate.figures.density_views import density_view
+from lidardesign.evaluate.report.density_views import density_view
 from lidardesign.evaluate.figures.plots import pictures, write_plots
 from lidardesign.evaluate.figures.scene import OUTCOME_LOOKS, framed_points, opened, scene_picture, shaded, view_of
-from lidardesign.evaluate.figures.scene_figure import FigureData, constraint_slack_of, scene_figure
+from lidardesign.evaluate.report.scene_figure import FigureData, constraint_slack_of, scene_figure
 from lidardesign.evaluate.figures.scores import MOST_ROWS, constraints_picture, curve_picture, drawn_pairs, phase_rows
 from lidardesign.evaluate.results import Evaluation, Paired, csv_text, write_csv
 from lidardesign.geometry.rays import Outcome, Rays

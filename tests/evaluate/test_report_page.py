@@ -12,7 +12,7 @@ import pytest
 from support.browsers import opened_browser
 from support.report_pages import FRAMES, NASTY, PLACES, make_report
 
-from lidardesign.evaluate.figures.drawing import body_triangles, frustum_lines, origin_lines, scene_bounds
+from lidardesign.evaluate.report.drawing import body_triangles, frustum_lines, origin_lines, scene_bounds
 from lidardesign.evaluate.report.report import report_html
 from lidardesign.geometry.rays import Outcome
 
