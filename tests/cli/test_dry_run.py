@@ -196,7 +196,6 @@ def test_files_that_were_given_are_among_those_that_are_read(lidardesign, given_
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("evaluate flat --plots flat/config.yaml", "run/config.yaml: is a file"),
         ("export flat/designs/fit.yaml --format csv --rate-hz 5", "csv cannot hold a frame rate"),
         ("fit flat --at y_m=1", "--at"),
     ],
