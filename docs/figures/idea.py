@@ -355,7 +355,8 @@ def field(view: DensityView) -> Figure:
         axes.contour(plane.targets, (0.5,), extent=extent, colors=[INK], linewidths=0.5)
         axes.set(xlabel=plane.labels[0], ylabel=plane.labels[1])
         axes.spines[["top", "right"]].set_visible(False)
-        figure.colorbar(drawn, label=plane.unit.replace("2", "²"), extend="max")
+        bar = figure.colorbar(drawn, extend="max")
+        bar.ax.set_title(plane.unit.replace("2", "²"), fontsize=9, loc="left")
     return figure
 
 

@@ -60,6 +60,13 @@ class DrawnDesign:
     outcome: np.ndarray
     fired: int
 
+    @property
+    def ends_m(self) -> np.ndarray:
+        """Where the drawn rays end at every position and frame, shape (P, T, N, 3) [m]."""
+        origin = np.stack([rays.origin_m for rays in self.rays])
+        direction = np.stack([rays.direction for rays in self.rays])
+        return origin[:, None] + self.length_m[..., None] * direction[:, None]
+
 
 @dataclass(frozen=True, eq=False)
 class SceneFigure:
