@@ -34,8 +34,8 @@ HOMES = {
     "typer": ("cli.",),
     "click": ("cli.",),
     "rich": ("cli.",),
-    "plotly": ("evaluate.report.", "evaluate.figures."),
-    "matplotlib": ("evaluate.figures.",),
+    "plotly": ("evaluate.report.",),
+    "matplotlib": (),
     "distributed": ("evaluate.workers.",),
     "dask": ("evaluate.workers.",),
     # it can abort its process: only the one of its own imports it

@@ -35,7 +35,7 @@ ENVIRONMENT = {
     **{"COLUMNS": "120", "LINES": "50", "TERM": "dumb", "NO_COLOR": "1", "TZ": "UTC", "CUDA_VISIBLE_DEVICES": ""},
     # the length of this path is in the size of an exported file
     **{"TMPDIR": "/tmp"},
-    **{"MPLBACKEND": "Agg", "PYTHONHASHSEED": "0"},
+    **{"PYTHONHASHSEED": "0"},
 }
 STARTED = "LIDARDESIGN_GOLDEN"
 QUICK = (
@@ -61,7 +61,7 @@ FURTHER = {
     "flatland": """
         learn flatland SETTINGS --out runs/flatland --resume
         learn flatland SETTINGS --tolerance 0.9 --out runs/staged
-        evaluate runs/flatland/designs/scan.yaml --rays 12 --plots pictures
+        evaluate runs/flatland/designs/scan.yaml --rays 12
         fit runs/flatland --layout selected --rays 12 --name chosen
         show runs/flatland/designs/chosen.yaml --json
         tasks check flatland --json

@@ -42,13 +42,6 @@ def save(figure: Figure, path: Path, colours: int | None = None) -> None:
         few.save(path, optimize=True)
 
 
-def save_smaller(png: bytes, path: Path, width: int = 1600) -> None:
-    """A PNG that is meant for paper as a smaller one of so many pixels across."""
-    drawn = Image.open(io.BytesIO(png)).convert("RGB")
-    height = round(drawn.height * width / drawn.width)
-    _save_rounded(drawn.resize((width, height), Image.Resampling.LANCZOS), path)
-
-
 def _save_rounded(drawn: Image.Image, path: Path) -> None:
     rounded = COLOUR_STEP * np.round(np.asarray(drawn.convert("RGB")) / COLOUR_STEP)
     Image.fromarray(rounded.astype(np.uint8)).save(path, optimize=True)

@@ -97,13 +97,13 @@ MANUALS: dict[str, Manual] = {
             "whether the effects that were skipped matter",
             "lidardesign evaluate runs/arm --baseline occupancy --baseline no-visibility": "two more rivals",
             "lidardesign evaluate runs/face --workers 8": "eight processes",
-            "lidardesign evaluate runs/face --accuracy --plots pictures": "what accuracy costs here, and pictures",
+            "lidardesign evaluate runs/face --accuracy --report face.html": "what accuracy costs here, on a page",
         },
         about="Scores designs in scenes that nothing was learned from, next to what an engineer would build without "
         "learning, at equal rays and at equal bandwidth, with intervals and paired differences.",
         files=(
             "RUN or DESIGN: designs, and the task and scenes of their run",
-            "--report, --plots, --csv: what is written",
+            "--report, --csv: what is written",
         ),
         exits={**GOAL, 5: "a numerical failure", 6: "the task's plugin failed"},
         see=("evaluate.md", "rivals.md", "detectors.md", "shell.md"),

@@ -96,7 +96,6 @@ def claim_outputs(
     dry_run: bool = False,
     csv: Path | None = None,
     report: Path | None = None,
-    plots: Path | None = None,
 ) -> None:
     """Claim what a command will write: standard output for `-`, a page for the report, places that can be written.
 
@@ -105,7 +104,7 @@ def claim_outputs(
         DataError: As of `check_outputs`.
     """
     claim_stdout(output, dry_run=dry_run, csv=csv, report=report)
-    check_outputs({"--csv": csv, "--report": report, "--plots": plots}, folders=("--plots",))
+    check_outputs({"--csv": csv, "--report": report})
     # pipes and devices have any name
     is_page = report is not None and (report.is_file() or not report.exists())
     if is_page and report.suffix.lower() not in ("", *PAGE_SUFFIXES):
@@ -115,7 +114,7 @@ def claim_outputs(
             allowed=", ".join(PAGE_SUFFIXES),
             hint=f"--report {quote(str(report.with_suffix('.html')))}; a browser prints it as PDF",
         )
-    note_new_folders([path for path in (csv, report, plots) if path is not None], output)
+    note_new_folders([path for path in (csv, report) if path is not None], output)
 
 
 def note_new_folders(paths: Iterable[Path], output: Output) -> None:

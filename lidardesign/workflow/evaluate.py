@@ -52,7 +52,6 @@ from lidardesign.workflow.select_rays import gate_margin_m, selection_scenes
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.cma.candidate import Show
-    from lidardesign.evaluate.figures.scene_figure import FigureData
     from lidardesign.evaluate.report.figures import Figure
 
 MOST_NAMED = 8
@@ -169,7 +168,7 @@ class ScoreRequest:
         given = [f"{name} {value}" for name, value in settings.items() if isinstance(value, str)]
         given += [*(f"--set {text}" for text in settings["--set"] or ()), *["--accuracy"] * options.accuracy]
         written = [
-            f"{path}/" if option == "--plots" else path for option, path in (outputs or {}).items() if path is not None
+            path for path in (outputs or {}).values() if path is not None
         ]
         return RequestPlan(
             COMMAND,
@@ -329,35 +328,19 @@ class Scores:
         write_csv(self.evaluation, Path(path))
         return Path(path)
 
-    def figure_data(self) -> FigureData:
-        """What pictures and reports draw in addition to the scores."""
-        from lidardesign.evaluate.figures.scene_figure import figure_data
-
-        clock = outermost_clock()
-        times = {**self.run.command_times(), COMMAND: self.timings if clock is None else clock.timings()}
-        return figure_data(self.evaluation, self.evaluation_request, times)
-
     @phase("writing")
-    def plots(self, folder: Path | str, pictured: FigureData | None = None) -> list[Path]:
-        """Write pictures for papers into a folder, as PNG and SVG."""
-        from lidardesign.evaluate.figures.plots import write_plots
-
-        return write_plots(self.evaluation, Path(folder), self.figure_data() if pictured is None else pictured)
-
-    @phase("writing")
-    def report(self, path: Path | str, command: Sequence[str] = (), pictured: FigureData | None = None) -> Path:
+    def report(self, path: Path | str, command: Sequence[str] = ()) -> Path:
         """Write one HTML page: tables, curves, a 3D view, and how to get the same figures again.
 
         Arguments:
             path: The file.
             command: What the page says that it was made by; this program's arguments by default.
-            pictured: What `figure_data` gave, to be used again.
         """
         from lidardesign.evaluate.report.report import evaluation_report, write_report
 
-        pictured = self.figure_data() if pictured is None else pictured
-        run, request = self.run, self.evaluation_request
-        page = evaluation_report(self.evaluation, request, run.folder, run.config, pictured, command or sys.argv)
+        run, request, clock = self.run, self.evaluation_request, outermost_clock()
+        times = {**run.command_times(), COMMAND: self.timings if clock is None else clock.timings()}
+        page = evaluation_report(self.evaluation, request, run.folder, run.config, times, command or sys.argv)
         write_report(page, Path(path))
         return Path(path)
 

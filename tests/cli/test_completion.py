@@ -20,7 +20,7 @@ from support.command_line import make_run, program
 from support.tables import each_row
 
 from lidardesign.cli import candidates
-from lidardesign.cli.candidates import BASELINES, FILE, FOLDER, PATH, BashCompletion, ShellCompletion, split_line
+from lidardesign.cli.candidates import BASELINES, FILE, PATH, BashCompletion, ShellCompletion, split_line
 from lidardesign.cli.commands.completion import VARIABLE
 from lidardesign.cli.main import app
 from lidardesign.cli.options import sensor_count
@@ -171,7 +171,6 @@ def test_runs_and_designs_are_completed_and_other_folders_lead_on(root, place, m
     ("line", "kind"),
     [
         ("learn face --config ", {FILE}),
-        ("evaluate run --plots ", {FOLDER}),
         ("evaluate ", {PATH}),
         ("fit run --rays ", set()),
         ("fit run extra ", set()),

@@ -196,7 +196,6 @@ def test_files_that_were_given_are_among_those_that_are_read(lidardesign, given_
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("evaluate run --plots run/config.yaml", "run/config.yaml: is a file"),
         ("export run/designs/fit.yaml --format csv --rate-hz 5", "csv cannot hold a frame rate"),
         ("fit run --at y_m=1", "--at"),
     ],

@@ -60,7 +60,6 @@ def test_a_report_that_is_called_something_else_than_a_page_is_refused(call, wor
     [
         "evaluate run --rays 9 --csv {}/deep/rows.csv",
         "evaluate run --rays 9 --report {}/page.html --dry-run",
-        "evaluate run --rays 9 --plots {}/plots --dry-run",
         "export run/designs/fit.yaml --format csv --rays 9 --out {}/rays.csv",
         "export run/designs/fit.yaml --format csv --rays 9 --out {}/rays.csv --dry-run",
         "config init flatland --out {}/flat.yaml",

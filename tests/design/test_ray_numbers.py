@@ -83,7 +83,7 @@ def numbers_of(document, name):
 
 @pytest.fixture
 def files(tmp_path):
-    return ["--csv", tmp_path / "rows.csv", "--report", tmp_path / "report.html", "--plots", tmp_path / "plots"]
+    return ["--csv", tmp_path / "rows.csv", "--report", tmp_path / "report.html"]
 
 
 def test_a_design_of_a_fixed_pattern_spoils_no_evaluation_of_its_run(call, run, tmp_path, files):
@@ -103,7 +103,6 @@ def test_a_design_of_a_fixed_pattern_spoils_no_evaluation_of_its_run(call, run, 
         lines = [line for line in csv.reader(file) if line[0] == "few"]
     assert [line[1] for line in lines] == ["5"]
     assert note in (tmp_path / "report.html").read_text()
-    assert list((tmp_path / "plots").glob("*.svg"))
 
 
 def test_without_numbers_all_of_the_task_are_evaluated_and_a_smaller_pattern_at_its_own_too(call, run):

@@ -12,7 +12,7 @@ import pytest
 from support.browsers import opened_browser
 from support.report_pages import FRAMES, NASTY, PLACES, make_report
 
-from lidardesign.evaluate.figures.drawing import body_triangles, frustum_lines, origin_lines, scene_bounds
+from lidardesign.evaluate.report.drawing import body_triangles, frustum_lines, origin_lines, scene_bounds
 from lidardesign.evaluate.report.report import report_html
 from lidardesign.geometry.rays import Outcome
 
@@ -357,3 +357,16 @@ def test_a_narrow_window_shows_everything_without_scrolling_sideways(page, width
     ]""")
     page.evaluate("() => { for (const fold of all('details')) fold.open = false; }")
     assert found == [width, 0, 0]
+
+
+def test_every_figure_downloads_as_svg_from_its_bar(page):
+    figures = page.locator(".js-plotly-plot")
+    settings = page.evaluate("() => all('.js-plotly-plot').map(one => one._context.toImageButtonOptions.format)")
+    assert settings == ["svg"] * figures.count()
+    assert page.locator(".modebar-btn").count() == figures.count() > 1
+    figures.first.scroll_into_view_if_needed()
+    figures.first.hover()
+    with page.expect_download() as download:
+        figures.first.locator(".modebar-btn").click()
+    assert download.value.suggested_filename == "curve-rays.svg"
+    assert download.value.path().read_bytes().startswith(b"<svg")

@@ -13,7 +13,6 @@ from lidardesign.cli.tables.scores import show_evaluation
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.evaluate.baselines import candidates
-from lidardesign.evaluate.figures.scores import curve_picture, differences_picture
 from lidardesign.evaluate.gates import worse_than_threshold
 from lidardesign.evaluate.report.figures import scores_figure
 from lidardesign.evaluate.report.tables import paired_tables
@@ -203,8 +202,6 @@ def test_scenes_of_one_group_give_no_interval_and_no_verdict():
     assert "None" not in console.file.getvalue()
     assert "over other scenes" not in console.file.getvalue()
     assert paired_tables(evaluation)
-    assert curve_picture(evaluation, "rays")
-    assert differences_picture(evaluation)
     assert scores_figure(evaluation, "rays")
 
 

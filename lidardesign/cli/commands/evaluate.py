@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from lidardesign.cli.progress import ProgressDisplay
     from lidardesign.evaluate.cma.candidate import Show
     from lidardesign.evaluate.cma.search import Progress
-    from lidardesign.evaluate.figures.scene_figure import FigureData
     from lidardesign.workflow.evaluate import ScoreRequest, Scores
     from lidardesign.workflow.seeds import SeedsRequest
 
@@ -130,16 +128,6 @@ def evaluate(
             "--report", metavar="FILE.html", help="Write one HTML page: tables, curves, 3D view.", show_default=False
         ),
     ] = None,
-    plots: Annotated[
-        Path | None,
-        typer.Option(
-            "--plots",
-            metavar="DIR",
-            help="Write pictures for papers into this folder, as PNG and SVG: scene, density, scores, differences, "
-            "constraints, effects, accuracy, times.",
-            show_default=False,
-        ),
-    ] = None,
     csv: Annotated[
         Path | None, typer.Option("--csv", metavar="FILE", help="Write the rows as CSV.", show_default=False)
     ] = None,
@@ -209,7 +197,7 @@ def evaluate(
 ) -> None:
     """Score designs on held-out scenes against the baselines uniform, random, bounding, silhouette and greedy."""
     with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
-        claim_outputs(output, dry_run=dry_run, csv=csv, report=report, plots=plots)
+        claim_outputs(output, dry_run=dry_run, csv=csv, report=report)
         with phase("libraries"):
             from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
             from lidardesign.workflow.seeds import SeedsRequest, differing_seeds
@@ -238,9 +226,9 @@ def evaluate(
             if runs
             else ScoreRequest.resolve(targets, chosen, notes=output.remark)
         )
-        files = {"--report": report, "--plots": plots, "--csv": csv}
+        files = {"--report": report, "--csv": csv}
         plan = request.plan(files)
-        check_outputs(files, plan.reads, ("--plots",))
+        check_outputs(files, plan.reads)
         if dry_run:
             return show_plan(plan, output)
         scores = _score(request, output)
@@ -292,16 +280,11 @@ def _with_accuracy(scores: Scores, output: Output) -> Scores:
 
 
 @phase("writing")
-def _write_files(
-    scores: Scores, written: dict[Path, None], report: Path | None, plots: Path | None, csv: Path | None
-) -> None:
-    """Write what was asked for, each whatever becomes of the others; what is there then is added to `written`."""
-    pictured = functools.cache(scores.figure_data)
+def _write_files(scores: Scores, written: dict[Path, None], report: Path | None, csv: Path | None) -> None:
+    """Write what was asked for, each whatever becomes of the other; what is there then is added to `written`."""
     with ExitStack() as rest:
         if report is not None:
-            rest.callback(_write_report, scores, written, report, pictured)
-        if plots is not None:
-            rest.callback(lambda: written.update(dict.fromkeys(scores.plots(plots, pictured()))))
+            rest.callback(_write_report, scores, written, report)
         if csv is not None:
             with written_file(csv) as file:
                 scores.to_csv(file)
@@ -309,11 +292,11 @@ def _write_files(
 
 
 def _kind(path: Path, files: Mapping[str, Path | None]) -> str:
-    """What a written file is: of pictures its name."""
-    return next((option.removeprefix("--") for option, given in files.items() if given == path), path.name)
+    """The option, without its dashes, that a written file was asked for by."""
+    return next(option.removeprefix("--") for option, given in files.items() if given == path)
 
 
-def _write_report(scores: Scores, written: dict[Path, None], path: Path, pictured: Callable[[], FigureData]) -> None:
+def _write_report(scores: Scores, written: dict[Path, None], path: Path) -> None:
     with written_file(path) as file:
-        scores.report(file, ("lidardesign", *sys.argv[1:]), pictured())
+        scores.report(file, ("lidardesign", *sys.argv[1:]))
     written[path] = None

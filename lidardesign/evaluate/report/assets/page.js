@@ -1,7 +1,15 @@
 "use strict";
 // What the page does beside the 3D view: draws its curves, answers their switches, and makes itself ready for paper.
 
-const QUIET = { responsive: true, displaylogo: false, displayModeBar: false, plotlyServerURL: "", showTips: false };
+// The bar over a figure, while the pointer is there, has one button: its picture as SVG.
+const settings = (name) => ({
+  responsive: true,
+  displaylogo: false,
+  plotlyServerURL: "",
+  showTips: false,
+  modeBarButtons: [["toImage"]],
+  toImageButtonOptions: { format: "svg", filename: name },
+});
 const [PAPER_PX, HALF_PX] = [680, 330]; // what fits on the width of a sheet, once and beside another
 
 // Every curve is a line and its band, and is switched in all figures of curves.
@@ -45,7 +53,7 @@ async function drawFigures() {
   document.head.append(Object.assign(document.createElement("script"), { textContent: find("#plotly").textContent }));
   for (const data of all("script[data-figure]")) {
     const { data: traces, layout } = JSON.parse(data.textContent);
-    await Plotly.newPlot(data.dataset.figure, traces, layout, QUIET);
+    await Plotly.newPlot(data.dataset.figure, traces, layout, settings(data.dataset.figure));
   }
   answerCurves();
   window.addEventListener("beforeprint", toPaper);
