@@ -11,7 +11,7 @@ from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import MAX_SEED, ConfigError, check_number
 from lidardesign.evaluate.baselines.simple import CMA, baseline_of
 from lidardesign.evaluate.mounting import MountError
-from lidardesign.evaluate.workers.pool import check_workers
+from lidardesign.evaluate.workers import check_workers
 from lidardesign.numerics import SLACK
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects

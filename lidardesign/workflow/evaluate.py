@@ -22,10 +22,9 @@ from lidardesign.evaluate.last_scores import SCORES, last_scores_of
 from lidardesign.evaluate.options import ScoreOptions
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
-from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.score import evaluate as score_designs
-from lidardesign.evaluate.workers.pool import check_workers, workers_of
-from lidardesign.run.clock import outermost_clock, phase, running
+from lidardesign.evaluate.workers import check_workers, scorer_of
+from lidardesign.run.clock import Progress, outermost_clock, phase, running
 from lidardesign.simulate.plan import Planner
 from lidardesign.workflow.designs import Design, collect_designs, html_table, judging_run, name_apart, named
 from lidardesign.workflow.run_folder import (
@@ -204,7 +203,7 @@ class ScoreRequest:
         """Score every design and baseline on every held-out scene.
 
         Arguments:
-            progress: Called with the scenes done, all scenes, and the name of the scene.
+            progress: Called with the name of the scene, the scenes done, and all scenes.
             searching: Called with how the searches of the baseline cma stand.
 
         Raises:
@@ -213,11 +212,8 @@ class ScoreRequest:
         """
         with nullcontext(outermost_clock()) if outermost_clock() else running() as clock:
             request = self.evaluation_request(searching)
-            with workers_of(check_workers(str(self.options.workers)), most=len(request.test)) as scorer:
-                if scorer is not None:
-                    scorer.prepare(request)
-                scoring = request if scorer is None else replace(request, scorer=scorer)
-                evaluation = score_designs(scoring, progress=progress)
+            with scorer_of(check_workers(str(self.options.workers)), request.task, len(request.test)) as scorer:
+                evaluation = score_designs(replace(request, scorer=scorer), progress=progress)
             timings = clock.timings()
         return Scores(evaluation, replace(request, cma=replace(request.cma, show=None)), self.learned, timings, self)
 
@@ -289,7 +285,7 @@ class Scores:
         """The scores, with what accuracy costs on this machine; takes minutes.
 
         Arguments:
-            progress: Called with the sweeps done, all sweeps, and the name of the sweep.
+            progress: Called with the name of the sweep, the sweeps done, and all sweeps.
 
         Raises:
             DataError: The run is unfinished or damaged.

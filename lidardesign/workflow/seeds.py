@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.request import usual_numbers
-from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.seeds import over_seeds
-from lidardesign.run.clock import outermost_clock, running
+from lidardesign.run.clock import Progress, outermost_clock, running
 from lidardesign.workflow.designs import Design
 from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest, Scores
 from lidardesign.workflow.run_folder import Notes, RequestPlan, RunFolder, log_note, read_design
@@ -57,7 +56,7 @@ def evaluate_seeds(
 
     Arguments:
         runs: Two or more runs of one task that differ only in their seed, or their folders.
-        progress: Called with the scenes done, all scenes, and the name of the scene.
+        progress: Called with the name of the scene, the scenes done, and all scenes.
         notes: Called with every note.
         options: designs (names; all that are common by default), scenes_seed (the first run's by default), and rays,
             baselines, effects, detector, settings, range_tolerance_mm, return_tolerance, mount_error, workers and
@@ -141,7 +140,7 @@ class SeedsRequest:
         """Score every run's designs and baselines, and take means over seeds.
 
         Arguments:
-            progress: Called with the scenes done, all scenes of all seeds, and the name of the scene.
+            progress: Called with the name of the scene, the scenes done, and all scenes of all seeds.
             searching: Called with how the searches of the baseline cma stand.
 
         Raises:
@@ -167,7 +166,7 @@ class SeedsRequest:
 def _part(progress: Progress | None, number: int, parts: int) -> Progress | None:
     if progress is None:
         return None
-    return lambda done, total, name: progress(number * total + done, parts * total, name)
+    return lambda name, done, total: progress(name, number * total + done, parts * total)
 
 
 def _check_runs(runs: Sequence[RunFolder]) -> None:

@@ -270,7 +270,7 @@ def evaluate(
 def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
     with output.progress("evaluating") as progress:
         return request.score(
-            lambda done, total, scene="": progress.show(done, total), search_display(request, progress)
+            lambda scene, done, total: progress.show(done, total), search_display(request, progress)
         )
 
 
@@ -287,7 +287,7 @@ def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDispl
 
 def _with_accuracy(scores: Scores, output: Output) -> Scores:
     with output.progress("measuring accuracy") as progress:
-        return scores.with_accuracy(lambda done, total, sweep: progress.show(done, total, detail=sweep))
+        return scores.with_accuracy(lambda sweep, done, total: progress.show(done, total, detail=sweep))
 
 
 @phase("writing")
