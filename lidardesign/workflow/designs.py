@@ -215,17 +215,22 @@ class Design(DesignSource):
 
 @phase("designs")
 def collect_designs(
-    targets: Sequence[Design | Path], runs: Sequence[RunFolder] = (), notes: Notes = log_note
-) -> tuple[list[Design], list[RunFolder]]:
-    """The designs that were named, and the runs: of folders all designs, of files the file; each once.
+    targets: Sequence[Design | Path], judge: RunFolder | None = None, notes: Notes = log_note
+) -> list[Design]:
+    """The designs that were named: of run folders all designs, of files the file; each once.
+
+    Arguments:
+        targets: Designs, design files and run folders.
+        judge: The run in whose scenes they are scored, where one was named.
+        notes: Called with every note.
 
     Raises:
-        DataError: One is not there.
+        DataError: One is not there, or there are none.
     """
     designs: list[Design] = []
     paths = [target for target in targets if isinstance(target, Path)]
     opened = {path: RunFolder.open(path) for path in paths if path.is_dir()}
-    runs = [*runs, *opened.values()]
+    runs = [judge] if judge else list(opened.values())
     reach_m = reach_beside([path for path in paths if path.is_file()], runs)
     for target in targets:
         if isinstance(target, Design):
@@ -243,7 +248,10 @@ def collect_designs(
         # they may be renamed: a user's own keep their names
         copy = Design(design.specification, design.run, design.path)
         seen.setdefault(id(design) if design.path is None else design.path.resolve(), copy)
-    return list(seen.values()), runs
+    if not seen:
+        where = str(runs[0].folder if judge else next(iter(opened)))
+        raise DataError("the run has no designs yet", where=where, hint=f"lidardesign fit {quote(where)}")
+    return list(seen.values())
 
 
 def named(designs: list[Design], names: Sequence[str]) -> list[Design]:
@@ -285,34 +293,30 @@ def name_apart(designs: list[Design]) -> list[Design]:
     return designs
 
 
-def judging_run(designs: Sequence[Design], runs: Sequence[RunFolder], notes: Notes = log_note) -> RunFolder:
-    """The run in whose scenes designs are scored: the first that was named, or else the one that they came from.
+def judging_run(designs: Sequence[Design], judge: RunFolder | None, notes: Notes = log_note) -> RunFolder:
+    """The run in whose scenes designs are scored: the one that was named, or else the one that they came from.
 
     Arguments:
         designs: The designs; of those from a run of other settings a note says whether they fit here.
-        runs: The runs that were named.
+        judge: The run that was named.
         notes: Called with every note.
 
     Raises:
-        ConfigError: There is none, or runs differ and no single one was named.
-        DataError: There are no designs.
+        ConfigError: There is none, or runs differ and none was named.
     """
-    candidates = runs or [design.run for design in designs if design.run is not None]
+    candidates = [judge] if judge else [design.run for design in designs if design.run is not None]
     if not candidates:
         raise ConfigError(
             "no design comes from a run that can be found, so the task is unknown",
-            hint="give the run folder too: lidardesign evaluate RUN DESIGN",
+            hint="name the run whose scenes are used: --in RUN",
         )
     judge = candidates[0]
     other = next((run for run in candidates if _settings(run) != _settings(judge)), None)
     if other is not None:
         raise ConfigError(
             f"{judge.folder} and {other.folder} differ in task, configuration or design space",
-            hint="name the run whose scenes are used: lidardesign evaluate RUN DESIGN ..., or compare A B --in RUN",
+            hint="name the run whose scenes are used: --in RUN",
         )
-    if not designs:
-        hint = f"lidardesign fit {quote(str(judge.folder))}"
-        raise DataError("the run has no designs yet", where=str(judge.folder), hint=hint)
     for design in designs:
         track = design.specification.track
         if track is not None and track.dimension not in judge.config.space.condition:

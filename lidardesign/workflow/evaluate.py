@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -12,20 +13,23 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import with_task_settings
 from lidardesign.design.compare import outside_notes
-from lidardesign.errors import ConfigError
+from lidardesign.design.sensor import MOST_RAYS
+from lidardesign.errors import MAX_SEED, ConfigError, check_number
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
-from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of, is_baseline
+from lidardesign.evaluate.baselines.simple import ALWAYS, CMA, NONE, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
 from lidardesign.evaluate.gates import check_audit, check_better, check_limit
 from lidardesign.evaluate.last_scores import SCORES, last_scores_of
-from lidardesign.evaluate.options import ScoreOptions
+from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
 from lidardesign.evaluate.score import evaluate as score_designs
 from lidardesign.evaluate.workers import check_workers, scorer_of
+from lidardesign.numerics import SLACK
 from lidardesign.run.clock import Progress, outermost_clock, phase, running
-from lidardesign.simulate.plan import Planner
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.workflow.designs import Design, collect_designs, html_table, judging_run, name_apart, named
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
@@ -47,8 +51,106 @@ if TYPE_CHECKING:
     from lidardesign.evaluate.figures.scene_figure import FigureData
     from lidardesign.evaluate.report.figures import Figure
 
+CMA_SECONDS = (0.1, 7 * 24 * 3600.0)
+# A picometre, and further than any sensor reaches.
+RANGE_TOLERANCES_MM = (SLACK, 1e9)
+RETURN_TOLERANCES = (SLACK, 1.0)
+MILLIMETRES = 1000.0
 MOST_NAMED = 8
 COMMAND = "evaluate"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreOptions:
+    """What a user may choose for an evaluation.
+
+    Arguments:
+        rays: Numbers of rays per frame; the task's by default, and those of smaller fixed patterns.
+        baselines: Further baselines beside uniform, random, bounding, silhouette and greedy, by name; ["none"] leaves
+            out all of them.
+        seed: Seed of all random numbers; the run's by default.
+        effects: auto, all, none, audit, or names of effects between commas.
+        detector: The name of a detector, or its file.
+        range_tolerance_mm: What all skipped effects together may change of ranges.
+        return_tolerance: Share of returns that all skipped effects together may change.
+        settings: Settings of the task to judge by other scenes than were learned.
+        workers: Processes that score scenes, or the address of a scheduler.
+        cma_seconds: Wall time of each search of the baseline cma [s].
+        accuracy: Whether what accuracy costs will be measured, too.
+        scenes_seed: Root of the held-out scenes; `seed` by default.
+        designs: Names of the designs that are scored; all by default.
+        mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
+        fail_above: What no design may be worse than, in the metric's unit; `Scores.check` sees to it.
+        fail_unless_better: A baseline or design that every other design must be better than; so does this.
+
+    Raises:
+        ConfigError: One of them says nothing that can be done.
+    """
+
+    rays: Sequence[int] | None = None
+    baselines: Sequence[str] = ()
+    seed: int | None = None
+    effects: str = "auto"
+    detector: str = "ideal"
+    range_tolerance_mm: float | None = None
+    return_tolerance: float | None = None
+    settings: Sequence[str] | Mapping[str, Any] = ()
+    workers: int | str = 1
+    cma_seconds: float | None = None
+    accuracy: bool = False
+    scenes_seed: int | None = None
+    designs: Sequence[str] = ()
+    mount_error: str | None = None
+    fail_above: float | None = None
+    fail_unless_better: str | None = None
+
+    def __post_init__(self) -> None:
+        check_workers(str(self.workers))
+        self.misplacement()
+        if NONE in self.baselines:
+            if len(self.baselines) > 1 or is_baseline(self.fail_unless_better or ""):
+                raise ConfigError("none together with another baseline", where="--baseline", allowed="none alone")
+        else:
+            for name in self.baselines:
+                baseline_of(name, where="--baseline")
+        limits = {
+            "cma_seconds": CMA_SECONDS,
+            "range_tolerance_mm": RANGE_TOLERANCES_MM,
+            "return_tolerance": RETURN_TOLERANCES,
+            "seed": (0, MAX_SEED),
+            "scenes_seed": (0, MAX_SEED),
+        }
+        for name, (low, high) in limits.items():
+            if getattr(self, name) is not None:
+                check_number(getattr(self, name), f"--{name.replace('_', '-')}", low, high, whole="seed" in name)
+        if self.fail_above is not None and not math.isfinite(self.fail_above):
+            raise ConfigError(f"{self.fail_above}", where="--fail-above", allowed="a finite number")
+        for count in self.rays or ():
+            check_number(count, "--rays", 1, MOST_RAYS, whole=True)
+        if self.cma_seconds is not None and CMA not in self.baselines:
+            raise ConfigError(
+                "there is no search", where="--cma-seconds", hint=f"add --baseline {CMA}, or leave it out"
+            )
+
+    def misplacement(self) -> MountError | None:
+        """How carelessly sensors are mounted in further rows."""
+        return None if self.mount_error is None else MountError.parse(self.mount_error)
+
+    def planner(self) -> tuple[Planner, bool]:
+        """How effects are chosen, and whether the choice is audited.
+
+        Raises:
+            ConfigError: An unknown effect or detector.
+        """
+        audit = self.effects.strip() == "audit"
+        choice = parse_effects("auto" if audit else self.effects)
+        detector = load_detector(self.detector)
+        tolerance = Tolerance.of(detector)
+        if self.range_tolerance_mm is not None:
+            tolerance = replace(tolerance, range_m=self.range_tolerance_mm / MILLIMETRES)
+        if self.return_tolerance is not None:
+            tolerance = replace(tolerance, lost=self.return_tolerance)
+        return Planner(detector, choice, tolerance), audit
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +184,7 @@ class ScoreRequest:
         cls,
         targets: Sequence[Design | Path],
         options: ScoreOptions,
-        runs: Sequence[RunFolder] = (),
+        judge: RunFolder | None = None,
         notes: Notes = log_note,
     ) -> ScoreRequest:
         """The request of a user's choices.
@@ -90,7 +192,7 @@ class ScoreRequest:
         Arguments:
             targets: Designs, design files, and run folders, which stand for all their designs.
             options: The choices.
-            runs: Runs that were opened for it; the first one's task judges.
+            judge: The run in whose scenes they are scored; the one that they came from by default.
             notes: Called with every note.
 
         Raises:
@@ -98,14 +200,15 @@ class ScoreRequest:
             DataError: A design or a run is not there, or damaged.
         """
         planner, audit = options.planner()
-        designs, opened = collect_designs(targets, runs, notes)
-        designs = named(designs, options.designs)
-        run = learned = judging_run(name_apart(designs), opened, notes)
+        designs = named(collect_designs(targets, judge, notes), options.designs)
+        run = learned = judging_run(name_apart(designs), judge, notes)
         for note in learned.input_notes():
             notes(note)
         rival = options.fail_unless_better
         _check_rival(rival, [design.name for design in designs])
         baselines = [*ALWAYS, *options.baselines, *([rival] if rival and is_baseline(rival) else [])]
+        if NONE in options.baselines:
+            baselines = []
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
         if options.accuracy:
             # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes

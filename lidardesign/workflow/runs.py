@@ -266,7 +266,7 @@ class Run(RunFolder):
         )
         chosen = self.designs() if designs is None else designs
         targets = [design if isinstance(design, Design) else Path(design) for design in chosen]
-        scores = ScoreRequest.resolve(targets, options, [self], notes).score(progress)
+        scores = ScoreRequest.resolve(targets, options, self, notes).score(progress)
         return scores.with_accuracy(progress) if options.accuracy else scores
 
     def __repr__(self) -> str:

@@ -107,7 +107,7 @@ class SeedsRequest:
             scenes_seed=runs[0].config.seed if options.scenes_seed is None else options.scenes_seed,
         )
         return cls(
-            [ScoreRequest.resolve(of_run, shared, [run], notes) for of_run, run in zip(designs, runs, strict=True)]
+            [ScoreRequest.resolve(of_run, shared, run, notes) for of_run, run in zip(designs, runs, strict=True)]
         )
 
     @property

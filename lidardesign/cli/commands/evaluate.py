@@ -34,7 +34,7 @@ BASELINE_HELP = (
     "(the first design refitted to the density without its occlusion term; takes some seconds), "
     "catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres and "
     "degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on "
-    "training scenes, for --cma-seconds). Repeatable."
+    "training scenes, for --cma-seconds). Repeatable. none: no baselines at all."
 )
 
 
@@ -44,11 +44,11 @@ def evaluate(
         typer.Argument(
             metavar="RUN|DESIGN",
             readable=False,
-            help="Run folders (all their designs) and design files. Designs of other runs are scored in the scenes of "
-            "the run that is named. Of runs that differ only in their seed, designs of one name are one row, with "
-            "intervals over seeds and scenes.",
+            help="Run folders (all their designs) and design files. Of runs that differ only in their seed, designs "
+            "of one name are one row, with intervals over seeds and scenes.",
         ),
     ],
+    space_of: options.SpaceOf = None,
     designs: Annotated[
         list[str] | None,
         typer.Option("--designs", metavar="NAME", help="Only designs of this name; repeatable.", show_default="all"),
@@ -211,6 +211,7 @@ def evaluate(
         claim_outputs(output, dry_run=dry_run, csv=csv, report=report, plots=plots)
         with phase("libraries"):
             from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
+            from lidardesign.workflow.run_folder import RunFolder
             from lidardesign.workflow.seeds import SeedsRequest, differing_seeds
 
         chosen = ScoreOptions(
@@ -231,11 +232,12 @@ def evaluate(
             fail_above=fail_above,
             fail_unless_better=fail_unless_better,
         )
-        runs = differing_seeds(targets, output.remark)
+        judge = None if space_of is None else RunFolder.open(space_of)
+        runs = differing_seeds(targets, output.remark) if judge is None else []
         request: ScoreRequest | SeedsRequest = (
             SeedsRequest.resolve(runs, chosen, output.remark)
             if runs
-            else ScoreRequest.resolve(targets, chosen, notes=output.remark)
+            else ScoreRequest.resolve(targets, chosen, judge, output.remark)
         )
         files = {"--report": report, "--plots": plots, "--csv": csv}
         plan = request.plan(files)
