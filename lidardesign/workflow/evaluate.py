@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.config import with_task_settings
 from lidardesign.design.compare import outside_notes
 from lidardesign.design.sensor import MOST_RAYS
-from lidardesign.errors import MAX_SEED, ConfigError, check_number
+from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
 from lidardesign.evaluate.baselines.simple import ALWAYS, CMA, NONE, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
@@ -371,12 +371,7 @@ class Scores:
             ThresholdError: One is worse than `fail_above`, or not better than `fail_unless_better`; or skipped effects
                 change a score by more than the metric's tolerance, where that was audited.
         """
-        options = self.request.options
-        if options.fail_above is not None:
-            check_limit(self.evaluation, options.fail_above)
-        if options.fail_unless_better is not None:
-            check_better(self.evaluation, options.fail_unless_better)
-        check_audit(self.evaluation)
+        names_arguments(check_scores)(self)
 
     def last_scores(self) -> dict[str, Any]:
         """What the run's manifest keeps of them: the scores of the designs that lie in the run."""
@@ -470,6 +465,16 @@ class Scores:
         ]
         caption = f"{metric.name}, {metric.better} is better, over {self.evaluation.scenes} held-out scenes"
         return html_table(caption, headings, rows)
+
+
+def check_scores(scores: Scores) -> None:
+    """As `Scores.check`, with errors that name options."""
+    options = scores.request.options
+    if options.fail_above is not None:
+        check_limit(scores.evaluation, options.fail_above)
+    if options.fail_unless_better is not None:
+        check_better(scores.evaluation, options.fail_unless_better)
+    check_audit(scores.evaluation)
 
 
 def _check_rival(name: str | None, designs: Sequence[str]) -> None:

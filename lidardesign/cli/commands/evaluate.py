@@ -210,7 +210,7 @@ def evaluate(
     with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
         claim_outputs(output, dry_run=dry_run, csv=csv, report=report, plots=plots)
         with phase("libraries"):
-            from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
+            from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest, check_scores
             from lidardesign.workflow.run_folder import RunFolder
             from lidardesign.workflow.seeds import SeedsRequest, differing_seeds
 
@@ -266,7 +266,7 @@ def evaluate(
             if accuracy:
                 scores = _with_accuracy(scores, output)
                 _write_files(scores, written, *files.values())
-        scores.check()
+        check_scores(scores)
 
 
 def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
