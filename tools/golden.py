@@ -76,7 +76,8 @@ FURTHER = {
         constrain runs/face --set gate.widht_m.max=0.1
         fit runs/face --like rig.sdf --name alike --json
         show rig.sdf
-        compare rig.sdf runs/face/designs/alike.yaml --rays 40
+        show rig.sdf runs/face/designs/alike.yaml
+        evaluate rig.sdf runs/face/designs/alike.yaml --rays 40 --baseline none
         export rig.sdf --format csv --out -
         export runs/face/designs/grid.yaml --format galvo --rays 40 --out mirrors.galvo.csv
         capture scan.npz runs/face/designs/grid.yaml --rays 40 --csv points.csv
@@ -97,7 +98,7 @@ FURTHER = {
         export runs/warehouse/designs/track.yaml --rays 12 --format csv
         show runs/warehouse/designs/track.yaml --at x_m=2.5
         export runs/warehouse/designs/track.yaml --rays 12 --at x_m=2.5 --format csv --out rays.csv
-        compare runs/warehouse/designs/track.yaml runs/warehouse/designs/here.yaml --json
+        show runs/warehouse/designs/track.yaml runs/warehouse/designs/here.yaml --json
         evaluate runs/warehouse/designs/track.yaml runs/warehouse/designs/here.yaml --rays 12 --json
     """,
     "arm": """
@@ -134,7 +135,7 @@ GENERAL = """
     fit runs/nothing --json
 """
 COMMANDS = (
-    "", "learn", "fit", "constrain", "evaluate", "export", "capture", "show", "compare", "completion", "tasks",
+    "", "learn", "fit", "constrain", "evaluate", "export", "capture", "show", "completion", "tasks",
     "tasks list", "tasks show", "tasks check", "tasks new", "catalog", "catalog list", "catalog show", "config",
     "config init", "config schema",
 )  # fmt: skip
@@ -245,8 +246,8 @@ def task_lines(task: str) -> Iterator[str]:
     for name, suffix in _formats() if task in EXPORTED else ():
         amount = "" if name in SENSOR_FORMATS else f"--rays {rays} "
         yield f"export {designs[0]} --format {name} {amount}--out all/{name}{suffix} --json"
-    yield f"compare {designs[0]} {designs[1]} --rays {rays}"
-    yield f"compare {designs[1]} {designs[2]} --rays {rays} --json"
+    yield f"evaluate {designs[0]} {designs[1]} --rays {rays} --baseline none"
+    yield f"show {designs[1]} {designs[2]} --json"
     yield f"evaluate {run} --rays {rays} --dry-run --json"
     yield f"evaluate {run} --rays {rays} --csv rows.csv"
     yield f"evaluate {designs[0]} --rays {rays} --baseline occupancy --json"

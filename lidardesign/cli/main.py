@@ -20,7 +20,7 @@ from lidardesign.cli.commands.evaluate import evaluate
 from lidardesign.cli.commands.export import export
 from lidardesign.cli.commands.fit import constrain, fit
 from lidardesign.cli.commands.learn import learn
-from lidardesign.cli.commands.show import compare, show
+from lidardesign.cli.commands.show import show
 from lidardesign.cli.commands.tasks import tasks_app
 from lidardesign.cli.environment import make_streams_tolerant, set_thread_defaults, terminate_cleanly
 from lidardesign.cli.help import WIDEST, ManualCommand, ManualGroup
@@ -57,7 +57,7 @@ app = typer.Typer(
 app.add_typer(tasks_app, name="tasks")
 app.add_typer(catalog_app, name="catalog")
 app.add_typer(config_app, name="config")
-for subcommand in (learn, fit, constrain, evaluate, export, capture, show, compare, completion):
+for subcommand in (learn, fit, constrain, evaluate, export, capture, show, completion):
     app.command(context_settings=SETTINGS)(subcommand)
 for group in (tasks_app, catalog_app, config_app):
     group.info.cls, group.info.context_settings = ManualGroup, SETTINGS

@@ -102,7 +102,7 @@ MANUALS: dict[str, Manual] = {
         about="Scores designs in scenes that nothing was learned from, next to what an engineer would build without "
         "learning, at equal rays and at equal bandwidth, with intervals and paired differences.",
         files=(
-            "RUN or DESIGN: designs, and the task and scenes of their run",
+            "RUN or DESIGN: designs, scored in the scenes of their run or of --in RUN",
             "--report, --csv: what is written",
         ),
         exits={**GOAL, 5: "a numerical failure", 6: "the task's plugin failed"},
@@ -138,23 +138,13 @@ MANUALS: dict[str, Manual] = {
             "lidardesign show runs/face/designs/free.yaml": "its sensors, constraints and cost",
             "lidardesign show runs/warehouse/designs/track.yaml --at x_m=3.91": "its rays at one position",
             "lidardesign show robot.sdf": "the lidars of a Gazebo model",
+            "lidardesign show robot.sdf runs/face/designs/free.yaml": "what differs between two designs",
         },
         files=(
             "DESIGN: a design, the research code's sensor CSV, or a rig of others: rays as CSV or NPZ, a MuJoCo model "
             "with rangefinders, an SDF file with lidars",
         ),
         see=("design-file.md", "rigs.md", "formats.md"),
-    ),
-    "compare": Manual(
-        {
-            "lidardesign compare runs/face/designs/free.yaml runs/face/designs/beams.yaml": "two designs of a run",
-            "lidardesign compare robot.sdf runs/face/designs/free.yaml --rays 100": "an existing rig, and a design",
-            "lidardesign compare rig.csv other.csv --in runs/face": "two rigs in the scenes of a run",
-        },
-        about="Shows what differs, sensor by sensor, and what that is worth: both are scored in the same held-out "
-        "scenes, and compared scene by scene.",
-        exits=FROM_A_RUN,
-        see=("rigs.md", "evaluate.md"),
     ),
     "catalog list": Manual(
         {"lidardesign catalog list --reflectance 10 --klux 100": "ranges stated for dark targets in the sun"},

@@ -150,8 +150,8 @@ SpaceOf = Annotated[
     typer.Option(
         "--in",
         metavar="RUN",
-        help="Take the design space and the task of this run.",
-        show_default="the run that a design came from",
+        help="Take the task, its scenes and the design space of this run, for designs of any origin.",
+        show_default="the run that designs came from",
     ),
 ]
 Overrides = Annotated[

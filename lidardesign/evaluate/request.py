@@ -131,8 +131,7 @@ class EvaluationRequest:
         self, fired: Callable[[int], Sequence[RaysPerCondition]], planner: Planner, plans: Sequence[EffectPlan] = ()
     ) -> ScenePass:
         """Sets of rays in the held-out scenes: see `ScenePass`."""
-        seeds = (self.seed, self.held_out_seed)
-        return ScenePass(self.task, self.metric, self.config, self.space, *seeds, self.test, fired, planner, plans)
+        return ScenePass(self.task, self.metric, self.seed, self.test, fired, planner, plans)
 
 
 def pattern_size(design: DesignSpec) -> int | None:

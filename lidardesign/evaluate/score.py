@@ -29,12 +29,12 @@ from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, left_out
 from lidardesign.evaluate.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
 from lidardesign.evaluate.rivals import strongest_rival
-from lidardesign.evaluate.scene_scores import Progress, silent_notes
+from lidardesign.evaluate.scene_scores import silent_notes
 from lidardesign.evaluate.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.numerics import ROUNDING
 from lidardesign.registry import plugin_guard
-from lidardesign.run.clock import phase
+from lidardesign.run.clock import Progress, phase
 from lidardesign.scene import Scene, group_numbers
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.task import Metric, Score, notes_of
@@ -59,7 +59,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
 
     Arguments:
         request: What to evaluate.
-        progress: Called with the scenes done, all scenes, and the name of the scene.
+        progress: Called with the name of the scene, the scenes done, and all scenes.
 
     Raises:
         ConfigError: No scenes, designs of one name, an unknown baseline, a layout that cannot be had, or an effect that
@@ -106,7 +106,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
 def _part(progress: Progress | None, number: int, passes: int) -> Progress | None:
     if progress is None:
         return None
-    return lambda done, total, name: progress(number * total + done, passes * total, name)
+    return lambda name, done, total: progress(name, number * total + done, passes * total)
 
 
 @phase("audit")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -12,14 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import with_task_settings
 from lidardesign.design.compare import outside_notes
-from lidardesign.errors import ConfigError
+from lidardesign.design.sensor import MOST_RAYS
+from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
-from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of, is_baseline
+from lidardesign.evaluate.baselines.simple import ALWAYS, CMA, NONE, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
 from lidardesign.evaluate.gates import check_audit, check_better, check_limit
 from lidardesign.evaluate.last_scores import SCORES, last_scores_of
-from lidardesign.evaluate.options import ScoreOptions
+from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import (
     EvaluationRequest,
     fired_numbers,
@@ -29,11 +31,12 @@ from lidardesign.evaluate.request import (
     usual_numbers,
 )
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
-from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.score import evaluate as score_designs
-from lidardesign.evaluate.workers.pool import check_workers, workers_of
-from lidardesign.run.clock import outermost_clock, phase, running
-from lidardesign.simulate.plan import Planner
+from lidardesign.evaluate.workers import check_workers, scorer_of
+from lidardesign.numerics import SLACK
+from lidardesign.run.clock import Progress, outermost_clock, phase, running
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.workflow.designs import Design, collect_designs, html_table, judging_run, name_apart, named
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
@@ -54,8 +57,106 @@ if TYPE_CHECKING:
     from lidardesign.evaluate.cma.candidate import Show
     from lidardesign.evaluate.report.figures import Figure
 
+CMA_SECONDS = (0.1, 7 * 24 * 3600.0)
+# A picometre, and further than any sensor reaches.
+RANGE_TOLERANCES_MM = (SLACK, 1e9)
+RETURN_TOLERANCES = (SLACK, 1.0)
+MILLIMETRES = 1000.0
 MOST_NAMED = 8
 COMMAND = "evaluate"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreOptions:
+    """What a user may choose for an evaluation.
+
+    Arguments:
+        rays: Numbers of rays per frame; the task's by default, and those of fixed patterns.
+        baselines: Further baselines beside uniform, random, bounding, silhouette and greedy, by name; ["none"] leaves
+            out all of them.
+        seed: Seed of all random numbers; the run's by default.
+        effects: auto, all, none, audit, or names of effects between commas.
+        detector: The name of a detector, or its file.
+        range_tolerance_mm: What all skipped effects together may change of ranges.
+        return_tolerance: Share of returns that all skipped effects together may change.
+        settings: Settings of the task to judge by other scenes than were learned.
+        workers: Processes that score scenes, or the address of a scheduler.
+        cma_seconds: Wall time of each search of the baseline cma [s].
+        accuracy: Whether what accuracy costs will be measured, too.
+        scenes_seed: Root of the held-out scenes; `seed` by default.
+        designs: Names of the designs that are scored; all by default.
+        mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
+        fail_above: What no design may be worse than, in the metric's unit; `Scores.check` sees to it.
+        fail_unless_better: A baseline or design that every other design must be better than; so does this.
+
+    Raises:
+        ConfigError: One of them says nothing that can be done.
+    """
+
+    rays: Sequence[int] | None = None
+    baselines: Sequence[str] = ()
+    seed: int | None = None
+    effects: str = "auto"
+    detector: str = "ideal"
+    range_tolerance_mm: float | None = None
+    return_tolerance: float | None = None
+    settings: Sequence[str] | Mapping[str, Any] = ()
+    workers: int | str = 1
+    cma_seconds: float | None = None
+    accuracy: bool = False
+    scenes_seed: int | None = None
+    designs: Sequence[str] = ()
+    mount_error: str | None = None
+    fail_above: float | None = None
+    fail_unless_better: str | None = None
+
+    def __post_init__(self) -> None:
+        check_workers(str(self.workers))
+        self.misplacement()
+        if NONE in self.baselines:
+            if len(self.baselines) > 1 or is_baseline(self.fail_unless_better or ""):
+                raise ConfigError("none together with another baseline", where="--baseline", allowed="none alone")
+        else:
+            for name in self.baselines:
+                baseline_of(name, where="--baseline")
+        limits = {
+            "cma_seconds": CMA_SECONDS,
+            "range_tolerance_mm": RANGE_TOLERANCES_MM,
+            "return_tolerance": RETURN_TOLERANCES,
+            "seed": (0, MAX_SEED),
+            "scenes_seed": (0, MAX_SEED),
+        }
+        for name, (low, high) in limits.items():
+            if getattr(self, name) is not None:
+                check_number(getattr(self, name), f"--{name.replace('_', '-')}", low, high, whole="seed" in name)
+        if self.fail_above is not None and not math.isfinite(self.fail_above):
+            raise ConfigError(f"{self.fail_above}", where="--fail-above", allowed="a finite number")
+        for count in self.rays or ():
+            check_number(count, "--rays", 1, MOST_RAYS, whole=True)
+        if self.cma_seconds is not None and CMA not in self.baselines:
+            raise ConfigError(
+                "there is no search", where="--cma-seconds", hint=f"add --baseline {CMA}, or leave it out"
+            )
+
+    def misplacement(self) -> MountError | None:
+        """How carelessly sensors are mounted in further rows."""
+        return None if self.mount_error is None else MountError.parse(self.mount_error)
+
+    def planner(self) -> tuple[Planner, bool]:
+        """How effects are chosen, and whether the choice is audited.
+
+        Raises:
+            ConfigError: An unknown effect or detector.
+        """
+        audit = self.effects.strip() == "audit"
+        choice = parse_effects("auto" if audit else self.effects)
+        detector = load_detector(self.detector)
+        tolerance = Tolerance.of(detector)
+        if self.range_tolerance_mm is not None:
+            tolerance = replace(tolerance, range_m=self.range_tolerance_mm / MILLIMETRES)
+        if self.return_tolerance is not None:
+            tolerance = replace(tolerance, lost=self.return_tolerance)
+        return Planner(detector, choice, tolerance), audit
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +190,7 @@ class ScoreRequest:
         cls,
         targets: Sequence[Design | Path],
         options: ScoreOptions,
-        runs: Sequence[RunFolder] = (),
+        judge: RunFolder | None = None,
         notes: Notes = log_note,
     ) -> ScoreRequest:
         """The request of a user's choices.
@@ -97,7 +198,7 @@ class ScoreRequest:
         Arguments:
             targets: Designs, design files, and run folders, which stand for all their designs.
             options: The choices.
-            runs: Runs that were opened for it; the first one's task judges.
+            judge: The run in whose scenes they are scored; the one that they came from by default.
             notes: Called with every note.
 
         Raises:
@@ -105,14 +206,15 @@ class ScoreRequest:
             DataError: A design or a run is not there, or damaged.
         """
         planner, audit = options.planner()
-        designs, opened = collect_designs(targets, runs, notes)
-        designs = named(designs, options.designs)
-        run = learned = judging_run(name_apart(designs), opened, notes)
+        designs = named(collect_designs(targets, judge, notes), options.designs)
+        run = learned = judging_run(name_apart(designs), judge, notes)
         for note in learned.input_notes():
             notes(note)
         rival = options.fail_unless_better
         _check_rival(rival, [design.name for design in designs])
         baselines = [*ALWAYS, *options.baselines, *([rival] if rival and is_baseline(rival) else [])]
+        if NONE in options.baselines:
+            baselines = []
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
         if options.accuracy:
             # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes
@@ -219,7 +321,7 @@ class ScoreRequest:
         """Score every design and baseline on every held-out scene.
 
         Arguments:
-            progress: Called with the scenes done, all scenes, and the name of the scene.
+            progress: Called with the name of the scene, the scenes done, and all scenes.
             searching: Called with how the searches of the baseline cma stand.
 
         Raises:
@@ -228,11 +330,8 @@ class ScoreRequest:
         """
         with nullcontext(outermost_clock()) if outermost_clock() else running() as clock:
             request = self.evaluation_request(searching)
-            with workers_of(check_workers(str(self.options.workers)), most=len(request.test)) as scorer:
-                if scorer is not None:
-                    scorer.prepare(request)
-                scoring = request if scorer is None else replace(request, scorer=scorer)
-                evaluation = score_designs(scoring, progress=progress)
+            with scorer_of(check_workers(str(self.options.workers)), request.task, len(request.test)) as scorer:
+                evaluation = score_designs(replace(request, scorer=scorer), progress=progress)
             timings = clock.timings()
         return Scores(evaluation, replace(request, cma=replace(request.cma, show=None)), self.learned, timings, self)
 
@@ -287,12 +386,7 @@ class Scores:
             ThresholdError: One is worse than `fail_above`, or not better than `fail_unless_better`; or skipped effects
                 change a score by more than the metric's tolerance, where that was audited.
         """
-        options = self.request.options
-        if options.fail_above is not None:
-            check_limit(self.evaluation, options.fail_above)
-        if options.fail_unless_better is not None:
-            check_better(self.evaluation, options.fail_unless_better)
-        check_audit(self.evaluation)
+        names_arguments(check_scores)(self)
 
     def last_scores(self) -> dict[str, Any]:
         """What the run's manifest keeps of them: the scores of the designs that lie in the run."""
@@ -304,7 +398,7 @@ class Scores:
         """The scores, with what accuracy costs on this machine; takes minutes.
 
         Arguments:
-            progress: Called with the sweeps done, all sweeps, and the name of the sweep.
+            progress: Called with the name of the sweep, the sweeps done, and all sweeps.
 
         Raises:
             DataError: The run is unfinished or damaged.
@@ -370,6 +464,16 @@ class Scores:
         ]
         caption = f"{metric.name}, {metric.better} is better, over {self.evaluation.scenes} held-out scenes"
         return html_table(caption, headings, rows)
+
+
+def check_scores(scores: Scores) -> None:
+    """As `Scores.check`, with errors that name options."""
+    options = scores.request.options
+    if options.fail_above is not None:
+        check_limit(scores.evaluation, options.fail_above)
+    if options.fail_unless_better is not None:
+        check_better(scores.evaluation, options.fail_unless_better)
+    check_audit(scores.evaluation)
 
 
 def _check_rival(name: str | None, designs: Sequence[str]) -> None:

@@ -229,7 +229,9 @@ CASES = [
     ("show rows.csv", 3, "rows.csv:1"),
     ("show short.csv", 3, "short.csv:1"),
     ("show garbage.yaml", 2, "garbage.yaml"),
-    ("evaluate run good.yaml --baseline best", 2, "uniform"),
+    ("evaluate good.yaml --in run --baseline best", 2, "uniform"),
+    ("evaluate good.yaml --in run --baseline none --baseline lloyd", 2, "none alone"),
+    ("evaluate good.yaml --in run --baseline none --fail-unless-better greedy", 2, "none alone"),
 ]
 
 
@@ -330,7 +332,7 @@ DESIGNS = [
 ]
 
 
-@pytest.mark.parametrize("command", ["show", "evaluate run", "export --format csv"])
+@pytest.mark.parametrize("command", ["show", "evaluate --in run", "export --format csv"])
 @pytest.mark.parametrize(
     ("path", "value", "words"), DESIGNS, ids=[f"{'.'.join(map(str, d[0]))}={d[1]}" for d in DESIGNS]
 )

@@ -92,7 +92,7 @@ CASES = [
         for option in ("--range-tolerance-mm", "--return-tolerance")
         for value in ("0", "-1", "nan", "inf")
     ),
-    ("evaluate run good.yaml far.yaml --rays 8", 2, "sensors[0].gate_m.end is 1e+300"),
+    ("evaluate good.yaml far.yaml --in run --rays 8", 2, "sensors[0].gate_m.end is 1e+300"),
     ("evaluate bare --effects audit", 3, "no designs yet"),
     ("evaluate bare --effects audit,all", 2, "--effects"),
     *(

@@ -166,7 +166,7 @@ def test_no_visibility_needs_a_design_whose_run_is_there(lidardesign, flat):
     away = Path("away.yaml")
     away.write_text((flat / "designs" / "fit.yaml").read_text())
     (flat / "designs" / "fit.yaml").unlink()
-    result = lidardesign("evaluate", flat, away, "--rays", 12, "--baseline", "no-visibility")
+    result = lidardesign("evaluate", away, "--in", flat, "--rays", 12, "--baseline", "no-visibility")
     assert result.code == 2
     assert "no design to refit" in result.err
 
@@ -329,13 +329,13 @@ def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesi
     assert lidardesign("export", copied, "--format", "csv").code == 0
     for arguments, words in (
         (("export", copied, "--format", "csv", "--rays", 20), "need samples of the learned density"),
-        (("evaluate", copied), "give the run folder too"),
+        (("evaluate", copied), "--in RUN"),
         (("constrain", copied), "the run of this design cannot be found"),
     ):
         result = lidardesign(*arguments)
         assert result.code in (2, 3)
         assert words in result.err
-    assert lidardesign("evaluate", flat, copied, "--rays", 12).code == 0
+    assert lidardesign("evaluate", copied, "--in", flat, "--rays", 12).code == 0
 
 
 @pytest.mark.parametrize("decided", ["raycast", "off", None])

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from support.command_line import caller, files_under, make_run
 
-EVALUATE = ("evaluate", "run", "mine.yaml", "--rays", 9)
+EVALUATE = ("evaluate", "mine.yaml", "--in", "run", "--rays", 9)
 EXPORT = ("export", "mine.yaml", "--format", "csv", "--rays", 9)
 LONG = 300 * "x"
 

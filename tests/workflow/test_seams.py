@@ -178,13 +178,13 @@ def test_a_track_without_its_run_is_evaluated_at_its_own_number_of_rays_alone(li
     assert lidardesign("fit", aisle, "--layout", "scan", "--rays", 6).code == 0
     inside, away = aisle / "designs" / "fit.yaml", tmp_path / "away.yaml"
     away.write_text(inside.read_text().replace("name: fit", "name: away"))
-    result = lidardesign("evaluate", aisle, away, "--rays", 6, "--json")
+    result = lidardesign("evaluate", inside, away, "--rays", 6, "--json")
     assert result.code == 0, result.err
     rows = {row["design"]: row for row in result.json["rows"]}
     for key in ("value", "bandwidth_mbps", "failures"):
         assert rows["away"][key] == rows["fit"][key]
     assert rows["fit"]["value"] < rows["uniform"]["value"]
-    refused = lidardesign("evaluate", aisle, away, "--rays", 7)
+    refused = lidardesign("evaluate", inside, away, "--rays", 7)
     assert refused.code == 2
     assert "7 rays" in refused.err
 

@@ -32,7 +32,7 @@ BASELINE_HELP = (
     "(the first design refitted to the density without its occlusion term; takes some seconds), "
     "catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres and "
     "degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on "
-    "training scenes, for --cma-seconds). Repeatable."
+    "training scenes, for --cma-seconds). Repeatable. none: no baselines at all."
 )
 
 
@@ -42,11 +42,11 @@ def evaluate(
         typer.Argument(
             metavar="RUN|DESIGN",
             readable=False,
-            help="Run folders (all their designs) and design files. Designs of other runs are scored in the scenes of "
-            "the run that is named. Of runs that differ only in their seed, designs of one name are one row, with "
-            "intervals over seeds and scenes.",
+            help="Run folders (all their designs) and design files. Of runs that differ only in their seed, designs "
+            "of one name are one row, with intervals over seeds and scenes.",
         ),
     ],
+    space_of: options.SpaceOf = None,
     designs: Annotated[
         list[str] | None,
         typer.Option("--designs", metavar="NAME", help="Only designs of this name; repeatable.", show_default="all"),
@@ -199,7 +199,8 @@ def evaluate(
     with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
         claim_outputs(output, dry_run=dry_run, csv=csv, report=report)
         with phase("libraries"):
-            from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
+            from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest, check_scores
+            from lidardesign.workflow.run_folder import RunFolder
             from lidardesign.workflow.seeds import SeedsRequest, differing_seeds
 
         chosen = ScoreOptions(
@@ -220,11 +221,12 @@ def evaluate(
             fail_above=fail_above,
             fail_unless_better=fail_unless_better,
         )
-        runs = differing_seeds(targets, output.remark)
+        judge = None if space_of is None else RunFolder.open(space_of)
+        runs = differing_seeds(targets, output.remark) if judge is None else []
         request: ScoreRequest | SeedsRequest = (
             SeedsRequest.resolve(runs, chosen, output.remark)
             if runs
-            else ScoreRequest.resolve(targets, chosen, notes=output.remark)
+            else ScoreRequest.resolve(targets, chosen, judge, output.remark)
         )
         files = {"--report": report, "--csv": csv}
         plan = request.plan(files)
@@ -253,13 +255,13 @@ def evaluate(
             if accuracy:
                 scores = _with_accuracy(scores, output)
                 _write_files(scores, written, *files.values())
-        scores.check()
+        check_scores(scores)
 
 
 def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
     with output.progress("evaluating") as progress:
         return request.score(
-            lambda done, total, scene="": progress.show(done, total), search_display(request, progress)
+            lambda scene, done, total: progress.show(done, total), search_display(request, progress)
         )
 
 
@@ -276,7 +278,7 @@ def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDispl
 
 def _with_accuracy(scores: Scores, output: Output) -> Scores:
     with output.progress("measuring accuracy") as progress:
-        return scores.with_accuracy(lambda done, total, sweep: progress.show(done, total, detail=sweep))
+        return scores.with_accuracy(lambda sweep, done, total: progress.show(done, total, detail=sweep))
 
 
 @phase("writing")

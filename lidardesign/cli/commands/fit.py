@@ -76,7 +76,7 @@ def run_fit(request: FitRequest, output: Output) -> None:
     check_writable(path)
     check_lock(request.run.folder)
     with output.progress("fitting") as progress:
-        design = Design.fitted(request, notes=output.remark, progress=lambda step: progress.show(label=step))
+        design = Design.fitted(request, notes=output.remark, progress=lambda step, *_: progress.show(label=step))
     try:
         design.save()
     except LidardesignError:

@@ -271,6 +271,8 @@ BASELINES: dict[str, Family] = {
 }
 
 
+# In the place of names: no baselines at all.
+NONE = "none"
 # What stands beside every design, asked for or not.
 ALWAYS = ("uniform", "random", "bounding", "silhouette", GREEDY)
 
