@@ -29,13 +29,6 @@ Quiet = Annotated[
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print everything: all tables and notes.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 
-DryRun = Annotated[
-    bool,
-    typer.Option(
-        "--dry-run",
-        help="Check what can be checked, say what would be done, read and written, and stop there.",
-    ),
-]
 Name = Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the design: RUN/designs/NAME.yaml.")]
 Layout = Annotated[
     str | None,
@@ -99,9 +92,8 @@ Sensors = Annotated[
     str | None,
     typer.Option(
         "--sensors",
-        metavar="N|best|auto",
-        help="Number of sensors (a scan has one per ray); best: by the task's score on training scenes, auto: by "
-        "held-out likelihood.",
+        metavar="N|best",
+        help="Number of sensors (a scan has one per ray); best: by the task's score on training scenes.",
         show_default="the design's, else best",
     ),
 ]

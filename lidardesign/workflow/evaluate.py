@@ -11,16 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import with_task_settings
-from lidardesign.design.compare import outside_notes
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
+from lidardesign.evaluate.baselines.greedy import GreedySource
 from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
 from lidardesign.evaluate.gates import check_audit, check_better, check_limit
 from lidardesign.evaluate.last_scores import SCORES, last_scores_of
 from lidardesign.evaluate.options import ScoreOptions
-from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
+from lidardesign.evaluate.request import EvaluationRequest, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
 from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.score import evaluate as score_designs
@@ -28,18 +27,7 @@ from lidardesign.evaluate.workers.pool import check_workers, workers_of
 from lidardesign.run.clock import outermost_clock, phase, running
 from lidardesign.simulate.plan import Planner
 from lidardesign.workflow.designs import Design, collect_designs, html_table, judging_run, name_apart, named
-from lidardesign.workflow.run_folder import (
-    CONFIGURATION,
-    DESIGN_FOLDER,
-    MANIFEST,
-    SAMPLES,
-    Notes,
-    RequestPlan,
-    RunFolder,
-    last_time,
-    log_note,
-    settings_texts,
-)
+from lidardesign.workflow.run_folder import DESIGN_FOLDER, Notes, RunFolder, log_note, settings_texts
 from lidardesign.workflow.run_samples import Layouts, learned_density, twin_without_visibility
 from lidardesign.workflow.select_rays import gate_margin_m, selection_scenes
 
@@ -48,7 +36,6 @@ if TYPE_CHECKING:
     from lidardesign.evaluate.figures.scene_figure import FigureData
     from lidardesign.evaluate.report.figures import Figure
 
-MOST_NAMED = 8
 COMMAND = "evaluate"
 
 
@@ -129,57 +116,6 @@ class ScoreRequest:
             planner,
             audit,
             options,
-        )
-
-    def plan(self, outputs: Mapping[str, Path | None] | None = None) -> RequestPlan:
-        """What the evaluation would do.
-
-        Arguments:
-            outputs: Files that are to be written, by the option that says so; None for those that are not.
-
-        Raises:
-            ConfigError: No design can fire any of the numbers of rays.
-        """
-        run, options = self.run, self.options
-        specifications = [design.specification for design in self.designs]
-        counts = fired_numbers(specifications, self.rays)
-        scored = sum(can_fire(design, count) for design in specifications for count in counts)
-        choosable, notes = greedy_rays(run.task, len(run.conditions()), counts)
-        baselines = [name for name in self.baselines if name != GREEDY or choosable]
-        rows, matched = scored + len(baselines) * len(counts), scored * len(baselines)
-        names = [design.name for design in specifications]
-        listed = ", ".join(names[:MOST_NAMED])
-        listed += f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-        settings = {
-            "--effects": options.effects,
-            "--detector": options.detector,
-            "--set": list(settings_texts(options.settings)) or None,
-            "--mount-error": options.mount_error,
-            "--accuracy": options.accuracy,
-        }
-        given = [f"{name} {value}" for name, value in settings.items() if isinstance(value, str)]
-        given += [*(f"--set {text}" for text in settings["--set"] or ()), *["--accuracy"] * options.accuracy]
-        written = [
-            f"{path}/" if option == "--plots" else path for option, path in (outputs or {}).items() if path is not None
-        ]
-        return RequestPlan(
-            COMMAND,
-            [
-                f"score {listed} in the held-out scenes of task {run.task.name}, with {', '.join(map(str, counts))} "
-                "rays per frame",
-                f"against {', '.join(baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
-                *left_out(specifications, self.rays),
-                *notes,
-                *(line for design in specifications for line in outside_notes(design, run.config.space)),
-                *([f"with {', '.join(given)}"] if given else []),
-            ],
-            [
-                *(design.name if design.path is None else design.path for design in self.designs),
-                *(run.folder / name for name in (CONFIGURATION, MANIFEST, *([SAMPLES] if run.has_samples else ()))),
-            ],
-            [*written, run.folder / MANIFEST],
-            {"designs": names, "rays": counts, "baselines": list(self.baselines), **settings},
-            last_time(run.folder, COMMAND),
         )
 
     @property

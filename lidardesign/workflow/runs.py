@@ -14,8 +14,7 @@ from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
 from lidardesign.workflow.designs import Design, html_table
 from lidardesign.workflow.fit import FitOptions, FitRequest
-from lidardesign.workflow.learn import LearnOptions, LearnRequest
-from lidardesign.workflow.learning_budget import check_met
+from lidardesign.workflow.learn import LearnOptions, LearnRequest, check_tolerance
 from lidardesign.workflow.run_folder import (
     MANIFEST,
     Notes,
@@ -138,8 +137,7 @@ class Run(RunFolder):
         """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
 
         Arguments:
-            sensors: How many, "best": as many as score best on training scenes, or "auto": as many as the
-                held-out likelihood favours; "best" by default.
+            sensors: How many, or "best" (the default): as many as score best on training scenes.
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
             layout: grid, density, scan, distributed, selected or spinning; by default selected, where the task
@@ -170,7 +168,7 @@ class Run(RunFolder):
         return Design.fitted(request, notes=notes, progress=progress)
 
     def fit_request(self, *, notes: Notes = log_note, **options: Any) -> FitRequest:
-        """What `fit` would do with the same choices; its `plan()` says it in words."""
+        """What `fit` would do with the same choices."""
         return FitRequest.resolve(self, FitOptions(**options), notes=notes)
 
     def designs(self) -> list[Design]:
@@ -338,7 +336,7 @@ def learn(
         resume: Continue an interrupted run.
         progress: Called about every tenth step.
         notes: Called with every note; they are logged by default.
-        further: tolerance or time_budget_s, which decide the number of steps; overwrite, which replaces a run.
+        further: tolerance of misplaced mass, time_budget_s, and overwrite, which replaces a run.
 
     Raises:
         ConfigError: An unknown task, impossible settings, or a folder that is not empty.
@@ -360,7 +358,7 @@ def learn(
     result = request.run(progress, remark)
     for note in (*result.notes, f"the density is {result.verdict.text(request.settings.preset)}"):
         remark(note)
-    check_met(result, request.goal)
+    check_tolerance(result, options.tolerance)
     return open_run(request.folder)
 
 

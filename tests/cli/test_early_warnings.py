@@ -159,7 +159,6 @@ def test_a_rig_in_millimetres_is_told_wherever_it_meets_a_run(capsys, monkeypatc
         ("show", name, "--in", flat),
         ("compare", name, name, "--in", flat, "--rays", 9),
         ("evaluate", flat, name, "--rays", 9),
-        ("evaluate", flat, name, "--rays", 9, "--dry-run"),
     )
     for arguments in commands:
         result = call(*arguments)

@@ -11,11 +11,10 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.output import Output, command, keep_times
-from lidardesign.cli.output_files import claim_outputs, written_file
+from lidardesign.cli.output_files import claim_outputs
 from lidardesign.cli.tables.grids import RichConsole, number, print_table
 from lidardesign.errors import ConfigError, DataError, check_choice
 from lidardesign.run.clock import phase
-from lidardesign.run.files import is_input, is_there
 from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
@@ -124,8 +123,8 @@ def capture(
             for folder in dict.fromkeys(folder for _, folder in scanned if folder is not None):
                 rest.callback(keep_times, folder, "capture", output)
             if csv is not None:
-                with phase("writing"), written_file(csv) as table:
-                    write_csv(evaluation, table)
+                with phase("writing"):
+                    write_csv(evaluation, csv)
                 written.append(csv)
 
 
@@ -138,9 +137,9 @@ def _rays_and_run(
     from lidardesign.workflow.run_folder import folder_of, read_design
 
     folder = None
-    if not is_there(path):
+    if not path.exists():
         raise DataError("no such design", where=str(path), hint="give design files or files of export --format galvo")
-    if not is_input(path) and is_galvo_file(path):
+    if is_galvo_file(path):
         if count is not None or at:
             raise ConfigError(
                 "holds its rays already",
@@ -152,7 +151,7 @@ def _rays_and_run(
     else:
         specification = read_design(path, output.remark)
         rays = DesignSource(specification, path=path).lay_out(count, at, seed, notes=output.remark)[1]
-        folder = None if is_input(path) else folder_of(specification, path)
+        folder = folder_of(specification, path)
     if not len(rays):
         raise DataError("fires no ray", where=str(path), hint="give --rays N" if not count else None)
     return rays, folder

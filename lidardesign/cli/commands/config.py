@@ -10,7 +10,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.output import Output, command
-from lidardesign.cli.output_files import is_output, note_new_folders, put_on_stdout
+from lidardesign.cli.output_files import note_new_folders
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_writable
@@ -79,7 +79,7 @@ def schema(
 
 
 def _check_new(out: Path | None) -> None:
-    if out is None or is_output(out):
+    if out is None:
         return
     check_writable(out)
     if out.is_file():
@@ -89,14 +89,13 @@ def _check_new(out: Path | None) -> None:
 def _write(text: str, document: dict[str, Any], out: Path | None, output: Output) -> None:
     from lidardesign.run.files import write_atomic
 
-    file = None if out is None or is_output(out) else out
-    if file is not None:
-        note_new_folders([file], output)
+    if out is not None:
+        note_new_folders([out], output)
         with phase("writing"):
-            write_atomic(file, text)
+            write_atomic(out, text)
     if output.json:
-        output.result({**document, "out": None if file is None else str(file)}, lambda rich: None)
-    elif file is not None:
-        output.note(f"wrote {file}")
+        output.result({**document, "out": out}, lambda rich: None)
+    elif out is not None:
+        output.note(f"wrote {out}")
     else:
-        put_on_stdout(text.encode(errors="backslashreplace"))
+        print(text, end="")

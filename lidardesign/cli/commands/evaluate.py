@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
-from lidardesign.cli.output_files import claim_outputs, is_output, written_file
+from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output_files import claim_outputs
 from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
 from lidardesign.errors import MAX_SEED
@@ -188,7 +188,6 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
-    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     scenes_seed: Annotated[
         int | None,
@@ -208,7 +207,7 @@ def evaluate(
 ) -> None:
     """Score designs on held-out scenes against the baselines uniform, random, bounding, silhouette and greedy."""
     with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
-        claim_outputs(output, dry_run=dry_run, csv=csv, report=report, plots=plots)
+        claim_outputs(output, csv=csv, report=report, plots=plots)
         with phase("libraries"):
             from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
             from lidardesign.workflow.seeds import SeedsRequest, differing_seeds
@@ -238,10 +237,7 @@ def evaluate(
             else ScoreRequest.resolve(targets, chosen, notes=output.remark)
         )
         files = {"--report": report, "--plots": plots, "--csv": csv}
-        plan = request.plan(files)
-        check_outputs(files, plan.reads, ("--plots",))
-        if dry_run:
-            return show_plan(plan, output)
+        check_outputs(files, targets, ("--plots",))
         scores = _score(request, output)
         written: dict[Path, None] = {}
 
@@ -260,7 +256,7 @@ def evaluate(
             rest.callback(show_result)
             rest.callback(keep_times, request.run.folder, "evaluate", output, further=scores.last_scores())
             # accuracy takes minutes: what was scored by then is written already
-            _write_files(scores, written, *(None if accuracy and is_output(path) else path for path in files.values()))
+            _write_files(scores, written, *files.values())
             if accuracy:
                 scores = _with_accuracy(scores, output)
                 _write_files(scores, written, *files.values())
@@ -302,8 +298,7 @@ def _write_files(
         if plots is not None:
             rest.callback(lambda: written.update(dict.fromkeys(scores.plots(plots, pictured()))))
         if csv is not None:
-            with written_file(csv) as file:
-                scores.to_csv(file)
+            scores.to_csv(csv)
             written[csv] = None
 
 
@@ -313,6 +308,5 @@ def _kind(path: Path, files: Mapping[str, Path | None]) -> str:
 
 
 def _write_report(scores: Scores, written: dict[Path, None], path: Path, pictured: Callable[[], FigureData]) -> None:
-    with written_file(path) as file:
-        scores.report(file, ("lidardesign", *sys.argv[1:]), pictured())
+    scores.report(path, ("lidardesign", *sys.argv[1:]), pictured())
     written[path] = None

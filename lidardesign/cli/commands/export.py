@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
-from lidardesign.cli.output_files import claim_stdout, note_new_folders, written_file
+from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output_files import note_new_folders, written_file
 from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
@@ -58,7 +58,6 @@ def export(
         ),
     ] = None,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
-    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -80,7 +79,6 @@ def export(
         check_frame_rate(rate_hz)
         if list_formats:
             return _list(output)
-        claim_stdout(output, dry_run=dry_run, out=out)
         place = options.parse_at(at)
         if design is None:
             raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
@@ -89,10 +87,7 @@ def export(
         target = export_target(design, out, exporter)
         request = ExportRequest(source, exporter, target, rays, place, rate_hz, seed or 0, robot)
         note_new_folders([target], output)
-        plan = request.plan()
-        check_outputs({"--out": target}, plan.reads, ("--out",) if exporter.folder else ())
-        if dry_run:
-            return show_plan(plan, output)
+        check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if exporter.folder else ())
         notes: list[str] = []
         with written_file(target, exporter.suffix) as file:
             exported = request.write(file, notes.append)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
+from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.cli.tables.designs import show_fit
 from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.errors import LidardesignError
@@ -33,7 +33,6 @@ def fit(
     parts: options.Parts = None,
     like: options.Like = None,
     name: options.Name = "fit",
-    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -60,10 +59,7 @@ def fit(
             name=name,
             seed=seed,
         )
-        request = FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark)
-        if dry_run:
-            return show_plan(request.plan(), output)
-        run_fit(request, output)
+        run_fit(FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark), output)
 
 
 def run_fit(request: FitRequest, output: Output) -> None:
@@ -119,7 +115,6 @@ def constrain(
     parts: options.Parts = None,
     like: options.Like = None,
     name: options.Name = "constrained",
-    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -149,8 +144,4 @@ def constrain(
             seed=seed,
         )
         run, design = open_target(target, output.remark)
-        files = [path for path in (target if design else None, constraints) if path is not None]
-        request = FitRequest.resolve(need_run(run, target), chosen, design, files=files, notes=output.remark)
-        if dry_run:
-            return show_plan(request.plan(), output)
-        run_fit(request, output)
+        run_fit(FitRequest.resolve(need_run(run, target), chosen, design, notes=output.remark), output)
