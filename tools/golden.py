@@ -123,9 +123,6 @@ GENERAL = """
     config schema constraints
     config schema design
     config schema evaluate
-    completion bash
-    completion zsh
-    completion fish
     tasks new landmark --out landmark
     lern face
     learn face --set density.sigma=1
@@ -133,7 +130,7 @@ GENERAL = """
     fit runs/nothing --json
 """
 COMMANDS = (
-    "", "learn", "fit", "constrain", "evaluate", "export", "capture", "show", "compare", "completion", "tasks",
+    "", "learn", "fit", "constrain", "evaluate", "export", "capture", "show", "compare", "tasks",
     "tasks list", "tasks show", "tasks check", "tasks new", "catalog", "catalog list", "catalog show", "config",
     "config init", "config schema",
 )  # fmt: skip

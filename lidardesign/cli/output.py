@@ -35,6 +35,8 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 EXIT_TERMINATED = 143
 PLAIN_WIDTH = 120
+# Where this is set in the environment, errors show their tracebacks.
+DEBUG = "LIDARDESIGN_DEBUG"
 NUMBA_CACHE = "numba/core/caching.py"
 NO_MEMORY = "can't allocate memory"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
@@ -66,7 +68,6 @@ class Output:
         json: Print one JSON document on stdout and nothing else there.
         quiet: No progress and no notes, and of a result its files alone.
         verbose: Everything: all tables, and notes on what was decided.
-        debug: Show tracebacks.
         stream: Where the result goes: the program's stdout.
         when_interrupted: What to say to the user after Ctrl-C or SIGTERM.
         answered: Whether the one JSON document was printed; an error after it adds none.
@@ -76,7 +77,6 @@ class Output:
     json: bool = False
     quiet: bool = False
     verbose: bool = False
-    debug: bool = False
     stream: TextIO = field(default_factory=lambda: sys.stdout)
     when_interrupted: Callable[[], str | None] = field(default=lambda: None)
     answered: bool = False
@@ -198,12 +198,12 @@ def json_text(document: dict[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def command(*, json: bool, quiet: bool, debug: bool, verbose: bool = False) -> Iterator[Output]:
+def command(*, json: bool, quiet: bool, verbose: bool = False) -> Iterator[Output]:
     """Run a command's body: its errors become one message and an exit code.
 
     With `--json`, whatever plugins and libraries print meanwhile goes to stderr, also by processes of their own.
     """
-    output = Output(json=json, quiet=quiet, verbose=verbose and not quiet, debug=debug, stream=sys.stdout)
+    output = Output(json=json, quiet=quiet, verbose=verbose and not quiet, stream=sys.stdout)
     try:
         with _guarded_stdout(output) if json else contextlib.nullcontext(), running(output.clock):
             yield output
@@ -267,7 +267,7 @@ def report_error(error: BaseException, output: Output) -> int:
     if output.json and not output.answered:
         print_json({"error": document, "exit_code": code}, output.stream)
     print_message(text)
-    if output.debug:
+    if os.environ.get(DEBUG):
         traceback.print_exception(error)
     return code
 
@@ -303,7 +303,7 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
         }
     else:
         text = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        hint = "this is a bug in lidardesign: please report it; --debug shows where"
+        hint = "this is a bug in lidardesign: please report it; LIDARDESIGN_DEBUG=1 shows where"
         document = {"kind": "internal", "message": text, "hint": hint}
         return document, EXIT_INTERNAL, f"internal error: {text}\n  {hint}"
     attempt = f"\n  try: {document['hint']}" if "hint" in document else ""

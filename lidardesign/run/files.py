@@ -67,8 +67,9 @@ def write_atomic(path: Path, content: bytes | str) -> None:
     Raises:
         DataError: The disk is full, the folder is read-only, or anything else the system reports.
     """
-    # what a link leads to is written; of /dev/stdout, too, nothing but the link would be replaced
-    path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+    path = Path(path)
+    if path.is_symlink() and (path.is_file() or not path.exists()):
+        path = Path(os.path.realpath(path))  # a rename would replace the link
     # names of files may be no UTF-8; they are shown escaped then
     payload = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     try:

@@ -98,8 +98,6 @@ def test_an_output_that_cannot_be_written_or_is_needed_is_refused_before_the_wor
         (("--csv", "a", "--report", "a/b.html"), "a is a folder of --report too"),
         (("--plots", "a", "--csv", "a"), "a is the same file"),
         (("--plots", "a/b", "--csv", "a"), "a is a folder of --plots too"),
-        (("--report", "-", "--csv", "-"), "both write to standard output"),
-        (("--json", "--csv", "-"), "both write to standard output"),
         (("--plots", "file"), "is a file"),
         (("--plots", "file/a"), "file is a file"),
         (("--detector", "file", "--csv", "file"), ""),

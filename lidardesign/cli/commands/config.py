@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from lidardesign.cli import options
+from lidardesign.cli.completion import tasks, words
 from lidardesign.cli.output import Output, command
 from lidardesign.cli.output_files import note_new_folders
 from lidardesign.errors import ConfigError, check_choice
@@ -20,24 +21,24 @@ Out = Annotated[
     typer.Option("--out", metavar="FILE", help="New file to write; none is overwritten.", show_default="stdout"),
 ]
 
-config_app = typer.Typer(
-    help="Write a configuration file to begin with, or the schema of a file.", no_args_is_help=True
-)
+config_app = typer.Typer(help="Write a configuration file, or the schema of a file.", no_args_is_help=True)
 
 
 @config_app.command("init")
 def init(
-    task: Annotated[str, typer.Argument(metavar="TASK", help="Name of a task; `lidardesign tasks` lists them.")],
+    task: Annotated[
+        str,
+        typer.Argument(metavar="TASK", help="Name of a task; `lidardesign tasks` lists them.", autocompletion=tasks),
+    ],
     preset: options.Preset = None,
     overrides: options.Overrides = None,
     out: Out = None,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Write a configuration file for TASK: every key with its default, its bounds and what it is."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    """Write a configuration file for TASK. Every key is there with its default, its bounds and what it is."""
+    with command(json=json, quiet=quiet) as output:
         _check_new(out)
         with phase("libraries"):
             from lidardesign.registry import load_task
@@ -50,7 +51,14 @@ def init(
 
 @config_app.command("schema")
 def schema(
-    kind: Annotated[str, typer.Argument(metavar="config|constraints|design|evaluate", help="What the schema is of.")],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="config|constraints|design|evaluate",
+            help="What the schema is of.",
+            autocompletion=words("config|constraints|design|evaluate"),
+        ),
+    ],
     task: Annotated[
         str | None,
         typer.Option(
@@ -58,13 +66,11 @@ def schema(
         ),
     ] = None,
     out: Out = None,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Print the JSON Schema of a configuration, a constraint file, a design file, or what `evaluate --json` prints."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    """Print a JSON Schema. KIND is config, constraints, design, or evaluate for what `evaluate --json` prints."""
+    with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.registry import load_task
             from lidardesign.workflow.config_reference import SCHEMA_KINDS, schema_of

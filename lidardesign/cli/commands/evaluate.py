@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
+from lidardesign.cli.completion import detectors, words
 from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.cli.output_files import claim_outputs
 from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
-from lidardesign.errors import MAX_SEED
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
@@ -65,7 +65,14 @@ def evaluate(
         ),
     ] = None,
     baseline: Annotated[
-        list[str] | None, typer.Option("--baseline", metavar="NAME", help=BASELINE_HELP, show_default=False)
+        list[str] | None,
+        typer.Option(
+            "--baseline",
+            metavar="NAME",
+            help=BASELINE_HELP,
+            show_default=False,
+            autocompletion=words("lloyd|occupancy|no-visibility|cma"),
+        ),
     ] = None,
     cma_seconds: Annotated[
         float | None,
@@ -85,6 +92,7 @@ def evaluate(
             help="Physical effects: auto for those that matter in each scene, all, none, or names separated by "
             "commas; audit: like auto, and every row under all effects too (exit 1 if a score moves by more than the "
             "metric's tolerance).",
+            autocompletion=words("auto|all|none|audit"),
         ),
     ] = "auto",
     detector: Annotated[
@@ -93,6 +101,7 @@ def evaluate(
             "--detector",
             metavar="NAME|FILE",
             help="The detector: ideal, single-photon, consumer-8x8, or a YAML file.",
+            autocompletion=detectors,
         ),
     ] = "ideal",
     range_tolerance_mm: Annotated[
@@ -194,8 +203,6 @@ def evaluate(
         typer.Option(
             "--scenes-seed",
             metavar="N",
-            min=0,
-            max=MAX_SEED,
             help="Seed of the held-out scenes.",
             show_default="--seed, or the (first) run's",
         ),
@@ -203,10 +210,9 @@ def evaluate(
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Score designs on held-out scenes against the baselines uniform, random, bounding, silhouette and greedy."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    """Score designs on held-out scenes against baselines."""
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         claim_outputs(output, csv=csv, report=report, plots=plots)
         with phase("libraries"):
             from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from lidardesign.cli import options
+from lidardesign.cli.completion import formats
 from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.cli.output_files import note_new_folders, written_file
 from lidardesign.cli.tables.grids import RichConsole, text_table
@@ -31,7 +32,13 @@ def export(
     ] = None,
     format_: Annotated[
         str | None,
-        typer.Option("--format", metavar="NAME", help="Format; --list shows them.", show_default=False),
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="Format; --list shows them.",
+            show_default=False,
+            autocompletion=formats,
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -58,14 +65,12 @@ def export(
         ),
     ] = None,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
     """Write a design in another program's format."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.workflow.export import (
                 DesignSource,
@@ -85,7 +90,7 @@ def export(
         exporter = exporter_of(format_)
         source = DesignSource(read_design(design, output.remark), path=design)
         target = export_target(design, out, exporter)
-        request = ExportRequest(source, exporter, target, rays, place, rate_hz, seed or 0, robot)
+        request = ExportRequest(source, exporter, target, rays, place, rate_hz, robot=robot)
         note_new_folders([target], output)
         check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if exporter.folder else ())
         notes: list[str] = []

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
+from lidardesign.cli.completion import constraint_keys
 from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.cli.tables.designs import show_fit
 from lidardesign.cli.tables.grids import RichConsole
@@ -37,10 +38,9 @@ def fit(
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
     """Fit sensors to the density of RUN."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.workflow.fit import FitOptions, FitRequest
             from lidardesign.workflow.run_folder import RunFolder
@@ -101,7 +101,11 @@ def constrain(
     overrides: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="KEY=VALUE", help="One constraint: gate.width_m.max=0.1; repeatable.", show_default=False
+            "--set",
+            metavar="KEY=VALUE",
+            help="One constraint: gate.width_m.max=0.1; repeatable.",
+            show_default=False,
+            autocompletion=constraint_keys,
         ),
     ] = None,
     sensors: options.Sensors = None,
@@ -119,10 +123,9 @@ def constrain(
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
     """Fit sensors again under constraints; nothing is learned again."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.design.constraints.document import Constraints
             from lidardesign.workflow.fit import FitOptions, FitRequest, load_constraints

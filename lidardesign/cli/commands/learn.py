@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli import options
+from lidardesign.cli.completion import tasks, words
 from lidardesign.cli.output import command, keep_times
 from lidardesign.cli.tables.grids import RichConsole, duration, text_table
 from lidardesign.run.clock import WAIT_S, phase
@@ -34,6 +35,7 @@ def learn(
         typer.Argument(
             metavar="TASK",
             help="Name of a task; `lidardesign tasks` lists them.",
+            autocompletion=tasks,
             show_default="that of --config, or of the run that is resumed",
         ),
     ] = None,
@@ -48,7 +50,10 @@ def learn(
     device: Annotated[
         str,
         typer.Option(
-            "--device", metavar="auto|cpu|cuda", help="Where the flow is trained; auto takes a GPU when there is one."
+            "--device",
+            metavar="auto|cpu|cuda",
+            help="Where the flow is trained; auto takes a GPU when there is one.",
+            autocompletion=words("auto|cpu|cuda"),
         ),
     ] = "auto",
     resume: Annotated[
@@ -86,10 +91,9 @@ def learn(
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
     """Learn where rays are worth firing for TASK, into a run folder."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.workflow.learn import LearnOptions, LearnRequest, check_tolerance, result_document
 

@@ -26,13 +26,11 @@ def show(
     ],
     at: options.At = None,
     space_of: options.SpaceOf = None,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Show what a run has and what can be done next, or a design: its sensors, rays, bandwidth and constraints."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    """Show a run with what can be done next, or a design."""
+    with command(json=json, quiet=quiet) as output:
         if design.is_dir():
             return _show_run(design, {"--at": at, "--in": space_of}, output)
         with phase("libraries"):
@@ -180,10 +178,9 @@ def compare(
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
     """Compare two designs: what differs in their sensors, and in their scores on held-out scenes of a run."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.workflow.compare import compare_designs
 

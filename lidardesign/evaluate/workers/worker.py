@@ -93,7 +93,7 @@ class SceneJob:
 
 
 class WorkerTraceback(Exception):  # noqa: N818 (it carries a worker's traceback and is never raised by itself)
-    """Where in a worker an error arose; the cause of the error that this process raises, shown by `--debug`."""
+    """Place in a worker where an error arose; LIDARDESIGN_DEBUG=1 shows it."""
 
 
 @dataclass(frozen=True, eq=False)
