@@ -35,7 +35,7 @@ def test_a_configuration_names_its_task(lidardesign, tmp_path):
     (tmp_path / "flat.yaml").write_text("task_name: flatland\n")
     plan = lidardesign("learn", "--config", "flat.yaml", "--dry-run", "--json").json
     assert plan["settings"]["task_name"] == "flatland"
-    assert plan["writes"][0]["path"].startswith("runs/flatland/")
+    assert plan["writes"][0].startswith("runs/flatland/")
 
 
 def test_without_any_name_of_a_task_there_is_nothing_to_learn(lidardesign, tmp_path):
