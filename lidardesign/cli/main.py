@@ -30,6 +30,7 @@ from lidardesign.cli.output import (
     print_message,
     report_error,
 )
+from lidardesign.errors import page
 
 PROGRAM = "lidardesign"
 COMPLETION = "_LIDARDESIGN_COMPLETE"
@@ -76,7 +77,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "lidardesign show robot.sdf",
     ),
     "compare": (
-        "lidardesign compare runs/face/designs/free.yaml runs/face/designs/beams.yaml",
+        "lidardesign compare runs/face/designs/one.yaml runs/face/designs/two.yaml",
         "lidardesign compare rig.csv other.csv --in runs/face",
     ),
     "catalog list": ("lidardesign catalog list --reflectance 10 --klux 100",),
@@ -109,7 +110,9 @@ PAGES = {
 def epilog_of(command: str) -> str:
     """The end of a command's help: examples, one a line, and pages of the documentation."""
     pages = PAGES[command if command in PAGES else command.split()[0]]
-    return "\n\n".join(["Examples:", *EXAMPLES[command], f"See also: docs/{pages.replace(', ', ', docs/')}"])
+    # \b keeps the lines as they are
+    examples = "\n".join(["\b", "Examples:", *(f"  {example}" for example in EXAMPLES[command])])
+    return f"{examples}\n\n\b\nSee also: {pages}\n  in {page('commands.md').parent}"
 
 
 app = typer.Typer(

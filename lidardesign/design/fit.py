@@ -165,7 +165,7 @@ def check_options(
     constraints: Constraints, space: DesignSpace, sensors: int | None, layout: Layout, rays: int | None
 ) -> None:
     """Options against each other and against the constraints, before anything is computed."""
-    if sensors is not None and not 1 <= sensors <= MOST_FITTED:
+    if sensors is not None and not (isinstance(sensors, int) and 1 <= sensors <= MOST_FITTED):
         raise ConfigError(
             f"{sensors} sensors", where="--sensors", allowed=f"1 to {MOST_FITTED}", hint="--layout scan has one per ray"
         )
