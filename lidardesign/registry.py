@@ -280,7 +280,7 @@ def plugin_guard(name: str) -> Iterator[None]:
         raise PluginError(
             f"{type(error).__name__}: {text_of(error)}",
             where=f"task {name}",
-            hint=f"--debug shows where; {AUTHOR_HINT}",
+            hint=f"LIDARDESIGN_DEBUG=1 shows where; {AUTHOR_HINT}",
         ) from error
 
 

@@ -135,7 +135,7 @@ def test_the_installed_wheel_shows_a_task_and_its_formats(installed, tmp_path):
 
 def test_pages_that_help_and_errors_of_an_installed_wheel_name_can_be_opened(installed, tmp_path):
     said = run_installed(installed, tmp_path, "constrain", "--help").stdout
-    names, place = re.search(r"^See also:\n  (.*)\n  in (.*)$", said, re.MULTILINE).groups()
+    names, place = re.search(r"^ +See also: (.*)\n +in (.*)$", said, re.MULTILINE).groups()
     assert Path(place) == installed / PAGES
     assert all((Path(place) / name).is_file() for name in names.split(", "))
     (tmp_path / "parts").mkdir()

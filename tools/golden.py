@@ -68,7 +68,6 @@ FURTHER = {
         evaluate runs/flatland/designs/scan.yaml --rays 12 --effects all --detector single-photon --json
     """,
     "face": """
-        fit runs/face --sensors auto --name auto --json
         fit runs/face --layout scan --rays 40 --weight area_exponent=0.25 --name weighted --json
         fit runs/face --sensors 2 --parts vl53l5cx,tmf8828 --name bought --json
         constrain runs/face --set 'parts={names: [vl53l5cx, vl53l8cx], count: 2}' --name ours
@@ -125,9 +124,6 @@ GENERAL = """
     config schema constraints
     config schema design
     config schema evaluate
-    completion bash
-    completion zsh
-    completion fish
     tasks new landmark --out landmark
     lern face
     learn face --set density.sigma=1
@@ -135,7 +131,7 @@ GENERAL = """
     fit runs/nothing --json
 """
 COMMANDS = (
-    "", "learn", "fit", "constrain", "evaluate", "export", "capture", "show", "completion", "tasks",
+    "", "learn", "fit", "constrain", "evaluate", "export", "capture", "show", "tasks",
     "tasks list", "tasks show", "tasks check", "tasks new", "catalog", "catalog list", "catalog show", "config",
     "config init", "config schema",
 )  # fmt: skip
@@ -229,7 +225,6 @@ def task_lines(task: str) -> Iterator[str]:
     yield f"config init {task} --preset draft"
     yield f"learn {task} {settings} --out {run} --dry-run --json"
     yield f"learn {task} {settings} --out {run}"
-    yield f"fit {run} --dry-run --json"
     for layout in LAYOUTS:
         how = f"--layout {layout} --rays {rays}" + ("" if layout == "scan" else " --sensors 2") + where
         yield f"fit {run} {how} --name {layout} --json"
@@ -248,7 +243,6 @@ def task_lines(task: str) -> Iterator[str]:
         yield f"export {designs[0]} --format {name} {amount}--out all/{name}{suffix} --json"
     yield f"evaluate {designs[0]} {designs[1]} --rays {rays} --baseline none"
     yield f"show {designs[1]} {designs[2]} --json"
-    yield f"evaluate {run} --rays {rays} --dry-run --json"
     yield f"evaluate {run} --rays {rays} --csv rows.csv"
     yield f"evaluate {designs[0]} --rays {rays} --baseline occupancy --json"
     yield f"evaluate {designs[0]} --rays {rays} --baseline no-visibility --json"

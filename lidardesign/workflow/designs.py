@@ -21,7 +21,7 @@ from lidardesign.design.sensor import CERTIFICATES, DesignSpec
 from lidardesign.errors import ConfigError, DataError, names_arguments
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import WAIT_S, Progress, phase
-from lidardesign.run.files import is_there, run_lock
+from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import write_recorded
 from lidardesign.task import scoring_settings
 from lidardesign.workflow.export import (
@@ -279,7 +279,7 @@ def collect_designs(
         elif target in opened:
             run = opened[target]
             designs += [Design(read_design(path, notes), run, path) for path in run.design_paths()]
-        elif not is_there(target):
+        elif not target.exists():
             raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
         else:
             design = read_design(target, notes, reach_m)

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import with_task_settings
-from lidardesign.design.compare import outside_notes
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
-from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
+from lidardesign.evaluate.baselines.greedy import GreedySource
 from lidardesign.evaluate.baselines.simple import ALWAYS, CMA, NONE, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
@@ -24,10 +23,7 @@ from lidardesign.evaluate.last_scores import SCORES, last_scores_of
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import (
     EvaluationRequest,
-    fired_numbers,
-    left_out,
     numbers_alone,
-    numbers_fired,
     usual_numbers,
 )
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
@@ -38,18 +34,7 @@ from lidardesign.run.clock import Progress, outermost_clock, phase, running
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.workflow.designs import Design, collect_designs, html_table, judging_run, name_apart, named
-from lidardesign.workflow.run_folder import (
-    CONFIGURATION,
-    DESIGN_FOLDER,
-    MANIFEST,
-    SAMPLES,
-    Notes,
-    RequestPlan,
-    RunFolder,
-    last_time,
-    log_note,
-    settings_texts,
-)
+from lidardesign.workflow.run_folder import DESIGN_FOLDER, Notes, RunFolder, log_note, settings_texts
 from lidardesign.workflow.run_samples import Layouts, learned_density, twin_without_visibility
 from lidardesign.workflow.select_rays import gate_margin_m, selection_scenes
 
@@ -62,7 +47,6 @@ CMA_SECONDS = (0.1, 7 * 24 * 3600.0)
 RANGE_TOLERANCES_MM = (SLACK, 1e9)
 RETURN_TOLERANCES = (SLACK, 1.0)
 MILLIMETRES = 1000.0
-MOST_NAMED = 8
 COMMAND = "evaluate"
 
 
@@ -237,59 +221,6 @@ class ScoreRequest:
             planner,
             audit,
             options,
-        )
-
-    def plan(self, outputs: Mapping[str, Path | None] | None = None) -> RequestPlan:
-        """What the evaluation would do.
-
-        Arguments:
-            outputs: Files that are to be written, by the option that says so; None for those that are not.
-
-        Raises:
-            ConfigError: No design can fire any of the numbers of rays.
-        """
-        run, options = self.run, self.options
-        specifications = [design.specification for design in self.designs]
-        counts = fired_numbers(specifications, self.rays)
-        shared = [count for count in counts if count not in self.alone]
-        fired = [count for design in specifications for count in numbers_fired(design, counts, self.alone)]
-        choosable, notes = greedy_rays(run.task, len(run.conditions()), shared)
-        baselines = [name for name in self.baselines if name != GREEDY or choosable]
-        rows = len(fired) + len(baselines) * len(shared)
-        matched = sum(count in shared for count in fired) * len(baselines)
-        names = [design.name for design in specifications]
-        listed = ", ".join(names[:MOST_NAMED])
-        listed += f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-        settings = {
-            "--effects": options.effects,
-            "--detector": options.detector,
-            "--set": list(settings_texts(options.settings)) or None,
-            "--mount-error": options.mount_error,
-            "--accuracy": options.accuracy,
-        }
-        given = [f"{name} {value}" for name, value in settings.items() if isinstance(value, str)]
-        given += [*(f"--set {text}" for text in settings["--set"] or ()), *["--accuracy"] * options.accuracy]
-        written = [
-            path for path in (outputs or {}).values() if path is not None
-        ]
-        return RequestPlan(
-            COMMAND,
-            [
-                f"score {listed} in the held-out scenes of task {run.task.name}, with {', '.join(map(str, counts))} "
-                "rays per frame",
-                f"against {', '.join(baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
-                *left_out(specifications, self.rays, self.alone),
-                *notes,
-                *(line for design in specifications for line in outside_notes(design, run.config.space)),
-                *([f"with {', '.join(given)}"] if given else []),
-            ],
-            [
-                *(design.name if design.path is None else design.path for design in self.designs),
-                *(run.folder / name for name in (CONFIGURATION, MANIFEST, *([SAMPLES] if run.has_samples else ()))),
-            ],
-            [*written, run.folder / MANIFEST],
-            {"designs": names, "rays": counts, "baselines": list(self.baselines), **settings},
-            last_time(run.folder, COMMAND),
         )
 
     @property

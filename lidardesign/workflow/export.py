@@ -16,17 +16,7 @@ from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
 from lidardesign.mujoco_model import RobotFile
 from lidardesign.run.clock import phase
-from lidardesign.run.files import STDIO, is_input
-from lidardesign.workflow.run_folder import (
-    CONFIGURATION,
-    MANIFEST,
-    Notes,
-    RequestPlan,
-    RunFolder,
-    folder_of,
-    last_time,
-    log_note,
-)
+from lidardesign.workflow.run_folder import Notes, RunFolder, folder_of, log_note
 from lidardesign.workflow.run_samples import RunTarget, Weighting, may_need_samples, weighted_samples
 
 # Of frames: slower than any survey, faster than any pulse.
@@ -190,38 +180,6 @@ class ExportRequest:
             raise ConfigError(f"{name} holds sensors, not rays", where="--rays", hint="leave it out")
         self.exporter.check_rate(self.rate_hz)
 
-    def plan(self) -> RequestPlan:
-        """What the export would do.
-
-        Raises:
-            ConfigError: The design is nowhere at such a condition, leaves its rays open without a run, or so many were
-                not chosen.
-        """
-        source, design, exporter = self.source, self.source.specification, self.exporter
-        if self.at or design.track is not None:
-            placed(design, self.at)
-        count = None if exporter.name in WITHOUT_RAYS else self.rays
-        if count is None and exporter.name not in WITHOUT_RAYS:
-            count = source.largest_budget() if source.leaves_rays_open else own_count(design)
-        if count is not None and layout_of(design).chosen_on_scenes:
-            # refuses a number of rays that was not chosen
-            lay_out(design, count, at=self.at or None)
-        content = "its sensors" if count is None else f"its {count} rays"
-        place = "".join(f" at {key} = {value:g}" for key, value in self.at.items())
-        run = [] if source.folder is None else [source.folder / CONFIGURATION, source.folder / MANIFEST]
-        robot = self._robot()
-        return RequestPlan(
-            "export",
-            [
-                f"write {content}{place} as {exporter.name}: {exporter.summary}",
-                "read the file back, and say what was lost",
-            ],
-            [design.name if source.path is None else source.path, *run, *([robot.path] if robot else [])],
-            [f"{self.target}/" if exporter.folder else self.target],
-            {"format": exporter.name, "rays": count, "at": dict(self.at)},
-            last_time(source.folder, "export"),
-        )
-
     def _robot(self) -> RobotFile | None:
         """The robot's model, and what the run of a mounted design says of it."""
         mounted = self.source.specification.mount is not None
@@ -273,19 +231,13 @@ def export_target(path: Path | None, out: Path | None, exporter: Exporter) -> Pa
     """Where to write a design: where a user says, or beside its file.
 
     Raises:
-        ConfigError: Over the design, to standard output a folder, or nowhere that is known.
+        ConfigError: Over the design, or nowhere that is known.
     """
-    if out is None and path is not None and is_input(path):
-        raise ConfigError(
-            "a design from standard input has no folder to write to", where="DESIGN -", hint="give --out PATH"
-        )
     if out is None and path is None:
         raise ConfigError(
             "a design without a file has no folder to write to", hint="save it, or say where to write the export"
         )
     target = out if out is not None else path.with_suffix(exporter.suffix)
-    if str(target) == STDIO and exporter.folder:
-        raise ConfigError(f"{exporter.name} is a folder of files", where="--out -", hint="give --out FOLDER")
     if path is not None and target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
     return target

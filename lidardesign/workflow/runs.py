@@ -15,8 +15,7 @@ from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
 from lidardesign.workflow.designs import Design, html_table
 from lidardesign.workflow.fit import FitOptions, FitRequest
-from lidardesign.workflow.learn import LearnOptions, LearnRequest
-from lidardesign.workflow.learning_budget import check_met
+from lidardesign.workflow.learn import LearnOptions, LearnRequest, check_tolerance
 from lidardesign.workflow.run_folder import (
     MANIFEST,
     Notes,
@@ -143,8 +142,7 @@ class Run(RunFolder):
         """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
 
         Arguments:
-            sensors: How many, "best": as many as score best on training scenes, or "auto": as many as the
-                held-out likelihood favours; "best" by default.
+            sensors: How many, or "best" (the default): as many as score best on training scenes.
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
             layout: grid, density, scan, distributed, selected or spinning; by default selected, where the task
@@ -409,7 +407,7 @@ def learn(
     result = request.run(progress and (lambda now: progress("learning", now.step, now.steps)), remark)
     for note in (*result.notes, f"the density is {result.verdict.text(request.settings.preset)}"):
         remark(note)
-    check_met(result, request.goal)
+    check_tolerance(result, options.tolerance)
     return open_run(request.folder)
 
 

@@ -20,7 +20,7 @@ from lidardesign.evaluate.seeds import over_seeds
 from lidardesign.run.clock import Progress, outermost_clock, running
 from lidardesign.workflow.designs import Design
 from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest, Scores
-from lidardesign.workflow.run_folder import Notes, RequestPlan, RunFolder, log_note, read_design
+from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, read_design
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.cma.candidate import Show
@@ -160,22 +160,6 @@ class SeedsRequest:
     def cma_seconds(self) -> float:
         """Wall time of each search of the baseline cma [s]."""
         return self.requests[0].cma_seconds
-
-    def plan(self, outputs: Mapping[str, Path | None] | None = None) -> RequestPlan:
-        """What the evaluation would do.
-
-        Arguments:
-            outputs: Files that are to be written, by the option that says so; None for those that are not.
-        """
-        plans = [request.plan(outputs) for request in self.requests]
-        seeds = [request.seed for request in self.requests]
-        heading = f"for each of the seeds {', '.join(map(str, seeds))}, in the scenes of seed {self._scenes_seed}:"
-        return replace(
-            plans[0],
-            steps=[heading, *plans[0].steps],
-            reads=list(dict.fromkeys(path for plan in plans for path in plan.reads)),
-            settings={**plans[0].settings, "seeds": seeds, "--scenes-seed": self._scenes_seed},
-        )
 
     def score(self, progress: Progress | None = None, searching: Show | None = None) -> Scores:
         """Score every run's designs and baselines, and take means over seeds.

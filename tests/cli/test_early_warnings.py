@@ -158,7 +158,6 @@ def test_a_rig_in_millimetres_is_told_wherever_it_meets_a_run(capsys, monkeypatc
     commands = (
         ("show", name, "--in", flat),
         ("evaluate", name, "--in", flat, "--rays", 9),
-        ("evaluate", name, "--in", flat, "--rays", 9, "--dry-run"),
     )
     for arguments in commands:
         result = call(*arguments)

@@ -96,8 +96,6 @@ def test_an_output_that_cannot_be_written_or_is_needed_is_refused_before_the_wor
         (("--csv", "a", "--report", "a"), "--csv and --report: a is the same file"),
         (("--csv", "a", "--report", "folder/../a"), "a is the same file"),
         (("--csv", "a", "--report", "a/b.html"), "a is a folder of --report too"),
-        (("--report", "-", "--csv", "-"), "both write to standard output"),
-        (("--json", "--csv", "-"), "both write to standard output"),
         (("--detector", "file", "--csv", "file"), ""),
     ],
 )
@@ -111,7 +109,7 @@ def test_outputs_that_are_in_each_others_way_are_refused_before_the_work(call, w
 
 def test_devices_and_places_beside_a_runs_files_may_be_written(call):
     for options in (("--csv", "/dev/null", "--report", "/dev/null"), ("--csv", "run/scores.csv")):
-        assert call(*EVALUATE, *options, "--dry-run").code == 0
+        assert call(*EVALUATE, *options).code == 0
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])

@@ -257,7 +257,7 @@ def robots(_: Path) -> list[bytes]:
 def manifests(folder: Path) -> list[bytes]:
     """The manifest of a run that was learned."""
     run = make_run(folder / "run", count=50)
-    note(run, learn={"ess": 0.5, "notes": []}, visibility="raycast", timings={"learn": 1.0}, goal={"steps": 10})
+    note(run, learn={"ess": 0.5, "notes": []}, visibility="raycast", timings={"learn": 1.0})
     return [json.dumps(read_manifest(run)).encode()]
 
 

@@ -29,7 +29,7 @@ from lidardesign.config import load_run_config, save_run_config
 from lidardesign.errors import PluginError
 from lidardesign.run import files as lock
 from lidardesign.run.files import run_lock
-from lidardesign.run.manifest import note, start_manifest
+from lidardesign.run.manifest import start_manifest
 from lidardesign.task import Score
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="faults of processes are made with POSIX calls")
@@ -195,8 +195,7 @@ class TestKillsFullDisksAndTwoWriters:
     def test_a_run_to_a_tolerance_is_resumed_by_the_command_that_started_it(self, tmp_path, lidardesign, monkeypatch):
         run = make_run(tmp_path / "run", count=1000)
         task, config = load_run_config(run)
-        note(run, goal={"tolerance": 0.1, "target_misplaced": 0.02})
-        learning = config.learning.model_copy(update={"misplaced": 0.08, "steps": 400})
+        learning = config.learning.model_copy(update={"misplaced": 0.1, "steps": 400})
         save_run_config(replace(config, learning=learning), run)
         monkeypatch.setattr(FlatlandTask, "scenes", lambda *_: (_ for _ in ()).throw(RuntimeError("as far as this")))
         again = ("learn", task.name, "--preset", "draft", "--out", run, "--tolerance", 0.1, "--resume", "--set")

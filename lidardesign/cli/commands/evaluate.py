@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
-from lidardesign.cli.output_files import claim_outputs, is_output, written_file
+from lidardesign.cli.completion import detectors, words
+from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output_files import claim_outputs
 from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
-from lidardesign.errors import MAX_SEED
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
@@ -64,7 +64,14 @@ def evaluate(
         ),
     ] = None,
     baseline: Annotated[
-        list[str] | None, typer.Option("--baseline", metavar="NAME", help=BASELINE_HELP, show_default=False)
+        list[str] | None,
+        typer.Option(
+            "--baseline",
+            metavar="NAME",
+            help=BASELINE_HELP,
+            show_default=False,
+            autocompletion=words("lloyd|occupancy|no-visibility|cma"),
+        ),
     ] = None,
     cma_seconds: Annotated[
         float | None,
@@ -84,6 +91,7 @@ def evaluate(
             help="Physical effects: auto for those that matter in each scene, all, none, or names separated by "
             "commas; audit: like auto, and every row under all effects too (exit 1 if a score moves by more than the "
             "metric's tolerance).",
+            autocompletion=words("auto|all|none|audit"),
         ),
     ] = "auto",
     detector: Annotated[
@@ -92,6 +100,7 @@ def evaluate(
             "--detector",
             metavar="NAME|FILE",
             help="The detector: ideal, single-photon, consumer-8x8, or a YAML file.",
+            autocompletion=detectors,
         ),
     ] = "ideal",
     range_tolerance_mm: Annotated[
@@ -177,15 +186,12 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
-    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     scenes_seed: Annotated[
         int | None,
         typer.Option(
             "--scenes-seed",
             metavar="N",
-            min=0,
-            max=MAX_SEED,
             help="Seed of the held-out scenes.",
             show_default="--seed, or the (first) run's",
         ),
@@ -193,11 +199,10 @@ def evaluate(
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Score designs on held-out scenes against the baselines uniform, random, bounding, silhouette and greedy."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
-        claim_outputs(output, dry_run=dry_run, csv=csv, report=report)
+    """Score designs on held-out scenes against baselines."""
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
+        claim_outputs(output, csv=csv, report=report)
         with phase("libraries"):
             from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest, check_scores
             from lidardesign.workflow.run_folder import RunFolder
@@ -229,10 +234,7 @@ def evaluate(
             else ScoreRequest.resolve(targets, chosen, judge, output.remark)
         )
         files = {"--report": report, "--csv": csv}
-        plan = request.plan(files)
-        check_outputs(files, plan.reads)
-        if dry_run:
-            return show_plan(plan, output)
+        check_outputs(files, targets)
         scores = _score(request, output)
         written: dict[Path, None] = {}
 
@@ -251,7 +253,7 @@ def evaluate(
             rest.callback(show_result)
             rest.callback(keep_times, request.run.folder, "evaluate", output, further=scores.last_scores())
             # accuracy takes minutes: what was scored by then is written already
-            _write_files(scores, written, *(None if accuracy and is_output(path) else path for path in files.values()))
+            _write_files(scores, written, *files.values())
             if accuracy:
                 scores = _with_accuracy(scores, output)
                 _write_files(scores, written, *files.values())
@@ -288,8 +290,7 @@ def _write_files(scores: Scores, written: dict[Path, None], report: Path | None,
         if report is not None:
             rest.callback(_write_report, scores, written, report)
         if csv is not None:
-            with written_file(csv) as file:
-                scores.to_csv(file)
+            scores.to_csv(csv)
             written[csv] = None
 
 
@@ -299,6 +300,5 @@ def _kind(path: Path, files: Mapping[str, Path | None]) -> str:
 
 
 def _write_report(scores: Scores, written: dict[Path, None], path: Path) -> None:
-    with written_file(path) as file:
-        scores.report(file, ("lidardesign", *sys.argv[1:]))
+    scores.report(path, ("lidardesign", *sys.argv[1:]))
     written[path] = None

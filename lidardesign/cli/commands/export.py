@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
-from lidardesign.cli.output_files import claim_stdout, note_new_folders, written_file
+from lidardesign.cli.completion import formats
+from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output_files import note_new_folders, written_file
 from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
@@ -31,7 +32,13 @@ def export(
     ] = None,
     format_: Annotated[
         str | None,
-        typer.Option("--format", metavar="NAME", help="Format; --list shows them.", show_default=False),
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="Format; --list shows them.",
+            show_default=False,
+            autocompletion=formats,
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -58,15 +65,12 @@ def export(
         ),
     ] = None,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
-    dry_run: options.DryRun = False,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
     """Write a design in another program's format."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.workflow.export import (
                 DesignSource,
@@ -80,19 +84,15 @@ def export(
         check_frame_rate(rate_hz)
         if list_formats:
             return _list(output)
-        claim_stdout(output, dry_run=dry_run, out=out)
         place = options.parse_at(at)
         if design is None:
             raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
         exporter = exporter_of(format_)
         source = DesignSource(read_design(design, output.remark), path=design)
         target = export_target(design, out, exporter)
-        request = ExportRequest(source, exporter, target, rays, place, rate_hz, seed or 0, robot)
+        request = ExportRequest(source, exporter, target, rays, place, rate_hz, robot=robot)
         note_new_folders([target], output)
-        plan = request.plan()
-        check_outputs({"--out": target}, plan.reads, ("--out",) if exporter.folder else ())
-        if dry_run:
-            return show_plan(plan, output)
+        check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if exporter.folder else ())
         notes: list[str] = []
         with written_file(target, exporter.suffix) as file:
             exported = request.write(file, notes.append)

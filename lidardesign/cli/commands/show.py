@@ -31,13 +31,11 @@ def show(
     ] = None,
     at: options.At = None,
     space_of: options.SpaceOf = None,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
     """Show what a run has and what can be done next, a design (sensors, rays, cost, constraints), or how two differ."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    with command(json=json, quiet=quiet) as output:
         if design.is_dir() and other is None:
             return _show_run(design, {"--at": at, "--in": space_of}, output)
         with phase("libraries"):

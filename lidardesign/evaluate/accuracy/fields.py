@@ -22,7 +22,7 @@ from functools import partial
 
 import numpy as np
 
-from lidardesign.config import DensitySettings, RunConfig
+from lidardesign.config import DensitySettings
 from lidardesign.density.fields.bodies import place_bodies
 from lidardesign.density.fields.distance import BodyField, Field, TableField, scene_columns
 from lidardesign.density.fields.grids import distance_grid, grid_around
@@ -45,7 +45,6 @@ from lidardesign.evaluate.accuracy.probes import (
 )
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
 from lidardesign.numerics import logsumexp
-from lidardesign.run.clock import phase
 from lidardesign.scene import Body, Mesh, Scene, inverse_rigid
 from lidardesign.space import DesignSpace
 
@@ -345,48 +344,3 @@ def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: Dens
 
 def _part(case: FieldCase, note: str) -> str:
     return f"measured on {len(case.few)} of {len(case.scenes)} training scenes; {note}"
-
-
-# Of the whole tolerance: the rest is for learning, whose every halving costs more than that of the fields.
-FIELD_SHARE = 0.2
-
-
-@dataclass(frozen=True)
-class FieldChoice:
-    """Fields for a tolerance.
-
-    Arguments:
-        density: Settings with their resolution.
-        misplaced: The share of the target's mass that they misplace; 0 where distances are exact.
-        note: What was chosen and why, or "".
-    """
-
-    density: DensitySettings
-    misplaced: float
-    note: str = ""
-
-
-@phase("fields")
-def fields_within(scenes: list[Scene], config: RunConfig, tolerance: float, *, fixed: bool) -> FieldChoice:
-    """The coarsest fields that misplace at most a fifth of a tolerance, the finest of the sweep where none does.
-
-    Arguments:
-        scenes: The training scenes.
-        config: The run's configuration.
-        tolerance: The whole tolerance of the density.
-        fixed: Only measure the configuration's own resolution.
-    """
-    density = config.density
-    if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
-        return FieldChoice(density, 0.0)
-    case = FieldCase.of(scenes, config.space, density, config.seed, density.visibility)
-    if case is None:
-        return FieldChoice(density, 0.0)
-    misplaced = 0.0
-    for resolution in (density.field_resolution,) if fixed else RESOLUTIONS:
-        density = density.model_copy(update={"field_resolution": resolution})
-        misplaced, _, _ = case.errors(fresh(case.few, case.scenes, resolution, density))
-        if misplaced <= FIELD_SHARE * tolerance:
-            break
-    note = f"fields of {density.field_resolution} grid points misplace {misplaced:.2g} of the target's mass"
-    return FieldChoice(density, misplaced, note)

@@ -18,7 +18,6 @@ import numpy as np
 from lidardesign.config import FILE_NAME as CONFIG_FILE
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import EM_SAMPLES, RESTARTS
-from lidardesign.design.layouts.layout import HELD_OUT_SHARE
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.mixture.bounds import Bounds, bounds_of, sensor_groups
 from lidardesign.design.mixture.em import fit_mixture
@@ -38,6 +37,7 @@ RESTART_COUNTS = (1, 2, 4, 8, 12)
 # Each setting is fitted so often, on other splits and with other seeds; more often where luck decides more. Fits take
 # in proportion to their sensors: of many, fewer are made, but no fewer than the least.
 REPEATS, LEAST_REPEATS, SENSORS_FITTED = 5, 2, 40
+HELD_OUT_SHARE = 1 / 3
 MORE_REPEATS = {1: 3, 2: 2, 4: 2}
 # Modules are found where this process finds them, and a folder's own files are not mistaken for libraries.
 PROGRAM = "import runpy, sys; sys.path[:] = {path!r}; runpy.run_module('lidardesign', run_name='__main__')"
