@@ -34,7 +34,7 @@ def show(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Show what a run has and what can be done next, a design (sensors, rays, cost, constraints), or how two differ."""
+    """Show a run and what to do next, a design, or how two differ."""
     with command(json=json, quiet=quiet) as output:
         if design.is_dir() and other is None:
             return _show_run(design, {"--at": at, "--in": space_of}, output)
