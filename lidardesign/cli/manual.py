@@ -114,7 +114,7 @@ MANUALS: dict[str, Manual] = {
             "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out rays.csv": "explicit rays",
             "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out - | head -3": "to stdout",
         },
-        about="Says what the format cannot hold, and reads the file back to say how exact its numbers are.",
+        about="Says what the format cannot hold.",
         files=(
             "DESIGN: a design file or one of a rig (lidardesign show --help), - for standard input",
             "--out PATH: what is written, - for standard output",

@@ -19,8 +19,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,28 +26,24 @@ import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import ConfigError, DataError
-from lidardesign.estimates import Estimate
-from lidardesign.export.common.even_grid import EvenGrid, by_channel, grid_of, grid_sensor_losses
-from lidardesign.export.common.poses import (
+from lidardesign.errors import ConfigError
+from lidardesign.export.mounts import (
+    EvenGrid,
     Mount,
-    Part,
     Place,
-    ReadMount,
+    by_channel,
     design_losses,
     fire_times_s,
+    grid_of,
+    grid_sensor_losses,
     mounts,
-    mounts_rounding,
     places,
-    rays_of_parts,
-    rays_rounding,
     require_rays,
 )
-from lidardesign.geometry.frames import rotation_of_rpy
 from lidardesign.geometry.rays import Rays
-from lidardesign.numerics import FULL_TURN, HALF_DIGITS, unit_vectors
+from lidardesign.numerics import FULL_TURN, HALF_DIGITS
 from lidardesign.run.files import write_atomic
-from lidardesign.space import angles, direction
+from lidardesign.space import angles
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 # A sweep of one column is as narrow as its field of view is written.
@@ -87,22 +81,6 @@ def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Ban
             f"{min(late):.3g} to {max(late):.3g} m"
         )
     return [*notes, "every frame has all rays once where the world's fixed_delta_seconds is that of the file"]
-
-
-def carla_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """How far the rays that CARLA fires are from the design's; its sensors have no gate start, so only ends count.
-
-    Raises:
-        DataError: The file holds no such sensors.
-    """
-    design, rays = by_channel(design, rays)
-    mounted = mounts(design, rays)
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        found = [_held(one, document["fixed_delta_seconds"]) for one in document["sensors"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"holds no lidars: {error!r}", where=str(path)) from error
-    return mounts_rounding(rays, mounted, found, path)
 
 
 def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
@@ -166,32 +144,6 @@ def _rotation(mount: Mount, grid: EvenGrid, field_deg: float) -> dict[str, float
     }
 
 
-def _axes(rotation: Mapping[str, float]) -> np.ndarray:
-    """The matrix of CARLA's transforms, whose columns are forward, right and up: a roll lowers the right side."""
-    pitch, yaw, roll = (math.radians(rotation[name]) for name in ("pitch", "yaw", "roll"))
-    cos_p, sin_p, cos_y, sin_y = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
-    cos_r, sin_r = math.cos(roll), math.sin(roll)
-    return np.array(
-        [
-            [cos_p * cos_y, cos_y * sin_p * sin_r - sin_y * cos_r, -cos_y * sin_p * cos_r - sin_y * sin_r],
-            [cos_p * sin_y, sin_y * sin_p * sin_r + cos_y * cos_r, -sin_y * sin_p * cos_r + cos_y * sin_r],
-            [sin_p, -cos_p * sin_r, cos_p * cos_r],
-        ]
-    )
-
-
-def _held(sensor: Mapping[str, Any], step_s: float) -> ReadMount:
-    attributes = sensor["attributes"]
-    rows = int(attributes["channels"])
-    columns = round(float(attributes["points_per_second"]) * step_s / rows)
-    field, high, low = (math.radians(float(attributes[f"{name}_fov"])) for name in ("horizontal", "upper", "lower"))
-    swept = -field / 2 + np.arange(columns) * field / columns
-    local = direction(np.tile(swept, rows), np.repeat(np.linspace(high, low, rows), columns))
-    location = np.array([sensor["transform"]["location"][axis] for axis in "xyz"])
-    world = local @ _axes(sensor["transform"]["rotation"]).T @ MIRROR
-    return ReadMount(MIRROR @ location, world, (math.nan, float(attributes["range"])))
-
-
 MICROSECONDS_PER_S = 1e6
 NANOSECONDS_PER_S = 10**9
 
@@ -222,6 +174,7 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
     write_atomic(path, json.dumps(whole, indent=1) + "\n")
     notes = [
         "gates are lost: `range` is the end of the last one",
+        "firing times are whole microseconds",
         "names are lost: sensor_id numbers the configurations, in the order of the sensors",
     ]
     if len(found) > len(mounted):
@@ -251,39 +204,3 @@ def _configuration(number: int, place: Place, rays: Rays, times_us: np.ndarray) 
 
 def _vector(values: np.ndarray) -> dict[str, float]:
     return dict(zip("xyz", values.tolist(), strict=True))
-
-
-def read_osi(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
-    """The rays of a file that `write_osi` made of a design and its rays, with their own gates, and the frame rate [Hz].
-
-    Raises:
-        DataError: The file cannot be read, or holds something else.
-    """
-    found = places(mounts(design, rays), rays)
-    try:
-        whole = json.loads(Path(path).read_text(encoding="utf-8"))
-        cycle = whole["updateCycleTime"]
-        rate_hz = NANOSECONDS_PER_S / (int(cycle["seconds"]) * NANOSECONDS_PER_S + int(cycle["nanos"]))
-        lidars = whole["lidarSensorViewConfiguration"]
-        parts = [_rays_of_lidar(place, lidar, rays) for place, lidar in zip(found, lidars, strict=True)]
-        times_us = np.zeros(len(rays))
-        for place, lidar in zip(found, lidars, strict=True):
-            times_us[place.ray] = lidar["timings"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"cannot be read as OSI: {error}", where=str(path), hint="export it again") from error
-    return replace(rays_of_parts(rays, parts, str(path)), time_s=times_us / MICROSECONDS_PER_S), rate_hz
-
-
-def _rays_of_lidar(place: Place, lidar: dict[str, Any], rays: Rays) -> Part:
-    mounting = lidar["mountingPosition"]
-    turn = rotation_of_rpy(*(mounting["orientation"][name] for name in ("roll", "pitch", "yaw")))
-    looking = np.array([[one[axis] for axis in "xyz"] for one in lidar["directions"]]).reshape(-1, 3)
-    origin = np.tile([mounting["position"][axis] for axis in "xyz"], (len(looking), 1))
-    return place.ray, origin, unit_vectors(looking @ turn.T), rays.gate_m[place.ray]
-
-
-def osi_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose: times are whole microseconds; gates are not held."""
-    found, rate_hz = read_osi(path, design, rays)
-    errors = rays_rounding(replace(rays, time_s=fire_times_s(rays, rate_hz)), found, path)
-    return {name: errors[name] for name in ("origin_m", "direction_rad", "time_s")}

@@ -32,8 +32,6 @@ from lidardesign.design.galvo import (
 )
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.estimates import Estimate
-from lidardesign.export.common.poses import rays_rounding
 from lidardesign.export.ray_lists import ray_list_losses
 from lidardesign.geometry.rays import Rays, fire_times
 from lidardesign.numerics import ROUNDING, SLACK, TINY
@@ -247,12 +245,8 @@ def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
             row = (len(lines) - 1, number, *shared, repr(x), repr(y), start, width, int(rays.sensor[ray]), ray)
             lines.append(",".join(map(str, row)))
     write_atomic(path, "\n".join(lines) + "\n")
-    return [*_summary(positions), *ray_list_losses(design), "firing times follow from the order of the rows"]
-
-
-def galvo_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose: gates open outward to whole picoseconds; firing times are lost."""
-    return rays_rounding(rays, read_galvo(path), path, times=False)
+    rounded = "gates are whole picoseconds (0.15 mm), opened outward; firing times follow from the order of the rows"
+    return [*_summary(positions), *ray_list_losses(design), rounded]
 
 
 def plan(design: DesignSpec, rays: Rays) -> list[Position]:

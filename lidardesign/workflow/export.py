@@ -11,7 +11,6 @@ from lidardesign.design.layouts.rays import lay_out, layout_of, own_count
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import BackgroundNote, ConfigError, check_number
-from lidardesign.estimates import Estimate, as_documents
 from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
 from lidardesign.mujoco_model import RobotFile
@@ -135,7 +134,6 @@ class Exported:
         sensors: How many sensors.
         bytes: The size of what was written; None for what is no file, as a pipe.
         notes: What the format cannot hold.
-        rounding: What its numbers lose, found by reading the file back.
     """
 
     path: Path
@@ -144,7 +142,6 @@ class Exported:
     sensors: int
     bytes: int | None
     notes: tuple[str, ...] = ()
-    rounding: Mapping[str, Estimate] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form; the path of the design is for the caller to add."""
@@ -154,7 +151,6 @@ class Exported:
             "rays": self.rays,
             "bytes": self.bytes,
             "notes": list(self.notes),
-            "error_estimates": as_documents(self.rounding),
         }
 
 
@@ -212,10 +208,7 @@ class ExportRequest:
         robot = self._robot()
         return RequestPlan(
             "export",
-            [
-                f"write {content}{place} as {exporter.name}: {exporter.summary}",
-                "read the file back, and say what was lost",
-            ],
+            [f"write {content}{place} as {exporter.name}: {exporter.summary}"],
             [design.name if source.path is None else source.path, *run, *([robot.path] if robot else [])],
             [f"{self.target}/" if exporter.folder else self.target],
             {"format": exporter.name, "rays": count, "at": dict(self.at)},
@@ -233,7 +226,7 @@ class ExportRequest:
         return path and RobotFile(path, getattr(task, "folder", None), getattr(task, "groups", None))
 
     def write(self, file: Path | None = None, notes: Notes = log_note) -> Exported:
-        """Write the design and read it back.
+        """Write the design.
 
         Arguments:
             file: What is written instead of the target, which it is copied to later.
@@ -244,13 +237,11 @@ class ExportRequest:
         design, rays = self.source.lay_out(self.rays, self.at, self.seed, may_stay_open=open_rays, notes=notes)
         with phase("writing"):
             lost = tuple(exporter.write(design, rays, file, self.rate_hz, self._robot()))
-        with phase("reading back"):
-            rounding = exporter.rounding(design, rays, file)
         for note in lost:
             notes(note)
         written = [path for path in (file, *file.rglob("*")) if path.is_file()]
         size = sum(path.stat().st_size for path in written) if written or file.is_dir() else None
-        return Exported(self.target, exporter.name, len(rays), len(design.sensors), size, lost, rounding)
+        return Exported(self.target, exporter.name, len(rays), len(design.sensors), size, lost)
 
 
 def exporter_of(name: str | None, path: Path | None = None) -> Exporter:
