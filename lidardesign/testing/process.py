@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.registry import BEGUN, GRACE_SECONDS, START_SECONDS, PluginProcess, answer, write_line
+from lidardesign.run.child import BEGUN, GRACE_SECONDS, START_SECONDS, Child, write_line
 from lidardesign.testing.law import LOADS, Finding, Law, Limits, error_words, place_of
 from lidardesign.testing.watch import Watch
 
@@ -30,10 +30,6 @@ if TYPE_CHECKING:
     from lidardesign.task import Task
     from lidardesign.testing.contract import Contract
 
-CHILD = (
-    "import json, sys; request = json.loads(sys.stdin.readline()); sys.path[:] = request['path']; "
-    "from lidardesign.testing.process import answer_check; answer_check(request)"
-)
 # A call that takes longer than it may ends within this many times as long, so that it can be told how long it took.
 OVERTIME = 3
 # The key of a line that says what is called now; empty once the call has ended.
@@ -74,7 +70,6 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
         return
     with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
         document = {
-            "path": sys.path,
             "folder": folder,
             "name": offer.name,
             "value": offer.value,
@@ -84,14 +79,14 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
             "seconds": request.limits.seconds,
             "memory_bytes": request.limits.memory_bytes,
         }
-        child = PluginProcess(CHILD, document)
+        child = Child(f"{__name__}:answer_check", document, {registry.PROBING: "1"})
         try:
             yield from _read_findings(child, request.limits.seconds)
         finally:
             child.end()
 
 
-def _read_findings(child: PluginProcess, seconds: float) -> Iterator[Finding]:
+def _read_findings(child: Child, seconds: float) -> Iterator[Finding]:
     """Findings as they come; where the process is lost, the law that it tried does not hold."""
     _, line = child.next_line(time.monotonic() + START_SECONDS)
     if line != BEGUN:
@@ -109,7 +104,7 @@ def _read_findings(child: PluginProcess, seconds: float) -> Iterator[Finding]:
             return
 
 
-def _next_finding(child: PluginProcess, seconds: float, *, loading: bool) -> dict[str, Any] | str:
+def _next_finding(child: Child, seconds: float, *, loading: bool) -> dict[str, Any] | str:
     """The next line that is a finding, or how the process was lost; every call of the task's code has time of its own.
 
     Arguments:
@@ -178,22 +173,17 @@ def _named(number: int) -> tuple[str, str, str]:
     return law.name, law.group, law.statement
 
 
-def answer_check(request: dict[str, Any]) -> None:
-    """In that process: try all laws, say what was found on stdout, and end."""
-    result = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    nowhere = open(os.devnull, "w")  # noqa: SIM115 - lives as long as the process
-    os.dup2(nowhere.fileno(), sys.stdout.fileno())
+def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
+    """In that process: try all laws and say what was found."""
     _settle(request)
-    result.write(BEGUN)
-    result.flush()
     contract = _begin(request, result)
     if contract is None:
-        os._exit(0)
+        return {}
     contract.subject.watch.empty_folder = Path(_make_folder(request, "work"))
     os.chdir(contract.subject.watch.empty_folder)
     for finding in contract.findings():
         write_line(result, finding.as_dict())
-    answer(result, {})
+    return {}
 
 
 def _settle(request: dict[str, Any]) -> None:

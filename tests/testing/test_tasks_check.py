@@ -14,7 +14,7 @@ from support.tables import each_row
 
 from lidardesign import registry
 from lidardesign.errors import ConfigError
-from lidardesign.registry import START_SECONDS
+from lidardesign.run.child import START_SECONDS
 from lidardesign.testing import process
 from lidardesign.testing.contract import LAWS
 from lidardesign.testing.law import Finding, Limits

@@ -8,17 +8,10 @@ without pickle.
 from __future__ import annotations
 
 import atexit
-import contextlib
 import importlib.metadata
 import importlib.util
-import io
-import json
 import os
-import queue
 import re
-import signal
-import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Mapping
@@ -29,8 +22,9 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError, NumericalError
+from lidardesign.run.child import Child, ChildError
 
-WORKER = "lidardesign.simulate.light_transport.worker"
+WORKER = "lidardesign.simulate.light_transport.worker:serve"
 # The simulator's packages and the oldest versions that answer as its tests expect.
 PACKAGES = {"mitsuba": (3, 9), "mitransient": (1, 3), "drjit": (1, 0)}
 # Older ones cannot select instructions for the kernels and abort (14 to 16), or are refused.
@@ -112,7 +106,6 @@ def ask(
     """
     with tempfile.TemporaryDirectory(prefix="lidardesign-light-") as name:
         folder = Path(name)
-        (folder / "request.json").write_text(json.dumps(request), encoding="utf-8")
         np.savez(folder / "request.npz", **arrays)
         with _one_at_a_time:
             reason = missing()
@@ -120,106 +113,28 @@ def ask(
                 raise ConfigError(f"the light-transport simulator cannot run: {reason}", hint=HINT)
             if not _running or not _running[0].alive:
                 end_worker()
-                environment = {**os.environ, LLVM_VARIABLE: str(llvm_library())}
-                _running[:] = [Worker([sys.executable, "-m", WORKER], environment)]
-            _running[0].ask(folder, limit_s)
-        failure = folder / "error.txt"
-        if failure.exists():
-            said = failure.read_text(encoding="utf-8").strip().splitlines()[-1]
-            raise NumericalError(f"the light-transport simulator failed: {said}", hint="report it with the scene")
+                _running[:] = [Child(WORKER, None, {LLVM_VARIABLE: str(llvm_library())})]
+            worker = _running[0]
+            worker.send({"folder": name, **request})
+            try:
+                found = worker.answer(limit_s, "while it renders")
+            except ChildError as lost:
+                end_worker()
+                lines = [line for line in worker.printed if line.strip()]
+                said = "\n".join(([line for line in lines if "error" in line.lower()] or lines)[-SHOWN_LINES:])
+                raise NumericalError(
+                    f"the light-transport simulator {lost}" + (f"; it said:\n{said}" if said else ""),
+                    hint="fewer rays, samples or bounces" if lost.reason == "late" else HINT,
+                ) from None
+        if "error" in found:
+            raise NumericalError(
+                f"the light-transport simulator failed: {found['error']}", hint="report it with the scene"
+            )
         with np.load(folder / "result.npz", allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}
 
 
-class Worker:
-    """One running simulator.
-
-    Arguments:
-        command: What to run.
-        environment: Its environment.
-    """
-
-    def __init__(self, command: list[str], environment: Mapping[str, str]) -> None:
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            # a request that is written is gone: nothing is left over to be written to a process that died
-            bufsize=0,
-            env=dict(environment),
-            # where this package is found, and nothing of a user's folder is mistaken for a library
-            cwd=Path(__file__).parents[3],
-        )
-        self.owner = os.getpid()
-        self._lines: queue.Queue[str | None] = queue.Queue()
-        threading.Thread(target=self._read, daemon=True).start()
-        self._started = False
-
-    @property
-    def alive(self) -> bool:
-        """Whether this process may ask it."""
-        return self.owner == os.getpid() and self._process.poll() is None
-
-    def ask(self, folder: Path, limit_s: float) -> None:
-        """Wait until the request in a folder is answered.
-
-        Raises:
-            NumericalError: It died, or took longer than the limit [s]; it is ended then.
-        """
-        if not self._started:
-            self._await("ready", limit_s)
-            self._started = True
-        # if it died since, its last words follow
-        with contextlib.suppress(OSError, ValueError):
-            self._process.stdin.write(f"{folder}\n".encode())
-        self._await("done", limit_s)
-
-    def end(self) -> None:
-        """End it, at the latest a moment later."""
-        self._process.kill()
-        self._process.wait()
-        self._process.stdin.close()
-
-    def _read(self) -> None:
-        with io.TextIOWrapper(io.BufferedReader(self._process.stdout), "utf-8", "replace") as printed:
-            for line in printed:
-                self._lines.put(line.rstrip("\n"))
-        self._lines.put(None)
-
-    def _await(self, word: str, limit_s: float) -> None:
-        printed: list[str] = []
-        while True:
-            try:
-                line = self._lines.get(timeout=limit_s)
-            except queue.Empty:
-                self.end()
-                raise NumericalError(
-                    f"the light-transport simulator gave no answer within {limit_s:g} s",
-                    hint="fewer rays, samples or bounces",
-                ) from None
-            if line == word:
-                return
-            if line is None:
-                # for whoever asks again
-                self._lines.put(None)
-                self.end()
-                names = {int(number): number.name for number in signal.Signals}
-                cause = (
-                    f"was ended by {names.get(-self._process.returncode, -self._process.returncode)}"
-                    if self._process.returncode < 0
-                    else f"ended with exit code {self._process.returncode}"
-                )
-                errors = [line.strip() for line in printed if "error" in line.lower()]
-                said = "\n".join((errors or [line for line in printed if line.strip()])[-SHOWN_LINES:])
-                raise NumericalError(
-                    f"the light-transport simulator's process {cause}" + (f"; it said:\n{said}" if said else ""),
-                    hint=HINT,
-                )
-            printed.append(line)
-
-
-_running: list[Worker] = []
+_running: list[Child] = []
 _one_at_a_time = threading.Lock()
 
 
