@@ -19,7 +19,6 @@ import numpy as np
 
 from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
-from lidardesign.export.mounts import constraint_losses
 from lidardesign.export.names import identifier, numbers, write_folder
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import unit_vectors
@@ -62,7 +61,7 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     moving = [length for length, _ in (sensor.travel_m for _, sensor in seen) if length > 0]
     if moving:
         notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: frusta stand in their middles")
-    return notes + constraint_losses(design)
+    return notes
 
 
 def _file(comments: list[str], **elements: np.ndarray) -> bytes:
@@ -152,7 +151,7 @@ def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     moving = [length for length, _ in (sensor.travel_m for sensor in design.sensors) if length > 0]
     if moving:
         notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: solids stand in their middles")
-    return notes + constraint_losses(design)
+    return notes
 
 
 def _solid(index: int, sensor: Sensor) -> str:

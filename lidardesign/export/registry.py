@@ -74,6 +74,8 @@ class Exporter:
         if self.rated:
             options["rate_hz"] = Bandwidth().rate_hz if rate_hz is None else rate_hz
         notes = write(design, rays, Path(path), **options)
+        if design.constraints:
+            notes.append("the constraints of the design are lost")
         if design.mount is not None and robot is None:
             hint = "; --robot MODEL puts the sensors on it" if self.robotic else ""
             notes.append(f"places and directions are in the frame of the robot's body {design.mount!r}{hint}")
@@ -101,7 +103,7 @@ EXPORTERS: dict[str, Exporter] = {
             "csv",
             ".csv",
             "one ray per row: origin, direction, angles, gate, time",
-            "lidardesign.export.ray_lists",
+            "lidardesign.design.rigs.ray_lists",
             "write_csv",
             reader="anything that reads CSV; `evaluate` and `fit` too",
             checked="read by numpy",
@@ -110,7 +112,7 @@ EXPORTERS: dict[str, Exporter] = {
             "npz",
             ".npz",
             "the same columns as numpy arrays",
-            "lidardesign.export.ray_lists",
+            "lidardesign.design.rigs.ray_lists",
             "write_npz",
             reader="numpy",
             checked="read by numpy",
@@ -119,7 +121,7 @@ EXPORTERS: dict[str, Exporter] = {
             "sensors-csv",
             ".sensors.csv",
             "one sensor per row, the 16 columns of the research code",
-            "lidardesign.export.ray_lists",
+            "lidardesign.design.rigs.ray_lists",
             "write_sensors_csv",
             reader="the research code of the paper",
             checked="read as a design; the columns are those of its own files",

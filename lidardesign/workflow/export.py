@@ -10,7 +10,7 @@ from typing import Any
 from lidardesign.design.layouts.rays import lay_out, layout_of, own_count
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import BackgroundNote, ConfigError, check_number
+from lidardesign.errors import BackgroundNote, ConfigError
 from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
 from lidardesign.mujoco_model import RobotFile
@@ -28,8 +28,6 @@ from lidardesign.workflow.run_folder import (
 )
 from lidardesign.workflow.run_samples import RunTarget, Weighting, may_need_samples, weighted_samples
 
-# Of frames: slower than any survey, faster than any pulse.
-RATES_HZ = (1e-3, 1e6)
 # Formats that hold sensors only, so that the number of rays may stay open.
 WITHOUT_RAYS = ("sensors-csv", "stl")
 
@@ -280,13 +278,3 @@ def export_target(path: Path | None, out: Path | None, exporter: Exporter) -> Pa
     if path is not None and target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
     return target
-
-
-def check_frame_rate(rate_hz: float | None) -> None:
-    """Refuse a frame rate that is none.
-
-    Raises:
-        ConfigError: So it is.
-    """
-    if rate_hz is not None:
-        check_number(rate_hz, "--rate-hz", *RATES_HZ)

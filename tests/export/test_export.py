@@ -12,11 +12,11 @@ from support.tables import each_row
 from lidardesign.design.files import load_design
 from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS
 from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.rigs.ray_lists import ray_columns
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.export.galvo import read_galvo
 from lidardesign.export.mounts import angles_between
-from lidardesign.export.ray_lists import ray_columns
 from lidardesign.export.registry import EXPORTERS
 
 

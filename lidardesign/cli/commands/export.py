@@ -69,13 +69,11 @@ def export(
             from lidardesign.workflow.export import (
                 DesignSource,
                 ExportRequest,
-                check_frame_rate,
                 export_target,
                 exporter_of,
             )
             from lidardesign.workflow.run_folder import read_design
 
-        check_frame_rate(rate_hz)
         if list_formats:
             return _list(output)
         claim_stdout(output, dry_run=dry_run, out=out)
