@@ -159,16 +159,9 @@ def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the file, atomically; returns what it came to and notes of what the format cannot hold.
 
     Raises:
-        ConfigError: Rays of one sensor start at several places, look beyond what the mirrors reach, or are gated
-            later than a whole number of picoseconds says.
+        ConfigError: Rays of one sensor start at several places, or look beyond what the mirrors reach.
     """
     positions = plan(design, rays)
-    latest_m = float(gate_m(np.array([[MOST_WHOLE, 0]]))[0, 1])
-    end_m = rays.gate_m[:, 1].max(initial=0.0)
-    if end_m > latest_m:
-        raise ConfigError(
-            f"a gate ends at {end_m:.4g} m", where=design.name, allowed=f"at most {latest_m:.4g} m, in picoseconds"
-        )
     gates = gate_ps(rays.gate_m)
     lines = [",".join(COLUMNS)]
     for number, one in enumerate(positions):

@@ -303,15 +303,16 @@ def grid_of(mount: Mount) -> EvenGrid:
     return nearest_grid(mount.azimuth_rad, mount.elevation_rad)
 
 
-def by_channel(design: DesignSpec, rays: Rays) -> tuple[DesignSpec, Rays]:
-    """A design of sensors that spin with a sensor for each of their channels, whose rings are even grids; others."""
+def channel_mounts(design: DesignSpec, rays: Rays) -> tuple[DesignSpec, Rays, list[Mount]]:
+    """A design with its mounts; one of sensors that spin has a sensor for each channel, whose ring is an even grid."""
     if design.layout != "spinning":
-        return design, rays
+        return design, rays, mounts(design, rays)
     rings = np.column_stack([rays.sensor, rays.elevation_rad])
     found, channel = np.unique(rings, axis=0, return_inverse=True)
     owners = [design.sensors[int(owner)] for owner in found[:, 0]]
     sensors = tuple(replace(one, name=f"{one.name} channel {number}") for number, one in enumerate(owners))
-    return replace(design, sensors=sensors), replace(rays, sensor=channel.reshape(-1))
+    design, rays = replace(design, sensors=sensors), replace(rays, sensor=channel.reshape(-1))
+    return design, rays, mounts(design, rays)
 
 
 def grid_sensor_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:

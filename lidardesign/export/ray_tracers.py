@@ -149,8 +149,6 @@ SCENE_SUFFIX = ".xml"
 SAMPLES = 64
 # From the light to a surface and back to the sensor.
 DEPTH = 2
-# Dr.Jit counts the numbers of an array with 32 bits.
-MOST_NUMBERS = 2**32 - 1
 
 
 def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
@@ -168,11 +166,6 @@ def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         f"the light is one flash for all rays: only light straight there and back (max_depth {DEPTH}) is the ray's own",
         f"gates end on whole bins of {MM_PER_M * Bandwidth().bin_m:.1f} mm; times within the frame are lost",
     ]
-    largest = max(len(one.ray) * _bins(rays, one) for one in found)
-    if largest > MOST_NUMBERS:
-        notes.append(
-            f"a film of {largest:.2g} numbers is more than Mitsuba holds: shorten its gates, or fire fewer rays"
-        )
     # a film has one gate
     wider = np.concatenate([np.abs(rays.gate_m[one.ray] - _gate_m(rays, one)).max(axis=1) for one in found])
     if wider.any():

@@ -23,7 +23,6 @@ are relative to the parent.
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -38,10 +37,8 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.export.mounts import (
-    EvenGrid,
     Mount,
-    angles_between,
-    by_channel,
+    channel_mounts,
     design_losses,
     grid_of,
     grid_sensor_losses,
@@ -59,7 +56,7 @@ from lidardesign.export.names import (
 )
 from lidardesign.geometry.rays import Rays
 from lidardesign.mujoco_model import RobotFile, load_model, mujoco_warnings, seen_geoms
-from lidardesign.numerics import SLACK, unit_vectors
+from lidardesign.numerics import SLACK
 
 WORLD = "world"
 # Half of what a site of one ray is drawn as [m].
@@ -164,18 +161,15 @@ def _rangefinder(site: str, rays: Rays, ray: int) -> Element:
 
 
 LINK = "lidar"
-# Sides of a face's picture, in pixels, and the least angle that is divided by to find them.
-FEWEST_PIXELS, MOST_PIXELS, LEAST_ANGLE_RAD = 128, 1024, 1e-4
-# Scans are pictures too, and GPUs have no wider ones.
-MOST_SAMPLES = 16_384
+# Half the diagonal of a pixel of a face's picture, whose sides have 128 or more.
+BESIDE_DEG = 0.64
 # Gazebo renders depth images, whose near plane must be in front of the camera.
 NEAREST_M = 0.001
 
 
 def write_sdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold."""
-    design, rays = by_channel(design, rays)
-    mounted = mounts(design, rays)
+    design, rays, mounted = channel_mounts(design, rays)
     link = element("link", {"name": LINK}, [sensor_element(one, rate_hz, posed=True) for one in mounted])
     model = element("model", {"name": identifier(design.name)}, [element("static", text="true"), link])
     write_xml(path, element("sdf", {"version": "1.9"}, [model]))
@@ -197,30 +191,10 @@ def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list
             f"gates of {len(near)} of {len(mounted)} sensors start below {NEAREST_M:g} m, where Gazebo's depth camera "
             f"cannot: they start at {NEAREST_M:g} m"
         )
-    grids = [grid_of(one) for one in mounted]
-    wide = sum(max(grid.columns, grid.rows) > MOST_SAMPLES for grid in grids)
-    if wide:
-        notes.append(
-            f"{wide} of {len(mounted)} sensors have more than {MOST_SAMPLES} columns or rows: Gazebo fails on them"
-        )
-    if grids:
-        beside = math.degrees(max(float(pixel_offsets_rad(grid).max()) for grid in grids))
-        notes.append(f"Gazebo measures along the pixels of a picture: up to {beside:.2g} deg beside the rays")
+    if mounted:
+        notes.append(f"Gazebo measures along the pixels of a picture: up to {BESIDE_DEG} deg beside the rays")
     names = [design.name, *(one.sensor.name for one in mounted)]
     return [*notes, *renamed_note(names, [identifier(design.name), *(one.name for one in mounted)])]
-
-
-def pixel_offsets_rad(grid: EvenGrid) -> np.ndarray:
-    """How far the middles of Gazebo's pixels are from the rays of a grid that lie in them, shape (rows * columns,)."""
-    axes = [(grid.azimuth_rad, grid.columns), *([(grid.elevation_rad, grid.rows)] if grid.rows > 1 else [])]
-    wanted = max(int(math.pi / 2 / max(high - low, LEAST_ANGLE_RAD) * count) for (low, high), count in axes)
-    pixels = min(max(2 ** math.ceil(math.log2(max(wanted, 1))), FEWEST_PIXELS), MOST_PIXELS)
-    looking = grid.directions()
-    reach = np.abs(looking).max(axis=1, keepdims=True)
-    on_face = looking / reach
-    pixel = np.clip(np.floor((on_face + 1) / 2 * pixels), 0, pixels - 1)
-    middle = np.where(np.abs(looking) == reach, on_face, (2 * pixel + 1) / pixels - 1)
-    return angles_between(unit_vectors(middle), looking)
 
 
 def sensor_element(mount: Mount, rate_hz: float, *, posed: bool, name: str | None = None) -> Element:
@@ -263,8 +237,7 @@ BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
 
 def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the description, atomically; returns notes of what the format cannot hold."""
-    design, rays = by_channel(design, rays)
-    mounted = mounts(design, rays)
+    design, rays, mounted = channel_mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
     write_xml(path, element("robot", {"name": identifier(design.name)}, [*_base(), *parts]))
     mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave out the sensors"
@@ -316,8 +289,8 @@ MACRO = "xacro:macro"
 
 def write_xacro(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the macro, atomically; returns how to use it and notes of what the format cannot hold."""
-    design, rays = by_channel(design, rays)
-    name, mounted = identifier(design.name), mounts(design, rays)
+    design, rays, mounted = channel_mounts(design, rays)
+    name = identifier(design.name)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent="${parent}", prefix="${prefix}")]
     macro = element(MACRO, {"name": name, "params": "parent prefix:=''"}, parts)
     write_xml(path, element("robot", {"xmlns:xacro": "http://www.ros.org/wiki/xacro", "name": name}, [macro]))

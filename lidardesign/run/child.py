@@ -105,14 +105,14 @@ class Child:
         """
         since = time.monotonic()
         if not self._begun:
-            since, line = self.next_line(since + START_SECONDS)
+            since, line = self._next_line(since + START_SECONDS)
             if line != BEGUN:
                 raise ChildError("could not be started", "unstarted")
             self._begun = True
         deadline = since + seconds + GRACE_SECONDS
-        _, line = self.next_line(deadline)
+        _, line = self._next_line(deadline)
         if not line:
-            died_of = None if line is None else self.died_of(deadline, when)
+            died_of = None if line is None else self._died_of(deadline, when)
             raise ChildError(died_of or f"gave no answer within {seconds:g} s", "died" if died_of else "late")
         with contextlib.suppress(ValueError):
             found = json.loads(line)
@@ -120,7 +120,7 @@ class Child:
                 return found
         raise ChildError(f"writes to a stream that is not its own {when}", "foreign")
 
-    def next_line(self, deadline: float) -> tuple[float, bytes | None]:
+    def _next_line(self, deadline: float) -> tuple[float, bytes | None]:
         """The next line and when it came: empty at the end, None where none came in time."""
         try:
             found = self._lines.get(timeout=max(deadline - time.monotonic(), 0.0))
@@ -131,13 +131,8 @@ class Child:
             self._lines.put(found)
         return found
 
-    def died_of(self, deadline: float, when: str) -> str | None:
-        """How it ended; None where it only closed its stream and hangs until the deadline and a little longer.
-
-        Arguments:
-            deadline: On the monotonic clock [s].
-            when: What it did meanwhile, as "while it is imported".
-        """
+    def _died_of(self, deadline: float, when: str) -> str | None:
+        """How it ended; None where it only closed its stream and hangs until the deadline and a little longer."""
         try:
             code = self._process.wait(max(deadline - time.monotonic(), 0.0) + GRACE_SECONDS)
         except subprocess.TimeoutExpired:

@@ -7,7 +7,6 @@ it may take.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import tempfile
@@ -21,7 +20,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.run.child import BEGUN, GRACE_SECONDS, START_SECONDS, Child, write_line
+from lidardesign.run.child import START_SECONDS, Child, ChildError, write_line
 from lidardesign.testing.law import LOADS, Finding, Law, Limits, error_words, place_of
 from lidardesign.testing.watch import Watch
 
@@ -88,10 +87,6 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
 
 def _read_findings(child: Child, seconds: float) -> Iterator[Finding]:
     """Findings as they come; where the process is lost, the law that it tried does not hold."""
-    _, line = child.next_line(time.monotonic() + START_SECONDS)
-    if line != BEGUN:
-        yield from _all_lost(0, "the process that checks could not be started")
-        return
     for number in range(len(_laws()) + 1):
         found = _next_finding(child, seconds, loading=number == 0)
         if isinstance(found, str):
@@ -116,16 +111,14 @@ def _next_finding(child: Child, seconds: float, *, loading: bool) -> dict[str, A
     allowed = seconds if loading else START_SECONDS + OVERTIME * seconds
     called = ""
     while True:
-        deadline = time.monotonic() + allowed + GRACE_SECONDS
-        _, line = child.next_line(deadline)
-        found = _read(line) if line else None
-        if found is None:
-            if line:
-                return "writes to a stream that is not its own while this is tried"
-            died_of = None if line is None else child.died_of(deadline, "while this is tried")
-            return died_of or f"{called} did not end within {allowed:g} s".lstrip()
-        if CALLED not in found:
+        try:
+            found = child.answer(allowed, "while this is tried")
+        except ChildError as lost:
+            return f"{called} did not end within {allowed:g} s".lstrip() if lost.reason == "late" else str(lost)
+        if "refused" in found or set(found) == FINDING_KEYS:
             return found
+        if set(found) != {CALLED}:
+            return "writes to a stream that is not its own while this is tried"
         called = str(found[CALLED])
         allowed = OVERTIME * seconds if called else START_SECONDS + OVERTIME * seconds
 
@@ -138,16 +131,6 @@ def _finding(found: dict[str, Any]) -> Finding:
     raise REFUSALS.get(told["kind"], ConfigError)(
         told["message"], **{key: told.get(key) for key in ("where", "allowed", "hint")}
     )
-
-
-def _read(line: bytes) -> dict[str, Any] | None:
-    """The content of a line; None where a plugin wrote it, which knows neither its form nor that it is read."""
-    try:
-        found = json.loads(line)
-    except ValueError:
-        return None
-    known = isinstance(found, dict) and ("refused" in found or set(found) in ({CALLED}, FINDING_KEYS))
-    return found if known else None
 
 
 def _all_lost(number: int, reason: str) -> Iterator[Finding]:

@@ -25,7 +25,7 @@ from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Pla
 from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.shadowing import visible_echoes
 from lidardesign.simulate.light import Beams, Echoes, direct_echoes
-from lidardesign.simulate.light_transport import process
+from lidardesign.simulate.light_transport import transport as process
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient
 
 # float32 intersections against float64 ones: 1e-7 of lengths, some ten times that where surfaces are curved or grazed
