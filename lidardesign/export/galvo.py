@@ -232,9 +232,8 @@ def read_galvo(path: Path) -> Rays:
 
 def is_galvo_file(path: Path) -> bool:
     """Whether a file begins as `write_galvo` begins one."""
-    header = ",".join(COLUMNS).encode()
     try:
-        return read_head(path, RAY_TABLE).removeprefix(BOM).startswith(header)
+        return read_head(path, RAY_TABLE).removeprefix(BOM).startswith(",".join(COLUMNS).encode())
     except DataError:
         return False
 
@@ -290,18 +289,14 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     }
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
-
-
 def _numbers(row: list[str], where: str) -> list[float]:
     """The values of a row: finite, and whole and not negative where they count or time something."""
     try:
         found = [plain_number(cell) for cell in row]
     except ValueError as error:
-        raise DataError(_short(str(error)), where=where, allowed="numbers") from error
+        raise DataError(str(error)[:LONGEST_SHOWN], where=where, allowed="numbers") from error
     if len(found) != len(COLUMNS) or not all(map(math.isfinite, found)):
-        raise DataError(f"holds {_short(str(row))}", where=where, allowed=f"{len(COLUMNS)} finite numbers")
+        raise DataError(f"holds {str(row)[:LONGEST_SHOWN]}", where=where, allowed=f"{len(COLUMNS)} finite numbers")
     for name, value in zip(COLUMNS, found, strict=True):
         if name in WHOLE and (value < 0 or value != int(value) or value > MOST_WHOLE):
             raise DataError(f"{name} is {value:g}", where=where, allowed="whole numbers, 0 or more")

@@ -18,7 +18,7 @@ import numpy as np
 
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
-from lidardesign.export.names import identifiers
+from lidardesign.export.names import distinct, identifier
 from lidardesign.geometry.rays import DEFAULT_RATE_HZ, Rays
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.space import angles, direction
@@ -71,7 +71,7 @@ class Mount:
 
 def mounts(design: DesignSpec, rays: Rays) -> list[Mount]:
     """The sensors of a design that fire rays, in their order."""
-    names = identifiers([sensor.name for sensor in design.sensors])
+    names = distinct([identifier(sensor.name) for sensor in design.sensors], "_")
     order = np.argsort(rays.sensor, kind="stable")
     edges = np.searchsorted(rays.sensor[order], np.arange(len(design.sensors) + 1))
     return [
@@ -294,10 +294,6 @@ def _nearest(values: np.ndarray, bounds: tuple[float, float], count: int) -> np.
     return low + index * ((high - low) / (count - 1))
 
 
-# So many sensors are named in the notes.
-MOST_NAMED = 4
-
-
 def grid_of(mount: Mount) -> EvenGrid:
     """The even grid that stands for the rays of a mount."""
     return nearest_grid(mount.azimuth_rad, mount.elevation_rad)
@@ -330,21 +326,13 @@ def grid_sensor_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays)
 
 def grid_losses(mounted: Sequence[Mount], rays: Rays) -> list[str]:
     """Notes of rays that are not on an even grid: how many, what replaces them, and how far off that is."""
-    off: list[tuple[Mount, EvenGrid, np.ndarray]] = []
-    for mount in mounted:
-        grid = grid_of(mount)
-        distance = grid.distance_rad(mount.azimuth_rad, mount.elevation_rad)
-        if distance.max() > ON_GRID_RAD or len(grid) != len(mount.ray):
-            off.append((mount, grid, distance))
-    if not off:
+    pairs = [(mount, grid_of(mount)) for mount in mounted]
+    off = np.array([one for mount, grid in pairs for one in grid.distance_rad(mount.azimuth_rad, mount.elevation_rad)])
+    count, fired = int((off > ON_GRID_RAD).sum()), sum(len(grid) for _, grid in pairs)
+    if not count and all(len(grid) == len(mount.ray) for mount, grid in pairs):
         return []
-    count = sum(int((distance > ON_GRID_RAD).sum()) for _, _, distance in off)
-    worst = math.degrees(max(float(distance.max()) for _, _, distance in off))
-    grids = ", ".join(f"{grid.columns} x {grid.rows} of {mount.name}" for mount, grid, _ in off[:MOST_NAMED])
-    more = f", and those of {len(off) - MOST_NAMED} more sensors" if len(off) > MOST_NAMED else ""
-    fired = len(rays) + sum(len(grid) - len(mount.ray) for mount, grid, _ in off)
     total = "" if fired == len(rays) else f", {fired} rays in all"
     return [
-        f"{count} of {len(rays)} rays are not on an even grid of azimuth and elevation; replaced by even grids "
-        f"({grids}{more}){total}: off by at most {worst:.2g} deg"
+        f"{count} of {len(rays)} rays are not on an even grid of azimuth and elevation; replaced by even grids{total}: "
+        f"off by at most {math.degrees(off.max()):.2g} deg"
     ]

@@ -35,11 +35,6 @@ def identifier(name: str) -> str:
     return word if (word[:1].isalpha() and word.lower() not in RESERVED) else f"s_{word}".rstrip("_")
 
 
-def identifiers(names: Sequence[str]) -> list[str]:
-    """An identifier of each name, no two alike, whatever their case."""
-    return distinct([identifier(name) for name in names], "_")
-
-
 def distinct(names: Sequence[str], between: str, taken: Iterable[str] = ()) -> list[str]:
     """Names, no two alike whatever their case, nor like one that is taken: the next number follows where they are.
 
@@ -138,12 +133,3 @@ def document(root: Element) -> bytes:
     """The content of a file: the declaration, then the root, indented."""
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
-
-
-def write_xml(path: Path, root: Element) -> None:
-    """Write a document, indented, atomically.
-
-    Raises:
-        DataError: The file cannot be written.
-    """
-    write_atomic(path, document(root))

@@ -46,17 +46,18 @@ from lidardesign.export.mounts import (
 )
 from lidardesign.export.names import (
     distinct,
+    document,
     element,
     identifier,
     number,
     numbers,
     renamed_note,
-    write_xml,
     xml_text,
 )
 from lidardesign.geometry.rays import Rays
 from lidardesign.mujoco_model import RobotFile, load_model, mujoco_warnings, seen_geoms
 from lidardesign.numerics import SLACK
+from lidardesign.run.files import write_atomic
 
 WORLD = "world"
 # Half of what a site of one ray is drawn as [m].
@@ -92,7 +93,7 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | No
         site[mount.ray] = [f"{name}_r{number}" for number in range(len(mount.ray))]
         place.append(_body(mount, name, rays, site[mount.ray]))
     sensors.extend(_rangefinder(str(site[ray]), rays, ray) for ray in range(len(rays)))
-    write_xml(path, model)
+    write_atomic(path, document(model))
     late = rays.gate_m[rays.gate_m[:, 0] > 0, 0]
     if len(late):
         notes.append(
@@ -172,7 +173,7 @@ def write_sdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandw
     design, rays, mounted = channel_mounts(design, rays)
     link = element("link", {"name": LINK}, [sensor_element(one, rate_hz, posed=True) for one in mounted])
     model = element("model", {"name": identifier(design.name)}, [element("static", text="true"), link])
-    write_xml(path, element("sdf", {"version": "1.9"}, [model]))
+    write_atomic(path, document(element("sdf", {"version": "1.9"}, [model])))
     return sdf_losses(design, mounted, rays)
 
 
@@ -239,7 +240,7 @@ def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Band
     """Write the description, atomically; returns notes of what the format cannot hold."""
     design, rays, mounted = channel_mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
-    write_xml(path, element("robot", {"name": identifier(design.name)}, [*_base(), *parts]))
+    write_atomic(path, document(element("robot", {"name": identifier(design.name)}, [*_base(), *parts])))
     mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave out the sensors"
     return [*urdf_losses(design, mounted, rays), mass]
 
@@ -293,6 +294,8 @@ def write_xacro(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Ban
     name = identifier(design.name)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent="${parent}", prefix="${prefix}")]
     macro = element(MACRO, {"name": name, "params": "parent prefix:=''"}, parts)
-    write_xml(path, element("robot", {"xmlns:xacro": "http://www.ros.org/wiki/xacro", "name": name}, [macro]))
+    write_atomic(
+        path, document(element("robot", {"xmlns:xacro": "http://www.ros.org/wiki/xacro", "name": name}, [macro]))
+    )
     usage = f'include it and call <xacro:{name} parent="base_link"/>: poses are relative to the parent'
     return [usage, *urdf_losses(design, mounted, rays)]

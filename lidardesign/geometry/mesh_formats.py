@@ -74,8 +74,8 @@ def _point(words: list[bytes], where: str, line: int, most: float = math.inf) ->
 
 
 def _mesh(points: array[float], triangles: array[int], colours: array[float] | None = None) -> Triangles:
-    painted = None if not colours or len(colours) < len(points) else np.array(colours).reshape(-1, 3)
-    return np.array(points).reshape(-1, 3), np.array(triangles).reshape(-1, 3), painted
+    rgb = np.array(colours).reshape(-1, 3) if colours and len(colours) == len(points) else None
+    return np.array(points).reshape(-1, 3), np.array(triangles).reshape(-1, 3), rgb
 
 
 def _add_fan(triangles: array[int], polygon: list[int]) -> None:
@@ -264,9 +264,7 @@ def check_gltf(data: bytes, where: str) -> None:
     Raises:
         DataError: So it does, or it needs what is not read: packed or sparse geometry.
     """
-    text = data
-    if data.startswith(b"glTF"):
-        text = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+    text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data.startswith(b"glTF") else data
     try:
         document = parse_json(text)
     except ValueError as error:
