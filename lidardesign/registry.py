@@ -67,8 +67,7 @@ def _probe_of(child: Child, seconds: float) -> Probe | None:
     try:
         found = child.answer(seconds, "while it is imported")
     except ChildError as lost:
-        late = f"was not imported within {seconds:g} s"
-        error = late if lost.reason == "late" else str(lost)
+        error = f"was not imported within {seconds:g} s" if lost.reason == "late" else str(lost)
         return None if lost.reason == "unstarted" else Probe(error=error, contained=True)
     return Probe(summary=str(found.get("summary", "")), error=found.get("error"))
 
