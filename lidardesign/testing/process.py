@@ -7,7 +7,6 @@ it may take.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import tempfile
@@ -21,7 +20,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.registry import BEGUN, GRACE_SECONDS, START_SECONDS, PluginProcess, answer, write_line
+from lidardesign.run.child import START_SECONDS, Child, ChildError, write_line
 from lidardesign.testing.law import LOADS, Finding, Law, Limits, error_words, place_of
 from lidardesign.testing.watch import Watch
 
@@ -30,10 +29,6 @@ if TYPE_CHECKING:
     from lidardesign.task import Task
     from lidardesign.testing.contract import Contract
 
-CHILD = (
-    "import json, sys; request = json.loads(sys.stdin.readline()); sys.path[:] = request['path']; "
-    "from lidardesign.testing.process import answer_check; answer_check(request)"
-)
 # A call that takes longer than it may ends within this many times as long, so that it can be told how long it took.
 OVERTIME = 3
 # The key of a line that says what is called now; empty once the call has ended.
@@ -74,7 +69,6 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
         return
     with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
         document = {
-            "path": sys.path,
             "folder": folder,
             "name": offer.name,
             "value": offer.value,
@@ -84,19 +78,15 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
             "seconds": request.limits.seconds,
             "memory_bytes": request.limits.memory_bytes,
         }
-        child = PluginProcess(CHILD, document)
+        child = Child(f"{__name__}:answer_check", document, {registry.PROBING: "1"})
         try:
             yield from _read_findings(child, request.limits.seconds)
         finally:
             child.end()
 
 
-def _read_findings(child: PluginProcess, seconds: float) -> Iterator[Finding]:
+def _read_findings(child: Child, seconds: float) -> Iterator[Finding]:
     """Findings as they come; where the process is lost, the law that it tried does not hold."""
-    _, line = child.next_line(time.monotonic() + START_SECONDS)
-    if line != BEGUN:
-        yield from _all_lost(0, "the process that checks could not be started")
-        return
     for number in range(len(_laws()) + 1):
         found = _next_finding(child, seconds, loading=number == 0)
         if isinstance(found, str):
@@ -109,7 +99,7 @@ def _read_findings(child: PluginProcess, seconds: float) -> Iterator[Finding]:
             return
 
 
-def _next_finding(child: PluginProcess, seconds: float, *, loading: bool) -> dict[str, Any] | str:
+def _next_finding(child: Child, seconds: float, *, loading: bool) -> dict[str, Any] | str:
     """The next line that is a finding, or how the process was lost; every call of the task's code has time of its own.
 
     Arguments:
@@ -121,16 +111,14 @@ def _next_finding(child: PluginProcess, seconds: float, *, loading: bool) -> dic
     allowed = seconds if loading else START_SECONDS + OVERTIME * seconds
     called = ""
     while True:
-        deadline = time.monotonic() + allowed + GRACE_SECONDS
-        _, line = child.next_line(deadline)
-        found = _read(line) if line else None
-        if found is None:
-            if line:
-                return "writes to a stream that is not its own while this is tried"
-            died_of = None if line is None else child.died_of(deadline, "while this is tried")
-            return died_of or f"{called} did not end within {allowed:g} s".lstrip()
-        if CALLED not in found:
+        try:
+            found = child.answer(allowed, "while this is tried")
+        except ChildError as lost:
+            return f"{called} did not end within {allowed:g} s".lstrip() if lost.reason == "late" else str(lost)
+        if "refused" in found or set(found) == FINDING_KEYS:
             return found
+        if set(found) != {CALLED}:
+            return "writes to a stream that is not its own while this is tried"
         called = str(found[CALLED])
         allowed = OVERTIME * seconds if called else START_SECONDS + OVERTIME * seconds
 
@@ -143,16 +131,6 @@ def _finding(found: dict[str, Any]) -> Finding:
     raise REFUSALS.get(told["kind"], ConfigError)(
         told["message"], **{key: told.get(key) for key in ("where", "allowed", "hint")}
     )
-
-
-def _read(line: bytes) -> dict[str, Any] | None:
-    """The content of a line; None where a plugin wrote it, which knows neither its form nor that it is read."""
-    try:
-        found = json.loads(line)
-    except ValueError:
-        return None
-    known = isinstance(found, dict) and ("refused" in found or set(found) in ({CALLED}, FINDING_KEYS))
-    return found if known else None
 
 
 def _all_lost(number: int, reason: str) -> Iterator[Finding]:
@@ -178,22 +156,17 @@ def _named(number: int) -> tuple[str, str, str]:
     return law.name, law.group, law.statement
 
 
-def answer_check(request: dict[str, Any]) -> None:
-    """In that process: try all laws, say what was found on stdout, and end."""
-    result = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    nowhere = open(os.devnull, "w")  # noqa: SIM115 - lives as long as the process
-    os.dup2(nowhere.fileno(), sys.stdout.fileno())
+def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
+    """In that process: try all laws and say what was found."""
     _settle(request)
-    result.write(BEGUN)
-    result.flush()
     contract = _begin(request, result)
     if contract is None:
-        os._exit(0)
+        return {}
     contract.subject.watch.empty_folder = Path(_make_folder(request, "work"))
     os.chdir(contract.subject.watch.empty_folder)
     for finding in contract.findings():
         write_line(result, finding.as_dict())
-    answer(result, {})
+    return {}
 
 
 def _settle(request: dict[str, Any]) -> None:

@@ -28,7 +28,6 @@ from lidardesign.workflow.export import (
     DesignSource,
     Exported,
     ExportRequest,
-    check_frame_rate,
     export_target,
     exporter_of,
 )
@@ -221,7 +220,6 @@ class Design(DesignSource):
             robot: A robot's MuJoCo model that the sensors are put into (mjcf).
             notes: Called with every note.
         """
-        check_frame_rate(rate_hz)
         out = None if path is None else Path(path)
         exporter = exporter_of(format, out)
         target = export_target(self.path, out, exporter)

@@ -10,8 +10,7 @@ from typing import Any
 from lidardesign.design.layouts.rays import lay_out, layout_of, own_count
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import BackgroundNote, ConfigError, check_number
-from lidardesign.estimates import Estimate, as_documents
+from lidardesign.errors import BackgroundNote, ConfigError
 from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
 from lidardesign.mujoco_model import RobotFile
@@ -19,8 +18,6 @@ from lidardesign.run.clock import phase
 from lidardesign.workflow.run_folder import Notes, RunFolder, folder_of, log_note
 from lidardesign.workflow.run_samples import RunTarget, Weighting, may_need_samples, weighted_samples
 
-# Of frames: slower than any survey, faster than any pulse.
-RATES_HZ = (1e-3, 1e6)
 # Formats that hold sensors only, so that the number of rays may stay open.
 WITHOUT_RAYS = ("sensors-csv", "stl")
 
@@ -125,7 +122,6 @@ class Exported:
         sensors: How many sensors.
         bytes: The size of what was written; None for what is no file, as a pipe.
         notes: What the format cannot hold.
-        rounding: What its numbers lose, found by reading the file back.
     """
 
     path: Path
@@ -134,7 +130,6 @@ class Exported:
     sensors: int
     bytes: int | None
     notes: tuple[str, ...] = ()
-    rounding: Mapping[str, Estimate] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form; the path of the design is for the caller to add."""
@@ -144,7 +139,6 @@ class Exported:
             "rays": self.rays,
             "bytes": self.bytes,
             "notes": list(self.notes),
-            "error_estimates": as_documents(self.rounding),
         }
 
 
@@ -191,7 +185,7 @@ class ExportRequest:
         return path and RobotFile(path, getattr(task, "folder", None), getattr(task, "groups", None))
 
     def write(self, file: Path | None = None, notes: Notes = log_note) -> Exported:
-        """Write the design and read it back.
+        """Write the design.
 
         Arguments:
             file: What is written instead of the target, which it is copied to later.
@@ -202,13 +196,11 @@ class ExportRequest:
         design, rays = self.source.lay_out(self.rays, self.at, self.seed, may_stay_open=open_rays, notes=notes)
         with phase("writing"):
             lost = tuple(exporter.write(design, rays, file, self.rate_hz, self._robot()))
-        with phase("reading back"):
-            rounding = exporter.rounding(design, rays, file)
         for note in lost:
             notes(note)
         written = [path for path in (file, *file.rglob("*")) if path.is_file()]
         size = sum(path.stat().st_size for path in written) if written or file.is_dir() else None
-        return Exported(self.target, exporter.name, len(rays), len(design.sensors), size, lost, rounding)
+        return Exported(self.target, exporter.name, len(rays), len(design.sensors), size, lost)
 
 
 def exporter_of(name: str | None, path: Path | None = None) -> Exporter:
@@ -241,13 +233,3 @@ def export_target(path: Path | None, out: Path | None, exporter: Exporter) -> Pa
     if path is not None and target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
     return target
-
-
-def check_frame_rate(rate_hz: float | None) -> None:
-    """Refuse a frame rate that is none.
-
-    Raises:
-        ConfigError: So it is.
-    """
-    if rate_hz is not None:
-        check_number(rate_hz, "--rate-hz", *RATES_HZ)

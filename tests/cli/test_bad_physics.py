@@ -16,7 +16,7 @@ from lidardesign.cli.output import EXIT_INTERRUPTED, Output, describe_error
 from lidardesign.errors import PluginError
 from lidardesign.registry import plugin_guard
 from lidardesign.scene import Ambient, Body, Medium, Mesh, Receiver, Scene, Sphere
-from lidardesign.simulate.light_transport import process as light_transport_process
+from lidardesign.simulate.light_transport import transport as light_transport_process
 
 LONG = "x" * 300
 BILLION_LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(

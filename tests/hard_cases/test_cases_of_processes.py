@@ -24,9 +24,9 @@ from support.command_line import files_under, make_run, program
 from support.hard_cases import hard_case
 
 from lidardesign import registry
-from lidardesign import registry as probe
 from lidardesign.config import load_run_config, save_run_config
 from lidardesign.errors import PluginError
+from lidardesign.run import child
 from lidardesign.run import files as lock
 from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import start_manifest
@@ -322,7 +322,7 @@ FATAL = {
 def install(tmp_path, monkeypatch):
     """Install plugins by name into a folder on the path, as a package that is not this one's."""
     monkeypatch.setattr(registry, "IMPORT_SECONDS", 0.3)
-    monkeypatch.setattr(probe, "GRACE_SECONDS", 0.3)
+    monkeypatch.setattr(child, "GRACE_SECONDS", 0.3)
     place = tmp_path / "installed"
     monkeypatch.syspath_prepend(place)
 
@@ -411,7 +411,7 @@ class TestBrokenPlugins:
         def refuse(*_, **__):
             raise OSError("no more processes")
 
-        monkeypatch.setattr(probe.subprocess, "Popen", refuse)
+        monkeypatch.setattr(child.subprocess, "Popen", refuse)
         listed = {listing.name: listing for listing in registry.list_tasks()}
         assert listed["good"].error is None
         assert "no licence" in listed["raises"].error

@@ -30,8 +30,6 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 CEILING = DesignSpace((-0.6, -0.5, 1.0, 0.0, -math.pi / 2, 0.2), (0.6, 0.7, 1.0, 2 * math.pi, -0.9, 1.3))
 RADIUS_M = 0.12
 FRAMES = 6
-# formats that keep lengths with some seven digits
-SINGLE_PRECISION = ("ply", "rgl", "stl")
 
 
 class HitTask:
@@ -219,7 +217,6 @@ def test_every_format_is_written_at_a_position_and_tables_have_its_rays_there(li
             assert "degrees" in result.err
             continue
         assert result.code == 0, result.err
-        assert result.json["error_estimates"]["origin_m"]["error"] <= (0.5e-6 if name in SINGLE_PRECISION else 0), name
     with np.load(tmp_path / "out.npz.csv") as arrays:
         tables = [arrays["origin_x_m"]]
     rows = list(csv.DictReader((tmp_path / "out.csv.csv").read_text().splitlines()))

@@ -19,8 +19,6 @@ from lidardesign.run.outputs import check_outputs
 
 # Where a note begins to explain itself.
 EXPLANATION = re.compile(r"[:;] .*", re.DOTALL)
-# Below it rounding is told with --verbose alone, whether of metres, radians or seconds.
-LEAST_ERROR = 1e-4
 
 
 def export(
@@ -75,13 +73,11 @@ def export(
             from lidardesign.workflow.export import (
                 DesignSource,
                 ExportRequest,
-                check_frame_rate,
                 export_target,
                 exporter_of,
             )
             from lidardesign.workflow.run_folder import read_design
 
-        check_frame_rate(rate_hz)
         if list_formats:
             return _list(output)
         place = options.parse_at(at)
@@ -107,14 +103,7 @@ def export(
 
         def show(rich: RichConsole) -> None:
             content = f"{exported.rays} rays" if exported.rays else f"{exported.sensors} sensors"
-            least = 0.0 if output.verbose else LEAST_ERROR
-            lost = [
-                f"{name.removesuffix(f'_{estimate.unit}')} {estimate.error:.2g} {estimate.unit}".rstrip()
-                for name, estimate in exported.rounding.items()
-                if estimate.error and estimate.error > least
-            ]
-            off = f"; read back, they are off by at most {', '.join(lost)}" if lost else ""
-            rich.print(f"wrote {target} ({content}{off})", soft_wrap=True)
+            rich.print(f"wrote {target} ({content})", soft_wrap=True)
 
         document = {"design": str(design), **exported.as_dict()}
         output.result(document, show, files={"wrote": target} if output.quiet else None, says_time=True)
