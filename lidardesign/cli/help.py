@@ -27,7 +27,7 @@ COMMON_OPTIONS = ("--seed", "--json", "--verbose", "--quiet", "--debug", "--help
 FURTHER_OPTIONS = frozenset(
     (
         "--accuracy", "--arrange", "--at", "--channels", "--cma-seconds", "--device", "--effects", "--false-alarm",
-        "--gates", "--level", "--memory-mb", "--mount-error", "--outlier-mm", "--range-tolerance-mm", "--rate-hz",
+        "--gates", "--level", "--mount-error", "--outlier-mm", "--range-tolerance-mm", "--rate-hz",
         "--return-tolerance", "--scenes-seed", "--seconds", "--weight", "--within-deg", "--workers",
     )
 )  # fmt: skip

@@ -178,9 +178,9 @@ MANUALS: dict[str, Manual] = {
             "lidardesign tasks check landmark": "a table of all laws, with what was measured",
             "lidardesign tasks check meshes --set folder=scans --json": "with settings, for scripts",
         },
-        about="Every law of the contract is tried: determinism, splits that share nothing, fields of the right sign "
-        "and slope that agree with rays, scores that are numbers and worse for less, no global random state, nothing "
-        "written. The task runs in a process of its own with limits.",
+        about="Every law of the contract is tried: determinism, splits that share nothing, targets in reach, "
+        "scores that are numbers and best on the truth, no global random state. The task runs in a process of its own "
+        "with a limit on time.",
         exits={6: "a law does not hold, or the plugin does not load"},
         see=("writing-tasks.md",),
     ),

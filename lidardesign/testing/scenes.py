@@ -2,19 +2,37 @@
 
 from __future__ import annotations
 
+import importlib
+import json
+import os
 import pickle
+import subprocess
+import sys
 from importlib.util import find_spec
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
 
+from lidardesign import registry
 from lidardesign.errors import LidardesignError
+from lidardesign.registry import START_SECONDS, plugin_guard
 from lidardesign.selection.information import informs_rays
-from lidardesign.task import Split
-from lidardesign.testing.elsewhere import fingerprints_in_process
+from lidardesign.space import DesignSpace
+from lidardesign.task import Split, scenes_of
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
 from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
+
+if TYPE_CHECKING:
+    from lidardesign.config import RunConfig
 
 # Training scenes are drawn with other seeds where rays are chosen; so many further seeds are tried.
 FURTHER_SEEDS = 2
 SPLITS: tuple[Split, ...] = ("train", "test")
+CHILD = (
+    "import json, sys; request = json.loads(sys.stdin.readline()); sys.path[:] = request['path']; "
+    "from lidardesign.testing.scenes import answer_fingerprints; answer_fingerprints(request)"
+)
+# Any number but 0, which would be no chance at all, and not the one of the process that asks.
+HASH_SEEDS = ("20251", "20252")
 
 
 def check_scenes(subject: Subject) -> LawHolds:
@@ -76,7 +94,7 @@ def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
     kind = type(subject.task)
     if kind.__module__ == "__main__" or "<locals>" in kind.__qualname__ or find_spec(kind.__module__) is None:
         return NotApplicable("the task's class cannot be imported in another process")
-    found = fingerprints_in_process(subject.config, kind, subject.limits.seconds)
+    found = fingerprints_in_process(subject.config, kind, subject.limit_s)
     for split in SPLITS:
         mine = [fingerprint(scene) for scene in subject.scenes(split)]
         if found[split] != mine:
@@ -86,6 +104,67 @@ def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
                 hint="do not use hash(), the order of sets, the time or the process in scenes",
             )
     return LawHolds("another process makes them the same to the bit")
+
+
+def fingerprints_in_process(config: RunConfig, kind: type, seconds: float) -> dict[str, list[str]]:
+    """Fingerprints of all scenes by split, made in a process of its own.
+
+    Arguments:
+        config: Whose scenes.
+        kind: The task's class; it must be importable.
+        seconds: How long the scenes of one split may take there.
+
+    Raises:
+        BrokenLawError: It failed there, or took longer.
+    """
+    request = {
+        "path": sys.path,
+        "module": kind.__module__,
+        "name": kind.__qualname__,
+        "task": config.task.model_dump(mode="json"),
+        "space": config.space.as_dict(),
+        "seed": config.seed,
+    }
+    hash_seed = next(seed for seed in HASH_SEEDS if seed != os.environ.get("PYTHONHASHSEED"))
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-c", CHILD],
+            input=json.dumps(request) + "\n",
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=START_SECONDS + len(SPLITS) * seconds,
+            env={**os.environ, "PYTHONHASHSEED": hash_seed},
+        )
+    except subprocess.TimeoutExpired:
+        raise BrokenLawError(f"scenes were not made within {len(SPLITS) * seconds:g} s in another process") from None
+    try:
+        found = json.loads(ended.stdout)
+    except ValueError:
+        found = {"error": f"exit code {ended.returncode}"}
+    if "error" in found:
+        raise BrokenLawError(f"scenes failed in another process: {found['error']}")
+    return found
+
+
+def answer_fingerprints(request: dict[str, Any]) -> None:
+    """In that process: make the scenes, say their fingerprints or what went wrong as JSON on stdout, and end.
+
+    What the task prints, also by processes of its own, goes to stderr.
+    """
+    result = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    try:
+        with plugin_guard(request["name"]):
+            task = attrgetter(request["name"])(importlib.import_module(request["module"]))()
+            config, space = task.Config(**request["task"]), DesignSpace.from_dict(request["space"])
+            found: dict[str, Any] = {
+                split: [fingerprint(scene) for scene in scenes_of(task, config, split, request["seed"], space)]
+                for split in SPLITS
+            }
+    except LidardesignError as error:
+        found = {"error": error.message}
+    registry.answer(result, found)
 
 
 def check_picklable(subject: Subject) -> LawHolds:
