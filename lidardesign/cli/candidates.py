@@ -42,7 +42,6 @@ BASELINES = {
     "greedy": "chosen on training scenes, without a density",
     "occupancy": "rays towards cells that targets occupy",
     "no-visibility": "the first design without its occlusion term",
-    "catalog:": "a real part where it sees most",
     "cma": "direct optimisation on training scenes",
 }
 # Marks the place of the cursor in a line that is split.
@@ -195,8 +194,6 @@ def _detectors(context: Any, current: str) -> Items:
 
 
 def _baselines(context: Any, current: str) -> Items:
-    if current.startswith("catalog:"):
-        return [(f"catalog:{name}", words) for name, words in _parts(context, current)]
     return list(BASELINES.items())
 
 

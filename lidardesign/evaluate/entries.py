@@ -102,7 +102,6 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         conditions=conditions,
         gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
         without_visibility=partial(_twin, request, conditions) if request.without_visibility else None,
-        density=request.density,
         optimised=partial(_optimised, request, conditions) if request.designs else None,
         chosen=partial(_chosen, request, conditions, designs, max(choosable, default=0)),
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import MAX_SEED, ConfigError, check_number
-from lidardesign.evaluate.baselines.simple import CMA, baseline_of
+from lidardesign.evaluate.baselines.simple import CMA, check_baseline
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.workers.pool import check_workers
 from lidardesign.numerics import SLACK
@@ -70,7 +70,7 @@ class ScoreOptions:
         check_workers(str(self.workers))
         self.misplacement()
         for name in self.baselines:
-            baseline_of(name, where="--baseline")
+            check_baseline(name, where="--baseline")
         limits = {
             "cma_seconds": CMA_SECONDS,
             "range_tolerance_mm": RANGE_TOLERANCES_MM,

@@ -17,9 +17,8 @@ from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
-from lidardesign.evaluate.baselines.catalog import Density
 from lidardesign.evaluate.baselines.greedy import GreedySource
-from lidardesign.evaluate.baselines.simple import ALWAYS, LayOut, baseline_of, is_baseline
+from lidardesign.evaluate.baselines.simple import ALWAYS, BASELINES, LayOut, check_baseline
 from lidardesign.evaluate.cma.candidate import CmaSettings
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.scene_scores import ScenePass, Scorer, score_here
@@ -51,7 +50,6 @@ class EvaluationRequest:
         lay_out: How a design becomes a ray list of a given length.
         without_visibility: The design that stands for the baseline `no-visibility`, and the samples that it was
             fitted to; called when that is asked for.
-        density: What was learned, for baselines that look where it is; None where a run has no samples.
         greedy: What the baseline `greedy` chooses by; None: it is left out.
         cma: How long the baseline `cma` searches, and who is told how it stands.
         planner: The detector, and how the effects that are simulated are chosen.
@@ -75,7 +73,6 @@ class EvaluationRequest:
     test: Sequence[Scene] = ()
     lay_out: LayOut = rays_at
     without_visibility: Callable[[], tuple[DesignSpec, Samples]] | None = None
-    density: Callable[[], Density | None] | None = None
     greedy: GreedySource | None = None
     cma: CmaSettings = field(default_factory=CmaSettings)
     planner: Planner = field(default_factory=Planner)
@@ -114,11 +111,11 @@ class EvaluationRequest:
                 raise ConfigError(f"{design.name} is mounted on the body {design.mount!r}", where=where, allowed=there)
         names = [design.name for design in self.designs]
         for name in names:
-            if names.count(name) > 1 or is_baseline(name):
-                other = "a baseline" if is_baseline(name) else "another design"
+            if names.count(name) > 1 or name in BASELINES:
+                other = "a baseline" if name in BASELINES else "another design"
                 raise ConfigError(f"a design has the same name as {other}: {name!r}", hint="rename its file")
         for name in self.baselines:
-            baseline_of(name, where="--baseline")
+            check_baseline(name, where="--baseline")
         if any(count < 1 for count in self.rays):
             raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
 

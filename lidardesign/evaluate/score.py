@@ -20,7 +20,6 @@ from lidardesign.design.compare import outside_notes
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import BackgroundNote
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
-from lidardesign.evaluate.baselines.catalog import part_notes
 from lidardesign.evaluate.baselines.greedy import GREEDY, greedy_rays
 from lidardesign.evaluate.baselines.simple import CMA
 from lidardesign.evaluate.effects import effect_notes, effect_summaries
@@ -89,7 +88,6 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
             *_notes(request, entries, matched),
             *worst_notes([*plain, *matched], request.metric),
             *(search.note(request.designs[0].name, request.metric) for search in searches),
-            *part_notes([(entry.name, entry.positions) for entry in entries if entry.matched_to is None]),
             *slipped_notes(scored.second_casts),
             *effect_notes(effects, request.planner.choice),
         ],

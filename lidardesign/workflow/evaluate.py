@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from lidardesign.config import with_task_settings
 from lidardesign.design.compare import outside_notes
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
-from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of, is_baseline
+from lidardesign.evaluate.baselines.simple import ALWAYS, BASELINES
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.cma.search import SearchBudget
 from lidardesign.evaluate.gates import check_audit, check_better, check_limit
@@ -40,7 +40,7 @@ from lidardesign.workflow.run_folder import (
     log_note,
     settings_texts,
 )
-from lidardesign.workflow.run_samples import Layouts, learned_density, twin_without_visibility
+from lidardesign.workflow.run_samples import Layouts, twin_without_visibility
 from lidardesign.workflow.select_rays import gate_margin_m, selection_scenes
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class ScoreRequest:
             notes(note)
         rival = options.fail_unless_better
         _check_rival(rival, [design.name for design in designs])
-        baselines = [*ALWAYS, *options.baselines, *([rival] if rival and is_baseline(rival) else [])]
+        baselines = [*ALWAYS, *options.baselines, *([rival] if rival in BASELINES else [])]
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
         if options.accuracy:
             # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes
@@ -376,14 +376,12 @@ class Scores:
 def _check_rival(name: str | None, designs: Sequence[str]) -> None:
     """Refuse a rival that nothing can be better than."""
     where = "--fail-unless-better"
-    if name is None:
+    if name is None or name in BASELINES:
         return
-    if is_baseline(name):
-        baseline_of(name, where=where)
-    elif name not in designs:
+    if name not in designs:
         allowed = f"a baseline, or a design: {', '.join(designs)}"
         raise ConfigError(f"no baseline or design {name!r}", where=where, allowed=allowed)
-    elif len(designs) == 1:
+    if len(designs) == 1:
         raise ConfigError(f"there is no other design to compare {name} with", where=where, hint="name a baseline")
 
 
@@ -425,6 +423,5 @@ def evaluation_request(
         scenes_seed=scenes_seed,
         lay_out=layouts,
         without_visibility=(lambda: twin_without_visibility(from_runs[0][0], learned, layouts)) if from_runs else None,
-        density=cache(lambda: learned_density(learned)),
         greedy=GreedySource(partial(selection_scenes, run, seed), gate_margin_m(run)),
     )

@@ -239,7 +239,7 @@ class Run(RunFolder):
         Arguments:
             designs: Designs and design files, of other runs too; all that are saved in the run by default.
             rays: Numbers of rays per frame; the task's by default.
-            baselines: Further baselines: "lloyd", "occupancy", "no-visibility", "cma" or "catalog:NAME".
+            baselines: Further baselines: "lloyd", "occupancy", "no-visibility" or "cma".
             seed: Seed of all random numbers; the run's by default.
             effects: Physical effects: "auto", "all", "none", "audit" or names separated by commas.
             detector: The name of a detector, or a YAML file.

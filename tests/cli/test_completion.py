@@ -26,8 +26,7 @@ from lidardesign.cli.main import app
 from lidardesign.cli.options import sensor_count
 from lidardesign.design.catalog.library import load_library
 from lidardesign.design.sensor import FITTED_LAYOUTS
-from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.simple import baseline_of
+from lidardesign.evaluate.baselines import simple
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.simulate.detector.detector import EFFECTS
 
@@ -119,7 +118,6 @@ def test_formats_parts_detectors_and_effects_are_those_of_the_program(root):
     assert completed(root, "export design.yaml --format ") == list(EXPORTERS)
     parts = {name for name in completed(root, "catalog show ")}
     assert parts == {part.name.partition(":")[0] for part in load_library().every_mode()}
-    assert "catalog:vlp-16" in completed(root, "evaluate run --baseline catalog:v")
     assert "single-photon" in completed(root, "evaluate run --detector ")
     assert set(completed(root, "evaluate run --effects ")) == {"auto", "all", "none", "audit", *EFFECTS}
     assert "jitter,motion" in completed(root, "evaluate run --effects jitter,")
@@ -127,12 +125,7 @@ def test_formats_parts_detectors_and_effects_are_those_of_the_program(root):
 
 
 def test_the_baselines_that_are_listed_are_those_that_there_are():
-    for name in BASELINES:
-        baseline_of(f"{name}vlp-16" if name.endswith(":") else name)
-    with pytest.raises(ConfigError) as caught:
-        baseline_of("nothing")
-    known = {name.partition(":")[0] for name in caught.value.allowed.split(", ")}
-    assert {name.rstrip(":") for name in BASELINES} == known
+    assert list(BASELINES) == list(simple.BASELINES)
 
 
 def test_keys_are_those_of_the_task_and_their_words_follow(root):

@@ -30,10 +30,9 @@ if TYPE_CHECKING:
 
 BASELINE_HELP = (
     "A baseline in addition to uniform, random, bounding, silhouette and greedy: lloyd (like silhouette, denser where "
-    "returns are frequent and surfaces large), occupancy (rays towards cells that targets occupy) or no-visibility "
+    "returns are frequent and surfaces large), occupancy (rays towards cells that targets occupy), no-visibility "
     "(the first design refitted to the density without its occlusion term; takes some seconds), "
-    "catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres and "
-    "degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on "
+    "or cma (direct optimisation of the first design's sensors on "
     "training scenes, for --cma-seconds). Repeatable."
 )
 
