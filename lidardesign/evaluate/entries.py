@@ -10,19 +10,16 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
-import numpy as np
-
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.layouts.track import travels
 from lidardesign.design.sensor import CERTIFICATES, DesignSpec
 from lidardesign.errors import ConfigError
+from lidardesign.evaluate.baselines import cma
 from lidardesign.evaluate.baselines.candidates import Candidate, RaysPerCondition, mean_mbps
 from lidardesign.evaluate.baselines.greedy import GREEDY, USUAL_SCENES, Fired, GreedyCandidate, greedy_rays
-from lidardesign.evaluate.baselines.simple import CMA, Baselines, Option, TwinCandidate
-from lidardesign.evaluate.baselines.views import TrainingViews
-from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
-from lidardesign.evaluate.cma.search import TrainingObjective
+from lidardesign.evaluate.baselines.simple import Baselines, Option, TwinCandidate
+from lidardesign.evaluate.baselines.views import TrainingObjective, TrainingViews
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
@@ -53,7 +50,7 @@ class Entry:
     redraw: Callable[[int], RaysPerCondition] | None = None
     matched_to: str | None = None
     matched_rays: int | None = None
-    search: SearchRecord | None = None
+    search: cma.SearchRecord | None = None
 
     @property
     def rays(self) -> int:
@@ -94,6 +91,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         if can_fire(design, count)
     ]
     choosable = [] if request.greedy is None else greedy_rays(request.task, len(conditions), counts)[0]
+    starts = {one.rays: one.positions for one in designs if one.name == request.designs[0].name}
     baselines = Baselines(
         request.space,
         request.train,
@@ -102,7 +100,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         conditions=conditions,
         gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
         without_visibility=partial(_twin, request, conditions) if request.without_visibility else None,
-        optimised=partial(_optimised, request, conditions) if request.designs else None,
+        optimised=partial(_optimised, request, conditions, starts) if request.designs else None,
         chosen=partial(_chosen, request, conditions, designs, max(choosable, default=0)),
     )
     wanted: list[tuple[str, list[Option], Entry | None]] = [
@@ -110,13 +108,14 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         for name in request.baselines
         for count in counts
         if name != GREEDY or count in choosable
+        if name != cma.CMA or count in starts or not starts
     ]
     if request.equal_bandwidth:
         wanted += [
             (name, baselines.options_within(name, entry.mbps(request.bandwidth), request.bandwidth), entry)
             for entry in designs
             for name in request.baselines
-            if name != CMA or entry.name == request.designs[0].name
+            if name != cma.CMA or entry.name == request.designs[0].name
             if name != GREEDY or entry.rays in choosable
         ]
     wanted = [one for one in wanted if one[1]]
@@ -147,6 +146,7 @@ def _check_tracks(request: EvaluationRequest, conditions: Sequence[Mapping[str, 
 
 def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | None) -> Entry:
     candidate, count = option.candidate, len(option.positions[0])
+    searched = matched is None and isinstance(candidate, cma.CmaCandidate)
     return Entry(
         name,
         option.positions,
@@ -154,7 +154,7 @@ def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | Non
         redraw=partial(candidate.positions, baselines.spaces, count) if candidate.drawn_anew else None,
         matched_to=None if matched is None else matched.name,
         matched_rays=None if matched is None else matched.rays,
-        search=candidate.record_of(option.positions) if isinstance(candidate, CmaCandidate) else None,
+        search=candidate.record_of(option.positions) if searched else None,
     )
 
 
@@ -180,16 +180,18 @@ def _twin(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]])
 
 
 def _optimised(
-    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], views: TrainingViews
+    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], starts: Mapping[int, RaysPerCondition]
 ) -> Candidate:
-    return CmaCandidate(
-        followed=request.designs[0],
-        space=request.space,
-        conditions=conditions,
-        views=views,
-        objective=TrainingObjective(request.task, request.metric, request.train, request.planner, request.seed),
+    design, space, scenes = request.designs[0], request.space, request.train[: cma.MOST_SCENES]
+    middle = conditions[len(conditions) // 2] if design.track is None else {}
+    return cma.CmaCandidate(
+        design=design,
+        starts=starts,
+        space=space.at({**middle, **design.at}) if space.conditioned else space,
+        objective=TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed),
         settings=request.cma,
         seed=request.seed,
+        bandwidth=request.bandwidth,
     )
 
 
@@ -220,5 +222,4 @@ def _judge(request: EvaluationRequest, lists: Sequence[RaysPerCondition]) -> lis
     objective = TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed)
     if not objective.scenes:
         return [0.0] * len(lists)
-    # one row per scene, whose rows are added one after the other
-    return np.array(objective.values(lists, range(len(objective.scenes))).T, order="C").mean(axis=0).tolist()
+    return objective.values(lists).mean(axis=0).tolist()

@@ -9,7 +9,8 @@ from typing import Any
 
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import MAX_SEED, ConfigError, check_number
-from lidardesign.evaluate.baselines.simple import CMA, check_baseline
+from lidardesign.evaluate.baselines.cma import CMA
+from lidardesign.evaluate.baselines.simple import check_baseline
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.workers.pool import check_workers
 from lidardesign.numerics import SLACK

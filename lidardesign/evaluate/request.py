@@ -17,9 +17,9 @@ from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
+from lidardesign.evaluate.baselines.cma import CmaSettings
 from lidardesign.evaluate.baselines.greedy import GreedySource
 from lidardesign.evaluate.baselines.simple import ALWAYS, BASELINES, LayOut, check_baseline
-from lidardesign.evaluate.cma.candidate import CmaSettings
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.scene_scores import ScenePass, Scorer, score_here
 from lidardesign.registry import plugin_guard

@@ -20,8 +20,8 @@ from lidardesign.design.compare import outside_notes
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import BackgroundNote
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
+from lidardesign.evaluate.baselines.cma import CMA
 from lidardesign.evaluate.baselines.greedy import GREEDY, greedy_rays
-from lidardesign.evaluate.baselines.simple import CMA
 from lidardesign.evaluate.effects import effect_notes, effect_summaries
 from lidardesign.evaluate.entries import Entry, entries_of
 from lidardesign.evaluate.mounting import MountError

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.config import with_task_settings
 from lidardesign.design.compare import outside_notes
 from lidardesign.errors import ConfigError
+from lidardesign.evaluate.baselines.cma import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
 from lidardesign.evaluate.baselines.simple import ALWAYS, BASELINES
-from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
-from lidardesign.evaluate.cma.search import SearchBudget
 from lidardesign.evaluate.gates import check_audit, check_better, check_limit
 from lidardesign.evaluate.last_scores import SCORES, last_scores_of
 from lidardesign.evaluate.options import ScoreOptions
@@ -44,7 +43,7 @@ from lidardesign.workflow.run_samples import Layouts, twin_without_visibility
 from lidardesign.workflow.select_rays import gate_margin_m, selection_scenes
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.cma.candidate import Show
+    from lidardesign.evaluate.baselines.cma import Show
     from lidardesign.evaluate.figures.scene_figure import FigureData
     from lidardesign.evaluate.report.figures import Figure
 
@@ -196,7 +195,7 @@ class ScoreRequest:
         request = evaluation_request(
             self.run, self.designs, self.rays, self.baselines, self.seed, self.options.scenes_seed, self.learned
         )
-        cma = CmaSettings(SearchBudget(self.cma_seconds), searching)
+        cma = CmaSettings(self.cma_seconds, show=searching)
         misplaced = self.options.misplacement()
         return replace(request, planner=self.planner, audit=self.audit, cma=cma, mount_error=misplaced)
 

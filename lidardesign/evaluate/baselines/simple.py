@@ -13,7 +13,7 @@ more candidate layouts; where there are several, the best on training scenes is 
 - `greedy`: rays chosen on training scenes without a density, see `lidardesign.evaluate.baselines.greedy`.
 - `occupancy`: see `lidardesign.evaluate.baselines.occupancy`.
 - `no-visibility`: the design fitted anew without its occlusion term, see below.
-- `cma`: see `lidardesign.evaluate.cma.candidate`.
+- `cma`: see `lidardesign.evaluate.baselines.cma`.
 
 Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
 
@@ -45,6 +45,7 @@ from lidardesign.evaluate.baselines.candidates import (
     most_within,
     whole_range,
 )
+from lidardesign.evaluate.baselines.cma import CMA
 from lidardesign.evaluate.baselines.even import even_placement
 from lidardesign.evaluate.baselines.greedy import GREEDY
 from lidardesign.evaluate.baselines.occupancy import occupancy
@@ -59,7 +60,6 @@ from lidardesign.task import random_generator
 
 Judge = Callable[[Sequence[RaysPerCondition]], Sequence[float]]
 NO_VISIBILITY = "no-visibility"
-CMA = "cma"
 
 
 class Option(NamedTuple):
@@ -94,7 +94,7 @@ class Baselines:
         conditions: Sequence[Mapping[str, float]] = ({},),
         gates_per_ray: bool = False,
         without_visibility: Callable[[], Candidate] | None = None,
-        optimised: Callable[[TrainingViews], Candidate] | None = None,
+        optimised: Callable[[], Candidate] | None = None,
         chosen: Callable[[TrainingViews], Candidate] | None = None,
     ) -> None:
         self.space, self.train, self.seed = space, train, seed
@@ -214,7 +214,7 @@ def _cma(source: Baselines) -> list[Candidate]:
             where=f"--baseline {CMA}",
             allowed="at least one design",
         )
-    return [source.optimised(source.views)]
+    return [source.optimised()]
 
 
 BASELINES: dict[str, Callable[[Baselines], list[Candidate]]] = {
