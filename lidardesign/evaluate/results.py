@@ -27,7 +27,7 @@ from lidardesign.task import Metric
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.baselines.cma import SearchRecord
-    from lidardesign.evaluate.rivals import StrongestRival
+    from lidardesign.evaluate.entries import StrongestRival
 
 
 ROW_KEYS = (

@@ -23,11 +23,10 @@ from lidardesign.evaluate.baselines.candidates import RaysPerCondition
 from lidardesign.evaluate.baselines.cma import CMA
 from lidardesign.evaluate.baselines.greedy import GREEDY, greedy_rays
 from lidardesign.evaluate.effects import effect_notes, effect_summaries
-from lidardesign.evaluate.entries import Entry, entries_of
+from lidardesign.evaluate.entries import Entry, entries_of, strongest_rival
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, left_out
 from lidardesign.evaluate.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
-from lidardesign.evaluate.rivals import strongest_rival
 from lidardesign.evaluate.scene_scores import Progress, silent_notes
 from lidardesign.evaluate.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.geometry.triangles import SecondCasts

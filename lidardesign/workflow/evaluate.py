@@ -16,13 +16,13 @@ from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.cma import DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
 from lidardesign.evaluate.baselines.simple import ALWAYS, BASELINES
-from lidardesign.evaluate.gates import check_audit, check_better, check_limit
 from lidardesign.evaluate.last_scores import SCORES, last_scores_of
 from lidardesign.evaluate.options import ScoreOptions
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
 from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.score import evaluate as score_designs
+from lidardesign.evaluate.thresholds import check_audit, check_better, check_limit
 from lidardesign.evaluate.workers.pool import check_workers, workers_of
 from lidardesign.run.clock import outermost_clock, phase, running
 from lidardesign.simulate.plan import Planner

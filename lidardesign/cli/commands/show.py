@@ -243,8 +243,8 @@ def _signed(value: float, decimals: int = 2) -> str:
 
 
 def _verdict(pair: dict[str, Any], metric: dict[str, Any]) -> str:
-    from lidardesign.evaluate.gates import difference_text
     from lidardesign.evaluate.results import Paired
+    from lidardesign.evaluate.thresholds import difference_text
 
     found = Paired(**{name: value for name, value in pair.items() if name != "half_width"})
     return difference_text(found, metric["better"], metric["unit"])

@@ -73,8 +73,8 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
 
 def sentence(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
     """What designs are against the strongest rival, in one sentence."""
-    from lidardesign.evaluate.gates import difference_text
     from lidardesign.evaluate.results import verdict
+    from lidardesign.evaluate.thresholds import difference_text
 
     metric, rival = evaluation.metric, pairs[0].b
     if len(pairs) == 1:
