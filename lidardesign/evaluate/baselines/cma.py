@@ -37,7 +37,7 @@ from lidardesign.task import Metric, random_generator
 CMA = "cma"
 DEFAULT_SECONDS = 60.0
 # More scenes tell candidates no better apart, and cost the search its time.
-MOST_SCENES = 20
+MOST_SCENES = 40
 STEP = 0.3  # the first standard deviation, in units of the vector
 # Beyond so many numbers a full covariance takes longer to learn than any search lasts: variances alone are adapted.
 MOST_CORRELATED = 250
