@@ -50,6 +50,7 @@ class EvaluationRequest:
         lay_out: How a design becomes a ray list of a given length.
         without_visibility: The design that stands for the baseline `no-visibility`, and the samples that it was
             fitted to; called when that is asked for.
+        density: Samples of what was learned, for figures; None where a run has none.
         greedy: What the baseline `greedy` chooses by; None: it is left out.
         cma: How long the baseline `cma` searches, and who is told how it stands.
         planner: The detector, and how the effects that are simulated are chosen.
@@ -73,6 +74,7 @@ class EvaluationRequest:
     test: Sequence[Scene] = ()
     lay_out: LayOut = rays_at
     without_visibility: Callable[[], tuple[DesignSpec, Samples]] | None = None
+    density: Callable[[], Samples | None] = lambda: None
     greedy: GreedySource | None = None
     cma: CmaSettings = field(default_factory=CmaSettings)
     planner: Planner = field(default_factory=Planner)

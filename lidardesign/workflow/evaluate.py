@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from lidardesign.evaluate.score import evaluate as score_designs
 from lidardesign.evaluate.thresholds import check_audit, check_better, check_limit
 from lidardesign.evaluate.workers.pool import check_workers, workers_of
 from lidardesign.run.clock import outermost_clock, phase, running
+from lidardesign.samples import load_samples
 from lidardesign.simulate.plan import Planner
 from lidardesign.workflow.designs import Design, collect_designs, html_table, judging_run, name_apart, named
 from lidardesign.workflow.run_folder import (
@@ -422,5 +423,6 @@ def evaluation_request(
         scenes_seed=scenes_seed,
         lay_out=layouts,
         without_visibility=(lambda: twin_without_visibility(from_runs[0][0], learned, layouts)) if from_runs else None,
+        density=cache(lambda: load_samples(learned.folder, learned.config.space) if learned.has_samples else None),
         greedy=GreedySource(partial(selection_scenes, run, seed), gate_margin_m(run)),
     )

@@ -201,8 +201,8 @@ def figure_data(
     planner = request.planner if any(effect.on for effect in evaluation.effects) else None
     scene, places = request.test[0], ordered_conditions(request)
     shown = scene_figure(scene, request.designs, places, laid_out, planner=planner, seed=request.seed)
-    density = request.density() if request.density is not None else None
-    view = None if density is None else density_view(density.samples, scene, request.designs)
+    samples = request.density()
+    view = None if samples is None else density_view(samples, scene, request.designs)
     slacks = {design.name: constraint_slack_of(design, request.space) for design in request.designs}
     return FigureData(shown, view, slacks, times)
 

@@ -235,10 +235,9 @@ def evaluation_report(
         command: The command line that makes the page again.
     """
     manifest = read_manifest(folder)
-    density = request.density() if request.density is not None else None
-    points = None
-    if density is not None:
-        points = observed_point(density.samples.resample(DENSITY_POINTS, random_generator(config.seed, "report")))
+    samples, points = request.density(), None
+    if samples is not None:
+        points = observed_point(samples.resample(DENSITY_POINTS, random_generator(config.seed, "report")))
     learned = manifest.get("command")
     commands = [("The run that was learned", _line(learned))] if isinstance(learned, list) and learned else []
     commands.append(("The scores and this page", _line(command)))
