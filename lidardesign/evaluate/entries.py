@@ -188,7 +188,7 @@ def _optimised(
     request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], starts: Mapping[int, RaysPerCondition]
 ) -> Candidate:
     design, space, scenes = request.designs[0], request.space, request.train[: cma.MOST_SCENES]
-    middle = conditions[len(conditions) // 2] if design.track is None else {}
+    middle = conditions[len(conditions) // 2]
     return cma.CmaCandidate(
         design=design,
         starts=starts,

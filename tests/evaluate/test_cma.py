@@ -24,6 +24,7 @@ from lidardesign.evaluate.baselines import cma
 from lidardesign.evaluate.baselines.candidates import mean_mbps, rays_at
 from lidardesign.evaluate.baselines.cma import CmaCandidate, CmaSettings, MovableSensors
 from lidardesign.evaluate.baselines.views import TrainingObjective
+from lidardesign.evaluate.entries import entries_of
 from lidardesign.evaluate.options import ScoreOptions
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.score import evaluate
@@ -232,6 +233,15 @@ def test_the_search_gains_in_the_direction_of_the_metric(task):
     (record,) = evaluate(request_of("grid", task, cma=CmaSettings(math.inf, 1500))).searches
     sign = 1.0 if task.metric.better == "lower" else -1.0
     assert sign * record.value < sign * record.start_value - 10
+
+
+@each_row("name", ["track", "chosen along"])
+def test_along_a_condition_rays_stay_where_the_condition_is(name):
+    task = AnyMissTask()
+    task.conditions = lambda config: [{"x_m": 0.25}, {"x_m": 0.75}]
+    found = next(entry for entry in entries_of(request_of(name, task)) if entry.name == "cma")
+    assert found.search.value < found.search.start_value
+    assert [np.unique(rays.origin_m[:, 0]).tolist() for rays in found.positions] == [[0.25], [0.75]]
 
 
 def test_a_design_that_does_not_fire_a_number_of_rays_is_not_followed_there():
