@@ -30,7 +30,7 @@ HOMES = {
     "safetensors": ("density.",),
     "zuko": ("density.",),
     "embreex": ("geometry.triangles",),
-    "cma": ("evaluate.cma.search",),
+    "cma": ("evaluate.baselines.cma",),
     "mujoco": ("mujoco_model.", "design.rigs.mjcf."),
     "mink": (),
     "typer": ("cli.",),

@@ -82,7 +82,6 @@ FURTHER = {
         capture scan.npz runs/face/designs/grid.yaml --rays 40 --csv points.csv
         capture scan.npz mirrors.galvo.csv
         capture scan.npz runs/face/designs/grid.yaml --estimator matched --rays 40 --json
-        evaluate runs/face/designs/grid.yaml --rays 40 --baseline catalog:vl53l8cx
         evaluate runs/face/designs/scan.yaml --rays 40 --effects audit --detector consumer-8x8 --json
         evaluate runs/face/designs/grid.yaml --rays 40 --fail-above 0.001 --report report.html
         evaluate runs/face/designs/grid.yaml --rays 400 --set truth_points=50000 --baseline cma --cma-seconds 0.1 --json

@@ -20,15 +20,13 @@ from lidardesign.design.compare import outside_notes
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import BackgroundNote
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
-from lidardesign.evaluate.baselines.catalog import part_notes
+from lidardesign.evaluate.baselines.cma import CMA
 from lidardesign.evaluate.baselines.greedy import GREEDY, greedy_rays
-from lidardesign.evaluate.baselines.simple import CMA
 from lidardesign.evaluate.effects import effect_notes, effect_summaries
-from lidardesign.evaluate.entries import Entry, entries_of
+from lidardesign.evaluate.entries import Entry, entries_of, strongest_rival
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, left_out
 from lidardesign.evaluate.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
-from lidardesign.evaluate.rivals import strongest_rival
 from lidardesign.evaluate.scene_scores import silent_notes
 from lidardesign.evaluate.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.geometry.triangles import SecondCasts
@@ -89,7 +87,6 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
             *_notes(request, entries, matched),
             *worst_notes([*plain, *matched], request.metric),
             *(search.note(request.designs[0].name, request.metric) for search in searches),
-            *part_notes([(entry.name, entry.positions) for entry in entries if entry.matched_to is None]),
             *slipped_notes(scored.second_casts),
             *effect_notes(effects, request.planner.choice),
         ],

@@ -1,8 +1,7 @@
-"""The contract tried in a process of its own, with limits: a plugin that hangs, crashes or hogs harms nobody.
+"""The contract tried in a process of its own: a plugin that hangs or crashes harms nobody.
 
 The process says by lines of JSON when it calls the task's code and what it found; whoever asks waits for each line no
-longer than a call may take. It works in an empty folder, has temporary files of its own, and is told how much memory
-it may take.
+longer than a call may take. It works in an empty folder and has temporary files of its own.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -21,8 +20,7 @@ from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.run.child import START_SECONDS, Child, ChildError, write_line
-from lidardesign.testing.law import LOADS, Finding, Law, Limits, error_words, place_of
-from lidardesign.testing.watch import Watch
+from lidardesign.testing.law import CALL_SECONDS, LOADS, Finding, Law, error_words, place_of, restore_random_states
 
 if TYPE_CHECKING:
     from lidardesign.config import RunConfig
@@ -46,14 +44,14 @@ class CheckRequest:
         config_file: A YAML file of its configuration.
         overrides: `KEY=VALUE` as `--set` takes it.
         seed: Root of all chance.
-        limits: What the task's code may take.
+        limit_s: What one call of the task's code may take [s].
     """
 
     name: str
     config_file: Path | None = None
     overrides: Sequence[str] = ()
     seed: int | None = None
-    limits: Limits = field(default_factory=Limits)
+    limit_s: float = CALL_SECONDS
 
 
 def check_in_process(request: CheckRequest) -> Iterator[Finding]:
@@ -75,12 +73,11 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
             "config_file": str(request.config_file) if request.config_file else None,
             "overrides": list(request.overrides),
             "seed": request.seed,
-            "seconds": request.limits.seconds,
-            "memory_bytes": request.limits.memory_bytes,
+            "seconds": request.limit_s,
         }
         child = Child(f"{__name__}:answer_check", document, {registry.PROBING: "1"})
         try:
-            yield from _read_findings(child, request.limits.seconds)
+            yield from _read_findings(child, request.limit_s)
         finally:
             child.end()
 
@@ -162,24 +159,16 @@ def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
     contract = _begin(request, result)
     if contract is None:
         return {}
-    contract.subject.watch.empty_folder = Path(_make_folder(request, "work"))
-    os.chdir(contract.subject.watch.empty_folder)
+    os.chdir(_make_folder(request, "work"))
     for finding in contract.findings():
         write_line(result, finding.as_dict())
     return {}
 
 
 def _settle(request: dict[str, Any]) -> None:
-    """Limits on memory, a place for temporary files, and no compiled Python beside the plugin's sources."""
+    """Provide a place for temporary files, and write no compiled Python beside the plugin's sources."""
     tempfile.tempdir = os.environ["TMPDIR"] = _make_folder(request, "temporary")
     os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
-    try:
-        import resource
-    except ImportError:  # not on Windows
-        return
-    _, most = resource.getrlimit(resource.RLIMIT_DATA)
-    wanted = request["memory_bytes"]
-    resource.setrlimit(resource.RLIMIT_DATA, (wanted if most == resource.RLIM_INFINITY else min(wanted, most), most))
 
 
 def _make_folder(request: dict[str, Any], name: str) -> str:
@@ -190,10 +179,10 @@ def _make_folder(request: dict[str, Any], name: str) -> str:
 
 def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     """Import the plugin and resolve its configuration; None where that is the end of it, which is told."""
-    watch = Watch(all_threads=True)
+    drawn: list[str] = []
     started = time.perf_counter()
     try:
-        task, config = _loaded(request, watch)
+        task, config = _loaded(request, drawn)
     except registry.PluginError as error:
         write_line(result, Finding(*LOADS, "fail", f"{error_words(error)}{place_of(error)}").as_dict())
         return None
@@ -213,16 +202,15 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     version = f"version {task.api_version} of the task interface"
     loaded = Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started)
     write_line(result, loaded.as_dict())
-    limits = Limits(request["seconds"], request["memory_bytes"])
-    return Contract(Subject(task, config, limits, watch, lambda what: write_line(result, {CALLED: what})))
+    return Contract(Subject(task, config, request["seconds"], drawn, lambda what: write_line(result, {CALLED: what})))
 
 
-def _loaded(request: dict[str, Any], watch: Watch) -> tuple[Task, RunConfig]:
+def _loaded(request: dict[str, Any], drawn: list[str]) -> tuple[Task, RunConfig]:
     offer = EntryPoint(request["name"], request["value"], registry.GROUP)
-    with watch.during("import"):
+    with restore_random_states(drawn, "import"):
         task = registry.import_task(offer, request["seconds"])
     config_file = Path(request["config_file"]) if request["config_file"] else None
-    with watch.during("space"):
+    with restore_random_states(drawn, "space"):
         return task, resolve(
             task, preset="draft", config_file=config_file, overrides=request["overrides"], seed=request["seed"]
         )

@@ -14,32 +14,28 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.config import with_task_settings
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
+from lidardesign.evaluate.baselines.cma import CMA, DEFAULT_SECONDS, CmaSettings
 from lidardesign.evaluate.baselines.greedy import GreedySource
-from lidardesign.evaluate.baselines.simple import ALWAYS, CMA, NONE, baseline_of, is_baseline
-from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
-from lidardesign.evaluate.cma.search import SearchBudget
-from lidardesign.evaluate.gates import check_audit, check_better, check_limit
+from lidardesign.evaluate.baselines.simple import ALWAYS, BASELINES, NONE, check_baseline
 from lidardesign.evaluate.last_scores import SCORES, last_scores_of
 from lidardesign.evaluate.mounting import MountError
-from lidardesign.evaluate.request import (
-    EvaluationRequest,
-    numbers_alone,
-    usual_numbers,
-)
+from lidardesign.evaluate.request import EvaluationRequest, numbers_alone, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
 from lidardesign.evaluate.score import evaluate as score_designs
+from lidardesign.evaluate.thresholds import check_audit, check_better, check_limit
 from lidardesign.evaluate.workers import check_workers, scorer_of
 from lidardesign.numerics import SLACK
 from lidardesign.run.clock import Progress, outermost_clock, phase, running
+from lidardesign.samples import load_samples
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.workflow.designs import Design, collect_designs, html_table, judging_run, name_apart, named
 from lidardesign.workflow.run_folder import DESIGN_FOLDER, Notes, RunFolder, log_note, settings_texts
-from lidardesign.workflow.run_samples import Layouts, learned_density, twin_without_visibility
+from lidardesign.workflow.run_samples import Layouts, twin_without_visibility
 from lidardesign.workflow.select_rays import gate_margin_m, selection_scenes
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.cma.candidate import Show
+    from lidardesign.evaluate.baselines.cma import Show
     from lidardesign.evaluate.report.figures import Figure
 
 CMA_SECONDS = (0.1, 7 * 24 * 3600.0)
@@ -98,11 +94,11 @@ class ScoreOptions:
         check_workers(str(self.workers))
         self.misplacement()
         if NONE in self.baselines:
-            if len(self.baselines) > 1 or is_baseline(self.fail_unless_better or ""):
+            if len(self.baselines) > 1 or self.fail_unless_better in BASELINES:
                 raise ConfigError("none together with another baseline", where="--baseline", allowed="none alone")
         else:
             for name in self.baselines:
-                baseline_of(name, where="--baseline")
+                check_baseline(name, where="--baseline")
         limits = {
             "cma_seconds": CMA_SECONDS,
             "range_tolerance_mm": RANGE_TOLERANCES_MM,
@@ -196,7 +192,7 @@ class ScoreRequest:
             notes(note)
         rival = options.fail_unless_better
         _check_rival(rival, [design.name for design in designs])
-        baselines = [*ALWAYS, *options.baselines, *([rival] if rival and is_baseline(rival) else [])]
+        baselines = [*ALWAYS, *options.baselines, *([rival] if rival in BASELINES else [])]
         if NONE in options.baselines:
             baselines = []
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
@@ -242,7 +238,7 @@ class ScoreRequest:
         request = evaluation_request(
             self.run, self.designs, self.rays, self.baselines, self.seed, self.options.scenes_seed, self.learned
         )
-        cma = CmaSettings(SearchBudget(self.cma_seconds), searching)
+        cma = CmaSettings(self.cma_seconds, show=searching)
         misplaced = self.options.misplacement()
         return replace(
             request, planner=self.planner, audit=self.audit, cma=cma, mount_error=misplaced, alone=self.alone
@@ -410,14 +406,12 @@ def check_scores(scores: Scores) -> None:
 def _check_rival(name: str | None, designs: Sequence[str]) -> None:
     """Refuse a rival that nothing can be better than."""
     where = "--fail-unless-better"
-    if name is None:
+    if name is None or name in BASELINES:
         return
-    if is_baseline(name):
-        baseline_of(name, where=where)
-    elif name not in designs:
+    if name not in designs:
         allowed = f"a baseline, or a design: {', '.join(designs)}"
         raise ConfigError(f"no baseline or design {name!r}", where=where, allowed=allowed)
-    elif len(designs) == 1:
+    if len(designs) == 1:
         raise ConfigError(f"there is no other design to compare {name} with", where=where, hint="name a baseline")
 
 
@@ -459,6 +453,6 @@ def evaluation_request(
         scenes_seed=scenes_seed,
         lay_out=layouts,
         without_visibility=(lambda: twin_without_visibility(from_runs[0][0], learned, layouts)) if from_runs else None,
-        density=cache(lambda: learned_density(learned)),
+        density=cache(lambda: load_samples(learned.folder, learned.config.space) if learned.has_samples else None),
         greedy=GreedySource(partial(selection_scenes, run, seed), gate_margin_m(run)),
     )

@@ -256,8 +256,7 @@ class Run(RunFolder):
         Arguments:
             designs: Designs and design files, of other runs too; all that are saved in the run by default.
             rays: Numbers of rays per frame; the task's by default.
-            baselines: Further baselines: "lloyd", "occupancy", "no-visibility", "cma" or "catalog:NAME"; ["none"]
-                leaves out all baselines.
+            baselines: Further baselines: "lloyd", "occupancy", "no-visibility" or "cma"; ["none"] leaves out all.
             seed: Seed of all random numbers; the run's by default.
             scenes_seed: Seed of the held-out scenes; `seed` by default.
             effects: Physical effects: "auto", "all", "none", "audit" or names separated by commas.

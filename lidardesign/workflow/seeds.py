@@ -23,7 +23,7 @@ from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest, Scores
 from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, read_design
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.cma.candidate import Show
+    from lidardesign.evaluate.baselines.cma import Show
 
 FEWEST_RUNS = 2
 SEED = "seed"

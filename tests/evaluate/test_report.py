@@ -25,6 +25,7 @@ from support.report_pages import (
 from support.tables import each_row
 
 from lidardesign.design.sensor import DesignSpec
+from lidardesign.evaluate.entries import StrongestRival
 from lidardesign.evaluate.report.drawing import (
     FEWEST_STEPS,
     MOST_FACES,
@@ -59,7 +60,6 @@ from lidardesign.evaluate.report.view import (
     view_notes,
 )
 from lidardesign.evaluate.results import Evaluation, leading_detail, verdict
-from lidardesign.evaluate.rivals import StrongestRival
 from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.task import Metric

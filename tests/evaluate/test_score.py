@@ -13,13 +13,13 @@ from lidardesign.cli.tables.scores import show_evaluation
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.evaluate.baselines import candidates
-from lidardesign.evaluate.gates import worse_than_threshold
+from lidardesign.evaluate.entries import FEWEST_RIVAL_SCENES
 from lidardesign.evaluate.report.figures import scores_figure
 from lidardesign.evaluate.report.tables import paired_tables
 from lidardesign.evaluate.results import csv_text, verdict
-from lidardesign.evaluate.rivals import FEWEST_SCENES
 from lidardesign.evaluate.score import evaluate
 from lidardesign.evaluate.statistics import mean_interval, paired_difference
+from lidardesign.evaluate.thresholds import worse_than_threshold
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score
 
@@ -216,7 +216,7 @@ def test_rows_that_fire_the_same_rays_are_scored_once():
     evaluate(make_request(task=Counting(), baselines=("uniform",), rays=(25, 25), test=scenes(2, 2)))
     # one design and one baseline at 25 rays, and the baseline at the design's bandwidth, in two scenes each; and the
     # baseline in the training scenes that the strongest rival is found on
-    assert len(calls) == 6 + FEWEST_SCENES
+    assert len(calls) == 6 + FEWEST_RIVAL_SCENES
 
 
 class BrokenTask(MissTask):

@@ -1,4 +1,4 @@
-"""The sweep of training: what a run had reached at its snapshots, and what runs of other presets beside it reach."""
+"""The sweep of training: the density that a run had reached at its snapshots."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from lidardesign.config import load_run_config, resolve, save_run_config
 from lidardesign.density.learn import learn
 from lidardesign.density.learned import load_flow, remeasured, seconds_at
 from lidardesign.density.training import training as steps
-from lidardesign.density.training.checkpoint import save_arrays
 from lidardesign.density.training.quality import draw_probes
 from lidardesign.density.training.training import Trainer
-from lidardesign.design.fit import fit
 from lidardesign.errors import DataError, NumericalError
 from lidardesign.evaluate.accuracy import sweeps as accuracy
 from lidardesign.evaluate.accuracy import training
@@ -26,8 +24,7 @@ from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Accuracy
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
-from lidardesign.run.manifest import note, read_manifest, record, start_manifest
-from lidardesign.samples import load_samples
+from lidardesign.run.manifest import record, start_manifest
 from lidardesign.task import random_generator, scenes_of
 from lidardesign.workflow import evaluate as scoring
 
@@ -53,17 +50,14 @@ def learned(folder, preset, steps, *further):
 def runs(tmp_path_factory):
     place = tmp_path_factory.mktemp("runs")
     mine = learned(place / "mine", "draft", 64)
-    learned(place / "longer", "standard", 96)
-    learned(place / "other_density", "fine", 8, "density.sigma_m=0.08")
-    (place / "nothing").mkdir()
     return mine
 
 
-def request_for(run, designs=()):
+def request_for(run):
     task, config = load_run_config(run)
     train, test = (scenes_of(task, config.task, split, config.seed, config.space) for split in ("train", "test"))
     asked = EvaluationRequest(
-        task=task, config=config.task, space=config.space, seed=config.seed, designs=designs, rays=[12],
+        task=task, config=config.task, space=config.space, seed=config.seed, designs=(), rays=[12],
         train=list(train), test=list(test),
     )  # fmt: skip
     return AccuracyRequest(config, run, asked, None)
@@ -71,7 +65,7 @@ def request_for(run, designs=()):
 
 @pytest.fixture(scope="module")
 def sweeps(runs):
-    return training.sweeps(request_for(runs, [fit(load_samples(runs), sensors=2, restarts=1).design]))
+    return training.steps_sweeps(request_for(runs))
 
 
 def test_every_snapshot_and_the_flow_itself_are_measurements_with_errors_and_seconds(sweeps):
@@ -85,21 +79,10 @@ def test_every_snapshot_and_the_flow_itself_are_measurements_with_errors_and_sec
     assert steps.measurements[-1].error < steps.measurements[0].error
 
 
-def test_measurements_carry_ess_kl_coverage_and_the_score_of_a_quick_fit(sweeps):
-    values = sweeps[0].measurements[-1].values
-    assert {"ess", "kl_nats", "coverage", "ess_error", "kl_nats_error"} <= values.keys()
-    assert any(name.startswith("score") for name in values)
-    differences = [v for name, v in values.items() if name.endswith("difference_error")]
-    assert differences == [0.0]
-    assert "quick fits" in sweeps[0].note
-
-
-def test_runs_of_other_presets_are_measurements_and_runs_of_other_densities_are_not(sweeps):
-    presets = sweeps[1]
-    assert presets.knob == "preset"
-    assert [measurement.setting for measurement in presets.measurements] == ["draft", "standard"]
-    assert [measurement.default for measurement in presets.measurements] == [True, False]
-    assert presets.measurements[0].error == sweeps[0].measurements[-1].error
+def test_measurements_carry_ess_kl_and_coverage(sweeps):
+    assert set(sweeps[0].measurements[-1].values) == {
+        name + end for name in ("ess", "kl_nats", "coverage") for end in ("", "_error")
+    }
 
 
 def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs, sweeps):
@@ -136,18 +119,6 @@ def test_progress_that_is_none_is_told(runs, tmp_path, text):
     record(tmp_path / "run", ["progress.jsonl"])
     with pytest.raises(DataError, match=r"progress.jsonl: does not hold the progress"):
         seconds_at(tmp_path / "run")
-
-
-def test_runs_beside_this_one_that_cannot_be_measured_are_left_out(runs, tmp_path, sweeps):
-    place = tmp_path / "runs"
-    shutil.copytree(runs.parent, place)
-    manifest = read_manifest(place / "longer")
-    note(place / "longer", learn=None)
-    assert "preset" not in [sweep.knob for sweep in training.sweeps(request_for(place / "mine"))]
-    note(place / "longer", learn=manifest["learn"])
-    weights = {"weights": np.zeros(3)}
-    save_arrays(place / "longer", "flow.safetensors", weights, {})
-    assert "preset" not in [sweep.knob for sweep in training.sweeps(request_for(place / "mine"))]
 
 
 @pytest.fixture

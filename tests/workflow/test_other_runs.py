@@ -16,7 +16,7 @@ from lidardesign.config import load_run_config, save_run_config, with_task_setti
 from lidardesign.design.compare import outside_space
 from lidardesign.design.files import load_design
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.gates import difference_text
+from lidardesign.evaluate.thresholds import difference_text
 from lidardesign.geometry.rays import Rays
 from lidardesign.space import DIMENSIONS, direction
 

@@ -21,18 +21,16 @@ from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
     from lidardesign.cli.progress import ProgressDisplay
-    from lidardesign.evaluate.cma.candidate import Show
-    from lidardesign.evaluate.cma.search import Progress
+    from lidardesign.evaluate.baselines.cma import Show
     from lidardesign.workflow.evaluate import ScoreRequest, Scores
     from lidardesign.workflow.seeds import SeedsRequest
 
 BASELINE_HELP = (
     "A baseline in addition to uniform, random, bounding, silhouette and greedy: lloyd (like silhouette, denser where "
-    "returns are frequent and surfaces large), occupancy (rays towards cells that targets occupy) or no-visibility "
+    "returns are frequent and surfaces large), occupancy (rays towards cells that targets occupy), no-visibility "
     "(the first design refitted to the density without its occlusion term; takes some seconds), "
-    "catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres and "
-    "degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on "
-    "training scenes, for --cma-seconds). Repeatable. none: no baselines at all."
+    "or cma (direct optimisation of the first design's sensors on training scenes, for --cma-seconds). Repeatable. "
+    "none: no baselines at all."
 )
 
 
@@ -78,8 +76,7 @@ def evaluate(
         typer.Option(
             "--cma-seconds",
             metavar="SECONDS",
-            help="Wall time of each search of `--baseline cma`: one per number of rays, and one per bandwidth of the "
-            "first design.",
+            help="Wall time of each search of `--baseline cma`, one per number of rays.",
             show_default="60",
         ),
     ] = None,
@@ -270,10 +267,10 @@ def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
 def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDisplay) -> Show:
     """What shows the best score of each search, in a line of its own."""
 
-    def show(label: str, now: Progress) -> None:
-        best = f"best {now.best:.4g} {request.run.metric.unit}"
-        left_s = (1 - now.share) * request.cma_seconds
-        progress.show(now.share, 1.0, label=label, detail=best, left_s=left_s, line=label)
+    def show(label: str, share: float, best: float) -> None:
+        found = f"best {best:.4g} {request.run.metric.unit}"
+        left_s = (1 - share) * request.cma_seconds
+        progress.show(share, 1.0, label=label, detail=found, left_s=left_s, line=label)
 
     return show
 

@@ -123,10 +123,6 @@ def check(
         float,
         typer.Option("--seconds", metavar="S", min=0.1, max=86_400, help="Longest time of one call of the task."),
     ] = 60.0,
-    memory_mb: Annotated[
-        int,
-        typer.Option("--memory-mb", metavar="MB", min=256, max=1_000_000, help="Most memory that it may use."),
-    ] = 4096,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -135,10 +131,9 @@ def check(
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.testing.contract import LAWS, refuse_broken
-            from lidardesign.testing.law import Limits
             from lidardesign.testing.process import CheckRequest, check_in_process
 
-        request = CheckRequest(name, config, tuple(overrides or ()), seed, Limits(seconds, memory_mb * 2**20))
+        request = CheckRequest(name, config, tuple(overrides or ()), seed, seconds)
         findings = []
         with output.progress("contract") as progress, phase("contract"):
             for finding in check_in_process(request):

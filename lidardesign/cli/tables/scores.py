@@ -37,7 +37,7 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
     """A row of every design, against the strongest rival; what else was asked for in a line each."""
-    from lidardesign.evaluate.gates import difference_text
+    from lidardesign.evaluate.thresholds import difference_text
 
     rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
     rival = evaluation.strongest_rival
@@ -81,8 +81,8 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
 
 def sentence(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
     """What designs are against the strongest rival, in one sentence."""
-    from lidardesign.evaluate.gates import difference_text
     from lidardesign.evaluate.results import verdict
+    from lidardesign.evaluate.thresholds import difference_text
 
     metric, rival = evaluation.metric, pairs[0].b
     if len(pairs) == 1:

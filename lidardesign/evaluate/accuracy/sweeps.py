@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from lidardesign.evaluate.accuracy import fields, held_out, mixture, physics, steps, training, visibility
+from lidardesign.evaluate.accuracy import evaluation, fields, training, visibility
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Accuracy, Sweep
 from lidardesign.run.clock import Progress, phase
@@ -14,12 +14,11 @@ from lidardesign.run.clock import Progress, phase
 SWEEPS = (
     ("visibility", "visibility", visibility.sweeps),
     ("fields", "distance fields", fields.sweeps),
-    ("precision", "arithmetic", steps.dtype_sweeps),
-    ("scenes", "scenes per step", steps.frames_sweeps),
-    ("training", "training", training.sweeps),
-    ("mixture", "samples and seeds of the fit", mixture.sweeps),
-    ("physics", "effects of light", physics.sweeps),
-    ("held_out", "held-out scenes", held_out.sweeps),
+    ("precision", "arithmetic", training.dtype_sweeps),
+    ("scenes", "scenes per step", training.frames_sweeps),
+    ("training", "training", training.steps_sweeps),
+    ("physics", "effects of light", evaluation.physics_sweeps),
+    ("held_out", "held-out scenes", evaluation.scenes_sweeps),
 )
 
 

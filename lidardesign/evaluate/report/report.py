@@ -233,11 +233,10 @@ def evaluation_report(
         command: The command line that makes the page again.
     """
     manifest = read_manifest(folder)
-    density = request.density() if request.density is not None else None
-    shown, view, points = evaluated_scene(evaluation, request), None, None
-    if density is not None:
-        view = density_view(density.samples, shown.scene, request.designs)
-        points = observed_point(density.samples.resample(DENSITY_POINTS, random_generator(config.seed, "report")))
+    samples, shown, view, points = request.density(), evaluated_scene(evaluation, request), None, None
+    if samples is not None:
+        view = density_view(samples, shown.scene, request.designs)
+        points = observed_point(samples.resample(DENSITY_POINTS, random_generator(config.seed, "report")))
     learned = manifest.get("command")
     commands = [("The run that was learned", _line(learned))] if isinstance(learned, list) and learned else []
     commands.append(("The scores and this page", _line(command)))
