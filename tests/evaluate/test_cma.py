@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lidardesign.evaluate.options import ScoreOptions
 from support.rivals import balls
 from support.scoring import HitTask, MissTask
 from support.tables import each_row
@@ -32,6 +31,7 @@ from lidardesign.numerics import wrap_angle
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace, angles
 from lidardesign.task import TaskConfig
+from lidardesign.workflow.evaluate import ScoreOptions
 
 FIXED = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
 FREE = DesignSpace((-0.2, -0.2, -0.2, -0.6, -0.5, 0.05), (0.2, 0.2, 0.2, 0.6, 0.5, 4.0))
