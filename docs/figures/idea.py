@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from drawing import INK, PAPER, QUIET, command, save
+from drawing import INK, PAPER, QUIET, SideOn, command, save
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
@@ -55,14 +55,15 @@ SERIES = {
     "random": ("#999999", "+", (0, (1, 1.5))),
 }
 SENSOR = "#3b3f8f"
-# Colour and dash by outcome, as in the report.
-OUTCOMES = {
-    Outcome.RETURN: ("#009E73", "solid"),
-    Outcome.OCCLUDED: ("#D55E00", "dashed"),
-    Outcome.AFTER_GATE: ("#0072B2", "dotted"),
-    Outcome.MISS: ("#808080", (0, (6, 3))),
+OUTCOME_LOOKS = {
+    Outcome.MISS: ("#9aa5b1", "dotted"),
+    Outcome.NOT_DETECTED: ("#CC79A7", "dashdot"),
+    Outcome.AFTER_GATE: ("#0072B2", "dashed"),
+    Outcome.OCCLUDED: ("#D55E00", (0, (4, 1.2, 1, 1.2))),
+    Outcome.RETURN: ("#007A59", "solid"),
 }
-SMALL_INCHES, SMALL_DOTS_PER_INCH = 7.1, 225  # pictures of the density: 1,600 pixels across
+# From pale to dark, so that grey print keeps the order; the least of it is left clear.
+FIELD = LinearSegmentedColormap.from_list("field", ["#fde9b8", "#f6b04a", "#d95f30", "#93265f", "#2b0f54"])
 HEAT = LinearSegmentedColormap.from_list("heat", ["#1b2a6b", "#7b2a8b", "#d5483c", "#f6a02c", "#fdf3b4"])
 GATES = LinearSegmentedColormap.from_list("gates", ["#f0a202", "#d5483c", "#8a2f8f", "#2c4bb0"])
 
@@ -203,7 +204,7 @@ def draw_scores(axes: Axes, evaluation: dict[str, Any]) -> None:
 
 
 class SideView:
-    """Heads seen straight from the side, with where rays may start and look."""
+    """Heads seen from the side, with where rays may start and look."""
 
     def __init__(self, config: RunConfig, heads: list[Scene], head: Scene) -> None:
         space = config.space
@@ -212,40 +213,23 @@ class SideView:
         self.rims = direction(np.full(2, middle), np.array([space.low[ELEVATION], space.high[ELEVATION]]))
         ahead = direction(middle, 0.0)
         corners = self.origin + np.array([0.68 * ahead, -0.04 * ahead, (0, 0, HALF_HIGH_M), (0, 0, -HALF_HIGH_M)])
-        self.axes = np.array([-ahead, (0.0, 0.0, 1.0)])  # to the right and up
-        (low, high) = self.project(corners).min(axis=0), self.project(corners).max(axis=0)
-        self.window = (low[0], high[0], low[1], high[1])
-        self.shade = self.shaded(head, PIXELS)
-        self.others = [self.shaded(one, PIXELS // 2) for one in heads]
-
-    def project(self, points_m: np.ndarray) -> np.ndarray:
-        """Metres to the right and up of points, (..., 3) to (..., 2)."""
-        return points_m @ self.axes.T
-
-    def shaded(self, scene: Scene, pixels: int) -> np.ndarray:
-        """How light a scene is, NaN where there is nothing."""
-        left, right, bottom, top = self.window
-        across, up = np.meshgrid(np.linspace(left, right, pixels), np.linspace(bottom, top, pixels))
-        into = np.cross(self.axes[1], self.axes[0])
-        starts = np.stack([across.ravel(), up.ravel()], axis=1) @ self.axes - 2.0 * into
-        hits = SceneCaster(scene).first_hit(starts, np.broadcast_to(into, starts.shape))
-        light = 0.4 + 0.3 * np.abs(hits.normal @ into) + 0.3 * np.clip(hits.normal @ -self.axes[0], 0.0, 1.0)
-        return np.where(np.isfinite(hits.range_m), light, np.nan).reshape(pixels, pixels)
+        self.view = SideOn(-ahead, corners)
+        self.head = self.view.shaded(head, 900)
+        self.others = [self.view.shaded(one, 450) for one in heads]
 
     def draw(self, axes: Axes) -> None:
         """The shaded head."""
-        axes.imshow(self.shade, extent=self.window, origin="lower", cmap="gray", vmin=0, vmax=1)
-        axes.set(xlim=self.window[:2], ylim=self.window[2:])
+        axes.imshow(self.head, extent=self.view.window, origin="lower", interpolation="antialiased")
+        axes.set(xlim=self.view.window[:2], ylim=self.view.window[2:])
         axes.set_aspect("equal")
         axes.set_axis_off()
 
     def draw_space(self, axes: Axes) -> None:
         """Outlines of the heads that are learned from, and the wedge of directions and ranges that rays may have."""
         for other in self.others:
-            seen = np.isfinite(other).astype(float)
-            axes.contour(seen, (0.5,), extent=self.window, colors=[QUIET], linewidths=0.8, alpha=0.6)
-        start = self.project(self.origin)
-        ends = self.project(self.origin + HALF_HIGH_M / abs(self.rims[0, 2]) * self.rims)
+            axes.contour(other[..., 3], (0.5,), extent=self.view.window, colors=[QUIET], linewidths=0.8, alpha=0.6)
+        start = self.view.project(self.origin)
+        ends = self.view.project(self.origin + HALF_HIGH_M / abs(self.rims[0, 2]) * self.rims)
         for end in ends:
             axes.plot(*np.stack([start, end]).T, color=SENSOR, linewidth=1.6, linestyle=(0, (4, 3)))
         axes.plot(*start, marker="D", color=SENSOR, markersize=10)
@@ -253,17 +237,17 @@ class SideView:
     def draw_rays(self, axes: Axes, rays: Rays, returns: Returns) -> None:
         """Rays by what became of them, up to their first hit or their gate's end, and the points that are measured."""
         length = np.where(returns.returned, np.nan_to_num(returns.range_m), rays.gate_m[:, 1])
-        starts, ends = self.project(rays.origin_m), rays.origin_m + length[:, None] * rays.direction
-        lines = np.stack([starts, self.project(ends)], axis=1)
-        for kind, (colour, dash) in OUTCOMES.items():
+        starts, ends = self.view.project(rays.origin_m), rays.origin_m + length[:, None] * rays.direction
+        lines = np.stack([starts, self.view.project(ends)], axis=1)
+        for kind, (colour, dash) in OUTCOME_LOOKS.items():
             some = returns.outcome == kind
             axes.add_collection(LineCollection(lines[some], colors=colour, linestyles=dash, linewidths=0.6, alpha=0.2))
-        measured = self.project(returns.points_m)
-        axes.plot(*measured.T, "o", color=OUTCOMES[Outcome.RETURN][0], markersize=3.4)
+        measured = self.view.project(returns.points_m)
+        axes.plot(*measured.T, "o", color=OUTCOME_LOOKS[Outcome.RETURN][0], markersize=3.4)
         axes.plot(*starts[0], marker="D", color=SENSOR, markersize=10)
-        shown = [kind for kind in OUTCOMES if (returns.outcome == kind).any()]
+        shown = [kind for kind in reversed(OUTCOME_LOOKS) if (returns.outcome == kind).any()]
         handles = [
-            Line2D([], [], color=OUTCOMES[kind][0], linestyle=OUTCOMES[kind][1], linewidth=2)
+            Line2D([], [], color=OUTCOME_LOOKS[kind][0], linestyle=OUTCOME_LOOKS[kind][1], linewidth=2)
             for kind in shown
         ]
         counts = [int((returns.outcome == kind).sum()) for kind in shown]
@@ -324,39 +308,42 @@ def overview(
     return figure
 
 
-def small_figure(high_inches: float) -> Figure:
-    """An empty figure for a picture of the density."""
-    figure = Figure(figsize=(SMALL_INCHES, high_inches), dpi=SMALL_DOTS_PER_INCH, layout="constrained")
+def marginals_picture(view: DensityView) -> Figure:
+    """The density along each dimension as an area, the design beside it as steps."""
+    figure = Figure(figsize=(16, 4.6), dpi=DOTS_PER_INCH, facecolor=PAPER, layout="constrained")
     FigureCanvasAgg(figure)
-    return figure
-
-
-def marginals(view: DensityView) -> Figure:
-    """One panel per dimension: the density as an area, designs as steps."""
-    figure = small_figure(2.3)
-    for axes, marginal in zip(figure.subplots(1, len(view.marginals)), view.marginals, strict=True):
-        axes.stairs(marginal.heights, marginal.edges, fill=True, color="#cfd6de", label="learned density")
-        for name, heights in marginal.designs.items():
-            axes.stairs(heights, marginal.edges, color="#0072B2", linewidth=1.1, baseline=None, label=name)
-        axes.set(xlim=marginal.edges[[0, -1]], ylim=(0.0, marginal.top), xlabel=marginal.label, ylabel=marginal.unit)
+    for axes, one in zip(figure.subplots(1, len(view.marginals)), view.marginals, strict=True):
+        axes.stairs(one.heights, one.edges, fill=True, color="#cfd6de", label="learned density")
+        for name, heights in one.designs.items():
+            axes.stairs(heights, one.edges, color=SENSOR, linewidth=2.2, baseline=None, label=name)
+        axes.set(xlim=(one.edges[0], one.edges[-1]), ylim=(0.0, one.top))
+        axes.set_xlabel(one.label, fontsize=15)
+        axes.set_ylabel(one.unit, fontsize=15)
+        axes.tick_params(labelsize=13)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=15)
     return figure
 
 
-def field(view: DensityView) -> Figure:
-    """Where in space the density observes, over the outline of what stands there."""
-    figure = small_figure(3.2)
+def field_picture(view: DensityView) -> Figure:
+    """Where in space the density looks, over what the scene covers."""
+    figure = Figure(figsize=(16, 7.2), dpi=DOTS_PER_INCH, facecolor=PAPER, layout="constrained")
+    FigureCanvasAgg(figure)
     for axes, plane in zip(figure.subplots(1, len(view.planes)), view.planes, strict=True):
-        extent = (*plane.edges[0][[0, -1]], *plane.edges[1][[0, -1]])
-        most = np.quantile(plane.heights[plane.heights > 0], 0.998)
-        heights = np.ma.masked_less(plane.heights, 0.02 * most)
-        drawn = axes.imshow(heights, extent=extent, origin="lower", cmap=HEAT.reversed(), vmin=0.0, vmax=most)
-        axes.contour(plane.targets, (0.5,), extent=extent, colors=[INK], linewidths=0.5)
-        axes.set(xlabel=plane.labels[0], ylabel=plane.labels[1])
+        across, up = plane.edges
+        image = {"extent": (across[0], across[-1], up[0], up[-1]), "origin": "lower", "interpolation": "nearest"}
+        axes.imshow(np.where(plane.targets, 0.85, 1.0), cmap="gray", vmin=0.0, vmax=1.0, **image)
+        most = float(np.quantile(plane.heights[plane.heights > 0], 0.998))
+        shown = np.ma.masked_less(plane.heights, 0.02 * most)
+        drawn = axes.imshow(shown, cmap=FIELD, vmin=0.0, vmax=most, **image)
+        axes.contour(plane.targets, (0.5,), extent=image["extent"], colors=[INK], linewidths=1.0, alpha=0.7)
+        axes.set_xlabel(plane.labels[0], fontsize=15)
+        axes.set_ylabel(plane.labels[1], fontsize=15)
+        axes.tick_params(labelsize=13)
         axes.spines[["top", "right"]].set_visible(False)
-        bar = figure.colorbar(drawn, extend="max")
-        bar.ax.set_title(plane.unit.replace("2", "²"), fontsize=9, loc="left")
+        bar = figure.colorbar(drawn, ax=axes, shrink=0.75)
+        bar.set_label(plane.unit.replace("2", "²"), fontsize=15)
+        bar.outline.set_visible(False)
     return figure
 
 
@@ -378,8 +365,8 @@ def main() -> None:
     figure = overview(side, front, samples, design, rays, simulate(head, rays)[0], scores)
     save(figure, options.out / "overview.png", colours=COLOURS)
     view = density_view(samples, head, [replace(design, name="10 sensors")])
-    save(marginals(view), options.out / "idea-marginals.png")
-    save(field(view), options.out / "idea-field.png")
+    save(marginals_picture(view), options.out / "idea-marginals.png")
+    save(field_picture(view), options.out / "idea-field.png")
     for name in ("overview", "idea-marginals", "idea-field"):
         path = options.out / f"{name}.png"
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")

@@ -6,6 +6,7 @@ One browser and one page for all tests; where there is no browser they are skipp
 from __future__ import annotations
 
 import io
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -359,14 +360,18 @@ def test_a_narrow_window_shows_everything_without_scrolling_sideways(page, width
     assert found == [width, 0, 0]
 
 
-def test_every_figure_downloads_as_svg_from_its_bar(page):
+def test_every_figure_downloads_as_svg_with_its_legend(opened):
+    page, heard, path = opened
     figures = page.locator(".js-plotly-plot")
-    settings = page.evaluate("() => all('.js-plotly-plot').map(one => one._context.toImageButtonOptions.format)")
-    assert settings == ["svg"] * figures.count()
     assert page.locator(".modebar-btn").count() == figures.count() > 1
     figures.first.scroll_into_view_if_needed()
     figures.first.hover()
     with page.expect_download() as download:
         figures.first.locator(".modebar-btn").click()
     assert download.value.suggested_filename == "curve-rays.svg"
-    assert download.value.path().read_bytes().startswith(b"<svg")
+    picture = ElementTree.parse(download.value.path())
+    words = {"".join(node.itertext()) for node in picture.iter("{http://www.w3.org/2000/svg}text")}
+    assert "rays" in words
+    assert any(word.startswith("</script>") for word in words)  # the legend has names as they are
+    assert [url for url in heard["requests"] if not url.startswith(("data:", "blob:"))] == [path.as_uri()]
+    assert heard["errors"] == []

@@ -102,10 +102,12 @@ def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
     across = [position(row, against) for row in curve.rows]
     name = html.escape(curve.name)
     red, green, blue = (int(curve.colour[i : i + 2], 16) for i in (1, 3, 5))
+    values = [row.value for row in curve.rows]
+    low, high = zip(*(row.drawn_interval for row in curve.rows), strict=True)
     band = {
         "type": "scatter",
         "x": [*across, *across[::-1]],
-        "y": [*(row.drawn_interval[1] for row in curve.rows), *(row.drawn_interval[0] for row in reversed(curve.rows))],
+        "y": [*high, *low[::-1]],
         "fill": "toself",
         "fillcolor": f"rgba({red},{green},{blue},0.13)",
         "line": {"width": 0},
@@ -117,7 +119,15 @@ def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
     line = {
         "type": "scatter",
         "x": across,
-        "y": [row.value for row in curve.rows],
+        "y": values,
+        # a single point has no band
+        "error_y": {
+            "type": "data",
+            "symmetric": False,
+            "array": [end - value for end, value in zip(high, values, strict=True)],
+            "arrayminus": [value - end for end, value in zip(low, values, strict=True)],
+            "visible": len(values) == 1,
+        },
         "name": name,
         "legendgroup": name,
         "mode": "lines+markers",
