@@ -20,7 +20,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: demo test docs consumers system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-benchmarks soak-runs soak-seeds soak-kills soak-promise clean
+.PHONY: demo test docs consumers setup system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-benchmarks soak-runs soak-seeds soak-kills soak-promise clean
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): once, a minute or more"
@@ -63,14 +63,17 @@ system-programs: $(BIN)/.transport
 
 consumers: $(BIN)/.transport $(BIN)/.consumers system-programs
 
-test: $(BIN)/.dev $(BIN)/.transport $(BIN)/.consumers $(if $(filter true,$(CI)),system-programs)
-	$(BIN)/python -m ruff check .
+# All that the tests need
+setup: $(BIN)/.dev $(BIN)/.transport $(BIN)/.consumers $(if $(filter true,$(CI)),system-programs)
+
+test: setup
+	$(BIN)/python -m ruff check --no-cache .
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 # Every kind of processor rounds in its own way, and a small run ends elsewhere on each: this is another one
 test-arithmetic: $(BIN)/.dev
 	ATEN_CPU_CAPABILITY=default MKL_CBWR=COMPATIBLE \
-		NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=$(CURDIR)/build/numba-generic \
+		NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR="$(CURDIR)/build/numba-generic" \
 		$(BIN)/python -m pytest tests/docs/test_docs_run.py
 
 # What every other Python that is found makes of the installation and of the core
@@ -94,7 +97,7 @@ mutation: $(BIN)/.dev
 	$(BIN)/python tools/mutation.py --out docs/soak/mutation-$$(date -u +%F).md
 
 lint: $(BIN)/.dev
-	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff check --no-cache .
 
 fuzz: $(BIN)/.dev
 	PYTHONPATH=tests $(BIN)/python -m fuzz.campaign --inputs 100000 --out docs/soak

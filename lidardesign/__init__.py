@@ -10,32 +10,99 @@
 Importing this package loads nothing heavy: every name is imported when it is first used.
 """
 
+import contextlib
+import os
+import stat
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lidardesign.design.constraints.document import Constraints
+    from lidardesign.geometry.rays import Rays, Returns
+    from lidardesign.scene import (
+        Ambient,
+        Body,
+        Box,
+        Capsule,
+        Cylinder,
+        Ellipsoid,
+        Medium,
+        Mesh,
+        Plane,
+        Receiver,
+        Scene,
+        Sphere,
+        rigid,
+    )
+    from lidardesign.space import DesignSpace
+    from lidardesign.task import Defaults, Information, Metric, Score, Split, Task, TaskConfig, random_generator
+    from lidardesign.workflow.designs import Design
+    from lidardesign.workflow.evaluate import Scores
+    from lidardesign.workflow.runs import Run, learn, load_design, open_run
+    from lidardesign.workflow.seeds import evaluate_seeds
 
 __version__ = "0.1.0"
+__all__ = [
+    "Ambient", "Body", "Box", "Capsule", "Constraints", "Cylinder", "Defaults", "Design", "DesignSpace", "Ellipsoid",
+    "Information", "Medium", "Mesh", "Metric", "Plane", "Rays", "Receiver", "Returns", "Run", "Scene", "Score",
+    "Scores", "Sphere", "Split", "Task", "TaskConfig", "__version__", "evaluate_seeds", "learn", "load_design",
+    "open_run", "random_generator", "rigid",
+]  # fmt: skip
+# Where names are imported from when they are first used; type checkers read the imports above.
 _HOMES = {
-    "Constraints": "lidardesign.design.constraints.document",
-    "Design": "lidardesign.workflow.designs",
-    "Rays": "lidardesign.geometry.rays",
-    "Run": "lidardesign.workflow.runs",
-    "Scene": "lidardesign.scene",
-    "Scores": "lidardesign.workflow.evaluate",
-    "Task": "lidardesign.task",
-    "evaluate_seeds": "lidardesign.workflow.seeds",
-    "learn": "lidardesign.workflow.runs",
-    "load_design": "lidardesign.workflow.runs",
-    "open_run": "lidardesign.workflow.runs",
+    "lidardesign.design.constraints.document": "Constraints",
+    "lidardesign.geometry.rays": "Rays Returns",
+    "lidardesign.scene": "Ambient Body Box Capsule Cylinder Ellipsoid Medium Mesh Plane Receiver Scene Sphere rigid",
+    "lidardesign.space": "DesignSpace",
+    "lidardesign.task": "Defaults Information Metric Score Split Task TaskConfig random_generator",
+    "lidardesign.workflow.designs": "Design",
+    "lidardesign.workflow.evaluate": "Scores",
+    "lidardesign.workflow.runs": "Run learn load_design open_run",
+    "lidardesign.workflow.seeds": "evaluate_seeds",
 }
-__all__ = ["__version__", *_HOMES]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+def _import(name: str) -> Any:
+    home = next((home for home, names in _HOMES.items() if name in names.split()), None)
+    if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value = getattr(import_module(home), name)
     return value
+
+
+if not TYPE_CHECKING:
+    # to a type checker any name would be there
+    __getattr__ = _import
 
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+def _is_cache(folder: str) -> bool:
+    """Whether numba can keep compiled code in a user's cache folder, which may still have to be made."""
+    place = os.path.abspath(os.path.join(folder, "numba"))
+    while not os.path.lexists(place):
+        place = os.path.dirname(place)
+    return not folder.startswith("~") and os.path.isdir(place) and os.access(place, os.W_OK | os.X_OK)
+
+
+def _make_cache() -> str:
+    """Path of a cache folder below the temporary files, the same for all processes of one user.
+
+    Its name is no secret and a cache holds code: what others made, or can open, is not used.
+    """
+    import tempfile
+
+    folder = os.path.join(tempfile.gettempdir(), f"lidardesign-{os.getuid()}")
+    with contextlib.suppress(FileExistsError):
+        os.mkdir(folder, 0o700)
+    found = os.lstat(folder)
+    own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077
+    return folder if own else tempfile.mkdtemp(prefix="lidardesign-")
+
+
+# numba refuses to import where neither the package's folder nor the user's cache can be written
+if not _is_cache(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")):
+    with contextlib.suppress(OSError):
+        os.environ["XDG_CACHE_HOME"] = _make_cache()

@@ -6,16 +6,28 @@ Exit codes (design contract): 0 ok, 1 threshold missed, 2 usage or config, 3 bad
 
 from __future__ import annotations
 
+import functools
+import re
 import site
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from numbers import Integral, Real
 from pathlib import Path
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 # What files and options say may be quoted; nobody reads more of it than this.
 LONGEST_PART = 1500
 Text = TypeVar("Text", str, None)
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+# Options in messages, and arguments that are not called as their option.
+OPTION = re.compile(r"(?<!\S)--([a-z][a-z-]*)")
+ARGUMENTS = {
+    "baseline": "baselines",
+    "set": "settings",
+    "time-budget": "time_budget_s",
+    "weight": "weights",
+}
 # The largest seed.
 MAX_SEED = 2**63 - 1
 # What to do where an option or a key has nothing behind it.
@@ -60,6 +72,12 @@ class LidardesignError(Exception):
             text += f"\n  try: {self.hint}"
         return text
 
+    def name_arguments(self) -> None:
+        """Name arguments of functions where options of commands are named."""
+        texts = (self.message, self.where, self.allowed, self.hint)
+        self.message, self.where, self.allowed, self.hint = map(_as_argument, texts)
+        self.args = (self.render(),)
+
     def as_dict(self) -> dict[str, object]:
         """The same content for `--json`."""
         fields = {"where": self.where, "allowed": self.allowed, "hint": self.hint}
@@ -71,6 +89,27 @@ def _short(text: Text) -> Text:
         return text
     half = LONGEST_PART // 2
     return f"{text[:half]} ... {text[-half:]}"
+
+
+def _as_argument(text: Text) -> Text:
+    if text is None or "lidardesign " in text:
+        # a command line stays one
+        return text
+    return OPTION.sub(lambda option: ARGUMENTS.get(option[1], option[1].replace("-", "_")), text)
+
+
+def names_arguments(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """A function of the Python interface, whose errors name its arguments instead of options."""
+
+    @functools.wraps(function)
+    def called(*arguments: Parameters.args, **options: Parameters.kwargs) -> Result:
+        try:
+            return function(*arguments, **options)
+        except LidardesignError as error:
+            error.name_arguments()
+            raise
+
+    return called
 
 
 class ConfigError(LidardesignError):
@@ -107,6 +146,11 @@ class InfeasibleError(LidardesignError):
     ) -> None:
         self.conflicts, self.admissible_mass = tuple(conflicts), admissible_mass
         super().__init__(message, where=where, allowed=allowed, hint=hint)
+
+    def name_arguments(self) -> None:
+        """Name arguments of functions where options of commands are named, in conflicts too."""
+        self.conflicts = tuple(map(_as_argument, self.conflicts))
+        super().name_arguments()
 
     def as_dict(self) -> dict[str, object]:
         """The same content for `--json`, with the conflicting names and the measured mass."""

@@ -10,36 +10,22 @@ import contextlib
 import difflib
 import faulthandler
 import functools
-import json
 import os
-import queue
 import signal
-import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, distributions, entry_points
 from typing import Any
 
 from lidardesign.errors import ConfigError, DataError, LidardesignError, PluginError
+from lidardesign.run.child import START_SECONDS, Child, ChildError
 from lidardesign.run.clock import phase
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
 
 # In the environment of a probing process, so that a plugin that asks for tasks does not start further ones.
 PROBING = "LIDARDESIGN_PROBING"
-CHILD = (
-    "import json, sys; request = json.loads(sys.stdin.readline()); sys.path[:] = request['path']; "
-    "from lidardesign.registry import answer_probe; answer_probe(request)"
-)
-BEGUN = b"begun\n"
-# Python and this package are loaded within this time [s], or the probe says nothing.
-START_SECONDS = 60.0
-# An import that can be interrupted was interrupted by then, and said so [s].
-GRACE_SECONDS = 2.0
-# The exit code of a probing process that could not say what it found.
-UNANSWERED = 117
 
 
 @dataclass(frozen=True)
@@ -57,102 +43,6 @@ class Probe:
     contained: bool = False
 
 
-class PluginProcess:
-    """A process of its own that runs a plugin's code and answers by lines; to be ended in any case.
-
-    Arguments:
-        code: Python that reads the request, one line of JSON, from standard input.
-        request: What it is asked.
-    """
-
-    def __init__(self, code: str, request: dict[str, Any]) -> None:
-        self._lines: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", code],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, PROBING: "1"},
-            # what the plugin starts is ended with it, and a terminal's Ctrl-C is for this process
-            start_new_session=True,
-        )
-        threading.Thread(target=self._read, daemon=True).start()
-        with contextlib.suppress(OSError), self._process.stdin as pipe:  # type: ignore[union-attr]
-            pipe.write(json.dumps(request).encode() + b"\n")
-
-    def end(self) -> None:
-        """End the process and what it started."""
-        if self._process.returncode is None and hasattr(os, "killpg"):
-            with contextlib.suppress(OSError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.kill()
-        self._process.wait()
-
-    def next_line(self, deadline: float) -> tuple[float, bytes | None]:
-        """The next line and when it came: empty at the end, None where none came in time."""
-        try:
-            return self._lines.get(timeout=max(deadline - time.monotonic(), 0.0))
-        except queue.Empty:
-            return deadline, None
-
-    def _read(self) -> None:
-        with self._process.stdout as pipe:  # type: ignore[union-attr]
-            while line := pipe.readline():
-                self._lines.put((time.monotonic(), line))
-        self._lines.put((time.monotonic(), b""))
-
-    def died_of(self, deadline: float, when: str) -> str | None:
-        """How it ended; None where it only closed its pipe and hangs until the deadline and a little longer.
-
-        Arguments:
-            deadline: On the monotonic clock [s].
-            when: What the plugin did meanwhile, as "while it is imported".
-        """
-        try:
-            code = self._process.wait(max(deadline - time.monotonic(), 0.0) + GRACE_SECONDS)
-        except subprocess.TimeoutExpired:
-            return None
-        if code == UNANSWERED:
-            return f"closes files that it did not open {when}"
-        if code < 0:
-            return f"crashes {when} ({signal.strsignal(-code)})"
-        return f"ends the program {when} (exit code {code})"
-
-
-class ImportProcess(PluginProcess):
-    """A plugin that is being imported elsewhere.
-
-    Arguments:
-        offer: Its entry point.
-        seconds: How long the import may take.
-    """
-
-    def __init__(self, offer: EntryPoint, seconds: float) -> None:
-        self._seconds = seconds
-        super().__init__(CHILD, {"name": offer.name, "value": offer.value, "path": sys.path, "seconds": seconds})
-
-    def result(self) -> Probe | None:
-        """What came of it, waited for; None where nothing could be found out."""
-        begun, line = self.next_line(time.monotonic() + START_SECONDS)
-        if line != BEGUN:
-            return None
-        deadline = begun + self._seconds + GRACE_SECONDS
-        _, line = self.next_line(deadline)
-        if line:
-            return _read(line)
-        died_of = None if line is None else self.died_of(deadline, "while it is imported")
-        return Probe(error=died_of or f"was not imported within {self._seconds:g} s", contained=True)
-
-
-def _read(line: bytes) -> Probe:
-    """The answer of a line; a plugin may have written it, which knows neither its form nor that it is read."""
-    try:
-        found = json.loads(line)
-        return Probe(summary=str(found.get("summary", "")), error=found.get("error"))
-    except (ValueError, AttributeError):
-        return Probe(error="writes to a stream that is not its own while it is imported", contained=True)
-
-
 def probed(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:
     """What each of some plugins does, found out side by side; None where no process could tell.
 
@@ -160,31 +50,26 @@ def probed(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:
         offers: Their entry points.
         seconds: How long each import may take.
     """
-    running: list[ImportProcess] = []
+    running: list[Child] = []
     try:
         for offer in offers:
-            running.append(ImportProcess(offer, seconds))
-        return [process.result() for process in running]
+            request = {"name": offer.name, "value": offer.value, "seconds": seconds}
+            running.append(Child(f"{__name__}:answer_probe", request, {PROBING: "1"}))
+        return [_probe_of(child, seconds) for child in running]
     except OSError:  # no further process may be started
         return [None] * len(offers)
     finally:
-        for process in running:
-            process.end()
+        for child in running:
+            child.end()
 
 
-def write_line(result: Any, document: dict[str, Any]) -> None:
-    """Write a line of a probe's answer; a process that cannot is ended."""
+def _probe_of(child: Child, seconds: float) -> Probe | None:
     try:
-        result.write(json.dumps(document).encode() + b"\n")
-        result.flush()
-    except OSError:
-        os._exit(UNANSWERED)
-
-
-def answer(result: Any, document: dict[str, Any]) -> None:
-    """Write a probe's answer and end the probing process: threads and exit handlers of the plugin end with it."""
-    write_line(result, document)
-    os._exit(0)
+        found = child.answer(seconds, "while it is imported")
+    except ChildError as lost:
+        error = f"was not imported within {seconds:g} s" if lost.reason == "late" else str(lost)
+        return None if lost.reason == "unstarted" else Probe(error=error, contained=True)
+    return Probe(summary=str(found.get("summary", "")), error=found.get("error"))
 
 
 GROUP = "lidardesign.tasks"
@@ -280,7 +165,7 @@ def plugin_guard(name: str) -> Iterator[None]:
         raise PluginError(
             f"{type(error).__name__}: {text_of(error)}",
             where=f"task {name}",
-            hint=f"--debug shows where; {AUTHOR_HINT}",
+            hint=f"LIDARDESIGN_DEBUG=1 shows where; {AUTHOR_HINT}",
         ) from error
 
 
@@ -378,22 +263,17 @@ def offer_of(name: str) -> EntryPoint:
     return _only(name, _known(name))
 
 
-def answer_probe(request: dict[str, Any]) -> None:
-    """In the process of a probe: import the plugin that is asked about, answer on stdout, and end."""
-    result = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    nowhere = open(os.devnull, "w")  # noqa: SIM115 - lives as long as the process
-    os.dup2(nowhere.fileno(), sys.stdout.fileno())
-    name, seconds = request["name"], request["seconds"]
-    result.write(BEGUN)
-    result.flush()
+def answer_probe(request: dict[str, Any], _: object) -> dict[str, Any]:
+    """In the process of a probe: import the plugin that is asked about, and say what came of it."""
     # ends this process even where nobody is left to do it, and long after whoever asked has stopped waiting
-    faulthandler.dump_traceback_later(seconds + START_SECONDS, exit=True, file=nowhere)
+    faulthandler.dump_traceback_later(request["seconds"] + START_SECONDS, exit=True)
+    offer = EntryPoint(request["name"], request["value"], GROUP)
     try:
-        answer(result, {"summary": import_task(EntryPoint(name, request["value"], GROUP), seconds).summary})
+        return {"summary": import_task(offer, request["seconds"]).summary}
     except PluginError as error:
-        answer(result, {"error": error.message})
+        return {"error": error.message}
     except BaseException as error:
-        answer(result, {"error": f"{type(error).__name__}: {text_of(error)}"})
+        return {"error": f"{type(error).__name__}: {text_of(error)}"}
 
 
 @contextlib.contextmanager

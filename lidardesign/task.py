@@ -154,7 +154,7 @@ class Information:
     frame: np.ndarray
     weight: np.ndarray | None = None
     harm: np.ndarray | None = None
-    sums: Sequence[float] | None = None
+    sums: Sequence[float] | np.ndarray | None = None
     complete: float = 1.0
     unit: str = "1"
     seen_in: np.ndarray | None = None

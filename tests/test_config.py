@@ -135,6 +135,7 @@ def test_paths_become_absolute_from_where_they_were_written(write, tmp_path, mon
     assert resolved.extra == (tmp_path / "b.ply",)
     assert resolve(TASK, overrides=["model=null"]).task.model is None
     assert resolve(TASK, overrides=["model=~/m.h5"]).task.model == Path.home() / "m.h5"
+    assert resolve(TASK, overrides=["model=~nobody-at-all/m.h5"]).task.model == elsewhere / "~nobody-at-all" / "m.h5"
 
 
 BAD_FILES = {

@@ -14,6 +14,8 @@ PACKAGE = ROOT / "lidardesign"
 TASKS = ROOT / "tasks" / "lidardesign_tasks"
 MOST_MODULES = 14
 MOST_PARAMETERS = 12
+# Functions that take what commands take, each choice by its name.
+API = {"constrain", "evaluate", "evaluate_seeds", "fit", "learn"}
 
 # From the ground up: a room imports its own modules and those of rooms before it.
 ROOMS = (
@@ -28,14 +30,14 @@ HOMES = {
     "safetensors": ("density.",),
     "zuko": ("density.",),
     "embreex": ("geometry.triangles",),
-    "cma": ("evaluate.cma.search",),
+    "cma": ("evaluate.baselines.cma",),
     "mujoco": ("mujoco_model.", "design.rigs.mjcf."),
     "mink": (),
     "typer": ("cli.",),
     "click": ("cli.",),
     "rich": ("cli.",),
-    "plotly": ("evaluate.report.", "evaluate.figures."),
-    "matplotlib": ("evaluate.figures.",),
+    "plotly": ("evaluate.report.",),
+    "matplotlib": (),
     "distributed": ("evaluate.workers.",),
     "dask": ("evaluate.workers.",),
     # it can abort its process: only the one of its own imports it
@@ -85,7 +87,9 @@ def imported(tree: ast.AST) -> list[tuple[str, int]]:
 
 @cache
 def imports_of(name: str) -> tuple[str, ...]:
-    return tuple({target for target, _ in imported(trees()[name]) if target in package() and target != name})
+    # the package itself imports nothing: it names for type checkers what it imports when it is used
+    found = {target for target, _ in imported(trees()[name]) if target in package()}
+    return () if name == "lidardesign" else tuple(found - {name})
 
 
 def room(name: str) -> str | None:
@@ -157,7 +161,7 @@ def test_functions_outside_commands_take_few_parameters():
         if name.startswith("lidardesign.cli.commands."):
             continue
         for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef):
+            if isinstance(node, ast.FunctionDef) and node.name not in API:
                 arguments = node.args
                 count = len(arguments.posonlyargs + arguments.args + arguments.kwonlyargs)
                 if count > MOST_PARAMETERS:

@@ -135,7 +135,7 @@ def test_the_installed_wheel_shows_a_task_and_its_formats(installed, tmp_path):
 
 def test_pages_that_help_and_errors_of_an_installed_wheel_name_can_be_opened(installed, tmp_path):
     said = run_installed(installed, tmp_path, "constrain", "--help").stdout
-    names, place = re.search(r"^See also:\n  (.*)\n  in (.*)$", said, re.MULTILINE).groups()
+    names, place = re.search(r"^ +See also: (.*)\n +in (.*)$", said, re.MULTILINE).groups()
     assert Path(place) == installed / PAGES
     assert all((Path(place) / name).is_file() for name in names.split(", "))
     (tmp_path / "parts").mkdir()
@@ -187,11 +187,11 @@ def test_a_workflow_installs_the_program_from_wherever_it_is(unpacked, wheel, tm
         "path": "vendor/lidardesign",
         "wheel": f"vendor/{wheel.name}",
         "index": "lidardesign",
-        "repository": f"git+file://{folder}/vendor/lidardesign",
+        "repository": f"git+{(folder / 'vendor' / 'lidardesign').as_uri()}",
     }
     python = environment_without_the_program(tmp_path / "venv")
     offline = {
-        "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(wheel.parent), "PIP_NO_DEPS": "1", "PIP_NO_BUILD_ISOLATION": "0",
+        "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": wheel.parent.as_uri(), "PIP_NO_DEPS": "1", "PIP_NO_BUILD_ISOLATION": "0",
         "PIP_DISABLE_PIP_VERSION_CHECK": "1",
     }  # fmt: skip
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
@@ -220,7 +220,7 @@ def environment_without_the_program(folder: Path) -> Path:
             link = shared / entry.name
             if "lidardesign" not in entry.name and not link.exists():
                 link.symlink_to(entry)
-    (own / "needed.pth").write_text(f"{shared}\n")
-    (Path(places["scripts"]) / "pip").write_text(f'#!/bin/sh\nexec {places["scripts"]}/python -m pip "$@"\n')
+    (own / "needed.pth").write_text(f"import sys; sys.path.append({str(shared)!a})\n")
+    (Path(places["scripts"]) / "pip").write_text(f'#!/bin/sh\nexec "{places["scripts"]}/python" -m pip "$@"\n')
     (Path(places["scripts"]) / "pip").chmod(0o755)
     return Path(places["scripts"]) / "python"

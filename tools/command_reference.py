@@ -21,13 +21,13 @@ PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 HEAD = """\
 # Commands
 
-After this page you know what every command does, and which options it has. `lidardesign COMMAND --help` adds files,
-examples and exit codes; [in the shell](shell.md) is what holds for all commands.
+After this page you know what every command does, and which options it has. `lidardesign COMMAND --help` adds
+examples; [in the shell](shell.md) is what holds for all commands.
 `tools/command_reference.py` writes this page.
 """
-# Every command has these; they are described once.
-COMMON = ("--seed", "--json", "--quiet", "--debug", "--help")
-COMMON_HEAD = "## Options of every command"
+# Most commands have these; they are described once.
+COMMON = ("--seed", "--json", "--quiet", "--verbose", "--help")
+COMMON_HEAD = "## Options of most commands"
 
 
 def reference() -> str:

@@ -35,7 +35,7 @@ ENVIRONMENT = {
     **{"COLUMNS": "120", "LINES": "50", "TERM": "dumb", "NO_COLOR": "1", "TZ": "UTC", "CUDA_VISIBLE_DEVICES": ""},
     # the length of this path is in the size of an exported file
     **{"TMPDIR": "/tmp"},
-    **{"MPLBACKEND": "Agg", "PYTHONHASHSEED": "0"},
+    **{"PYTHONHASHSEED": "0"},
 }
 STARTED = "LIDARDESIGN_GOLDEN"
 QUICK = (
@@ -61,14 +61,13 @@ FURTHER = {
     "flatland": """
         learn flatland SETTINGS --out runs/flatland --resume
         learn flatland SETTINGS --tolerance 0.9 --out runs/staged
-        evaluate runs/flatland/designs/scan.yaml --rays 12 --plots pictures
+        evaluate runs/flatland/designs/scan.yaml --rays 12
         fit runs/flatland --layout selected --rays 12 --name chosen
         show runs/flatland/designs/chosen.yaml --json
         tasks check flatland --json
         evaluate runs/flatland/designs/scan.yaml --rays 12 --effects all --detector single-photon --json
     """,
     "face": """
-        fit runs/face --sensors auto --name auto --json
         fit runs/face --layout scan --rays 40 --weight area_exponent=0.25 --name weighted --json
         fit runs/face --sensors 2 --parts vl53l5cx,tmf8828 --name bought --json
         constrain runs/face --set 'parts={names: [vl53l5cx, vl53l8cx], count: 2}' --name ours
@@ -76,13 +75,13 @@ FURTHER = {
         constrain runs/face --set gate.widht_m.max=0.1
         fit runs/face --like rig.sdf --name alike --json
         show rig.sdf
-        compare rig.sdf runs/face/designs/alike.yaml --rays 40
+        show rig.sdf runs/face/designs/alike.yaml
+        evaluate rig.sdf runs/face/designs/alike.yaml --rays 40 --baseline none
         export rig.sdf --format csv --out -
         export runs/face/designs/grid.yaml --format galvo --rays 40 --out mirrors.galvo.csv
         capture scan.npz runs/face/designs/grid.yaml --rays 40 --csv points.csv
         capture scan.npz mirrors.galvo.csv
         capture scan.npz runs/face/designs/grid.yaml --estimator matched --rays 40 --json
-        evaluate runs/face/designs/grid.yaml --rays 40 --baseline catalog:vl53l8cx
         evaluate runs/face/designs/scan.yaml --rays 40 --effects audit --detector consumer-8x8 --json
         evaluate runs/face/designs/grid.yaml --rays 40 --fail-above 0.001 --report report.html
         evaluate runs/face/designs/grid.yaml --rays 400 --set truth_points=50000 --baseline cma --cma-seconds 0.1 --json
@@ -97,7 +96,7 @@ FURTHER = {
         export runs/warehouse/designs/track.yaml --rays 12 --format csv
         show runs/warehouse/designs/track.yaml --at x_m=2.5
         export runs/warehouse/designs/track.yaml --rays 12 --at x_m=2.5 --format csv --out rays.csv
-        compare runs/warehouse/designs/track.yaml runs/warehouse/designs/here.yaml --json
+        show runs/warehouse/designs/track.yaml runs/warehouse/designs/here.yaml --json
         evaluate runs/warehouse/designs/track.yaml runs/warehouse/designs/here.yaml --rays 12 --json
     """,
     "arm": """
@@ -124,9 +123,6 @@ GENERAL = """
     config schema constraints
     config schema design
     config schema evaluate
-    completion bash
-    completion zsh
-    completion fish
     tasks new landmark --out landmark
     lern face
     learn face --set density.sigma=1
@@ -134,7 +130,7 @@ GENERAL = """
     fit runs/nothing --json
 """
 COMMANDS = (
-    "", "learn", "fit", "constrain", "evaluate", "export", "capture", "show", "compare", "completion", "tasks",
+    "", "learn", "fit", "constrain", "evaluate", "export", "capture", "show", "tasks",
     "tasks list", "tasks show", "tasks check", "tasks new", "catalog", "catalog list", "catalog show", "config",
     "config init", "config schema",
 )  # fmt: skip
@@ -228,7 +224,6 @@ def task_lines(task: str) -> Iterator[str]:
     yield f"config init {task} --preset draft"
     yield f"learn {task} {settings} --out {run} --dry-run --json"
     yield f"learn {task} {settings} --out {run}"
-    yield f"fit {run} --dry-run --json"
     for layout in LAYOUTS:
         how = f"--layout {layout} --rays {rays}" + ("" if layout == "scan" else " --sensors 2") + where
         yield f"fit {run} {how} --name {layout} --json"
@@ -245,9 +240,8 @@ def task_lines(task: str) -> Iterator[str]:
     for name, suffix in _formats() if task in EXPORTED else ():
         amount = "" if name in SENSOR_FORMATS else f"--rays {rays} "
         yield f"export {designs[0]} --format {name} {amount}--out all/{name}{suffix} --json"
-    yield f"compare {designs[0]} {designs[1]} --rays {rays}"
-    yield f"compare {designs[1]} {designs[2]} --rays {rays} --json"
-    yield f"evaluate {run} --rays {rays} --dry-run --json"
+    yield f"evaluate {designs[0]} {designs[1]} --rays {rays} --baseline none"
+    yield f"show {designs[1]} {designs[2]} --json"
     yield f"evaluate {run} --rays {rays} --csv rows.csv"
     yield f"evaluate {designs[0]} --rays {rays} --baseline occupancy --json"
     yield f"evaluate {designs[0]} --rays {rays} --baseline no-visibility --json"

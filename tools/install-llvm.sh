@@ -4,7 +4,7 @@
 #
 #   tools/install-llvm.sh PYTHON
 missing() {
-    "$1" -c 'from lidardesign.simulate.light_transport.process import missing; print(missing() or "")'
+    "$1" -c 'from lidardesign.simulate.light_transport.transport import missing; print(missing() or "")'
 }
 reason=$(missing "$1") || exit 0
 case "$reason" in

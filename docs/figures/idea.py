@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from drawing import INK, PAPER, QUIET, command, save, save_smaller
+from drawing import INK, PAPER, QUIET, SideOn, command, save
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
@@ -32,10 +32,7 @@ from lidardesign.design.files import load_design
 from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
-from lidardesign.evaluate.figures.canvas import picture, picture_style
-from lidardesign.evaluate.figures.density import field_picture, marginals_picture
-from lidardesign.evaluate.figures.density_views import density_view
-from lidardesign.evaluate.figures.scene import OUTCOME_LOOKS, View, shaded, view_of
+from lidardesign.evaluate.report.density_views import DensityView, density_view
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.samples import Samples, load_samples
@@ -58,6 +55,15 @@ SERIES = {
     "random": ("#999999", "+", (0, (1, 1.5))),
 }
 SENSOR = "#3b3f8f"
+OUTCOME_LOOKS = {
+    Outcome.MISS: ("#9aa5b1", "dotted"),
+    Outcome.NOT_DETECTED: ("#CC79A7", "dashdot"),
+    Outcome.AFTER_GATE: ("#0072B2", "dashed"),
+    Outcome.OCCLUDED: ("#D55E00", (0, (4, 1.2, 1, 1.2))),
+    Outcome.RETURN: ("#007A59", "solid"),
+}
+# From pale to dark, so that grey print keeps the order; the least of it is left clear.
+FIELD = LinearSegmentedColormap.from_list("field", ["#fde9b8", "#f6b04a", "#d95f30", "#93265f", "#2b0f54"])
 HEAT = LinearSegmentedColormap.from_list("heat", ["#1b2a6b", "#7b2a8b", "#d5483c", "#f6a02c", "#fdf3b4"])
 GATES = LinearSegmentedColormap.from_list("gates", ["#f0a202", "#d5483c", "#8a2f8f", "#2c4bb0"])
 
@@ -207,19 +213,13 @@ class SideView:
         self.rims = direction(np.full(2, middle), np.array([space.low[ELEVATION], space.high[ELEVATION]]))
         ahead = direction(middle, 0.0)
         corners = self.origin + np.array([0.68 * ahead, -0.04 * ahead, (0, 0, HALF_HIGH_M), (0, 0, -HALF_HIGH_M)])
-        # straight from the side: the camera's own height and slant would hide the wedge
-        view = view_of(ahead[None], corners)
-        right = -ahead / np.linalg.norm(ahead)
-        up = np.array([0.0, 0.0, 1.0])
-        across, high = corners @ right, corners @ up
-        window = (across.min(), across.max(), high.min(), high.max())
-        self.view = View(right, up, np.cross(up, right), tuple(map(float, window)), view.near_m - 2.0)
-        self.head = shaded(head, 0, self.view, 900)
-        self.others = [shaded(one, 0, self.view, 450) for one in heads]
+        self.view = SideOn(-ahead, corners)
+        self.head = self.view.shaded(head, 900)
+        self.others = [self.view.shaded(one, 450) for one in heads]
 
     def draw(self, axes: Axes) -> None:
         """The shaded head."""
-        axes.imshow(self.head.colour, extent=self.view.window, origin="lower", interpolation="antialiased")
+        axes.imshow(self.head, extent=self.view.window, origin="lower", interpolation="antialiased")
         axes.set(xlim=self.view.window[:2], ylim=self.view.window[2:])
         axes.set_aspect("equal")
         axes.set_axis_off()
@@ -227,8 +227,7 @@ class SideView:
     def draw_space(self, axes: Axes) -> None:
         """Outlines of the heads that are learned from, and the wedge of directions and ranges that rays may have."""
         for other in self.others:
-            seen = np.isfinite(other.depth_m).astype(float)
-            axes.contour(seen, (0.5,), extent=self.view.window, colors=[QUIET], linewidths=0.8, alpha=0.6)
+            axes.contour(other[..., 3], (0.5,), extent=self.view.window, colors=[QUIET], linewidths=0.8, alpha=0.6)
         start = self.view.project(self.origin)
         ends = self.view.project(self.origin + HALF_HIGH_M / abs(self.rims[0, 2]) * self.rims)
         for end in ends:
@@ -240,7 +239,7 @@ class SideView:
         length = np.where(returns.returned, np.nan_to_num(returns.range_m), rays.gate_m[:, 1])
         starts, ends = self.view.project(rays.origin_m), rays.origin_m + length[:, None] * rays.direction
         lines = np.stack([starts, self.view.project(ends)], axis=1)
-        for kind, (colour, dash, _) in OUTCOME_LOOKS.items():
+        for kind, (colour, dash) in OUTCOME_LOOKS.items():
             some = returns.outcome == kind
             axes.add_collection(LineCollection(lines[some], colors=colour, linestyles=dash, linewidths=0.6, alpha=0.2))
         measured = self.view.project(returns.points_m)
@@ -309,6 +308,45 @@ def overview(
     return figure
 
 
+def marginals_picture(view: DensityView) -> Figure:
+    """The density along each dimension as an area, the design beside it as steps."""
+    figure = Figure(figsize=(16, 4.6), dpi=DOTS_PER_INCH, facecolor=PAPER, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, one in zip(figure.subplots(1, len(view.marginals)), view.marginals, strict=True):
+        axes.stairs(one.heights, one.edges, fill=True, color="#cfd6de", label="learned density")
+        for name, heights in one.designs.items():
+            axes.stairs(heights, one.edges, color=SENSOR, linewidth=2.2, baseline=None, label=name)
+        axes.set(xlim=(one.edges[0], one.edges[-1]), ylim=(0.0, one.top))
+        axes.set_xlabel(one.label, fontsize=15)
+        axes.set_ylabel(one.unit, fontsize=15)
+        axes.tick_params(labelsize=13)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=15)
+    return figure
+
+
+def field_picture(view: DensityView) -> Figure:
+    """Where in space the density looks, over what the scene covers."""
+    figure = Figure(figsize=(16, 7.2), dpi=DOTS_PER_INCH, facecolor=PAPER, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, plane in zip(figure.subplots(1, len(view.planes)), view.planes, strict=True):
+        across, up = plane.edges
+        image = {"extent": (across[0], across[-1], up[0], up[-1]), "origin": "lower", "interpolation": "nearest"}
+        axes.imshow(np.where(plane.targets, 0.85, 1.0), cmap="gray", vmin=0.0, vmax=1.0, **image)
+        most = float(np.quantile(plane.heights[plane.heights > 0], 0.998))
+        shown = np.ma.masked_less(plane.heights, 0.02 * most)
+        drawn = axes.imshow(shown, cmap=FIELD, vmin=0.0, vmax=most, **image)
+        axes.contour(plane.targets, (0.5,), extent=image["extent"], colors=[INK], linewidths=1.0, alpha=0.7)
+        axes.set_xlabel(plane.labels[0], fontsize=15)
+        axes.set_ylabel(plane.labels[1], fontsize=15)
+        axes.tick_params(labelsize=13)
+        axes.spines[["top", "right"]].set_visible(False)
+        bar = figure.colorbar(drawn, ax=axes, shrink=0.75)
+        bar.set_label(plane.unit.replace("2", "²"), fontsize=15)
+        bar.outline.set_visible(False)
+    return figure
+
+
 def main() -> None:
     """Compute what is not there, and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -327,9 +365,8 @@ def main() -> None:
     figure = overview(side, front, samples, design, rays, simulate(head, rays)[0], scores)
     save(figure, options.out / "overview.png", colours=COLOURS)
     view = density_view(samples, head, [replace(design, name="10 sensors")])
-    with picture_style():
-        save_smaller(picture(marginals_picture(view), "png"), options.out / "idea-marginals.png")
-        save_smaller(picture(field_picture(view), "png"), options.out / "idea-field.png")
+    save(marginals_picture(view), options.out / "idea-marginals.png")
+    save(field_picture(view), options.out / "idea-field.png")
     for name in ("overview", "idea-marginals", "idea-field"):
         path = options.out / f"{name}.png"
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")

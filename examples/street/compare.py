@@ -14,7 +14,7 @@ from pathlib import Path
 
 import lidardesign as ld
 import numpy as np
-from lidardesign.simulate.returns import Rays
+from lidardesign import Rays
 from lidardesign.simulate.simulate import simulate
 
 from lidardesign_street.scenes import OWN, scene_of, user_of

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import os
-import shutil
 import signal
 import sys
-import tempfile
-from pathlib import Path
 from typing import Any
 
 # One thread each: two thread pools that spin on shared cores make each other 8 to 40 times slower. These must
@@ -30,29 +26,6 @@ def set_thread_defaults() -> None:
     """One thread per numerical library unless the user chose otherwise."""
     for name, value in THREAD_DEFAULTS.items():
         os.environ.setdefault(name, value)
-
-
-def set_cache_default() -> None:
-    """A folder of this process alone for compiled code, where neither the package nor the home can be written.
-
-    numba refuses to import otherwise. Nobody else can write there: numba's cache is code.
-    """
-    user_caches = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
-    places = (Path(__file__).parents[1] / "density" / "fields" / "__pycache__", user_caches / "numba")
-    if "NUMBA_CACHE_DIR" in os.environ or any(_can_be_written(place) for place in places):
-        return
-    folder = tempfile.mkdtemp(prefix="lidardesign-numba-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    os.environ["NUMBA_CACHE_DIR"] = folder
-
-
-def _can_be_written(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
 
 
 def make_streams_tolerant() -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
+import contextlib
 import os
-import shlex
 import sys
-from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -14,16 +12,15 @@ import typer
 from lidardesign import __version__
 from lidardesign.cli.commands.capture import capture
 from lidardesign.cli.commands.catalog import catalog_app
-from lidardesign.cli.commands.completion import VARIABLE, answer_shell, completion
 from lidardesign.cli.commands.config import config_app
 from lidardesign.cli.commands.evaluate import evaluate
 from lidardesign.cli.commands.export import export
 from lidardesign.cli.commands.fit import constrain, fit
 from lidardesign.cli.commands.learn import learn
-from lidardesign.cli.commands.show import compare, show
+from lidardesign.cli.commands.show import show
 from lidardesign.cli.commands.tasks import tasks_app
-from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
-from lidardesign.cli.help import WIDEST, ManualCommand, ManualGroup
+from lidardesign.cli.environment import make_streams_tolerant, set_thread_defaults, terminate_cleanly
+from lidardesign.cli.options import StrictCommand
 from lidardesign.cli.output import (
     EXIT_BROKEN_PIPE,
     Output,
@@ -33,37 +30,108 @@ from lidardesign.cli.output import (
     print_message,
     report_error,
 )
+from lidardesign.errors import page
 
 PROGRAM = "lidardesign"
+COMPLETION = "_LIDARDESIGN_COMPLETE"
 EXIT_USAGE = 2
-HELP_WORDS = ("help", "man", "usage")
-# Options that belong to commands, and are often written before them.
-COMMON_OPTIONS = ("--json", "--quiet", "-q", "--verbose", "-v", "--debug", "--seed")
 VERSION_HELP = "Print the version; with --json those of Python and the libraries too."
-SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": WIDEST}
+SETTINGS = {"help_option_names": ["-h", "--help"]}
+
+# What `--help` of a command ends with: every example is parsed by the tests.
+EXAMPLES: dict[str, tuple[str, ...]] = {
+    "learn": (
+        "lidardesign learn face --preset draft --out runs/face",
+        "lidardesign learn meshes --set folder=scans --set scale=0.001",
+        "lidardesign learn --config face.yaml --tolerance 0.1",
+        "lidardesign learn face --time-budget 60 --out runs/minute",
+        "lidardesign learn face --out runs/face --resume",
+        "lidardesign learn face --out runs/face --dry-run",
+    ),
+    "fit": (
+        "lidardesign fit runs/face",
+        "lidardesign fit runs/face --sensors 4 --layout grid --name even",
+        "lidardesign fit runs/face --layout scan --rays 576 --name beams",
+        "lidardesign fit runs/face --parts vl53l8cx,tmf8828 --sensors 2",
+        "lidardesign fit runs/face --like robot.sdf --name instead",
+        "lidardesign fit runs/warehouse --rays 12 --at x_m=0.37",
+    ),
+    "constrain": (
+        "lidardesign constrain runs/face --set gate.width_m.max=0.1",
+        "lidardesign constrain runs/face --constraints buyable.yaml",
+    ),
+    "evaluate": (
+        "lidardesign evaluate runs/face --report report.html --csv rows.csv",
+        "lidardesign evaluate runs/face/designs/free.yaml --fail-above 8",
+        "lidardesign evaluate runs/face --detector single-photon",
+        "lidardesign evaluate rig.csv other.csv --in runs/face --baseline none",
+        "lidardesign evaluate runs/arm --baseline occupancy --workers 8",
+    ),
+    "export": (
+        "lidardesign export --list",
+        "lidardesign export runs/face/designs/free.yaml --format csv --rays 576",
+    ),
+    "capture": ("lidardesign capture scan.npz runs/face/designs/free.yaml --rays 576",),
+    "show": (
+        "lidardesign show runs/face",
+        "lidardesign show runs/warehouse/designs/track.yaml --at x_m=3.91",
+        "lidardesign show rig.csv runs/face/designs/one.yaml",
+    ),
+    "catalog list": ("lidardesign catalog list --reflectance 10 --klux 100",),
+    "catalog show": (
+        "lidardesign catalog show vl53l5cx:4x4",
+        "lidardesign catalog show vl53l8cx --out bought.yaml --rays 196",
+    ),
+    "tasks list": ("lidardesign tasks list",),
+    "tasks show": ("lidardesign tasks show face",),
+    "tasks check": ("lidardesign tasks check meshes --set folder=scans --json",),
+    "tasks new": ("lidardesign tasks new landmark --out work/landmark",),
+    "config init": ("lidardesign config init meshes --set folder=scans --out scans.yaml",),
+    "config schema": ("lidardesign config schema config --task face --out face.json",),
+}
+PAGES = {
+    "learn": "run-folder.md, accuracy.md",
+    "fit": "design-file.md, selection.md, parts.md, importance.md",
+    "constrain": "constraints.md, catalog.md",
+    "evaluate": "evaluate.md, rivals.md, detectors.md, shell.md",
+    "export": "formats.md, design-file.md",
+    "capture": "captures.md",
+    "show": "design-file.md, rigs.md, formats.md",
+    "catalog": "catalog.md",
+    "tasks": "writing-tasks.md",
+    "config": "run-folder.md, shell.md",
+}
+
+
+def epilog_of(command: str) -> str:
+    """The end of a command's help: examples, one a line, and pages of the documentation."""
+    pages = PAGES[command if command in PAGES else command.split()[0]]
+    # \b keeps the lines as they are
+    examples = "\n".join(["\b", "Examples:", *(f"  {example}" for example in EXAMPLES[command])])
+    return f"{examples}\n\n\b\nSee also: {pages}\n  in {page('commands.md').parent}"
+
 
 app = typer.Typer(
     name=PROGRAM,
-    cls=ManualGroup,
     help="Design LiDARs: learn which rays are worth firing, fit sensors, prove what they are worth.",
     epilog="Exit codes: 0 ok, 1 threshold missed, 2 usage or config, 3 bad input data, "
     "4 infeasible constraints, 5 numerical failure, 6 plugin failure, 70 internal error, 130 interrupted, "
-    "141 output closed, 143 terminated. `lidardesign COMMAND --help` has examples and names pages to read.",
+    "141 output closed, 143 terminated.",
     context_settings=SETTINGS,
-    add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # panels take half as long again, and fold at 80 columns
 )
-app.add_typer(tasks_app, name="tasks")
-app.add_typer(catalog_app, name="catalog")
-app.add_typer(config_app, name="config")
-for subcommand in (learn, fit, constrain, evaluate, export, capture, show, compare, completion):
-    app.command(context_settings=SETTINGS)(subcommand)
-for group in (tasks_app, catalog_app, config_app):
-    group.info.cls, group.info.context_settings = ManualGroup, SETTINGS
-for group in (app, tasks_app, catalog_app, config_app):
+app.add_typer(tasks_app, name="tasks", context_settings=SETTINGS)
+app.add_typer(catalog_app, name="catalog", context_settings=SETTINGS)
+app.add_typer(config_app, name="config", context_settings=SETTINGS)
+for subcommand in (learn, fit, constrain, evaluate, export, capture, show):
+    app.command()(subcommand)
+for prefix, group in (("", app), ("tasks ", tasks_app), ("catalog ", catalog_app), ("config ", config_app)):
     for registered in group.registered_commands:
-        registered.cls = ManualCommand
+        name = registered.name or registered.callback.__name__
+        registered.cls, registered.context_settings = StrictCommand, SETTINGS
+        registered.epilog = epilog_of(f"{prefix}{name}")
 
 
 def _print_version(wanted: bool) -> None:
@@ -92,9 +160,10 @@ def program(
 def run(arguments: list[str] | None = None) -> None:
     """Run the program on command line arguments and exit; where a shell asks what to complete, answer it."""
     set_thread_defaults()
-    if VARIABLE in os.environ:
-        sys.exit(answer_shell(app))
-    set_cache_default()
+    if COMPLETION in os.environ:
+        with contextlib.suppress(Exception):  # nobody can be told at a prompt
+            app(prog_name=PROGRAM)
+        sys.exit(1)
     make_streams_tolerant()
     terminate_cleanly()
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -114,7 +183,7 @@ def run(arguments: list[str] | None = None) -> None:
 
 def _invoke(arguments: list[str]) -> int:
     """Run typer without letting it print or exit for errors."""
-    output = Output(json="--json" in arguments, debug="--debug" in arguments)
+    output = Output(json="--json" in arguments)
     if sorted(arguments) == ["--json", "--version"]:
         return _print_versions()
     try:
@@ -134,8 +203,7 @@ def _invoke(arguments: list[str]) -> int:
         # One message for what typer finds wrong with the command line
         context = getattr(error, "ctx", None)
         path = context.command_path if context else PROGRAM
-        message = error.format_message().rstrip()
-        hint = _similar_line(arguments, typer.main.get_command(app)) or f"{path} --help"
+        message, hint = error.format_message().rstrip(), f"{path} --help"
         if type(error).__name__ == "NoArgsIsHelpError":
             print_message(message)
             message = "no command was given"
@@ -145,36 +213,3 @@ def _invoke(arguments: list[str]) -> int:
         print_message(f"usage error: {path}: {message}\n  try: {hint}")
         return EXIT_USAGE
     return code if isinstance(code, int) else 0
-
-
-def _similar_line(words: Sequence[str], root: Any) -> str | None:
-    """A command line close to the given one that would be understood, if there is one."""
-    commands = root.commands
-    first, *rest = words or [""]
-    split = first.split()
-    similar: list[str] | None = None
-    if len(split) > 1 and split[0] in commands:
-        similar = [*split, *rest]
-    elif first in HELP_WORDS:
-        named = [word for word in rest if not word.startswith("-")][:1]
-        similar = [*named, "--help"] if not named or named[0] in commands else ["--help"]
-    elif first in COMMON_OPTIONS:  # they belong behind the command
-        options, behind = [], list(words)
-        while behind and behind[0] in COMMON_OPTIONS:
-            count = 2 if behind[0] == "--seed" else 1
-            options, behind = options + behind[:count], behind[count:]
-        similar = [*behind, *options] if behind and behind[0] in commands else None
-    elif first in commands:
-        similar = _with_known_command(words, 1, getattr(commands[first], "commands", None))
-    elif first and not first.startswith("-"):
-        similar = _with_known_command(words, 0, commands)
-    return None if similar is None else shlex.join([PROGRAM, *similar])
-
-
-def _with_known_command(words: Sequence[str], index: int, commands: Any) -> list[str] | None:
-    """A command line with the word at a place replaced by the command that it is most like."""
-    if not commands or len(words) <= index or words[index] in commands:
-        return None
-    names = [name for name, command in commands.items() if not command.hidden]
-    close = difflib.get_close_matches(words[index], names, n=1)
-    return [*words[:index], close[0], *words[index + 1 :]] if close else None

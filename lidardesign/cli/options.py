@@ -5,37 +5,24 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
-from lidardesign.errors import MAX_SEED, ConfigError
+from lidardesign.cli.completion import configuration_keys, words
+from lidardesign.errors import UNSET_HINT, ConfigError
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, for errors too.")]
 Seed = Annotated[
     int | None,
-    typer.Option(
-        "--seed",
-        metavar="N",
-        min=0,
-        max=MAX_SEED,
-        help="Seed of all random numbers.",
-        show_default="the run's, or 0",
-    ),
+    typer.Option("--seed", metavar="N", help="Seed of all random numbers.", show_default="the run's, or 0"),
 ]
 Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Print no notes and no progress; of a result in a file, only its path.")
+    bool,
+    typer.Option("--quiet", "-q", help="Print no notes and no progress; of a result in a file, only its path."),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print everything: all tables and notes.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
-
-DryRun = Annotated[
-    bool,
-    typer.Option(
-        "--dry-run",
-        help="Check what can be checked, say what would be done, read and written, and stop there.",
-    ),
-]
 Name = Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the design: RUN/designs/NAME.yaml.")]
 Layout = Annotated[
     str | None,
@@ -45,6 +32,7 @@ Layout = Annotated[
         help="Where rays lie: evenly in the field of view, by density, each its own sensor, starting all over the "
         "origins, chosen on training scenes, or on chosen rings.",
         show_default="the design's, else selected; grid or scan where rays cannot be chosen",
+        autocompletion=words("grid|density|scan|distributed|selected|spinning"),
     ),
 ]
 At = Annotated[
@@ -93,15 +81,15 @@ Gates = Annotated[
         metavar="sensor|ray",
         help="One gate per sensor, or one per ray; in a scan every ray is a sensor.",
         show_default="sensor; ray where rays are distributed, or chosen along a condition",
+        autocompletion=words("sensor|ray"),
     ),
 ]
 Sensors = Annotated[
     str | None,
     typer.Option(
         "--sensors",
-        metavar="N|best|auto",
-        help="Number of sensors (a scan has one per ray); best: by the task's score on training scenes, auto: by "
-        "held-out likelihood.",
+        metavar="N|best",
+        help="Number of sensors (a scan has one per ray); best: by the task's score on training scenes.",
         show_default="the design's, else best",
     ),
 ]
@@ -132,6 +120,7 @@ Preset = Annotated[
         metavar="draft|standard|fine",
         help="Effort: about ten seconds, half a minute, or minutes.",
         show_default="standard",
+        autocompletion=words("draft|standard|fine"),
     ),
 ]
 Like = Annotated[
@@ -150,8 +139,8 @@ SpaceOf = Annotated[
     typer.Option(
         "--in",
         metavar="RUN",
-        help="Take the design space and the task of this run.",
-        show_default="the run that a design came from",
+        help="Take the task, its scenes and the design space of this run, for designs of any origin.",
+        show_default="the run that designs came from",
     ),
 ]
 Overrides = Annotated[
@@ -161,6 +150,7 @@ Overrides = Annotated[
         metavar="KEY=VALUE",
         help="Set one value, such as density.sigma_m=0.002 (`tasks show TASK` lists keys); repeatable.",
         show_default=False,
+        autocompletion=configuration_keys,
     ),
 ]
 ConfigFile = Annotated[
@@ -212,3 +202,46 @@ def part_names(text: str | None) -> list[str] | str | None:
     if not all(names):
         raise ConfigError(f"{text!r} has an empty part name", where="--parts", allowed="NAME,NAME or catalog")
     return text if text in (None, "catalog") else names
+
+
+class StrictCommand(TyperCommand):
+    """A command that takes no values which nobody writes on purpose."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the command line; a value that is empty or -, or `1_0` where a number is asked for, is a mistake.
+
+        Raises:
+            ConfigError: At the option or argument.
+        """
+        rest = list(args)
+        given = {} if ctx.resilient_parsing else self.make_parser(ctx).parse_args(args=rest)[0]
+        texts = [(parameter, text) for parameter in self.get_params(ctx) for text in _texts(given.get(parameter.name))]
+        for parameter, text in texts:
+            if not text.strip():
+                raise ConfigError("is empty", where=_name(parameter), allowed="a value", hint=UNSET_HINT)
+            if text == "-":
+                raise ConfigError(
+                    "'-' is no value", where=_name(parameter), hint="give the name of a file; /dev/stdout is one"
+                )
+        left = super().parse_args(ctx, args)
+        from lidardesign.run.yaml import plain_number
+
+        for parameter, text in texts:
+            value = ctx.params.get(parameter.name)
+            values = value if isinstance(value, list | tuple) else [value]
+            if all(isinstance(each, int | float) and not isinstance(each, bool) for each in values):
+                try:
+                    plain_number(text)
+                except ValueError:
+                    raise ConfigError(repr(text), where=_name(parameter), allowed="a finite number") from None
+        return left
+
+
+def _texts(given: Any) -> list[str]:
+    """What a command line gives for a parameter: nothing, one text, or several."""
+    return [text for text in (given if isinstance(given, list | tuple) else [given]) if isinstance(text, str)]
+
+
+def _name(parameter: Any) -> str:
+    """A parameter as the command line calls it."""
+    return parameter.opts[0] if parameter.param_type_name == "option" else parameter.metavar or parameter.name

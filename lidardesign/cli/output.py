@@ -23,12 +23,9 @@ from lidardesign.cli.tables.grids import duration
 from lidardesign.cli.tables.scores import show_times
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
-from lidardesign.run.files import STDIO, offered_input
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
-
-    from lidardesign.workflow.run_folder import RequestPlan
 
 
 SCHEMA_VERSION = 1
@@ -38,7 +35,8 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 EXIT_TERMINATED = 143
 PLAIN_WIDTH = 120
-BYTES_PER_MEGABYTE = 1e6
+# Where this is set in the environment, errors show their tracebacks.
+DEBUG = "LIDARDESIGN_DEBUG"
 NUMBA_CACHE = "numba/core/caching.py"
 NO_MEMORY = "can't allocate memory"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
@@ -70,7 +68,6 @@ class Output:
         json: Print one JSON document on stdout and nothing else there.
         quiet: No progress and no notes, and of a result its files alone.
         verbose: Everything: all tables, and notes on what was decided.
-        debug: Show tracebacks.
         stream: Where the result goes: the program's stdout.
         when_interrupted: What to say to the user after Ctrl-C or SIGTERM.
         answered: Whether the one JSON document was printed; an error after it adds none.
@@ -80,7 +77,6 @@ class Output:
     json: bool = False
     quiet: bool = False
     verbose: bool = False
-    debug: bool = False
     stream: TextIO = field(default_factory=lambda: sys.stdout)
     when_interrupted: Callable[[], str | None] = field(default=lambda: None)
     answered: bool = False
@@ -202,14 +198,14 @@ def json_text(document: dict[str, Any]) -> str:
 
 
 @contextlib.contextmanager
-def command(*, json: bool, quiet: bool, debug: bool, verbose: bool = False) -> Iterator[Output]:
+def command(*, json: bool, quiet: bool, verbose: bool = False) -> Iterator[Output]:
     """Run a command's body: its errors become one message and an exit code.
 
     With `--json`, whatever plugins and libraries print meanwhile goes to stderr, also by processes of their own.
     """
-    output = Output(json=json, quiet=quiet, verbose=verbose and not quiet, debug=debug, stream=sys.stdout)
+    output = Output(json=json, quiet=quiet, verbose=verbose and not quiet, stream=sys.stdout)
     try:
-        with _guarded_stdout(output) if json else contextlib.nullcontext(), running(output.clock), offered_input():
+        with _guarded_stdout(output) if json else contextlib.nullcontext(), running(output.clock):
             yield output
         output.stream.flush()
     except typer.Exit:
@@ -271,7 +267,7 @@ def report_error(error: BaseException, output: Output) -> int:
     if output.json and not output.answered:
         print_json({"error": document, "exit_code": code}, output.stream)
     print_message(text)
-    if output.debug:
+    if os.environ.get(DEBUG):
         traceback.print_exception(error)
     return code
 
@@ -307,7 +303,7 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
         }
     else:
         text = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        hint = "this is a bug in lidardesign: please report it; --debug shows where"
+        hint = "this is a bug in lidardesign: please report it; LIDARDESIGN_DEBUG=1 shows where"
         document = {"kind": "internal", "message": text, "hint": hint}
         return document, EXIT_INTERNAL, f"internal error: {text}\n  {hint}"
     attempt = f"\n  try: {document['hint']}" if "hint" in document else ""
@@ -338,47 +334,3 @@ def keep_times(
     except (ConfigError, DataError, OSError) as error:
         message = error.message if isinstance(error, ConfigError | DataError) else error.strerror or error
         output.note(f"note: the times of {name} are not kept in {run}: {message}")
-
-
-def _forecast_lines(found: Mapping[str, Any]) -> list[str]:
-    """How long it will take and how much memory, and what is not known of that."""
-    seconds, longest = found["seconds"], found["longest_seconds"]
-    length = duration(seconds) if longest == seconds else f"{duration(seconds)} to {duration(longest)}"
-    each = f"{1e3 * found['pathwise_s']:.0f} and {1e3 * found['balancing_s']:.0f} ms"
-    lines = [
-        f"time   about {length}: preparing {duration(found['preparing_s'])}, {found['steps']:,} steps of {each}, "
-        f"measuring {duration(found['finishing_s'])}"
-    ]
-    for name, held in (("memory", found["peak_memory_bytes"]), ("memory on the GPU", found["gpu_memory_bytes"])):
-        if held is not None:
-            lines.append(f"{name} about {held / BYTES_PER_MEGABYTE:,.0f} MB")
-    return lines + [f"not known: {what}" for what in found["unknown"]]
-
-
-def show_plan(plan: RequestPlan, output: Output) -> None:
-    """Give what `--dry-run` says as the result of a command: what it would do, read and write.
-
-    Raises:
-        DataError: What would be written could not be.
-    """
-    plan.check_writable()
-    document = plan.as_dict()
-    lines = [f"{document['command']} would", *(f"  {step}" for step in document["steps"])]
-    for entry in document["reads"]:
-        size = entry["bytes"] or 0
-        text = f"{size / BYTES_PER_MEGABYTE:.1f} MB" if size >= BYTES_PER_MEGABYTE else f"{size:,} bytes"
-        text = f"{entry['files']} files, {text}" if "files" in entry else text
-        place = "standard input" if entry["path"] == STDIO else entry["path"]
-        lines.append(f"read   {place}{'' if entry['bytes'] is None else f' ({text})'}")
-    for entry in document["writes"]:
-        place = "standard output" if entry["path"] == STDIO else entry["path"]
-        lines.append(f"write  {place}{' (replaced)' if entry['replaces'] else ''}")
-    if not document["writes"]:
-        lines.append("write  nothing")
-    if document["before"]:
-        lines.append(f"time   {document['before']['of']} took {document['before']['seconds']:.1f} s")
-    if document["forecast"]:
-        lines += _forecast_lines(document["forecast"])
-    lines.append("nothing was done: leave out --dry-run to do it")
-
-    output.result(document, lambda rich: rich.print("\n".join(lines), soft_wrap=True), show_costs=False)

@@ -48,7 +48,7 @@ class LearnResult:
     """What learning reached; `timings` are seconds by phase, `notes` what the user should know.
 
     `misplaced` is the share of the density's mass in the wrong place. `error_estimates` has the standard errors of ess,
-    kl_nats, log_z, coverage and misplaced. `goal` is what decided the number of steps, where the configuration did not.
+    kl_nats, log_z, coverage and misplaced.
     """
 
     run: str
@@ -63,7 +63,6 @@ class LearnResult:
     notes: tuple[str, ...] = ()
     timings: dict[str, float] = field(default_factory=dict)
     error_estimates: dict[str, Estimate] = field(default_factory=dict)
-    goal: dict[str, Any] | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -154,7 +153,6 @@ def learn(
     resume: bool = False,
     device: str = "auto",
     progress: Callable[[LearnProgress], None] | None = None,
-    data: TrainingData | None = None,
     is_over: Callable[[Trainer], bool] | None = None,
     remark: Callable[[str], None] | None = None,
 ) -> LearnResult:
@@ -167,7 +165,6 @@ def learn(
         resume: Continue from the run's checkpoint; the result is that of an uninterrupted run, bit for bit.
         device: auto, cpu or cuda: where the flow lives, and what of the target can (`device_target`).
         progress: Called about every tenth step.
-        data: What `prepare_training_data` made of the same task and configuration, to be learned on again.
         is_over: Asked whether time is over; see `Trainer`.
         remark: See `prepare_training_data`.
 
@@ -177,7 +174,7 @@ def learn(
     """
     place = choose_device(device)
     with running() as clock, on_one_thread():
-        data = prepare_training_data(task, config, remark) if data is None else data
+        data = prepare_training_data(task, config, remark)
         trainer = make_trainer(data, config, run, place)
         trainer.is_over = is_over
         if resume:

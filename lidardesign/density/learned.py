@@ -37,7 +37,6 @@ from lidardesign.estimates import Estimate
 from lidardesign.numerics import TINY
 from lidardesign.run.inputs import RECORD, read_file
 from lidardesign.run.manifest import verify
-from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 from lidardesign.task import Task
 
@@ -50,13 +49,11 @@ class SnapshotQuality:
         step: The number of steps done.
         seconds: What they took [s].
         estimates: ess, kl_nats, log_z, coverage and misplaced, with standard errors.
-        samples: The samples that these were measured on.
     """
 
     step: int
     seconds: float
     estimates: Mapping[str, Estimate]
-    samples: Samples
 
 
 def check_kept(run: Path) -> None:
@@ -91,7 +88,7 @@ def remeasured(
     for step, name in {**stored_snapshots(run), max(seconds): FLOW}.items():
         reached = measure(load_flow(run, name, config, target, seed), probes, count)
         taken = float(np.interp(step, list(seconds), list(seconds.values())))
-        qualities.append(SnapshotQuality(step, taken, reached.estimates, reached.samples))
+        qualities.append(SnapshotQuality(step, taken, reached.estimates))
     return qualities
 
 
@@ -260,48 +257,6 @@ def _variance(products: np.ndarray) -> float:
     """E |g - E g|^2 from the products of gradients (K, K)."""
     count = len(products)
     return float((np.trace(products) - products.sum() / count) / (count - 1))
-
-
-@dataclass(frozen=True, eq=False)
-class FlowSamples:
-    """Samples of a flow in float64, to be evaluated in any arithmetic.
-
-    Arguments:
-        base: Base points, shape (N, D).
-        values: The points that they become, shape (N, D).
-        conditions: Shape (N, context), or None.
-        log_prob: Their exact log density, shape (N,).
-    """
-
-    base: torch.Tensor
-    values: torch.Tensor
-    conditions: torch.Tensor | None
-    log_prob: np.ndarray
-
-    @classmethod
-    def of(cls, flow: DesignFlow, count: int, seed: int) -> FlowSamples:
-        """Samples of a float64 flow."""
-        generator = torch.Generator().manual_seed(seed)
-        base, conditions = flow.draw(count, generator)
-        with torch.no_grad():
-            values, log_prob = flow(base, conditions)
-        return cls(base, values, conditions, log_prob.numpy())
-
-    def log_densities(self, flow: DesignFlow) -> np.ndarray:
-        """log density of the points in a flow's own arithmetic, shape (N,)."""
-        with torch.no_grad():
-            return flow.log_prob(*self._like(flow, self.values)).double().numpy()
-
-    def round_trip_nats(self, flow: DesignFlow) -> float:
-        """The largest difference of log densities from base to point and back, in a flow's own arithmetic [nats]."""
-        base, conditions = self._like(flow, self.base)
-        with torch.no_grad():
-            values, drawn = flow(base, conditions)
-            return float((drawn - flow.log_prob(values, conditions)).abs().max())
-
-    def _like(self, flow: DesignFlow, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        like = next(flow.parameters())
-        return values.to(like), None if self.conditions is None else self.conditions.to(like)
 
 
 # Samples to be kept of those that are drawn at a time.

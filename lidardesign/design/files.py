@@ -208,7 +208,7 @@ def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
 
     path = Path(path)
     hint = "give a design file, as RUN/designs/NAME.yaml"
-    head = read_head(path, RAY_TABLE, hint=f"{hint}, or - for standard input")
+    head = read_head(path, RAY_TABLE, hint=hint)
     rig = read_rig(path, head)
     if rig is not None:
         return rig_design(rig, path, reach_m)

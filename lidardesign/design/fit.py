@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -93,7 +93,7 @@ class FitResult:
 def fit(
     samples: Samples,
     *,
-    sensors: int | Literal["auto"] | None = None,
+    sensors: int | None = None,
     layout: LayoutName = "grid",
     rays: int | None = None,
     constraints: Constraints | None = None,
@@ -109,8 +109,7 @@ def fit(
 
     Arguments:
         samples: Weighted samples of the learned density.
-        sensors: How many; `auto` chooses by held-out likelihood; None takes the constraints' or 4. A scan has
-            one component per ray instead.
+        sensors: How many; None takes the constraints' or 4. A scan has one component per ray instead.
         layout: How rays are laid out.
         rays: Rays per frame; None takes the budget's.
         constraints: A checked constraint file.
@@ -164,12 +163,10 @@ def fit(
 
 
 def check_options(
-    constraints: Constraints, space: DesignSpace, sensors: int | str | None, layout: Layout, rays: int | None
+    constraints: Constraints, space: DesignSpace, sensors: int | None, layout: Layout, rays: int | None
 ) -> None:
     """Options against each other and against the constraints, before anything is computed."""
-    if isinstance(sensors, str) and sensors != "auto":
-        raise ConfigError(f"{sensors!r} sensors", where="--sensors", allowed="a whole number, or auto")
-    if isinstance(sensors, int) and not 1 <= sensors <= MOST_FITTED:
+    if sensors is not None and not (isinstance(sensors, int) and 1 <= sensors <= MOST_FITTED):
         raise ConfigError(
             f"{sensors} sensors", where="--sensors", allowed=f"1 to {MOST_FITTED}", hint="--layout scan has one per ray"
         )
@@ -183,7 +180,7 @@ def check_options(
             hint=f"--layout scan, or {' '.join(f'--at {condition}=VALUE' for condition in names)}",
         )
     layout.check_constraints(constraints)
-    count = sensors if isinstance(sensors, int) and not layout.one_sensor_per_ray else None
+    count = None if layout.one_sensor_per_ray else sensors
     check_feasible(constraints, space, sensors=count, rays=rays)
 
 

@@ -1,12 +1,13 @@
 """The rows of an evaluation: which rays every design and baseline fires, at equal rays and at equal bandwidth.
 
-Baselines are built from training scenes alone.
+Baselines are built from training scenes alone. The one to be held against is the strongest of them there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -17,15 +18,16 @@ from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.layouts.track import travels
 from lidardesign.design.sensor import CERTIFICATES, DesignSpec
 from lidardesign.errors import ConfigError
+from lidardesign.evaluate.baselines import cma
 from lidardesign.evaluate.baselines.candidates import Candidate, RaysPerCondition, mean_mbps
 from lidardesign.evaluate.baselines.greedy import GREEDY, USUAL_SCENES, Fired, GreedyCandidate, greedy_rays
-from lidardesign.evaluate.baselines.simple import CMA, Baselines, Option, TwinCandidate
-from lidardesign.evaluate.baselines.views import TrainingViews
-from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
-from lidardesign.evaluate.cma.search import TrainingObjective
+from lidardesign.evaluate.baselines.simple import Baselines, Option, TwinCandidate
+from lidardesign.evaluate.baselines.views import TrainingObjective, TrainingViews
 from lidardesign.evaluate.request import EvaluationRequest, fired_numbers, numbers_fired
+from lidardesign.evaluate.scene_scores import score_here
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
+from lidardesign.scene import Scene
 from lidardesign.selection.candidates import CANDIDATES_PER_RAY
 from lidardesign.task import conditions_of
 
@@ -53,7 +55,7 @@ class Entry:
     redraw: Callable[[int], RaysPerCondition] | None = None
     matched_to: str | None = None
     matched_rays: int | None = None
-    search: SearchRecord | None = None
+    search: cma.SearchRecord | None = None
 
     @property
     def rays(self) -> int:
@@ -94,6 +96,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     ]
     shared = [count for count in counts if count not in request.alone]
     choosable = [] if request.greedy is None else greedy_rays(request.task, len(conditions), shared)[0]
+    starts = {one.rays: one.positions for one in designs if one.name == request.designs[0].name}
     baselines = Baselines(
         request.space,
         request.train,
@@ -102,8 +105,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         conditions=conditions,
         gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
         without_visibility=partial(_twin, request, conditions) if request.without_visibility else None,
-        density=request.density,
-        optimised=partial(_optimised, request, conditions) if request.designs else None,
+        optimised=partial(_optimised, request, conditions, starts) if request.designs else None,
         chosen=partial(_chosen, request, conditions, designs, max(choosable, default=0)),
     )
     wanted: list[tuple[str, list[Option], Entry | None]] = [
@@ -111,6 +113,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         for name in request.baselines
         for count in shared
         if name != GREEDY or count in choosable
+        if name != cma.CMA or count in starts or not starts
     ]
     if request.equal_bandwidth:
         wanted += [
@@ -118,7 +121,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
             for entry in designs
             if entry.rays in shared
             for name in request.baselines
-            if name != CMA or entry.name == request.designs[0].name
+            if name != cma.CMA or entry.name == request.designs[0].name
             if name != GREEDY or entry.rays in choosable
         ]
     wanted = [one for one in wanted if one[1]]
@@ -149,6 +152,7 @@ def _check_tracks(request: EvaluationRequest, conditions: Sequence[Mapping[str, 
 
 def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | None) -> Entry:
     candidate, count = option.candidate, len(option.positions[0])
+    searched = matched is None and isinstance(candidate, cma.CmaCandidate)
     return Entry(
         name,
         option.positions,
@@ -156,7 +160,7 @@ def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | Non
         redraw=partial(candidate.positions, baselines.spaces, count) if candidate.drawn_anew else None,
         matched_to=None if matched is None else matched.name,
         matched_rays=None if matched is None else matched.rays,
-        search=candidate.record_of(option.positions) if isinstance(candidate, CmaCandidate) else None,
+        search=candidate.record_of(option.positions) if searched else None,
     )
 
 
@@ -182,16 +186,18 @@ def _twin(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]])
 
 
 def _optimised(
-    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], views: TrainingViews
+    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], starts: Mapping[int, RaysPerCondition]
 ) -> Candidate:
-    return CmaCandidate(
-        followed=request.designs[0],
-        space=request.space,
-        conditions=conditions,
-        views=views,
-        objective=TrainingObjective(request.task, request.metric, request.train, request.planner, request.seed),
+    design, space, scenes = request.designs[0], request.space, request.train[: cma.MOST_SCENES]
+    middle = conditions[len(conditions) // 2]
+    return cma.CmaCandidate(
+        design=design,
+        starts=starts,
+        space=space.at({**middle, **design.at}) if space.conditioned else space,
+        objective=TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed),
         settings=request.cma,
         seed=request.seed,
+        bandwidth=request.bandwidth,
     )
 
 
@@ -222,5 +228,77 @@ def _judge(request: EvaluationRequest, lists: Sequence[RaysPerCondition]) -> lis
     objective = TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed)
     if not objective.scenes:
         return [0.0] * len(lists)
-    # one row per scene, whose rows are added one after the other
-    return np.array(objective.values(lists, range(len(objective.scenes))).T, order="C").mean(axis=0).tolist()
+    return objective.values(lists).mean(axis=0).tolist()
+
+
+# The strongest baseline is found on training scenes that no baseline's rays were chosen on: whoever picks the best of
+# several by their scores on held-out scenes holds designs against a lucky one.
+MOST_RIVAL_SCENES = 20
+FEWEST_RIVAL_SCENES = 5
+LARGEST_RIVAL_SHARE = 0.1  # of the rays that an evaluation fires may be fired to find it
+
+
+@dataclass(frozen=True)
+class StrongestRival:
+    """The best of all baselines at one number of rays.
+
+    Arguments:
+        name: Its name.
+        rays: Rays per frame.
+        scenes: The number of training scenes that it was found on.
+        values: The mean score of every baseline on them.
+    """
+
+    name: str
+    rays: int
+    scenes: int
+    values: Mapping[str, float]
+
+    @classmethod
+    def best_of(cls, values: Mapping[str, float], better: str, rays: int, scenes: int) -> StrongestRival:
+        """The best of mean scores by name; the first of equal ones."""
+        choose = min if better == "lower" else max
+        return cls(choose(values, key=lambda name: values[name]), rays, scenes, dict(values))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {"name": self.name, "rays": self.rays, "scenes": self.scenes, "values": dict(self.values)}
+
+
+@phase("strongest rival")
+def strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: int) -> StrongestRival | None:
+    """The best of all baselines at a number of rays, under the effects of the evaluation; None without baselines.
+
+    Arguments:
+        request: The evaluation.
+        entries: All its rows to be.
+        rays: The number of rays.
+    """
+    rivals = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
+    if not rivals or not request.train:
+        return None
+    fired = sum(entry.rays for entry in entries) * len(request.test)
+    affordable = int(LARGEST_RIVAL_SHARE * fired / (rays * len(rivals)))
+    scenes = held_back_scenes(request, min(max(affordable, FEWEST_RIVAL_SCENES), MOST_RIVAL_SCENES))
+    scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in rivals], request.planner)
+    found = score_here(replace(scene_pass, scenes=scenes), None)
+    means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
+    values = dict(zip((entry.name for entry in rivals), means, strict=True))
+    return StrongestRival.best_of(values, request.metric.better, rays, len(scenes))
+
+
+def held_back_scenes(request: EvaluationRequest, count: int) -> list[Scene]:
+    """Training scenes that no rival's rays were chosen on; the first ones where a request has no others."""
+    scenes = iter(request.train) if request.greedy is None else request.greedy.scenes("held back")
+    return list(itertools.islice(scenes, count))
+
+
+def mean_rival(found: Iterable[StrongestRival | None], better: str) -> StrongestRival | None:
+    """The strongest rival of several seeds, by its mean score over them; None where one seed has none."""
+    each = list(found)
+    known = [one for one in each if one is not None]
+    if not known or len(known) < len(each):
+        return None
+    names = [name for name in known[0].values if all(name in one.values for one in known)]
+    values = {name: float(np.mean([one.values[name] for one in known])) for name in names}
+    return StrongestRival.best_of(values, better, known[0].rays, sum(one.scenes for one in known))

@@ -18,10 +18,9 @@ from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
-from lidardesign.evaluate.baselines.catalog import Density
+from lidardesign.evaluate.baselines.cma import CmaSettings
 from lidardesign.evaluate.baselines.greedy import GreedySource
-from lidardesign.evaluate.baselines.simple import ALWAYS, LayOut, baseline_of, is_baseline
-from lidardesign.evaluate.cma.candidate import CmaSettings
+from lidardesign.evaluate.baselines.simple import ALWAYS, BASELINES, LayOut, check_baseline
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.scene_scores import ScenePass, Scorer, score_here
 from lidardesign.registry import plugin_guard
@@ -54,7 +53,7 @@ class EvaluationRequest:
         lay_out: How a design becomes a ray list of a given length.
         without_visibility: The design that stands for the baseline `no-visibility`, and the samples that it was
             fitted to; called when that is asked for.
-        density: What was learned, for baselines that look where it is; None where a run has no samples.
+        density: Samples of what was learned, for figures; None where a run has none.
         greedy: What the baseline `greedy` chooses by; None: it is left out.
         cma: How long the baseline `cma` searches, and who is told how it stands.
         planner: The detector, and how the effects that are simulated are chosen.
@@ -79,7 +78,7 @@ class EvaluationRequest:
     test: Sequence[Scene] = ()
     lay_out: LayOut = rays_at
     without_visibility: Callable[[], tuple[DesignSpec, Samples]] | None = None
-    density: Callable[[], Density | None] | None = None
+    density: Callable[[], Samples | None] = lambda: None
     greedy: GreedySource | None = None
     cma: CmaSettings = field(default_factory=CmaSettings)
     planner: Planner = field(default_factory=Planner)
@@ -119,11 +118,11 @@ class EvaluationRequest:
                 raise ConfigError(f"{design.name} is mounted on the body {design.mount!r}", where=where, allowed=there)
         names = [design.name for design in self.designs]
         for name in names:
-            if names.count(name) > 1 or is_baseline(name):
-                other = "a baseline" if is_baseline(name) else "another design"
+            if names.count(name) > 1 or name in BASELINES:
+                other = "a baseline" if name in BASELINES else "another design"
                 raise ConfigError(f"a design has the same name as {other}: {name!r}", hint="rename its file")
         for name in self.baselines:
-            baseline_of(name, where="--baseline")
+            check_baseline(name, where="--baseline")
         if any(count < 1 for count in self.rays):
             raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
 
@@ -131,8 +130,7 @@ class EvaluationRequest:
         self, fired: Callable[[int], Sequence[RaysPerCondition]], planner: Planner, plans: Sequence[EffectPlan] = ()
     ) -> ScenePass:
         """Sets of rays in the held-out scenes: see `ScenePass`."""
-        seeds = (self.seed, self.held_out_seed)
-        return ScenePass(self.task, self.metric, self.config, self.space, *seeds, self.test, fired, planner, plans)
+        return ScenePass(self.task, self.metric, self.seed, self.test, fired, planner, plans)
 
 
 def pattern_size(design: DesignSpec) -> int | None:

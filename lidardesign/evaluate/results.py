@@ -11,7 +11,7 @@ import csv
 import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +26,8 @@ from lidardesign.run.files import write_atomic
 from lidardesign.task import Metric
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.cma.candidate import SearchRecord
-    from lidardesign.evaluate.rivals import StrongestRival
+    from lidardesign.evaluate.baselines.cma import SearchRecord
+    from lidardesign.evaluate.entries import StrongestRival
 
 
 ROW_KEYS = (
@@ -279,7 +279,7 @@ class Evaluation:
             "planning_seconds": self.planning_seconds,
             "accuracy": [] if self.accuracy is None else self.accuracy.as_rows(),
             "notes": list(self.notes),
-            "cma": [search.as_dict() for search in self.searches],
+            "cma": [asdict(search) for search in self.searches],
             "error_estimates": as_documents(self.estimates()),
         }
         asked = {"audit": self.audit, "mounting": self.mounting}

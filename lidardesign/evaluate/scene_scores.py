@@ -3,7 +3,7 @@
 One pass over scenes: many sets of rays, scored in each scene under the effects that it calls for.
 
 A scene is the unit of work: all its rays are planned and traced together, and what comes of it depends on nothing
-else. So scenes can be scored one after the other here, or by workers (`lidardesign.evaluate.workers.pool`), to the same
+else. So scenes can be scored one after the other here, or by workers (`lidardesign.evaluate.workers`), to the same
 numbers.
 """
 
@@ -13,7 +13,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -23,12 +22,11 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays, Returns
 from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.registry import plugin_guard
-from lidardesign.run.clock import phase
+from lidardesign.run.clock import Progress, phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Physics
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.simulate import build_casters, simulate_many
-from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Score, Task
 
 # Rays times frames that are traced together: their returns take 24 bytes each.
@@ -124,7 +122,7 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
             f"score returned the detail {bad[0]!r}: {score.details[bad[0]]!r}", where=where, allowed="a number"
         )
     if score.failed:
-        return Score(float(metric.worst), failed=True, details=score.details)
+        return Score(float(metric.worst), failed=True, details=dict(score.details))
     if not _is_number(score.value) or not math.isfinite(score.value):
         raise PluginError(
             f"score returned {score.value!r}",
@@ -133,7 +131,7 @@ def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Re
             hint="where there are too few returns, return Score(metric.worst, failed=True)",
         )
     clip = min if metric.better == "lower" else max
-    return Score(clip(float(score.value), float(metric.worst)), details=score.details)
+    return Score(clip(float(score.value), float(metric.worst)), details=dict(score.details))
 
 
 def _is_number(value: object) -> bool:
@@ -167,9 +165,6 @@ def silent_notes(scenes: Sequence[Scene], fired: Mapping[str, RaysPerCondition])
     return notes
 
 
-Progress = Callable[[int, int, str], None]
-
-
 @dataclass(frozen=True, eq=False)
 class ScenePass:
     """Sets of rays to be scored in all held-out scenes.
@@ -177,9 +172,7 @@ class ScenePass:
     Arguments:
         task: Whose score is taken.
         metric: What it means.
-        config, space: The task's configuration and the design space: with `held_out_seed`, they make the scenes.
         seed: Root of the effects' random streams.
-        held_out_seed: Root of the scenes.
         scenes: The held-out scenes.
         fired: The sets of rays that are fired in a scene, by its number.
         planner: How their effects are chosen.
@@ -188,10 +181,7 @@ class ScenePass:
 
     task: Task
     metric: Metric
-    config: Any
-    space: DesignSpace
     seed: int
-    held_out_seed: int
     scenes: Sequence[Scene]
     fired: Callable[[int], Sequence[RaysPerCondition]]
     planner: Planner
@@ -228,17 +218,17 @@ def score_here(scenes: ScenePass, progress: Progress | None) -> list[SceneScores
 
     Arguments:
         scenes: The scenes, what is fired there, and under which effects.
-        progress: Called with the scenes done, all scenes, and the name of the scene.
+        progress: Called with the name of the scene, the scenes done, and all scenes.
     """
     found = []
     total = len(scenes.scenes)
     for number, scene in enumerate(scenes.scenes):
         if progress:
-            progress(number, total, scene.name)
+            progress(scene.name, number, total)
         sets, known = scenes.fired(number), scenes.known(number)
         found.append(score_in_scene(scenes.task, scenes.metric, scene, sets, scenes.planner, known, scenes.seed))
     if progress:
-        progress(total, total, "")
+        progress("", total, total)
     return found
 
 

@@ -20,21 +20,19 @@ from lidardesign.design.compare import outside_notes
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import BackgroundNote
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition
-from lidardesign.evaluate.baselines.catalog import part_notes
+from lidardesign.evaluate.baselines.cma import CMA
 from lidardesign.evaluate.baselines.greedy import GREEDY, greedy_rays
-from lidardesign.evaluate.baselines.simple import CMA
 from lidardesign.evaluate.effects import effect_notes, effect_summaries
-from lidardesign.evaluate.entries import Entry, entries_of
+from lidardesign.evaluate.entries import Entry, entries_of, strongest_rival
 from lidardesign.evaluate.mounting import MountError
 from lidardesign.evaluate.request import EvaluationRequest, left_out
 from lidardesign.evaluate.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
-from lidardesign.evaluate.rivals import strongest_rival
-from lidardesign.evaluate.scene_scores import Progress, silent_notes
+from lidardesign.evaluate.scene_scores import silent_notes
 from lidardesign.evaluate.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.numerics import ROUNDING
 from lidardesign.registry import plugin_guard
-from lidardesign.run.clock import phase
+from lidardesign.run.clock import Progress, phase
 from lidardesign.scene import Scene, group_numbers
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.task import Metric, Score, notes_of
@@ -59,7 +57,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
 
     Arguments:
         request: What to evaluate.
-        progress: Called with the scenes done, all scenes, and the name of the scene.
+        progress: Called with the name of the scene, the scenes done, and all scenes.
 
     Raises:
         ConfigError: No scenes, designs of one name, an unknown baseline, a layout that cannot be had, or an effect that
@@ -89,7 +87,6 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
             *_notes(request, entries, matched),
             *worst_notes([*plain, *matched], request.metric),
             *(search.note(request.designs[0].name, request.metric) for search in searches),
-            *part_notes([(entry.name, entry.positions) for entry in entries if entry.matched_to is None]),
             *slipped_notes(scored.second_casts),
             *effect_notes(effects, request.planner.choice),
         ],
@@ -106,7 +103,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
 def _part(progress: Progress | None, number: int, passes: int) -> Progress | None:
     if progress is None:
         return None
-    return lambda done, total, name: progress(number * total + done, passes * total, name)
+    return lambda name, done, total: progress(name, number * total + done, passes * total)
 
 
 @phase("audit")

@@ -16,8 +16,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lidardesign.errors import NumericalError
+from lidardesign.evaluate.entries import mean_rival
 from lidardesign.evaluate.results import Evaluation, Mounting, Paired, Row
-from lidardesign.evaluate.rivals import mean_rival
 from lidardesign.evaluate.statistics import LEVEL, Interval, student_interval
 
 # Design, rays, and what the bandwidth is matched to; rays at equal bandwidth differ between seeds.

@@ -7,9 +7,8 @@ A position's boresight is the middle of its rays.
 
 The order is a short round trip. Both mirrors turn at once, so a step takes as long as the one that turns further: the
 length of a step is the larger of its two angles. A frame follows the next, so the trip leads back to where it began.
-Tours start from the nearest neighbour and from rows to and fro, and are improved by turning stretches round (2-opt,
-Croes 1958) and by moving stretches of up to three stops elsewhere (Or 1976) until neither helps. Nothing in it is
-random.
+Tours start from the nearest neighbour and from the rays' own order, and are improved by turning stretches round (2-opt,
+Croes 1958) until that helps no more. Nothing in it is random.
 """
 
 from __future__ import annotations
@@ -30,23 +29,18 @@ from lidardesign.design.galvo import (
     scan_angles_deg,
     scan_directions,
 )
+from lidardesign.design.rigs.ray_lists import LOST
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.estimates import Estimate
-from lidardesign.export.common.poses import rays_rounding
-from lidardesign.export.ray_lists import ray_list_losses
 from lidardesign.geometry.rays import Rays, fire_times
-from lidardesign.numerics import ROUNDING, SLACK, TINY
+from lidardesign.numerics import ROUNDING, SLACK
 from lidardesign.run.arrays import csv_rows
 from lidardesign.run.files import write_atomic
 from lidardesign.run.inputs import RAY_TABLE, read_head
 from lidardesign.run.yaml import plain_number
 
 NEIGHBOURS = 6
-LONGEST_MOVED = 3
-# So many stops are improved from both starts, for some percent of the way; more from one, to save time.
-MOST_TWICE = 2000
-# Nearest-neighbour tours cost time with the square of their stops; larger ones start from rows.
+# Nearest-neighbour tours cost time with the square of their stops; larger ones start from the rays' own order alone.
 MOST_NEAREST = 20_000
 # Rounds of improvement: 576 stops take 40, 5000 take 200; bounds the time of ever larger tours.
 MOST_ROUNDS = 500
@@ -70,10 +64,8 @@ def short_tour(points: np.ndarray) -> np.ndarray:
     own = found == np.arange(len(points))[:, None]
     own[~own.any(axis=1), -1] = True
     near = found[~own].reshape(len(points), -1)
-    starts = [_nearest] if count <= MOST_NEAREST else []
-    if count <= MOST_TWICE or not starts:
-        starts.append(_rows)
-    tours = [_improved(points, near, start(points)) for start in starts]
+    starts = [np.arange(count), *([_nearest(points)] if count <= MOST_NEAREST else [])]
+    tours = [_improved(points, near, start) for start in starts]
     best = min(tours, key=lambda tour: travel(points[tour]))
     longest = int(_lengths(points[best], points[np.roll(best, -1)]).argmax())
     return np.roll(best, -(longest + 1))
@@ -86,16 +78,6 @@ def travel(stops: np.ndarray) -> float:
 
 def _lengths(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.abs(first - second).max(axis=-1)
-
-
-def _rows(points: np.ndarray) -> np.ndarray:
-    """Rows to and fro, as many as make their stops as far apart as the rows are."""
-    low, extent = points.min(axis=0), np.maximum(np.ptp(points, axis=0), TINY)
-    # a column of stops has no extent to divide by
-    steepness = len(points) if extent[1] >= len(points) * extent[0] else float(extent[1] / extent[0])
-    rows = max(1, round(float(np.sqrt(len(points) * steepness))))
-    row = np.minimum((points[:, 1] - low[1]) / extent[1] * rows, rows - 1).astype(np.int64)
-    return np.lexsort((np.where(row % 2 == 0, points[:, 0], -points[:, 0]), row))
 
 
 def _nearest(points: np.ndarray) -> np.ndarray:
@@ -113,18 +95,10 @@ def _nearest(points: np.ndarray) -> np.ndarray:
 
 
 def _improved(points: np.ndarray, near: np.ndarray, tour: np.ndarray) -> np.ndarray:
-    """The tour after all moves that shorten it, as far as `MOST_ROUNDS` go."""
-    least = LEAST_GAIN * float(np.ptp(points, axis=0).max())
-    rounds = 0
-    while rounds < MOST_ROUNDS:
-        changed = False
-        for step in (_turned, _moved):
-            while rounds < MOST_ROUNDS and step(points, near, tour, least):
-                changed, rounds = True, rounds + 1
-        if not changed:
-            break
-        # stretches are not moved across the array's ends: let others be its ends
-        tour = np.roll(tour, len(tour) // 2)
+    """The tour after all turns that shorten it, as far as `MOST_ROUNDS` go."""
+    least, rounds = LEAST_GAIN * float(np.ptp(points, axis=0).max()), 0
+    while rounds < MOST_ROUNDS and _turned(points, near, tour, least):
+        rounds += 1
     return tour
 
 
@@ -146,49 +120,6 @@ def _turned(points: np.ndarray, near: np.ndarray, tour: np.ndarray, least: float
             free[low : high + 2] = False
             tour[low + 1 : high + 1] = tour[low + 1 : high + 1][::-1].copy()
     return bool(len(helpful))
-
-
-def _moved(points: np.ndarray, near: np.ndarray, tour: np.ndarray, least: float) -> bool:
-    """One round of Or's moves, in place: short stretches go between two stops elsewhere, the best first."""
-    moves = [_stretch_moves(points, near, tour, length, least) for length in range(1, LONGEST_MOVED + 1)]
-    gain, start, length, after, turned = (np.concatenate(columns) for columns in zip(*moves, strict=True))
-    free = np.ones(len(tour), dtype=bool)
-    for move in np.argsort(-gain, kind="stable"):
-        begin, end, behind = int(start[move]), int(start[move] + length[move]), int(after[move])
-        low, high = min(begin - 1, behind), max(end, behind + 1)
-        if not free[low : high + 1].all():
-            continue
-        free[low : high + 1] = False
-        stretch = tour[begin:end][:: -1 if turned[move] else 1].copy()
-        if behind < begin:
-            tour[behind + 1 : end] = np.concatenate([stretch, tour[behind + 1 : begin]])
-        else:
-            tour[begin : behind + 1] = np.concatenate([tour[end : behind + 1], stretch])
-    return bool(len(gain))
-
-
-def _stretch_moves(
-    points: np.ndarray, near: np.ndarray, tour: np.ndarray, length: int, least: float
-) -> tuple[np.ndarray, ...]:
-    """Moves of stretches of a length that help: gain, start, length, the place they go behind, turned round or not."""
-    count, place, stops = len(tour), np.argsort(tour), points[tour]
-    starts = np.arange(1, count - length)
-    ends = starts + length - 1
-    # next to a neighbour of the stretch's first or last stop, before or behind it
-    beside = np.concatenate([place[near[tour[starts]]], place[near[tour[ends]]]], axis=1)
-    behind = np.concatenate([beside, beside - 1], axis=1)
-    start = np.repeat(starts, behind.shape[1])
-    behind = behind.ravel()
-    apart = (behind >= 0) & (behind < count - 1) & ((behind < start - 1) | (behind > start + length - 1))
-    start, behind = start[apart], behind[apart]
-    before, first, last, after = (stops[start + offset] for offset in (-1, 0, length - 1, length))
-    here, there = stops[behind], stops[behind + 1]
-    saved = _lengths(before, first) + _lengths(last, after) - _lengths(before, after) + _lengths(here, there)
-    straight = _lengths(here, first) + _lengths(last, there)
-    round_ = _lengths(here, last) + _lengths(first, there)
-    gain = saved - np.minimum(straight, round_)
-    kept = gain > least
-    return gain[kept], start[kept], np.full(int(kept.sum()), length), behind[kept], (round_ < straight)[kept]
 
 
 WHOLE = ("step", "position", "gate_start_ps", "gate_width_ps", "sensor", "ray")
@@ -228,16 +159,9 @@ def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the file, atomically; returns what it came to and notes of what the format cannot hold.
 
     Raises:
-        ConfigError: Rays of one sensor start at several places, look beyond what the mirrors reach, or are gated
-            later than a whole number of picoseconds says.
+        ConfigError: Rays of one sensor start at several places, or look beyond what the mirrors reach.
     """
     positions = plan(design, rays)
-    latest_m = float(gate_m(np.array([[MOST_WHOLE, 0]]))[0, 1])
-    end_m = rays.gate_m[:, 1].max(initial=0.0)
-    if end_m > latest_m:
-        raise ConfigError(
-            f"a gate ends at {end_m:.4g} m", where=design.name, allowed=f"at most {latest_m:.4g} m, in picoseconds"
-        )
     gates = gate_ps(rays.gate_m)
     lines = [",".join(COLUMNS)]
     for number, one in enumerate(positions):
@@ -247,12 +171,8 @@ def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
             row = (len(lines) - 1, number, *shared, repr(x), repr(y), start, width, int(rays.sensor[ray]), ray)
             lines.append(",".join(map(str, row)))
     write_atomic(path, "\n".join(lines) + "\n")
-    return [*_summary(positions), *ray_list_losses(design), "firing times follow from the order of the rows"]
-
-
-def galvo_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose: gates open outward to whole picoseconds; firing times are lost."""
-    return rays_rounding(rays, read_galvo(path), path, times=False)
+    rounded = "gates are whole picoseconds (0.15 mm), opened outward; firing times follow from the order of the rows"
+    return [*_summary(positions), *LOST, rounded]
 
 
 def plan(design: DesignSpec, rays: Rays) -> list[Position]:
@@ -312,9 +232,8 @@ def read_galvo(path: Path) -> Rays:
 
 def is_galvo_file(path: Path) -> bool:
     """Whether a file begins as `write_galvo` begins one."""
-    header = ",".join(COLUMNS).encode()
     try:
-        return read_head(path, RAY_TABLE).removeprefix(BOM).startswith(header)
+        return read_head(path, RAY_TABLE).removeprefix(BOM).startswith(",".join(COLUMNS).encode())
     except DataError:
         return False
 
@@ -370,18 +289,14 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     }
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
-
-
 def _numbers(row: list[str], where: str) -> list[float]:
     """The values of a row: finite, and whole and not negative where they count or time something."""
     try:
         found = [plain_number(cell) for cell in row]
     except ValueError as error:
-        raise DataError(_short(str(error)), where=where, allowed="numbers") from error
+        raise DataError(str(error)[:LONGEST_SHOWN], where=where, allowed="numbers") from error
     if len(found) != len(COLUMNS) or not all(map(math.isfinite, found)):
-        raise DataError(f"holds {_short(str(row))}", where=where, allowed=f"{len(COLUMNS)} finite numbers")
+        raise DataError(f"holds {str(row)[:LONGEST_SHOWN]}", where=where, allowed=f"{len(COLUMNS)} finite numbers")
     for name, value in zip(COLUMNS, found, strict=True):
         if name in WHOLE and (value < 0 or value != int(value) or value > MOST_WHOLE):
             raise DataError(f"{name} is {value:g}", where=where, allowed="whole numbers, 0 or more")

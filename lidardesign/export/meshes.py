@@ -13,17 +13,13 @@ of 20 mm along the boresight; its far face is 16 mm wide at the bottom and 8 mm 
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 
 from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
-from lidardesign.errors import DataError
-from lidardesign.estimates import ROUNDING, Estimate
-from lidardesign.export.common.names import identifier, numbers, write_folder
-from lidardesign.export.common.poses import angles_between, constraint_losses, rays_rounding, require_sensors
+from lidardesign.export.names import identifier, numbers, write_folder
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import unit_vectors
 from lidardesign.run.files import write_atomic
@@ -65,7 +61,7 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     moving = [length for length, _ in (sensor.travel_m for _, sensor in seen) if length > 0]
     if moving:
         notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: frusta stand in their middles")
-    return notes + constraint_losses(design)
+    return notes
 
 
 def _file(comments: list[str], **elements: np.ndarray) -> bytes:
@@ -137,42 +133,12 @@ def _frustum(sensor: Sensor) -> np.ndarray:
     return np.concatenate([np.asarray(sensor.origin_m) + end * looking for end in sensor.gate_m])
 
 
-def read_ply(path: Path) -> Rays:
-    """The rays of a folder that `write_ply` made.
-
-    Raises:
-        DataError: The folder cannot be read, or holds something else.
-    """
-    kinds = np.dtype(PLACE + NORMAL + COLOUR + RAY)
-    where = Path(path) / RAYS
-    try:
-        header, found, content = where.read_bytes().partition(b"end_header\n")
-        if not found or [line for line in header.decode().split("\n") if line.startswith("property")] != _properties(
-            kinds
-        ):
-            raise DataError("holds no rays", where=str(where), hint="export it again")
-        table = np.frombuffer(content, dtype=kinds)
-    except (OSError, ValueError) as error:
-        raise DataError(f"cannot be read as rays: {error}", where=str(where), hint="export it again") from error
-    origin, looking, gate = (
-        np.stack([table[name] for name in names], axis=1)
-        for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("scalar_gate_start", "scalar_gate_end"))
-    )
-    return Rays(origin, looking, gate, table["scalar_sensor"], table["scalar_time"])
-
-
-def ply_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose: nothing, they are kept bit for bit."""
-    return rays_rounding(rays, read_ply(path), path)
-
-
 MM_PER_M = 1000.0
 # Forward, to the left and up from the tip [mm]: the tip, then the far face from its bottom right against the clock.
 CORNERS_MM = np.array([(0, 0, 0), (20, -8, -6), (20, -4, 6), (20, 4, 6), (20, 8, -6)], dtype=np.float64)
 # Seen from outside against the clock.
 FACETS = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (1, 4, 3), (1, 3, 2)])
 KEYWORDS = ("solid", "facet", "loop", "vertex")
-_VERTEX = re.compile(r"^\s*vertex (\S+) (\S+) (\S+)$", re.MULTILINE)
 
 
 def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
@@ -185,7 +151,7 @@ def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     moving = [length for length, _ in (sensor.travel_m for sensor in design.sensors) if length > 0]
     if moving:
         notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: solids stand in their middles")
-    return notes + constraint_losses(design)
+    return notes
 
 
 def _solid(index: int, sensor: Sensor) -> str:
@@ -199,35 +165,3 @@ def _solid(index: int, sensor: Sensor) -> str:
         vertices = "".join(f"   vertex {numbers(corner)}\n" for corner in triangle)
         facets.append(f" facet normal {numbers(normal)}\n  outer loop\n{vertices}  endloop\n endfacet\n")
     return f"solid {name}\n{''.join(facets)}endsolid {name}\n"
-
-
-def read_stl(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Places [m], shape (G, 3), and boresight frames, shape (G, 3, 3), of the solids of a file that `write_stl` made.
-
-    Raises:
-        DataError: The file cannot be read, or holds other solids.
-    """
-    try:
-        found = _VERTEX.findall(Path(path).read_text(encoding="utf-8"))
-        corners = np.array(found, dtype=np.float64).reshape(-1, *FACETS.shape, 3)
-    except (OSError, ValueError) as error:
-        raise DataError(f"cannot be read as STL: {error}", where=str(path), hint="export it again") from error
-    # corner k of the solid, wherever it is first
-    first = [int((corner == FACETS).argmax()) for corner in range(len(CORNERS_MM))]
-    tip, right, right_up, left_up, left = corners.reshape(len(corners), FACETS.size, 3)[:, first].transpose(1, 0, 2)
-    across = unit_vectors(left - right)
-    up = unit_vectors((left_up + right_up) - (left + right))
-    return tip / MM_PER_M, np.stack([np.cross(across, up), across, up], axis=1)
-
-
-def stl_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose, of places, boresights and rolls."""
-    places, frames = read_stl(path)
-    require_sensors(len(design.sensors), len(places), path)
-    written = np.stack([sensor.frame for sensor in design.sensors])
-    origin = np.linalg.norm(places - np.array([sensor.origin_m for sensor in design.sensors]), axis=1)
-    turned = np.concatenate([angles_between(frames[:, row], written[:, row]) for row in range(3)])
-    return {
-        "origin_m": Estimate(None, float(origin.max()), "m", ROUNDING),
-        "direction_rad": Estimate(None, float(turned.max()), "rad", ROUNDING),
-    }

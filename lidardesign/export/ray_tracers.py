@@ -26,8 +26,6 @@ and the `.time1f` files (float32, milliseconds) are.
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -35,37 +33,28 @@ import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import DataError
-from lidardesign.estimates import Estimate
-from lidardesign.export.common.names import (
-    child,
-    document,
-    element,
-    identifier,
-    numbers,
-    read_xml,
-    renamed_note,
-    write_folder,
-)
-from lidardesign.export.common.poses import (
+from lidardesign.export.mounts import (
     Mount,
-    Part,
     Place,
     design_losses,
     fire_times_s,
     gate_losses,
     mounts,
     places,
-    quaternion,
-    rays_of_parts,
-    rays_rounding,
     require_rays,
 )
-from lidardesign.geometry.frames import rotations_of_quaternions
+from lidardesign.export.names import (
+    child,
+    document,
+    element,
+    identifier,
+    numbers,
+    renamed_note,
+    write_folder,
+)
 from lidardesign.geometry.rays import Rays
-from lidardesign.numerics import unit_vectors
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
-from lidardesign.space import angles, direction
+from lidardesign.space import angles
 
 SCANNERS, PLATFORMS, SURVEY, SCENE = "scanners.xml", "platforms.xml", ".survey.xml", "scene.xml#scene"
 # HELIOS++ drops echoes whose rise begins before the gate does: a short pulse, in fine bins, loses little. Half a bin
@@ -156,49 +145,10 @@ def _add_scanner(root: Element, mount: Mount, rays: Rays, pulse_hz: int) -> None
         child(origin, "rot", axis="z", angle_deg=float(azimuth_deg[number] - 90.0))
 
 
-def read_helios(path: Path, design: DesignSpec, rays: Rays) -> Rays:
-    """The rays of a folder that `write_helios` made of a design and its rays, with their sensors and times.
-
-    Raises:
-        DataError: The folder cannot be read, or holds something else.
-    """
-    path = Path(path)
-    scanners = {scanner.get("id"): scanner for scanner in read_xml(path / SCANNERS, "document")}
-    parts = [
-        _rays_of_scanner(mount.ray, scanners.get(mount.name), path / f"{mount.name}{SURVEY}")
-        for mount in mounts(design, rays)
-    ]
-    return rays_of_parts(rays, parts, str(path))
-
-
-def _rays_of_scanner(ray: np.ndarray, scanner: Element | None, survey: Path) -> Part:
-    settings = read_xml(survey, "document").find("survey/leg/platformSettings")
-    if scanner is None or settings is None:
-        raise DataError("holds no survey of this design", where=str(survey), hint="export it again")
-    channels = scanner.findall("channels/channel")
-    beams = scanner.findall("channels/channel/beamOrigin")
-    try:
-        place = np.array([float(settings.attrib[axis]) for axis in "xyz"])
-        gate = np.array([[float(one.attrib[name]) for name in ("rangeMin_m", "rangeMax_m")] for one in channels])
-        offset = np.array([[float(beam.attrib[axis]) for axis in "xyz"] for beam in beams])
-        turns = np.array([[float(rot.attrib["angle_deg"]) for rot in beam] for beam in beams])
-        elevation, yaw = np.radians(turns.reshape(-1, 2)).T
-        return ray, place + offset, direction(yaw + math.pi / 2, elevation), gate.reshape(-1, 2)
-    except (KeyError, ValueError) as error:
-        raise DataError(f"holds no survey of this design: {error}", where=str(survey)) from error
-
-
-def helios_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose."""
-    return rays_rounding(rays, read_helios(path, design, rays), path, times=False)
-
-
 SCENE_SUFFIX = ".xml"
 SAMPLES = 64
 # From the light to a surface and back to the sensor.
 DEPTH = 2
-# Dr.Jit counts the numbers of an array with 32 bits.
-MOST_NUMBERS = 2**32 - 1
 
 
 def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
@@ -216,11 +166,6 @@ def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         f"the light is one flash for all rays: only light straight there and back (max_depth {DEPTH}) is the ray's own",
         f"gates end on whole bins of {MM_PER_M * Bandwidth().bin_m:.1f} mm; times within the frame are lost",
     ]
-    largest = max(len(one.ray) * _bins(rays, one) for one in found)
-    if largest > MOST_NUMBERS:
-        notes.append(
-            f"a film of {largest:.2g} numbers is more than Mitsuba holds: shorten its gates, or fire fewer rays"
-        )
     # a film has one gate
     wider = np.concatenate([np.abs(rays.gate_m[one.ray] - _gate_m(rays, one)).max(axis=1) for one in found])
     if wider.any():
@@ -283,41 +228,8 @@ def _add_vector(parent: Element, tag: str, name: str, values: np.ndarray) -> Non
     child(parent, tag, name=name, x=x, y=y, z=z)
 
 
-def read_mitsuba(path: Path, design: DesignSpec, rays: Rays) -> Rays:
-    """The rays of a folder that `write_mitsuba` made of a design and its rays, with their sensors and times.
-
-    Raises:
-        DataError: The folder cannot be read, or holds something else.
-    """
-    found = places(mounts(design, rays), rays)
-    return rays_of_parts(
-        rays, [_rays_of_scene(one, Path(path) / f"{one.name}{SCENE_SUFFIX}") for one in found], str(path)
-    )
-
-
-def _rays_of_scene(place: Place, path: Path) -> Part:
-    root = read_xml(path, "scene")
-    film = {one.get("name"): float(one.get("value", "nan")) for one in root.findall("sensor/film/*[@value]")}
-    try:
-        origin, looking = (
-            np.array([[float(one.attrib[axis]) for axis in "xyz"] for one in root.findall(f"sensor/sensor/{tag}")])
-            for tag in ("point", "vector")
-        )
-        start, bins, width = (film[name] for name in ("start_opl", "temporal_bins", "bin_width_opl"))
-        gate = np.tile([start / 2, (start + bins * width) / 2], (len(origin), 1))
-        return place.ray, origin.reshape(-1, 3), unit_vectors(looking.reshape(-1, 3)), gate
-    except (KeyError, ValueError) as error:
-        raise DataError(f"holds no sensor of this design: {error}", where=str(path), hint="export it again") from error
-
-
-def mitsuba_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose, gates on whole bins that rays share included."""
-    return rays_rounding(rays, read_mitsuba(path, design, rays), path, times=False)
-
-
 MODEL, PATTERN, RANGES, TIMES = "model.sdf", ".mat3x4f", ".range2f", ".time1f"
 MS_PER_S = 1000.0
-POSE_NUMBERS = 6
 
 
 def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
@@ -361,6 +273,7 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
         f"{MODEL} names the patterns by their absolute paths in {path.resolve()}: export again where they move",
         f"the plugin fires all rays of a frame at once; the {TIMES} files hold when each fires, for "
         "rgl_node_rays_set_time_offsets of the library",
+        "patterns, gates and times are kept in single precision",
     ]
     for lost in gate_losses(mounted):
         notes += [lost, f"the {RANGES} files hold each ray's own gate, for rgl_node_rays_set_range of the library"]
@@ -376,53 +289,3 @@ def _matrices(mount: Mount, rays: Rays) -> np.ndarray:
     across = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(rays))], axis=1)
     offset = (rays.origin_m - rays.origin_m[0]) @ mount.sensor.frame.T
     return np.stack([np.cross(across, looking), across, looking, offset], axis=2)
-
-
-def read_rgl(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
-    """The rays of a folder that `write_rgl` made of a design and its rays, with their sensors, and the frame rate [Hz].
-
-    Raises:
-        DataError: The folder cannot be read, or holds something else.
-    """
-    path = Path(path)
-    found = {sensor.get("name"): sensor for sensor in read_xml(path / MODEL, "sdf").findall("model/link/sensor")}
-    times_s, rates_hz, parts = np.zeros(len(rays)), [], []
-    for mount in mounts(design, rays):
-        pose, rate_hz = _pose_and_rate(found.get(mount.name), mount, path)
-        # The rays of one sensor: its pose, and its pattern in the frame of that
-        matrices = _float32_records(path / f"{mount.name}{PATTERN}", (3, 4))
-        gate = _float32_records(path / f"{mount.name}{RANGES}", (2,))
-        turn = rotations_of_quaternions(np.array(quaternion(*pose[3:])))
-        looking = unit_vectors(matrices[:, :, 2] @ turn.T)
-        parts.append((mount.ray, pose[:3] + matrices[:, :, 3] @ turn.T, looking, gate))
-        rates_hz.append(rate_hz)
-        times = _float32_records(path / f"{mount.name}{TIMES}", ()) / MS_PER_S
-        if len(times) != len(mount.ray):
-            raise DataError(f"holds {len(times)} times of {len(mount.ray)} rays", where=str(path / mount.name))
-        times_s[mount.ray] = times
-    return replace(rays_of_parts(rays, parts, str(path)), time_s=times_s), max(rates_hz)
-
-
-def _pose_and_rate(sensor: Element | None, mount: Mount, path: Path) -> tuple[list[float], float]:
-    try:
-        pose = [float(number) for number in ("" if sensor is None else sensor.findtext("pose", "")).split()]
-        rate_hz = float("" if sensor is None else sensor.findtext("plugin/update_rate", ""))
-    except ValueError as error:
-        raise DataError(f"holds no {mount.name}: {error}", where=str(path / MODEL), hint="export it again") from error
-    if len(pose) != POSE_NUMBERS:
-        raise DataError(f"holds no pose of {mount.name}", where=str(path / MODEL), hint="export it again")
-    return pose, rate_hz
-
-
-def _float32_records(path: Path, shape: tuple[int, ...]) -> np.ndarray:
-    """The float32 records of a file as float64, shape (K, *shape)."""
-    try:
-        return np.fromfile(path, dtype="<f4").astype(np.float64).reshape(-1, *shape)
-    except (OSError, ValueError) as error:
-        raise DataError(f"cannot be read as a pattern: {error}", where=str(path), hint="export it again") from error
-
-
-def rgl_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose: patterns are float32."""
-    found, rate_hz = read_rgl(path, design, rays)
-    return rays_rounding(replace(rays, time_s=fire_times_s(rays, rate_hz)), found, path)

@@ -10,7 +10,6 @@ from typing import Any
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
-from lidardesign.estimates import Estimate
 from lidardesign.geometry.rays import Rays
 from lidardesign.mujoco_model import RobotFile
 
@@ -26,9 +25,8 @@ class Exporter:
         name: As `export --format` takes it.
         suffix: Of the file that it writes, with the dot; of the folder where it writes several.
         summary: One line for `export --list`.
-        module: Where its functions are.
-        functions: The names of the one that writes, `(design, rays, path) -> list[str]`, and of the one that reads the
-            file back and says what its numbers lose, `(design, rays, path)`.
+        module: The module of its function.
+        function: The name of the function that writes it, `(design, rays, path) -> list[str]`.
         reader: The program that reads it.
         checked: How the tests show that this program takes what is written.
         folder: Whether it writes a folder of files.
@@ -40,7 +38,7 @@ class Exporter:
     suffix: str
     summary: str
     module: str
-    functions: tuple[str, str]
+    function: str
     reader: str
     checked: str
     folder: bool = False
@@ -68,7 +66,7 @@ class Exporter:
             ConfigError: A frame rate or a robot for a format that holds none, or a rate that no sensor has.
             DataError: The file cannot be written, or the format cannot hold such a design at all.
         """
-        write = getattr(import_module(self.module), self.functions[0])
+        write = getattr(import_module(self.module), self.function)
         self.check_rate(rate_hz)
         if robot is not None and not self.robotic:
             raise ConfigError(f"{self.name} cannot hold a robot", where="--robot", allowed="with mjcf")
@@ -76,6 +74,8 @@ class Exporter:
         if self.rated:
             options["rate_hz"] = Bandwidth().rate_hz if rate_hz is None else rate_hz
         notes = write(design, rays, Path(path), **options)
+        if design.constraints:
+            notes.append("the constraints of the design are lost")
         if design.mount is not None and robot is None:
             hint = "; --robot MODEL puts the sensors on it" if self.robotic else ""
             notes.append(f"places and directions are in the frame of the robot's body {design.mount!r}{hint}")
@@ -95,14 +95,6 @@ class Exporter:
                 f"{self.name} cannot hold a frame rate", where="--rate-hz", allowed=f"with {rated}" if rated else "none"
             )
 
-    def rounding(self, design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-        """What the numbers in a file that was just written lose, by reading it back: the largest error of each kind.
-
-        Raises:
-            DataError: The file does not hold what was written.
-        """
-        return getattr(import_module(self.module), self.functions[1])(design, rays, Path(path))
-
 
 EXPORTERS: dict[str, Exporter] = {
     exporter.name: exporter
@@ -111,44 +103,44 @@ EXPORTERS: dict[str, Exporter] = {
             "csv",
             ".csv",
             "one ray per row: origin, direction, angles, gate, time",
-            "lidardesign.export.ray_lists",
-            ("write_csv", "csv_rounding"),
+            "lidardesign.design.rigs.ray_lists",
+            "write_csv",
             reader="anything that reads CSV; `evaluate` and `fit` too",
-            checked="read by numpy, and read back",
+            checked="read by numpy",
         ),
         Exporter(
             "npz",
             ".npz",
             "the same columns as numpy arrays",
-            "lidardesign.export.ray_lists",
-            ("write_npz", "npz_rounding"),
+            "lidardesign.design.rigs.ray_lists",
+            "write_npz",
             reader="numpy",
-            checked="read by numpy, and read back",
+            checked="read by numpy",
         ),
         Exporter(
             "sensors-csv",
             ".sensors.csv",
             "one sensor per row, the 16 columns of the research code",
-            "lidardesign.export.ray_lists",
-            ("write_sensors_csv", "sensors_csv_rounding"),
+            "lidardesign.design.rigs.ray_lists",
+            "write_sensors_csv",
             reader="the research code of the paper",
-            checked="read back; the columns are those of its own files",
+            checked="read as a design; the columns are those of its own files",
         ),
         Exporter(
             "galvo",
             ".galvo.csv",
             "mirror angles in the order of least travel, gates in ps: +-20 degrees per axis",
             "lidardesign.export.galvo",
-            ("write_galvo", "galvo_rounding"),
+            "write_galvo",
             reader="a script that drives two mirrors and a gated detector",
-            checked="read back, and by `capture`",
+            checked="read by `capture`",
         ),
         Exporter(
             "mjcf",
             ".mjcf.xml",
             "a rangefinder site per ray",
             "lidardesign.export.robots",
-            ("write_mjcf", "mjcf_rounding"),
+            "write_mjcf",
             robotic=True,
             reader="MuJoCo",
             checked="loaded and run in MuJoCo: its distances agree with ours",
@@ -158,7 +150,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".sdf",
             "a gpu_lidar per sensor, on even grids",
             "lidardesign.export.robots",
-            ("write_sdf", "sdf_rounding"),
+            "write_sdf",
             reader="Gazebo",
             checked="parsed by libsdformat without a warning, all values compared; its pixels in a twin",
             rated=True,
@@ -168,7 +160,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".urdf",
             "a fixed link per sensor, with Gazebo's gpu_lidar",
             "lidardesign.export.robots",
-            ("write_urdf", "urdf_rounding"),
+            "write_urdf",
             reader="ROS, robot_state_publisher",
             checked="parsed by check_urdf; sensors by libsdformat",
             rated=True,
@@ -178,7 +170,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".urdf.xacro",
             "the same as a macro that mounts it on a robot",
             "lidardesign.export.robots",
-            ("write_xacro", "xacro_rounding"),
+            "write_xacro",
             reader="ROS, xacro",
             checked="expanded by xacro and parsed by check_urdf",
             rated=True,
@@ -187,29 +179,18 @@ EXPORTERS: dict[str, Exporter] = {
             "carla",
             ".carla.json",
             "attributes and transform of a ray_cast lidar per sensor",
-            "lidardesign.export.driving",
-            ("write_carla", "carla_rounding"),
+            "lidardesign.export.simulators",
+            "write_carla",
             reader="a script that sets blueprint attributes",
             checked="names and types against CARLA's documented ones; its sweep in a twin",
-            rated=True,
-        ),
-        Exporter(
-            "isaac-json",
-            ".isaac",
-            "a solid-state profile per sensor, and where they are",
-            "lidardesign.export.isaac",
-            ("write_isaac_json", "isaac_json_rounding"),
-            reader="Isaac Sim before 5",
-            checked="fields, types and lengths against a JSON Schema of NVIDIA's profiles",
-            folder=True,
             rated=True,
         ),
         Exporter(
             "isaac-usd",
             ".usda",
             "an OmniLidar per sensor, gates per ray",
-            "lidardesign.export.isaac",
-            ("write_isaac_usd", "isaac_usd_rounding"),
+            "lidardesign.export.simulators",
+            "write_isaac_usd",
             reader="Isaac Sim from 5 on",
             checked="opened with OpenUSD; types, tokens and lengths as its schema has them",
             rated=True,
@@ -219,7 +200,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".helios",
             "a scanner per sensor with a channel per ray, and surveys of one frame each",
             "lidardesign.export.ray_tracers",
-            ("write_helios", "helios_rounding"),
+            "write_helios",
             reader="HELIOS++",
             checked="valid by schemas of its fields; a twin of HELIOS++ fires the rays and finds their echoes",
             folder=True,
@@ -229,8 +210,8 @@ EXPORTERS: dict[str, Exporter] = {
             "osi",
             ".osi.json",
             "a lidar configuration per sensor: mounting position, unit vectors, microseconds",
-            "lidardesign.export.driving",
-            ("write_osi", "osi_rounding"),
+            "lidardesign.export.simulators",
+            "write_osi",
             reader="sensor models and simulators of ASAM OSI",
             checked="parsed by protobuf, with ASAM's own bindings where they are",
             rated=True,
@@ -240,9 +221,9 @@ EXPORTERS: dict[str, Exporter] = {
             ".rgl",
             "a pattern of float32 ray poses per sensor, and the model with the plugin",
             "lidardesign.export.ray_tracers",
-            ("write_rgl", "rgl_rounding"),
+            "write_rgl",
             reader="Robotec GPU Lidar and its Gazebo plugin",
-            checked="parsed by libsdformat, and read back as the plugin reads patterns",
+            checked="parsed by libsdformat; a twin reads patterns as the plugin does",
             folder=True,
             rated=True,
         ),
@@ -251,7 +232,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".mitsuba",
             "a scene per sensor: gated film, rays as radiancemeters, a flash beside them",
             "lidardesign.export.ray_tracers",
-            ("write_mitsuba", "mitsuba_rounding"),
+            "write_mitsuba",
             reader="Mitsuba 3 with mitransient",
             checked="rendered by them: light comes back in the bin of its range",
             folder=True,
@@ -261,9 +242,9 @@ EXPORTERS: dict[str, Exporter] = {
             ".ply.d",
             "rays as points, beams as edges, fields of view as surfaces",
             "lidardesign.export.meshes",
-            ("write_ply", "ply_rounding"),
+            "write_ply",
             reader="CloudCompare, Blender, MeshLab",
-            checked="loaded by trimesh, and read back; names as CloudCompare and Blender know them",
+            checked="loaded by trimesh; names as CloudCompare and Blender know them",
             folder=True,
         ),
         Exporter(
@@ -271,9 +252,9 @@ EXPORTERS: dict[str, Exporter] = {
             ".stl",
             "mounting positions as small solids, in millimetres",
             "lidardesign.export.meshes",
-            ("write_stl", "stl_rounding"),
+            "write_stl",
             reader="CAD programs",
-            checked="loaded by trimesh as closed solids, and read back",
+            checked="loaded by trimesh as closed solids",
         ),
     )
 }

@@ -23,7 +23,6 @@ are relative to the parent.
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -37,33 +36,28 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
-from lidardesign.estimates import Estimate
-from lidardesign.export.common.even_grid import EvenGrid, by_channel, grid_of, grid_sensor_losses
-from lidardesign.export.common.names import (
+from lidardesign.export.mounts import (
+    Mount,
+    channel_mounts,
+    design_losses,
+    grid_of,
+    grid_sensor_losses,
+    mounts,
+)
+from lidardesign.export.names import (
     distinct,
+    document,
     element,
     identifier,
     number,
     numbers,
-    read_xml,
     renamed_note,
-    write_xml,
     xml_text,
 )
-from lidardesign.export.common.poses import (
-    Mount,
-    ReadMount,
-    angles_between,
-    design_losses,
-    mounts,
-    mounts_rounding,
-    quaternion,
-    rays_rounding,
-)
-from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
 from lidardesign.mujoco_model import RobotFile, load_model, mujoco_warnings, seen_geoms
-from lidardesign.numerics import SLACK, unit_vectors
+from lidardesign.numerics import SLACK
+from lidardesign.run.files import write_atomic
 
 WORLD = "world"
 # Half of what a site of one ray is drawn as [m].
@@ -99,7 +93,7 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | No
         site[mount.ray] = [f"{name}_r{number}" for number in range(len(mount.ray))]
         place.append(_body(mount, name, rays, site[mount.ray]))
     sensors.extend(_rangefinder(str(site[ray]), rays, ray) for ray in range(len(rays)))
-    write_xml(path, model)
+    write_atomic(path, document(model))
     late = rays.gate_m[rays.gate_m[:, 0] > 0, 0]
     if len(late):
         notes.append(
@@ -139,34 +133,6 @@ def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Elemen
     return root, place, sensors
 
 
-def read_mjcf(path: Path, count: int | None = None) -> Rays:
-    """The rays of a file that `write_mjcf` made, in the order of its rangefinders; beside a robot's, the last so many.
-
-    Raises:
-        DataError: The file cannot be read, or is no such model.
-    """
-    root = read_xml(path, "mujoco")
-    try:
-        frames: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        found = list(root.iterfind("sensor/rangefinder"))
-        found = found if count is None else found[len(found) - count :]
-        names = {one.get("site") for one in found}
-        for body in root.iter("body"):
-            if any(site.get("name") in names for site in body.iterfind("site")):
-                frames.update(_sites(body))
-        user = np.array([_floats(one, "user") for one in found]).reshape(len(found), -1)
-        origin = np.array([frames[one.attrib["site"]][0] for one in found]).reshape(-1, 3)
-        looking = np.array([frames[one.attrib["site"]][1] for one in found]).reshape(-1, 3)
-        return Rays(origin, unit_vectors(looking), user[:, :2], user[:, 2].astype(np.int64), user[:, 3])
-    except (KeyError, ValueError, IndexError) as error:
-        raise DataError(f"is not a model of rangefinders: {error!r}", where=str(path)) from error
-
-
-def mjcf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose."""
-    return rays_rounding(rays, read_mjcf(path, len(rays)) if len(rays) else rays, path)
-
-
 def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:
     frame = mount.sensor.frame
     places = (rays.origin_m[mount.ray] - mount.origin_m) @ frame.T
@@ -195,45 +161,20 @@ def _rangefinder(site: str, rays: Rays, ray: int) -> Element:
     return element("rangefinder", {"name": site, "site": site, "cutoff": number(max(end, SLACK)), "user": user})
 
 
-def _sites(body: Element) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Where each site of a body is and where its +z looks, in the world."""
-    place, turn = _floats(body, "pos"), rotations_of_quaternions(_floats(body, "quat"))
-    sites = list(body.iterfind("site"))
-    local = np.array([_floats(one, "pos") for one in sites]).reshape(-1, 3)
-    looking = rotations_of_quaternions(np.array([_floats(one, "quat") for one in sites]).reshape(-1, 4))[:, :, 2]
-    world = zip(place + local @ turn.T, looking @ turn.T, strict=True)
-    return {one.attrib["name"]: pose for one, pose in zip(sites, world, strict=True)}
-
-
-def _floats(one: Element, name: str) -> np.ndarray:
-    return np.array(one.attrib[name].split(), dtype=np.float64)
-
-
 LINK = "lidar"
-# Sides of a face's picture, in pixels, and the least angle that is divided by to find them.
-FEWEST_PIXELS, MOST_PIXELS, LEAST_ANGLE_RAD = 128, 1024, 1e-4
-# Scans are pictures too, and GPUs have no wider ones.
-MOST_SAMPLES = 16_384
+# Half the diagonal of a pixel of a face's picture, whose sides have 128 or more.
+BESIDE_DEG = 0.64
 # Gazebo renders depth images, whose near plane must be in front of the camera.
 NEAREST_M = 0.001
 
 
 def write_sdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold."""
-    design, rays = by_channel(design, rays)
-    mounted = mounts(design, rays)
+    design, rays, mounted = channel_mounts(design, rays)
     link = element("link", {"name": LINK}, [sensor_element(one, rate_hz, posed=True) for one in mounted])
     model = element("model", {"name": identifier(design.name)}, [element("static", text="true"), link])
-    write_xml(path, element("sdf", {"version": "1.9"}, [model]))
+    write_atomic(path, document(element("sdf", {"version": "1.9"}, [model])))
     return sdf_losses(design, mounted, rays)
-
-
-def sdf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """How far the rays that Gazebo fires are from the design's."""
-    design, rays = by_channel(design, rays)
-    mounted = mounts(design, rays)
-    found = read_xml(path, "sdf").findall(f"model/link[@name='{LINK}']/sensor")
-    return mounts_rounding(rays, mounted, [read_sensor(one, path) for one in found], path)
 
 
 def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
@@ -251,30 +192,10 @@ def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list
             f"gates of {len(near)} of {len(mounted)} sensors start below {NEAREST_M:g} m, where Gazebo's depth camera "
             f"cannot: they start at {NEAREST_M:g} m"
         )
-    grids = [grid_of(one) for one in mounted]
-    wide = sum(max(grid.columns, grid.rows) > MOST_SAMPLES for grid in grids)
-    if wide:
-        notes.append(
-            f"{wide} of {len(mounted)} sensors have more than {MOST_SAMPLES} columns or rows: Gazebo fails on them"
-        )
-    if grids:
-        beside = math.degrees(max(float(pixel_offsets_rad(grid).max()) for grid in grids))
-        notes.append(f"Gazebo measures along the pixels of a picture: up to {beside:.2g} deg beside the rays")
+    if mounted:
+        notes.append(f"Gazebo measures along the pixels of a picture: up to {BESIDE_DEG} deg beside the rays")
     names = [design.name, *(one.sensor.name for one in mounted)]
     return [*notes, *renamed_note(names, [identifier(design.name), *(one.name for one in mounted)])]
-
-
-def pixel_offsets_rad(grid: EvenGrid) -> np.ndarray:
-    """How far the middles of Gazebo's pixels are from the rays of a grid that lie in them, shape (rows * columns,)."""
-    axes = [(grid.azimuth_rad, grid.columns), *([(grid.elevation_rad, grid.rows)] if grid.rows > 1 else [])]
-    wanted = max(int(math.pi / 2 / max(high - low, LEAST_ANGLE_RAD) * count) for (low, high), count in axes)
-    pixels = min(max(2 ** math.ceil(math.log2(max(wanted, 1))), FEWEST_PIXELS), MOST_PIXELS)
-    looking = grid.directions()
-    reach = np.abs(looking).max(axis=1, keepdims=True)
-    on_face = looking / reach
-    pixel = np.clip(np.floor((on_face + 1) / 2 * pixels), 0, pixels - 1)
-    middle = np.where(np.abs(looking) == reach, on_face, (2 * pixel + 1) / pixels - 1)
-    return angles_between(unit_vectors(middle), looking)
 
 
 def sensor_element(mount: Mount, rate_hz: float, *, posed: bool, name: str | None = None) -> Element:
@@ -310,28 +231,6 @@ def _axis(name: str, samples: int, bounds_rad: tuple[float, float]) -> Element:
     )
 
 
-def read_sensor(sensor: Element, path: Path, pose: np.ndarray | None = None) -> ReadMount:
-    """What a <sensor> that `sensor_element` made holds, at its own pose or at a given one (6,).
-
-    Raises:
-        DataError: An element is missing, or is no number.
-    """
-    try:
-        if pose is None:
-            pose = np.array(str(sensor.findtext("pose")).split(), dtype=np.float64)
-        start, end = (float(str(sensor.findtext(f"lidar/range/{name}"))) for name in ("min", "max"))
-        columns, rows = (int(str(sensor.findtext(f"lidar/scan/{axis}/samples"))) for axis in ("horizontal", "vertical"))
-        azimuth, elevation = (
-            tuple(float(str(sensor.findtext(f"lidar/scan/{axis}/{name}_angle"))) for name in ("min", "max"))
-            for axis in ("horizontal", "vertical")
-        )
-        turn = rotations_of_quaternions(np.array(quaternion(*pose[3:])))
-    except (ValueError, TypeError) as error:
-        raise DataError(f"holds no such lidar: {error}", where=str(path)) from error
-    grid = EvenGrid(columns, rows, (azimuth[0], azimuth[1]), (elevation[0], elevation[1]))
-    return ReadMount(pose[:3], grid.directions() @ turn.T, (start, end))
-
-
 # No sensor's link is called so: those end in _link. Nor its joint, for none has the name of the world.
 BASE = "lidar_base"
 BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
@@ -339,19 +238,11 @@ BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
 
 def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the description, atomically; returns notes of what the format cannot hold."""
-    design, rays = by_channel(design, rays)
-    mounted = mounts(design, rays)
+    design, rays, mounted = channel_mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
-    write_xml(path, element("robot", {"name": identifier(design.name)}, [*_base(), *parts]))
+    write_atomic(path, document(element("robot", {"name": identifier(design.name)}, [*_base(), *parts])))
     mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave out the sensors"
     return [*urdf_losses(design, mounted, rays), mass]
-
-
-def urdf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """How far the rays of the described sensors are from the design's."""
-    design, rays = by_channel(design, rays)
-    mounted = mounts(design, rays)
-    return mounts_rounding(rays, mounted, read_sensors(read_xml(path, "robot"), path), path)
 
 
 def urdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
@@ -394,47 +285,17 @@ def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = ""
     return [element("link", {"name": name}), joint, element("gazebo", {"reference": name}, [sensor])]
 
 
-def read_sensors(root: Element, path: Path) -> list[ReadMount]:
-    """What the joints and Gazebo sensors below an element hold, in their order.
-
-    Raises:
-        DataError: A joint is missing, or has no origin.
-    """
-    joints = {child.get("link", ""): joint for joint in root.iterfind("joint") for child in joint.findall("child")[:1]}
-    found = []
-    for extension in root.iterfind("gazebo"):
-        try:
-            origin = next(joints[extension.attrib["reference"]].iterfind("origin"))
-            values = f"{origin.attrib['xyz']} {origin.attrib['rpy']}".split()
-            found.append(read_sensor(extension[0], path, np.array(values, dtype=np.float64)))
-        except (KeyError, StopIteration, IndexError, ValueError) as error:
-            raise DataError(f"holds no joint for a sensor: {error!r}", where=str(path)) from error
-    return found
-
-
 MACRO = "xacro:macro"
 
 
 def write_xacro(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the macro, atomically; returns how to use it and notes of what the format cannot hold."""
-    design, rays = by_channel(design, rays)
-    name, mounted = identifier(design.name), mounts(design, rays)
+    design, rays, mounted = channel_mounts(design, rays)
+    name = identifier(design.name)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent="${parent}", prefix="${prefix}")]
     macro = element(MACRO, {"name": name, "params": "parent prefix:=''"}, parts)
-    write_xml(path, element("robot", {"xmlns:xacro": "http://www.ros.org/wiki/xacro", "name": name}, [macro]))
+    write_atomic(
+        path, document(element("robot", {"xmlns:xacro": "http://www.ros.org/wiki/xacro", "name": name}, [macro]))
+    )
     usage = f'include it and call <xacro:{name} parent="base_link"/>: poses are relative to the parent'
     return [usage, *urdf_losses(design, mounted, rays)]
-
-
-def xacro_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """How far the rays of the described sensors are from the design's.
-
-    Raises:
-        DataError: The file holds no such macro.
-    """
-    design, rays = by_channel(design, rays)
-    mounted = mounts(design, rays)
-    macro = next((part for part in read_xml(path, "robot") if part.tag == MACRO), None)
-    if macro is None:
-        raise DataError("holds no macro", where=str(path))
-    return mounts_rounding(rays, mounted, read_sensors(macro, path), path)

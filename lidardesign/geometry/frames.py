@@ -89,7 +89,7 @@ def rotation_of_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.nda
 
 
 def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> np.ndarray:
-    """The rotation of a quaternion of any length above 0, shape (3, 3).
+    """The rotation of a quaternion of any length above 0, shape (3, 3); columns are the axes.
 
     Raises:
         ValueError: It has no length.
@@ -98,15 +98,13 @@ def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> np.ndarray
     largest = np.abs(quaternion).max()
     if largest == 0:
         raise ValueError("a quaternion has no length")
-    return rotations_of_quaternions(quaternion / largest)
-
-
-def rotations_of_quaternions(quaternions: np.ndarray) -> np.ndarray:
-    """Rotations of quaternions (w, x, y, z) that are not zero: (..., 4) to (..., 3, 3); columns are the axes."""
-    w, x, y, z = np.moveaxis(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    # the largest first, so that squares neither vanish nor overflow
+    quaternion /= largest
+    w, x, y, z = quaternion / np.linalg.norm(quaternion, axis=-1)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,16 +1,22 @@
 """Mesh formats whose every index and count is checked: a file that names or promises what it lacks is refused.
 
-OBJ, OFF and STL are read here, with the line of whatever is wrong in text. Of PLY and glTF, which a library reads, the
-counts and references in the header are checked before it does: it would make room for what they promise, and take a
-negative number for one from the end.
+OBJ, OFF and STL are read here, with the line of whatever is wrong in text: trimesh takes index 0 of an OBJ for its last
+vertex, leaves out OFF faces and STL solids that are cut short, and orders faces by their numbers of corners. Of PLY and
+glTF, which it reads, the counts and references in the header are checked before: it would make room for what they
+promise, and take a negative number for one from the end.
+
+Readers return the vertices (V, 3), the faces as indices from 0 (F, 3), polygons in fans of triangles, and red, green
+and blue of every vertex from 0 to 1 (V, 3), None where it has none.
 """
 
 from __future__ import annotations
 
-import copy
+import math
 import re
-import warnings
-from typing import Any, NamedTuple
+from array import array
+from collections.abc import Iterator
+from itertools import islice, pairwise
+from typing import Any
 
 import numpy as np
 
@@ -19,145 +25,160 @@ from lidardesign.run.inputs import MESH, check_bytes, parse_json
 
 # Of all parts of a file together, as often as they are placed; checking so many takes 5 GB.
 MOST_TRIANGLES = 10_000_000
-# Vertices and faces of a text take some hundred bytes each while they are read.
+# Lines of a text, each of which is taken apart by itself.
 MOST_ROWS = 5_000_000
 LONGEST_LINE = LONGEST_HEADER = 100_000
 BINARY_HINT = "export it as binary PLY or GLB"
 AGAIN_HINT = "open it in a mesh viewer and export it again"
 
+Triangles = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
-class TextMesh(NamedTuple):
-    """What a file holds.
 
-    Arguments:
-        vertices: Shape (V, 3).
-        faces: Indices from 0, shape (F, 3).
-        colours: Red, green and blue from 0 to 1 of every vertex, shape (V, 3); None: it has none.
+def _rows(data: bytes, where: str, joining: bytes | None = None) -> Iterator[tuple[int, list[bytes]]]:
+    """The words of every line of a text that has any, with the line's number from 1; comments are left out.
+
+    A line that ends in `joining` goes on in the next one.
     """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    colours: np.ndarray | None = None
-
-
-class Rows:
-    """Rows of a text that are alike: what the last group of a pattern finds; or some of them, changed."""
-
-    def __init__(self, data: bytes, pattern: bytes) -> None:
-        self._data, self._pattern, self._first = data, re.compile(b"(?mi)" + pattern), 0
-        self.texts: list[bytes] = self._pattern.findall(data)
-
-    def part(self, first: int, texts: list[bytes]) -> Rows:
-        """Other texts of the rows from one on."""
-        part = copy.copy(self)
-        part._first, part.texts = self._first + first, texts
-        return part
-
-    def lines(self) -> np.ndarray:
-        """The line of each row, from 1; found when it is asked for, as messages do."""
-        ends = np.flatnonzero(np.frombuffer(self._data, dtype=np.uint8) == ord("\n"))
-        starts = [match.start(1) for match in self._pattern.finditer(self._data)]
-        return 1 + np.searchsorted(ends, starts)[self._first : self._first + len(self.texts)]
+    data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if data.count(b"\n") > MOST_ROWS:
+        raise DataError("has too many lines", where=where, allowed=f"{MOST_ROWS}", hint=BINARY_HINT)
+    lines, begun, before = data.split(b"\n"), 0, b""
+    for line, text in enumerate(lines, 1):
+        begun, before = begun or line, before + text.rstrip()
+        if len(before) > LONGEST_LINE:
+            found = f"has a line of {len(before)} characters"
+            raise DataError(found, where=f"{where}:{begun}", allowed=f"{LONGEST_LINE}")
+        if joining and before.endswith(joining) and line < len(lines):
+            before = before.removesuffix(joining) + b" "
+            continue
+        words = before.partition(b"#")[0].split()
+        if words:
+            yield begun, words
+        begun, before = 0, b""
 
 
-def read_obj(data: bytes, where: str) -> TextMesh:
-    """A Wavefront OBJ file: all its faces, in fans of triangles; groups, materials and lines are left out.
+def _point(words: list[bytes], where: str, line: int, most: float = math.inf) -> list[float]:
+    """The finite numbers of a vertex in a line: three, or more where that is allowed."""
+    if not 3 <= len(words) <= most:
+        allowed = "3 or more" if most > 3 else "3"
+        raise DataError(f"has {len(words)} values", where=f"{where}:{line}", allowed=allowed)
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = [math.nan]
+    # Python's own numbers may have underscores
+    if not all(map(math.isfinite, values)) or b"_" in b"".join(words):
+        shown = b" ".join(words)[:60].decode(errors="replace")
+        raise DataError(f"the vertex is {shown!r}", where=f"{where}:{line}", allowed="finite numbers")
+    return values
+
+
+def _mesh(points: array[float], triangles: array[int], colours: array[float] | None = None) -> Triangles:
+    rgb = np.array(colours).reshape(-1, 3) if colours and len(colours) == len(points) else None
+    return np.array(points).reshape(-1, 3), np.array(triangles).reshape(-1, 3), rgb
+
+
+def _add_fan(triangles: array[int], polygon: list[int]) -> None:
+    for second, third in pairwise(polygon[1:]):
+        triangles.extend((polygon[0], second, third))
+
+
+# Lists of an OBJ file in the order in which a corner of a face names their entries.
+OBJ_LISTS = {b"v": "vertex", b"vt": "texture coordinate", b"vn": "normal"}
+OBJ_CORNER = re.compile(rb"[-+]?\d{1,18}(?:/(?:[-+]?\d{1,18})?){0,2}")
+
+
+def read_obj(data: bytes, where: str) -> Triangles:
+    """A Wavefront OBJ file: all its faces; groups, materials and lines are left out.
 
     Raises:
         DataError: A number is none or a face names what is not there; with its line.
     """
-    data = _plain(data, where)
-    # a line that ends in \ goes on in the next; the lines after it keep their numbers
-    data = re.sub(rb"(?:[^\n]*\\[ ]*\n)+[^\n]*", _joined, data) if b"\\" in data else data
-    points, places, normals, faces = (
-        Rows(data, rb"^[ \t]*%b[ \t]+([^\n#]*)" % name) for name in (b"v", b"vt", b"vn", b"f")
-    )
-    columns = _column_counts(points, 3, where)
-    least = int(columns.min()) if len(columns) else 3
-    numbers = _numbers(points, least if (columns == least).all() else None, where)
-    corners = _column_counts(faces, 3, where)
-    references = _references(faces, where)
-    vertices = np.zeros(len(references), dtype=np.int64)
-    for column, (what, rows) in enumerate((("vertex", points), ("texture coordinate", places), ("normal", normals))):
-        named = references[:, column]
-        index = _resolved(named, rows, faces, corners) if (named < 0).any() else named - 1
-        wrong = ((index < 0) | (index >= len(rows.texts))) & ((column == 0) | (named != ABSENT))
-        if wrong.any():
-            first = int(np.argmax(wrong))
-            line = faces.lines()[int(np.searchsorted(np.cumsum(corners), first, side="right"))]
-            allowed = f"1 to {len(rows.texts)}, or as far back from here as there are some before it"
-            raise DataError(f"a face names {what} {named[first]}", where=f"{where}:{line}", allowed=allowed)
-        vertices = index if column == 0 else vertices
-    colours = numbers[:, 3:6] if numbers.shape[1] >= 6 else None
-    return TextMesh(numbers[:, :3], fans(vertices, corners), colours)
+    text = data.replace(b"\r", b"\n")
+    totals = {word: len(re.findall(rb"(?mi)^[ \t]*%b[ \t]" % word, text)) for word in OBJ_LISTS}
+    before = dict.fromkeys(OBJ_LISTS, 0)
+    points, colours, triangles, known = array("d"), array("d"), array("q"), {}
+    for line, (word, *values) in _rows(data, where, b"\\"):
+        kind = word.lower()
+        if kind in before:
+            before[kind] += 1
+        if kind == b"v":
+            point = _point(values, where, line)
+            points.extend(point[:3])
+            colours.extend(point[3:6])
+        elif kind == b"f":
+            if len(values) < 3:
+                raise DataError(f"has {len(values)} values", where=f"{where}:{line}", allowed="3 or more")
+            for corner in values:
+                # negative numbers count back from here
+                if corner not in known or b"-" in corner:
+                    known[corner] = _named_vertex(corner, totals, before, f"{where}:{line}")
+            _add_fan(triangles, [known[corner] for corner in values])
+    return _mesh(points, triangles, colours)
 
 
-def _resolved(named: np.ndarray, rows: Rows, faces: Rows, corners: np.ndarray) -> np.ndarray:
-    """Indices from 0 of what faces name: negative numbers count back from the line of the face; -1 where it is 0."""
-    before = np.repeat(np.searchsorted(rows.lines(), faces.lines()), corners)
-    return np.where(named > 0, named - 1, np.where(named < 0, np.maximum(named, -1 - before) + before, -1))
+def _named_vertex(corner: bytes, totals: dict[bytes, int], before: dict[bytes, int], place: str) -> int:
+    """The vertex of a face's corner, from 0; all that it names is there."""
+    if not OBJ_CORNER.fullmatch(corner):
+        shown, allowed = corner[:40].decode(errors="replace"), "whole numbers, as 1, 1/2, 1//3 or 1/2/3"
+        raise DataError(f"a corner of the face is {shown!r}", where=place, allowed=allowed)
+    indices = []
+    for word, number in zip(OBJ_LISTS, corner.split(b"/"), strict=False):
+        named = int(number or 1)
+        index = named - 1 if named > 0 else before[word] + named if named else -1
+        if number and not 0 <= index < totals[word]:
+            allowed = f"1 to {totals[word]}, or as far back from here as there are some before it"
+            raise DataError(f"a face names {OBJ_LISTS[word]} {named}", where=place, allowed=allowed)
+        indices.append(index)
+    return indices[0]
 
 
-def _joined(found: re.Match[bytes]) -> bytes:
-    parts = re.split(rb"\\[ ]*\n", found[0])
-    return b" ".join(parts) + b"\n" * (len(parts) - 1)
+WHOLE_NUMBER = re.compile(rb"[-+]?\d{1,18}")
 
 
-def read_off(data: bytes, where: str) -> TextMesh:
-    """An OFF file, with colours or normals behind its vertices or without; faces become fans of triangles.
+def read_off(data: bytes, where: str) -> Triangles:
+    """An OFF file, with colours or normals behind its vertices or without.
 
     Raises:
         DataError: It promises more than it has, a number is none, or a face names what is not there; with its line.
     """
-    data = _plain(data, where)
-    rows = Rows(data, rb"^[ \t]*([^\s#][^\n#]*)")
-    word, _, rest = (rows.texts[0] if rows.texts else b"").partition(b" ")
-    if not re.fullmatch(rb"C?N?OFF", word.strip().upper()) or rest.strip().upper() == b"BINARY":
+    rows = _rows(data, where)
+    line, (word, *counts) = next(rows, (1, [b""]))
+    if not re.fullmatch(rb"C?N?OFF", word.upper()) or [one.upper() for one in counts] == [b"BINARY"]:
         raise DataError("is not an OFF text file", where=where, allowed="a first line OFF, COFF, NOFF or CNOFF")
-    begin = 0 if rest.strip() else 1
-    counts = (rest if rest.strip() else b" ".join(rows.texts[1:2])).split()
+    line, counts = (line, counts) if counts else next(rows, (line, []))
     if len(counts) < 2 or not all(count.isdigit() and len(count) < 19 for count in counts[:2]):
-        line = rows.lines()[min(begin, len(rows.texts) - 1)]
         raise DataError("has no counts of vertices and faces", where=f"{where}:{line}", hint=AGAIN_HINT)
-    count, face_count = int(counts[0]), int(counts[1])
-    texts = rows.texts[begin + 1 :]
-    if len(texts) < count + face_count:
+    count, face_count, found = int(counts[0]), int(counts[1]), 0
+    points, triangles = array("d"), array("q")
+    for found, (row, words) in enumerate(islice(rows, count + face_count), 1):
+        if found <= count:
+            points.extend(_point(words[:3], where, row))
+            continue
+        place = f"{where}:{row}"
+        size = int(words[0]) if words[0].isdigit() and len(words[0]) < 9 else 0
+        corners = words[1 : size + 1]
+        if not 3 <= size == len(corners) or not all(map(WHOLE_NUMBER.fullmatch, corners)):
+            shown = b" ".join(words)[:40].decode(errors="replace")
+            raise DataError(f"the face is {shown!r}", where=place, allowed="3 or more, and so many whole numbers")
+        polygon = list(map(int, corners))
+        if not 0 <= min(polygon) <= max(polygon) < count:
+            wrong = next(index for index in polygon if not 0 <= index < count)
+            raise DataError(f"a face names vertex {wrong}", where=place, allowed=f"0 to {count - 1}")
+        _add_fan(triangles, polygon)
+    if found < count + face_count:
         raise DataError(
-            f"promises {count} vertices and {face_count} faces, and has {len(texts)} lines of them",
-            where=f"{where}:{rows.lines()[begin]}",
+            f"promises {count} vertices and {face_count} faces, and has {found} lines of them",
+            where=f"{where}:{line}",
             hint="it may be cut short",
         )
-    points = rows.part(begin + 1, [b" ".join(text.split()[:3]) for text in texts[:count]])
-    _column_counts(points, 3, where)
-    faces = rows.part(begin + 1 + count, texts[count : count + face_count])
-    found = [_polygon(text) for text in faces.texts]
-    if None in found:
-        first = found.index(None)
-        shown, place = faces.texts[first][:40].decode(errors="replace"), f"{where}:{faces.lines()[first]}"
-        raise DataError(f"the face is {shown!r}", where=place, allowed="3 or more, and so many whole numbers")
-    corners = np.array([len(polygon) for polygon in found], dtype=np.int64)  # type: ignore[arg-type]
-    vertices = np.array([index for polygon in found for index in polygon], dtype=np.int64)  # type: ignore[union-attr]
-    wrong = (vertices < 0) | (vertices >= count)
-    if wrong.any():
-        first = int(np.argmax(wrong))
-        line = faces.lines()[int(np.searchsorted(np.cumsum(corners), first, side="right"))]
-        raise DataError(f"a face names vertex {vertices[first]}", where=f"{where}:{line}", allowed=f"0 to {count - 1}")
-    return TextMesh(_numbers(points, 3, where), fans(vertices, corners))
-
-
-def _polygon(text: bytes) -> tuple[int, ...] | None:
-    """The corners of a face that says first how many they are; None where it has fewer, or one is no number."""
-    size, *indices = text.split()
-    corners = int(size) if size.isdigit() and len(size) < 9 else 0
-    if not 3 <= corners <= len(indices) or not all(WHOLE_NUMBER.fullmatch(index) for index in indices[:corners]):
-        return None
-    return tuple(map(int, indices[:corners]))
+    return _mesh(points, triangles)
 
 
 STL_HEADER, STL_FACET = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def read_stl(data: bytes, where: str) -> TextMesh:
+def read_stl(data: bytes, where: str) -> Triangles:
     """An STL file, binary or text; every triangle has corners of its own.
 
     Raises:
@@ -166,136 +187,29 @@ def read_stl(data: bytes, where: str) -> TextMesh:
     promised = int.from_bytes(data[80:STL_HEADER], "little") if len(data) >= STL_HEADER else 0
     if len(data) == STL_HEADER + promised * STL_FACET.itemsize:
         points = np.frombuffer(data, STL_FACET, promised, STL_HEADER)["corners"].reshape(-1, 3).astype(np.float64)
-        wrong = ~np.isfinite(points).all(axis=1)
-        if wrong.any():
-            raise DataError(f"triangle {int(np.argmax(wrong)) // 3} has a corner that is NaN or infinite", where=where)
-        return TextMesh(points, np.arange(len(points)).reshape(-1, 3))
+        return points, np.arange(len(points)).reshape(-1, 3), None
     if not re.search(rb"(?im)^[ \t]*vertex\b", data):
         raise DataError(
             f"promises {promised} triangles in {STL_HEADER + promised * STL_FACET.itemsize} bytes, and has {len(data)}",
             where=where,
             hint="it may be cut short, or not an STL file",
         )
-    data = _plain(data, where)
-    corners, words = (
-        Rows(data, rb"^[ \t]*vertex\b([^\n]*)"),
-        Rows(data, rb"^[ \t]*(vertex|end ?facet|end ?solid)\b"),
-    )
-    # the last letters of the words: three of `vertex`, then one of `endfacet`, and so on until `endsolid`
-    letters = b"".join(word[-1:].lower() for word in words.texts)
-    fitting = re.match(rb"(?:xxxt|d)*", letters)
-    assert fitting is not None, "nothing fits as well"
-    if fitting.end() < len(letters.rstrip(b"x")):
-        line = words.lines()[fitting.end()]
-        raise DataError("a facet does not have 3 corners", where=f"{where}:{line}", allowed="3 in each")
-    if not letters.endswith(b"d"):
+    corners, is_open, last = array("d"), 0, b""
+    for line, words in _rows(data, where):
+        word = (b"".join(words[:2]) if words[0].lower() == b"end" else words[0]).lower()
+        if word.startswith(b"vertex"):
+            corners.extend(_point(words[1:] if word == b"vertex" else words, where, line, most=3))
+            is_open += 1
+        elif word in (b"facet", b"endfacet", b"endsolid"):
+            if is_open != (3 if word == b"endfacet" else 0):
+                raise DataError("a facet does not have 3 corners", where=f"{where}:{line}", allowed="3 in each")
+            is_open = 0
+        else:
+            continue
+        last = word
+    if last != b"endsolid":
         raise DataError("ends early: the last solid is not closed", where=where, hint="it may be cut short")
-    _column_counts(corners, 3, where, most=3)
-    return TextMesh(_numbers(corners, 3, where), np.arange(len(corners.texts)).reshape(-1, 3))
-
-
-def fans(vertices: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """The triangles (F, 3) of polygons that have so many corners (P,), whose vertices follow one another (N,)."""
-    triangles = corners - 2
-    start = np.repeat(np.cumsum(corners) - corners, triangles)
-    step = np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    return vertices[np.stack([start, start + step + 1, start + step + 2], axis=1)]
-
-
-def _plain(data: bytes, where: str) -> bytes:
-    """A text whose lines end in a line feed alone, without the mark of UTF-8; refuses more than a few million lines."""
-    data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    if data.count(b"\n") > MOST_ROWS:
-        raise DataError("has too many lines", where=where, allowed=f"{MOST_ROWS}", hint=BINARY_HINT)
-    ends = np.flatnonzero(np.frombuffer(data + b"\n", dtype=np.uint8) == ord("\n"))
-    longest = int(np.argmax(np.diff(ends, prepend=-1)))
-    length = int(np.diff(ends, prepend=-1)[longest])
-    if length > LONGEST_LINE:
-        raise DataError(f"has a line of {length} characters", where=f"{where}:{longest + 1}", allowed=f"{LONGEST_LINE}")
-    data = data.replace(b"\t", b" ")
-    # patterns would look at every blank several times
-    return re.sub(rb" {2,}", b" ", data) if 8 * data.count(b" " * 4) > len(data) else data
-
-
-def _column_counts(rows: Rows, least: int, where: str, most: int | None = None) -> np.ndarray:
-    """How many numbers each row has; raises for the first that has too few or too many."""
-    counts = np.array([len(text.split()) for text in rows.texts], dtype=np.int64)
-    wrong = (counts < least) | (counts > (most or np.inf))
-    if wrong.any():
-        first = int(np.argmax(wrong))
-        allowed = f"{least}" if most else f"{least} or more"
-        raise DataError(f"has {counts[first]} values", where=f"{where}:{rows.lines()[first]}", allowed=allowed)
-    return counts
-
-
-def _numbers(rows: Rows, columns: int | None, where: str) -> np.ndarray:
-    """The finite numbers of rows of so many columns; of the first three where rows differ."""
-    texts = rows.texts if columns else [b" ".join(text.split()[:3]) for text in rows.texts]
-    found = _parsed(b" ".join(texts), np.float64)
-    if found is None or not np.isfinite(found).all():
-        for text, line in zip(texts, rows.lines(), strict=True):
-            one = _parsed(text, np.float64)
-            if one is None or not np.isfinite(one).all():
-                shown = text[:60].decode(errors="replace").strip()
-                raise DataError(f"the vertex is {shown!r}", where=f"{where}:{line}", allowed="finite numbers")
-    assert found is not None, "every row is numbers, so all are"
-    return found.reshape(-1, columns or 3)
-
-
-def _parsed(text: bytes, kind: type) -> np.ndarray | None:
-    """The numbers of a text that blanks separate; None where something is none."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            return np.fromstring(text, dtype=kind, sep=" ") if text.strip() else np.zeros(0, dtype=kind)
-        except (ValueError, DeprecationWarning, OverflowError):
-            return None
-
-
-# No index: of texture coordinates and normals that a face does not name.
-ABSENT = np.iinfo(np.int64).min
-WHOLE_NUMBER = re.compile(rb"[-+]?\d{1,18}")
-# Faces whose corners are taken apart at once; bounds memory.
-ROWS_AT_ONCE = 100_000
-BLANKS = b" \t\v\f"
-
-
-def _references(faces: Rows, where: str) -> np.ndarray:
-    """The indices of vertex, texture coordinate and normal of every corner as they stand there, shape (N, 3)."""
-    found = [np.zeros((0, 3), dtype=np.int64)]
-    for begin in range(0, len(faces.texts), ROWS_AT_ONCE):
-        texts = faces.texts[begin : begin + ROWS_AT_ONCE]
-        part = _indices(b" ".join(texts))
-        if part is None:
-            row = next(row for row, text in enumerate(texts) if _indices(text) is None)
-            wrong = next(corner for corner in texts[row].split() if _indices(corner) is None)
-            place, shown = f"{where}:{faces.lines()[begin + row]}", repr(wrong[:40].decode(errors="replace"))
-            allowed = "whole numbers, as 1, 1/2, 1//3 or 1/2/3"
-            raise DataError(f"a corner of the face is {shown}", where=place, allowed=allowed)
-        found.append(part)
-    return np.concatenate(found)
-
-
-def _indices(text: bytes) -> np.ndarray | None:
-    """Three indices of each corner, (N, 3); None where something is no corner."""
-    letters = np.frombuffer(b" " + text + b" ", dtype=np.uint8)
-    digit, slash = (letters >= ord("0")) & (letters <= ord("9")), letters == ord("/")
-    blank, sign = np.isin(letters, np.frombuffer(BLANKS, dtype=np.uint8)), (letters == ord("+")) | (letters == ord("-"))
-    loose_sign = sign[1:-1] & ~(digit[2:] & (blank | slash)[:-2])
-    if loose_sign.any() or not (digit | slash | blank | sign).all():
-        return None
-    begins = np.flatnonzero(~blank[1:] & blank[:-1]) + 1
-    numbers = np.flatnonzero(digit[1:] & ~digit[:-1]) + 1
-    corner, passed = np.searchsorted(begins, numbers, side="right") - 1, np.cumsum(slash, dtype=np.int32)
-    column = passed[numbers] - passed[begins][corner]
-    most = np.append(passed[begins[1:] - 1], passed[-1]) - passed[begins]
-    found = _parsed(text.replace(b"/", b" "), np.int64)
-    named_first = np.bincount(corner[column == 0], minlength=len(begins)) == 1
-    if slash[begins].any() or (most > 2).any() or not named_first.all() or found is None or len(found) != len(numbers):
-        return None
-    indices = np.full((len(begins), 3), ABSENT)
-    indices[corner, column] = found
-    return indices
+    return _mesh(corners, array("q", range(len(corners) // 3)))
 
 
 PLY_BYTES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
@@ -350,9 +264,7 @@ def check_gltf(data: bytes, where: str) -> None:
     Raises:
         DataError: So it does, or it needs what is not read: packed or sparse geometry.
     """
-    text = data
-    if data.startswith(b"glTF"):
-        text = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+    text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data.startswith(b"glTF") else data
     try:
         document = parse_json(text)
     except ValueError as error:

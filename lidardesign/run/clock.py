@@ -10,12 +10,14 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+# Called with what is done, how much of it, and of how much; None where that is not counted.
+Progress = Callable[[str, int | None, int | None], None]
 # Between the name of a phase and that of one inside of it.
 INSIDE = "/"
 # What passed outside of all phases.

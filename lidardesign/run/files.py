@@ -1,4 +1,4 @@
-"""Files that are either whole or absent, and standard input where a command is given `-` for a file.
+"""Files that are either whole or absent.
 
 Who left a temporary file behind is known from its name, and removed once that process is gone.
 
@@ -17,14 +17,11 @@ import os
 import re
 import secrets
 import socket
-import sys
-import tempfile
 from collections.abc import Iterator
-from contextvars import ContextVar
 from pathlib import Path
 
-from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.run.inputs import DESIGN, RECORD, STATE, check_file, parse_json, read_file
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.run.inputs import RECORD, STATE, check_file, parse_json, read_file
 
 HOST_DIGITS = 8
 
@@ -70,8 +67,9 @@ def write_atomic(path: Path, content: bytes | str) -> None:
     Raises:
         DataError: The disk is full, the folder is read-only, or anything else the system reports.
     """
-    # what a link leads to is written; of /dev/stdout, too, nothing but the link would be replaced
-    path = Path(os.path.realpath(path)) if os.path.islink(path) else Path(path)
+    path = Path(path)
+    if path.is_symlink() and (path.is_file() or not path.exists()):
+        path = Path(os.path.realpath(path))  # a rename would replace the link
     # names of files may be no UTF-8; they are shown escaped then
     payload = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     try:
@@ -182,100 +180,6 @@ def sha256_file(path: Path) -> str:
     except OSError as error:
         raise DataError(f"cannot be read: {error.strerror or error}", where=str(path)) from error
     return digest.hexdigest()
-
-
-# What stands for standard input where a file is read, and for standard output where one is written.
-STDIO = "-"
-HINT = "give one of them as a file; give a file called - by its full path"
-
-
-class Input:
-    """What standard input holds, for one kind of content."""
-
-    def __init__(self) -> None:
-        self._content: bytes | None = None
-        self._kind = ""
-
-    def read(self, kind: str, most_bytes: int) -> bytes:
-        """All of it.
-
-        Arguments:
-            kind: What it is read as, for messages.
-            most_bytes: More is refused.
-
-        Raises:
-            ConfigError: It is too much, there is none, or it was read as something else already.
-        """
-        if self._content is None:
-            if sys.stdin is None:
-                raise ConfigError("standard input is closed", where=STDIO, hint="give a file")
-            self._content, self._kind = sys.stdin.buffer.read(most_bytes + 1), kind
-        if kind != self._kind:
-            raise ConfigError(f"is {self._kind} already, and cannot be {kind} too", where=STDIO, hint=HINT)
-        if len(self._content) > most_bytes:
-            raise ConfigError("standard input is too large", where=STDIO, allowed=f"at most {most_bytes} bytes")
-        return self._content
-
-
-_OFFERED: ContextVar[Input | None] = ContextVar("standard input", default=None)
-
-
-@contextlib.contextmanager
-def offered_input() -> Iterator[Input]:
-    """Let `-` mean standard input inside; elsewhere, as for who uses the library, it is the name of a file."""
-    offered = Input()
-    token = _OFFERED.set(offered)
-    try:
-        yield offered
-    finally:
-        _OFFERED.reset(token)
-
-
-def is_input(path: Path | str) -> bool:
-    """Whether a path stands for standard input here."""
-    return str(path) == STDIO and _OFFERED.get() is not None
-
-
-def is_there(path: Path) -> bool:
-    """Whether a path can be read: standard input, or one that exists."""
-    return is_input(path) or path.exists()
-
-
-def read_input(kind: str, most_bytes: int) -> bytes:
-    """What standard input holds; see `Input.read`.
-
-    Raises:
-        ConfigError: As there, or it stands for nothing here.
-    """
-    offered = _OFFERED.get()
-    if offered is None:
-        raise ConfigError("means standard input in commands only", where=STDIO, hint="give a file")
-    return offered.read(kind, most_bytes)
-
-
-@contextlib.contextmanager
-def readable(path: Path, kind: str = "a design") -> Iterator[Path]:
-    """The file to read for a path: of standard input, a copy for as long as it is read.
-
-    Errors inside name standard input, not the copy.
-
-    Raises:
-        ConfigError: Standard input is too large, or was read as something else.
-    """
-    if not is_input(path):
-        yield path
-        return
-    content = read_input(kind, DESIGN.most_bytes)
-    with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
-        copy = Path(folder) / "stdin"
-        copy.write_bytes(content)
-        try:
-            yield copy
-        except LidardesignError as error:
-            error.where = (error.where or STDIO).replace(str(copy), STDIO)
-            error.message = error.message.replace(str(copy), STDIO)
-            error.args = (error.render(),)
-            raise
 
 
 FILE_NAME = ".lock"

@@ -16,7 +16,7 @@ from typing import Any
 from lidardesign.errors import ConfigError, DataError
 
 HEAD_BYTES = 4096
-STDIN_HINT = "give a file; commands take - for standard input where they read a design or YAML"
+FILE_HINT = "give a file"
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def check_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint
     if stat.S_ISDIR(status.st_mode):
         raise kind.error("cannot be read: it is a folder", where=str(path), allowed=allowed or "a file", hint=hint)
     if not stat.S_ISREG(status.st_mode):
-        raise kind.error("is not a regular file", where=str(path), allowed=allowed, hint=hint or STDIN_HINT)
+        raise kind.error("is not a regular file", where=str(path), allowed=allowed, hint=hint or FILE_HINT)
     check_bytes(status.st_size, kind, str(path))
     return status.st_size
 

@@ -20,7 +20,7 @@ FILE_NAME = "manifest.json"
 SCHEMA_VERSION = 1
 PACKAGES = ("numpy", "torch", "zuko", "embreex")
 # What is merged or looked up by key; each may be missing.
-MAPPINGS = ("timings", "learn", "goal", "inputs", "scores")
+MAPPINGS = ("timings", "learn", "inputs", "scores")
 # What the run's own probe may have decided, where the configuration left it open.
 VISIBILITIES = ("off", "raycast", "quadrature")
 DAMAGED_HINT = "restore it or learn the run again"

@@ -12,7 +12,6 @@ from pathlib import Path
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.files import FILE_NAME as LOCK
-from lidardesign.run.files import STDIO
 from lidardesign.run.inputs import parse_json
 from lidardesign.run.manifest import FILE_NAME as MANIFEST
 
@@ -30,7 +29,7 @@ def check_outputs(
     """Refuse outputs that cannot be written, or that would replace what is needed.
 
     Arguments:
-        outputs: What will be written, by the option that says so; None and - are left out.
+        outputs: What will be written, by the option that says so; None is left out.
         inputs: Files that the command reads.
         folders: The options whose output is a folder of files.
 
@@ -38,9 +37,9 @@ def check_outputs(
         ConfigError: Two are one file, or one is an input, a file of a run, or where standard output goes.
         DataError: One cannot be written.
     """
-    places = {name: Path(path) for name, path in outputs.items() if path is not None and str(path) != STDIO}
+    places = {name: Path(path) for name, path in outputs.items() if path is not None}
     files = {name: path for name, path in places.items() if name not in folders}
-    inputs = [Path(path) for path in inputs if str(path) != STDIO]
+    inputs = [Path(path) for path in inputs]
     for name, path in places.items():
         check_writable(path, is_folder=name in folders)
     for name, path in files.items():
@@ -63,7 +62,7 @@ def _check_replaced(name: str, path: Path, inputs: Iterable[Path]) -> None:
     for stream, words in STREAMS.items():
         with contextlib.suppress(OSError):
             if os.path.samestat(os.fstat(stream), path.stat()):
-                raise ConfigError(f"{path} is where {words} goes", where=name, hint=f"give - or another file to {name}")
+                raise ConfigError(f"{path} is where {words} goes", where=name, hint=ELSEWHERE)
     if any(read.is_file() and read.samefile(path) for read in inputs):
         raise ConfigError(f"{path} is an input, and would be overwritten", where=name, hint=ELSEWHERE)
     for folder in path.resolve().parents[:2]:

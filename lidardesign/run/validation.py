@@ -113,7 +113,7 @@ def anchor_paths(values: Any, given: Any, model: type[BaseModel], base: Path) ->
 
 def _absolute(value: Any, base: Path) -> Any:
     if isinstance(value, str) and value:
-        return os.path.abspath(base / Path(value).expanduser())
+        return os.path.abspath(base / os.path.expanduser(value))
     if isinstance(value, list):
         return [_absolute(item, base) for item in value]
     return value

@@ -11,7 +11,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from lidardesign.errors import DataError
-from lidardesign.run.inputs import XML, Kind, read_file
+from lidardesign.run.inputs import XML, read_file
 from lidardesign.run.yaml import plain_number
 
 DEEPEST = 200
@@ -37,13 +37,13 @@ class Element(ElementTree.Element):
     line: int = 0
 
 
-def read_xml(path: Path, allowed: str, *, kind: Kind = XML, most_elements: int = MOST_ELEMENTS) -> Element:
+def read_xml(path: Path, allowed: str, *, most_elements: int = MOST_ELEMENTS) -> Element:
     """The root element of a file.
 
     Raises:
         DataError: The file cannot be read, is too large, is not XML, has a document type, or is nested too deep.
     """
-    content = read_file(path, kind, allowed=allowed)
+    content = read_file(path, XML, allowed=allowed)
     builder = _Builder(path, most_elements)
     try:
         return builder.build(content)

@@ -19,7 +19,6 @@ from typing import Any
 import yaml
 
 from lidardesign.errors import ConfigError, NumericalError
-from lidardesign.run.files import is_input, read_input
 from lidardesign.run.inputs import YAML, Kind, read_file
 
 MAX_DEPTH = 32
@@ -89,7 +88,7 @@ class Document:
 
 
 def load_yaml(path: Path, kind: Kind = YAML, *, empty_sections: bool = False) -> Document:
-    """Read a YAML file; in a command `-` is standard input.
+    """Read a YAML file.
 
     Arguments:
         path: The file.
@@ -101,7 +100,7 @@ def load_yaml(path: Path, kind: Kind = YAML, *, empty_sections: bool = False) ->
         ConfigError: The file cannot be read, is too large, is not UTF-8, or is not in the accepted subset.
     """
     path = Path(path)
-    content = read_input("a YAML file", kind.most_bytes) if is_input(path) else read_file(path, kind)
+    content = read_file(path, kind)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

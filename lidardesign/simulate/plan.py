@@ -52,7 +52,7 @@ from lidardesign.simulate.effects import (
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.effects.steps import with_steps
-from lidardesign.simulate.light_transport import process
+from lidardesign.simulate.light_transport import transport
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import Metric
 
@@ -252,7 +252,7 @@ class Planner:
             wanted = available_effects(self.detector)
         else:
             wanted = frozenset() if self.choice == "none" else self.choice
-        missing = {name: process.missing() if name == "multipath" else None for name in sorted(wanted)}
+        missing = {name: transport.missing() if name == "multipath" else None for name in sorted(wanted)}
         for name, reason in missing.items():
             if reason is not None and isinstance(self.choice, frozenset):
                 raise ConfigError(f"{name} cannot be simulated here: {reason}", where="--effects", hint="leave it out")

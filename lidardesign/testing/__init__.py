@@ -1,7 +1,7 @@
 """The contract of task plugins as laws that can be tried: from Python, by `tasks check` and in pytest.
 
-`check_task(MyTask())` tries all of them; the modules are the groups of laws: `interface`, `scenes`, `geometry`,
-`scoring` and `conduct`. The names here are loaded when they are used.
+`check_task(MyTask())` tries all of them; the modules are the groups of laws: `interface`, `scenes`,
+`scoring` and `contract`. The names here are loaded when they are used.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ _HOMES = {
     "BrokenLawError": "law",
     "Finding": "law",
     "Law": "law",
-    "Limits": "law",
     "LAWS": "contract",
     "Contract": "contract",
     "check_task": "contract",

@@ -1,6 +1,6 @@
 """The whole contract of a task plugin, law by law, each tried once.
 
-Laws of what a task does to the process that runs it: random state, files, environment, time and memory.
+Laws of what a task does to the process that runs it: random state and time.
 """
 
 from __future__ import annotations
@@ -12,54 +12,35 @@ from lidardesign import registry
 from lidardesign.config import RunConfig, resolve
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.registry import text_of
-from lidardesign.run.clock import peak_memory_bytes
 from lidardesign.task import Task
-from lidardesign.testing import geometry, interface, scenes, scoring
+from lidardesign.testing import interface, scenes, scoring
 from lidardesign.testing.law import (
-    GIBIBYTE,
+    CALL_SECONDS,
     BrokenLawError,
     Finding,
     Law,
     LawHolds,
-    Limits,
     NotApplicable,
     Subject,
     error_words,
     place_of,
+    restore_random_states,
 )
-from lidardesign.testing.watch import Watch
-
-MEBIBYTE = 2**20
 
 
 def check_random(subject: Subject) -> LawHolds:
     """No global random state is drawn from or seeded."""
-    if subject.watch.drawn:
+    if subject.drawn:
         raise BrokenLawError(
-            f"uses {', '.join(subject.watch.drawn)}",
+            f"uses {', '.join(subject.drawn)}",
             hint="draw from lidardesign.task.random_generator(seed, ...) and pass the generator on",
         )
     return LawHolds("Python's, numpy's and torch's random states are as they were")
 
 
-def check_files(subject: Subject) -> LawHolds:
-    """Nothing is written but temporary files and caches."""
-    found = subject.watch.written_files()
-    if found:
-        raise BrokenLawError(f"writes {', '.join(found)}", allowed="temporary files and the user's caches")
-    return LawHolds("nothing but temporary files and caches")
-
-
-def check_surroundings(subject: Subject) -> LawHolds:
-    """The working folder, the environment, the locale, signals and numpy's error settings stay."""
-    if subject.watch.changed:
-        raise BrokenLawError(f"changes {', '.join(subject.watch.changed)}", hint="put back what you change")
-    return LawHolds("working folder, environment, locale, signals and numpy's error settings are as they were")
-
-
 def check_time(subject: Subject) -> LawHolds:
     """Every call of the task's code ends within the limit."""
-    limit = subject.limits.seconds
+    limit = subject.limit_s
     slow = [what for what, seconds in subject.seconds.items() if seconds > limit]
     if slow:
         raise BrokenLawError(
@@ -71,37 +52,14 @@ def check_time(subject: Subject) -> LawHolds:
     return LawHolds(f"at most: {said}", {f"{what}_s": round(seconds, 4) for what, seconds in subject.seconds.items()})
 
 
-def check_memory(subject: Subject) -> LawHolds | NotApplicable:
-    """The process holds no more memory than the limit."""
-    peak = peak_memory_bytes()
-    if peak is None:
-        return NotApplicable("this system does not say how much memory a process holds")
-    if peak > subject.limits.memory_bytes:
-        raise BrokenLawError(
-            f"the process used {peak / GIBIBYTE:.2f} GiB",
-            allowed=f"{subject.limits.memory_bytes / GIBIBYTE:.2f} GiB",
-            hint="check fewer or smaller scenes (--set), or allow more (--memory-mb)",
-        )
-    return LawHolds(f"the process used {peak / MEBIBYTE:.0f} MiB at most", {"peak_bytes": peak})
-
-
 _AFTER = ("scores are numbers", "returns inform")
 CONDUCT_LAWS = (
     Law("no global random state", "conduct", "no global random state is used", check_random, after=_AFTER),
-    Law("nothing is written", "conduct", "only temporary files and caches are written", check_files, after=_AFTER),
-    Law(
-        "nothing else is changed",
-        "conduct",
-        "working folder, environment, locale and signals stay",
-        check_surroundings,
-        after=_AFTER,
-    ),
     Law("within time", "conduct", "every call ends in time", check_time, after=_AFTER),
-    Law("within memory", "conduct", "the process stays within memory", check_memory, after=_AFTER),
 )
 
 
-LAWS: tuple[Law, ...] = (*interface.LAWS, *scenes.LAWS, *geometry.LAWS, *scoring.LAWS, *CONDUCT_LAWS)
+LAWS: tuple[Law, ...] = (*interface.LAWS, *scenes.LAWS, *scoring.LAWS, *CONDUCT_LAWS)
 
 
 class Contract:
@@ -147,9 +105,6 @@ class Contract:
             found = law.check(self.subject)
         except LidardesignError as error:
             return Finding(*known, "fail", error_words(error), time.perf_counter() - started)
-        except MemoryError:
-            limit = self.subject.limits.memory_bytes
-            return Finding(*known, "fail", f"needs more than {limit / 2**20:.0f} MiB", time.perf_counter() - started)
         except Exception as error:  # what a task gives instead of what it should surprises in any way
             return Finding(
                 *known,
@@ -168,8 +123,7 @@ def contract_of(
     *,
     overrides: Sequence[str] = (),
     config: RunConfig | None = None,
-    limits: Limits | None = None,
-    watch: Watch | None = None,
+    limit_s: float = CALL_SECONDS,
 ) -> Contract:
     """The contract of a task object, registered or not.
 
@@ -177,8 +131,7 @@ def contract_of(
         task: The task.
         overrides: `KEY=VALUE` as `--set` takes it.
         config: A whole configuration instead.
-        limits: What the task's code may take.
-        watch: Notes what its code does.
+        limit_s: What one call of the task's code may take [s].
 
     Raises:
         PluginError: The task lacks a member of the interface.
@@ -186,25 +139,25 @@ def contract_of(
     """
     with registry.plugin_guard(str(getattr(task, "name", type(task).__name__))):
         registry.check_interface(str(getattr(task, "name", "")), task)
-    watch = watch or Watch()
+    drawn: list[str] = []
     if config is None:
-        with watch.during("space"):
+        with restore_random_states(drawn, "space"):
             config = resolve(task, overrides=overrides)
-    return Contract(Subject(task, config, limits or Limits(), watch))
+    return Contract(Subject(task, config, limit_s, drawn))
 
 
-def check_task(task: Task, *, overrides: Sequence[str] = (), limits: Limits | None = None) -> list[Finding]:
+def check_task(task: Task, *, overrides: Sequence[str] = (), limit_s: float = CALL_SECONDS) -> list[Finding]:
     """Try the whole contract on a task object, in this process.
 
     Arguments:
         task: The task.
         overrides: `KEY=VALUE` as `--set` takes it.
-        limits: What the task's code may take.
+        limit_s: What one call of the task's code may take [s].
 
     Raises:
         BrokenLawError: A law does not hold; the message names all that do not.
     """
-    findings = list(contract_of(task, overrides=overrides, limits=limits).findings())
+    findings = list(contract_of(task, overrides=overrides, limit_s=limit_s).findings())
     refuse_broken(task.name, findings)
     return findings
 

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from lidardesign.config import PRESETS, resolve
 from lidardesign.errors import ConfigError
 from lidardesign.space import DesignSpace
-from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
+from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject, restore_random_states
 
 
 def check_config(subject: Subject) -> LawHolds:
@@ -85,7 +85,7 @@ def check_defaults(subject: Subject) -> LawHolds:
     task = {f"task.{name}": value for name, value in subject.config.task.model_dump(mode="json").items()}
     for preset in PRESETS:
         try:
-            with subject.watch.during("space"):
+            with restore_random_states(subject.drawn, "space"):
                 resolve(subject.task, preset=preset, overrides=[f"{key}={_as_yaml(v)}" for key, v in task.items()])
         except ConfigError as error:
             raise BrokenLawError(f"preset {preset}: {error.message}", allowed=error.allowed) from error

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import random
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,6 +12,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
+
+import numpy as np
 
 from lidardesign.config import RunConfig
 from lidardesign.errors import LidardesignError, PluginError
@@ -22,7 +26,6 @@ from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.task import Metric, Score, Split, Task, conditions_of, metric_of, scenes_of
 from lidardesign.testing.fingerprint import fingerprint
 from lidardesign.testing.probing import rays_at_targets
-from lidardesign.testing.watch import Watch
 
 PACKAGE = Path(__file__).parents[1]
 # Libraries that tasks call, and that errors are raised in when they are called wrongly.
@@ -36,20 +39,8 @@ LOADS = (
 )
 
 
-GIBIBYTE = 2**30
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What a task's code may take.
-
-    Arguments:
-        seconds: One call of it [s].
-        memory_bytes: The process that runs it.
-    """
-
-    seconds: float = 60.0
-    memory_bytes: int = 4 * GIBIBYTE
+# One call of a task's code may take so long, where nothing else is asked for.
+CALL_SECONDS = 60.0
 
 
 class BrokenLawError(PluginError):
@@ -156,6 +147,37 @@ def place_of(error: BaseException) -> str:
     return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
 
 
+@contextlib.contextmanager
+def restore_random_states(drawn: list[str], what: str) -> Iterator[None]:
+    """Put global random states back as they were before, and note those that had changed.
+
+    Arguments:
+        drawn: Gets the states that changed, in words.
+        what: What runs meanwhile.
+    """
+    before = _random_states()
+    try:
+        yield
+    finally:
+        now = _random_states()
+        changed = [f"{name} in {what}" for name in before if fingerprint(now[name]) != fingerprint(before[name])]
+        drawn += [note for note in changed if note not in drawn]
+        random.setstate(before["Python's random"])
+        np.random.set_state(before["numpy's random"])  # noqa: NPY002 - it is this state that must not change
+        if "torch's random" in before:
+            sys.modules["torch"].set_rng_state(before["torch's random"])
+
+
+def _random_states() -> dict[str, Any]:
+    """The global random states by the words for them; torch's only where torch is loaded."""
+    found: dict[str, Any] = {
+        "Python's random": random.getstate(),
+        "numpy's random": np.random.get_state(),  # noqa: NPY002
+    }
+    torch = sys.modules.get("torch")
+    return found if torch is None else found | {"torch's random": torch.get_rng_state()}
+
+
 # The geometry and the scores of so many training scenes are looked at.
 LOOKED_AT = 3
 
@@ -167,15 +189,15 @@ class Subject:
     Arguments:
         task: The plugin.
         config: Its resolved configuration.
-        limits: What its code may take.
-        watch: Notes what its code does to the process.
+        limit_s: What one call of its code may take [s].
+        drawn: Global random states that its code drew from or seeded, and when.
         on_call: Called with what is called before every call of its code, and "" after it.
     """
 
     task: Task
     config: RunConfig
-    limits: Limits = field(default_factory=Limits)
-    watch: Watch = field(default_factory=Watch)
+    limit_s: float = CALL_SECONDS
+    drawn: list[str] = field(default_factory=list)
     on_call: Callable[[str], None] = lambda what: None
 
     def __post_init__(self) -> None:
@@ -195,7 +217,7 @@ class Subject:
         self.on_call(what)
         started = time.perf_counter()
         try:
-            with self.watch.during(what), plugin_guard(self.task.name):
+            with restore_random_states(self.drawn, what), plugin_guard(self.task.name):
                 yield
         except LidardesignError as error:
             told = error.message if error.message.startswith((what, "scoring")) else f"{what} failed: {error.message}"

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Hits, Outcome, Rays, Returns
+from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.geometry.surface import sample_body
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH, ELEVATION, FARTHEST_M, RANGE, DesignSpace, aim, direction
@@ -36,7 +35,7 @@ def rays_at_targets(scene: Scene, space: DesignSpace, casters: Sequence[SceneCas
     for _ in range(DRAW_ROUNDS):
         for frame in frames:
             per = -(-count // len(frames))
-            found.append(rays_that_meet(scene, space, casters[frame], int(frame), per, generator)[0])
+            found.append(rays_that_meet(scene, space, casters[frame], int(frame), per, generator))
         if sum(map(len, found)) >= count:
             break
     return full_rays(generator.permutation(np.concatenate(found))[:count], space)
@@ -53,8 +52,8 @@ def full_rays(points: np.ndarray, space: DesignSpace) -> Rays:
 
 def rays_that_meet(
     scene: Scene, space: DesignSpace, caster: SceneCaster, frame: int, count: int, generator: np.random.Generator
-) -> tuple[np.ndarray, Hits]:
-    """Rays of a design space towards targets that meet a target first.
+) -> np.ndarray:
+    """Rays of a design space towards targets that meet a target first, observed design points of shape (K, 6).
 
     Arguments:
         scene: Whose targets, at one of its frames.
@@ -63,9 +62,6 @@ def rays_that_meet(
         frame: Its number.
         count: How many are tried.
         generator: Draws origins and places.
-
-    Returns:
-        The observed design points, shape (K, 6), and their hits.
     """
     origins = space.sample(count, generator)[:, :3]
     points = sample_body([body for body in scene.bodies if body.is_target], space, count, generator, frame).points
@@ -76,18 +72,7 @@ def rays_that_meet(
     hits = caster.first_hit(design[:, :3], direction(design[:, AZIMUTH], design[:, ELEVATION]))
     design[:, RANGE] = np.where(np.isfinite(hits.range_m), hits.range_m, 2 * FARTHEST_M)
     kept = np.array([*(body.is_target for body in scene.bodies), False])[hits.body] & space.contains(design)
-    return design[kept], hits.subset(kept)
-
-
-def with_noise(returns: Sequence[Returns], share: float, generator: np.random.Generator) -> list[Returns]:
-    """The same returns with normal noise on their ranges; its spread is a share of their median range."""
-    received = np.concatenate([one.range_m[one.returned] for one in returns])
-    spread_m = share * float(np.median(received)) if len(received) else 0.0
-    noise = [spread_m * generator.normal(size=len(one.range_m)) for one in returns]
-    return [
-        replace(one, range_m=np.maximum(one.range_m + added, one.rays.gate_m[:, 0]))
-        for one, added in zip(returns, noise, strict=True)
-    ]
+    return design[kept]
 
 
 def shuffled(returns: Sequence[Returns], generator: np.random.Generator) -> list[Returns]:

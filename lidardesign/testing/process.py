@@ -1,19 +1,17 @@
-"""The contract tried in a process of its own, with limits: a plugin that hangs, crashes or hogs harms nobody.
+"""The contract tried in a process of its own: a plugin that hangs or crashes harms nobody.
 
 The process says by lines of JSON when it calls the task's code and what it found; whoever asks waits for each line no
-longer than a call may take. It works in an empty folder, has temporary files of its own, and is told how much memory
-it may take.
+longer than a call may take. It works in an empty folder and has temporary files of its own.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -21,19 +19,14 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.registry import BEGUN, GRACE_SECONDS, START_SECONDS, PluginProcess, answer, write_line
-from lidardesign.testing.law import LOADS, Finding, Law, Limits, error_words, place_of
-from lidardesign.testing.watch import Watch
+from lidardesign.run.child import START_SECONDS, Child, ChildError, write_line
+from lidardesign.testing.law import CALL_SECONDS, LOADS, Finding, Law, error_words, place_of, restore_random_states
 
 if TYPE_CHECKING:
     from lidardesign.config import RunConfig
     from lidardesign.task import Task
     from lidardesign.testing.contract import Contract
 
-CHILD = (
-    "import json, sys; request = json.loads(sys.stdin.readline()); sys.path[:] = request['path']; "
-    "from lidardesign.testing.process import answer_check; answer_check(request)"
-)
 # A call that takes longer than it may ends within this many times as long, so that it can be told how long it took.
 OVERTIME = 3
 # The key of a line that says what is called now; empty once the call has ended.
@@ -51,14 +44,14 @@ class CheckRequest:
         config_file: A YAML file of its configuration.
         overrides: `KEY=VALUE` as `--set` takes it.
         seed: Root of all chance.
-        limits: What the task's code may take.
+        limit_s: What one call of the task's code may take [s].
     """
 
     name: str
     config_file: Path | None = None
     overrides: Sequence[str] = ()
     seed: int | None = None
-    limits: Limits = field(default_factory=Limits)
+    limit_s: float = CALL_SECONDS
 
 
 def check_in_process(request: CheckRequest) -> Iterator[Finding]:
@@ -74,29 +67,23 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
         return
     with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
         document = {
-            "path": sys.path,
             "folder": folder,
             "name": offer.name,
             "value": offer.value,
             "config_file": str(request.config_file) if request.config_file else None,
             "overrides": list(request.overrides),
             "seed": request.seed,
-            "seconds": request.limits.seconds,
-            "memory_bytes": request.limits.memory_bytes,
+            "seconds": request.limit_s,
         }
-        child = PluginProcess(CHILD, document)
+        child = Child(f"{__name__}:answer_check", document, {registry.PROBING: "1"})
         try:
-            yield from _read_findings(child, request.limits.seconds)
+            yield from _read_findings(child, request.limit_s)
         finally:
             child.end()
 
 
-def _read_findings(child: PluginProcess, seconds: float) -> Iterator[Finding]:
+def _read_findings(child: Child, seconds: float) -> Iterator[Finding]:
     """Findings as they come; where the process is lost, the law that it tried does not hold."""
-    _, line = child.next_line(time.monotonic() + START_SECONDS)
-    if line != BEGUN:
-        yield from _all_lost(0, "the process that checks could not be started")
-        return
     for number in range(len(_laws()) + 1):
         found = _next_finding(child, seconds, loading=number == 0)
         if isinstance(found, str):
@@ -109,7 +96,7 @@ def _read_findings(child: PluginProcess, seconds: float) -> Iterator[Finding]:
             return
 
 
-def _next_finding(child: PluginProcess, seconds: float, *, loading: bool) -> dict[str, Any] | str:
+def _next_finding(child: Child, seconds: float, *, loading: bool) -> dict[str, Any] | str:
     """The next line that is a finding, or how the process was lost; every call of the task's code has time of its own.
 
     Arguments:
@@ -121,16 +108,14 @@ def _next_finding(child: PluginProcess, seconds: float, *, loading: bool) -> dic
     allowed = seconds if loading else START_SECONDS + OVERTIME * seconds
     called = ""
     while True:
-        deadline = time.monotonic() + allowed + GRACE_SECONDS
-        _, line = child.next_line(deadline)
-        found = _read(line) if line else None
-        if found is None:
-            if line:
-                return "writes to a stream that is not its own while this is tried"
-            died_of = None if line is None else child.died_of(deadline, "while this is tried")
-            return died_of or f"{called} did not end within {allowed:g} s".lstrip()
-        if CALLED not in found:
+        try:
+            found = child.answer(allowed, "while this is tried")
+        except ChildError as lost:
+            return f"{called} did not end within {allowed:g} s".lstrip() if lost.reason == "late" else str(lost)
+        if "refused" in found or set(found) == FINDING_KEYS:
             return found
+        if set(found) != {CALLED}:
+            return "writes to a stream that is not its own while this is tried"
         called = str(found[CALLED])
         allowed = OVERTIME * seconds if called else START_SECONDS + OVERTIME * seconds
 
@@ -143,16 +128,6 @@ def _finding(found: dict[str, Any]) -> Finding:
     raise REFUSALS.get(told["kind"], ConfigError)(
         told["message"], **{key: told.get(key) for key in ("where", "allowed", "hint")}
     )
-
-
-def _read(line: bytes) -> dict[str, Any] | None:
-    """The content of a line; None where a plugin wrote it, which knows neither its form nor that it is read."""
-    try:
-        found = json.loads(line)
-    except ValueError:
-        return None
-    known = isinstance(found, dict) and ("refused" in found or set(found) in ({CALLED}, FINDING_KEYS))
-    return found if known else None
 
 
 def _all_lost(number: int, reason: str) -> Iterator[Finding]:
@@ -178,35 +153,22 @@ def _named(number: int) -> tuple[str, str, str]:
     return law.name, law.group, law.statement
 
 
-def answer_check(request: dict[str, Any]) -> None:
-    """In that process: try all laws, say what was found on stdout, and end."""
-    result = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    nowhere = open(os.devnull, "w")  # noqa: SIM115 - lives as long as the process
-    os.dup2(nowhere.fileno(), sys.stdout.fileno())
+def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
+    """In that process: try all laws and say what was found."""
     _settle(request)
-    result.write(BEGUN)
-    result.flush()
     contract = _begin(request, result)
     if contract is None:
-        os._exit(0)
-    contract.subject.watch.empty_folder = Path(_make_folder(request, "work"))
-    os.chdir(contract.subject.watch.empty_folder)
+        return {}
+    os.chdir(_make_folder(request, "work"))
     for finding in contract.findings():
         write_line(result, finding.as_dict())
-    answer(result, {})
+    return {}
 
 
 def _settle(request: dict[str, Any]) -> None:
-    """Limits on memory, a place for temporary files, and no compiled Python beside the plugin's sources."""
+    """Provide a place for temporary files, and write no compiled Python beside the plugin's sources."""
     tempfile.tempdir = os.environ["TMPDIR"] = _make_folder(request, "temporary")
     os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
-    try:
-        import resource
-    except ImportError:  # not on Windows
-        return
-    _, most = resource.getrlimit(resource.RLIMIT_DATA)
-    wanted = request["memory_bytes"]
-    resource.setrlimit(resource.RLIMIT_DATA, (wanted if most == resource.RLIM_INFINITY else min(wanted, most), most))
 
 
 def _make_folder(request: dict[str, Any], name: str) -> str:
@@ -217,10 +179,10 @@ def _make_folder(request: dict[str, Any], name: str) -> str:
 
 def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     """Import the plugin and resolve its configuration; None where that is the end of it, which is told."""
-    watch = Watch(all_threads=True)
+    drawn: list[str] = []
     started = time.perf_counter()
     try:
-        task, config = _loaded(request, watch)
+        task, config = _loaded(request, drawn)
     except registry.PluginError as error:
         write_line(result, Finding(*LOADS, "fail", f"{error_words(error)}{place_of(error)}").as_dict())
         return None
@@ -240,16 +202,15 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     version = f"version {task.api_version} of the task interface"
     loaded = Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started)
     write_line(result, loaded.as_dict())
-    limits = Limits(request["seconds"], request["memory_bytes"])
-    return Contract(Subject(task, config, limits, watch, lambda what: write_line(result, {CALLED: what})))
+    return Contract(Subject(task, config, request["seconds"], drawn, lambda what: write_line(result, {CALLED: what})))
 
 
-def _loaded(request: dict[str, Any], watch: Watch) -> tuple[Task, RunConfig]:
+def _loaded(request: dict[str, Any], drawn: list[str]) -> tuple[Task, RunConfig]:
     offer = EntryPoint(request["name"], request["value"], registry.GROUP)
-    with watch.during("import"):
+    with restore_random_states(drawn, "import"):
         task = registry.import_task(offer, request["seconds"])
     config_file = Path(request["config_file"]) if request["config_file"] else None
-    with watch.during("space"):
+    with restore_random_states(drawn, "space"):
         return task, resolve(
             task, preset="draft", config_file=config_file, overrides=request["overrides"], seed=request["seed"]
         )

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 import pickle
 from importlib.util import find_spec
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
 
 from lidardesign.errors import LidardesignError
+from lidardesign.registry import plugin_guard
+from lidardesign.run.child import ChildError, ask
 from lidardesign.selection.information import informs_rays
-from lidardesign.task import Split
-from lidardesign.testing.elsewhere import fingerprints_in_process
+from lidardesign.space import DesignSpace
+from lidardesign.task import Split, scenes_of
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
 from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
+
+if TYPE_CHECKING:
+    from lidardesign.config import RunConfig
 
 # Training scenes are drawn with other seeds where rays are chosen; so many further seeds are tried.
 FURTHER_SEEDS = 2
 SPLITS: tuple[Split, ...] = ("train", "test")
+# Any number but 0, which would be no chance at all, and not the one of the process that asks.
+HASH_SEEDS = ("20251", "20252")
 
 
 def check_scenes(subject: Subject) -> LawHolds:
@@ -76,7 +87,7 @@ def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
     kind = type(subject.task)
     if kind.__module__ == "__main__" or "<locals>" in kind.__qualname__ or find_spec(kind.__module__) is None:
         return NotApplicable("the task's class cannot be imported in another process")
-    found = fingerprints_in_process(subject.config, kind, subject.limits.seconds)
+    found = fingerprints_in_process(subject.config, kind, subject.limit_s)
     for split in SPLITS:
         mine = [fingerprint(scene) for scene in subject.scenes(split)]
         if found[split] != mine:
@@ -86,6 +97,49 @@ def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
                 hint="do not use hash(), the order of sets, the time or the process in scenes",
             )
     return LawHolds("another process makes them the same to the bit")
+
+
+def fingerprints_in_process(config: RunConfig, kind: type, seconds: float) -> dict[str, list[str]]:
+    """Fingerprints of all scenes by split, made in a process of its own.
+
+    Arguments:
+        config: Whose scenes.
+        kind: The task's class; it must be importable.
+        seconds: How long the scenes of one split may take there.
+
+    Raises:
+        BrokenLawError: It failed there, or took longer.
+    """
+    request = {
+        "module": kind.__module__,
+        "name": kind.__qualname__,
+        "task": config.task.model_dump(mode="json"),
+        "space": config.space.as_dict(),
+        "seed": config.seed,
+    }
+    hash_seed = next(seed for seed in HASH_SEEDS if seed != os.environ.get("PYTHONHASHSEED"))
+    try:
+        limit_s, work = len(SPLITS) * seconds, f"{__name__}:answer_fingerprints"
+        found = ask(work, request, limit_s, "there", {"PYTHONHASHSEED": hash_seed})
+    except ChildError as lost:
+        raise BrokenLawError(f"scenes failed in another process, which {lost}") from None
+    if "error" in found:
+        raise BrokenLawError(f"scenes failed in another process: {found['error']}")
+    return found
+
+
+def answer_fingerprints(request: dict[str, Any], _: object) -> dict[str, Any]:
+    """In that process: make the scenes, and say their fingerprints or what went wrong."""
+    try:
+        with plugin_guard(request["name"]):
+            task = attrgetter(request["name"])(importlib.import_module(request["module"]))()
+            config, space = task.Config(**request["task"]), DesignSpace.from_dict(request["space"])
+            return {
+                split: [fingerprint(scene) for scene in scenes_of(task, config, split, request["seed"], space)]
+                for split in SPLITS
+            }
+    except LidardesignError as error:
+        return {"error": error.message}
 
 
 def check_picklable(subject: Subject) -> LawHolds:

@@ -1,4 +1,4 @@
-"""Laws of a task's score: always a number, best on the truth, worse for less, and moved by nothing but returns."""
+"""Laws of a task's targets and score: in reach; a number, best on the truth, moved by nothing but returns."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ from lidardesign.selection.information import checked_information, informs_rays
 from lidardesign.task import Information
 from lidardesign.testing.fingerprint import fingerprint
 from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
-from lidardesign.testing.probing import full_rays, returns_of_rays, shuffled, with_noise, without_returns
+from lidardesign.testing.probing import full_rays, returns_of_rays, shuffled, without_returns
 
 DENSE, SPARSE = 400, 12
 SEED = 20_253
-# The spread of noise on ranges, as shares of the median range: from what a sensor has to what spoils any estimate.
-NOISE_SHARES = (0.01, 0.1)
 # Of the metric's tolerance: what another order of the same additions may change.
 ORDER_SHARE = 0.01
 COPIES = "work on copies: the next design is scored there too"
@@ -33,6 +31,17 @@ def _worse(subject: Subject, value: float, than: float) -> float:
 
 def _scenes(subject: Subject) -> list[tuple[int, Scene]]:
     return list(enumerate(subject.looked_at))
+
+
+def check_reach(subject: Subject) -> LawHolds:
+    """Rays of the design space meet targets in every scene that is looked at."""
+    counts = [sum(map(len, subject.rays(number, DENSE))) for number, _ in _scenes(subject)]
+    if not min(counts):
+        raise BrokenLawError(
+            f"no ray from the design space meets a target of scene {subject.looked_at[counts.index(0)].name!r}",
+            hint="widen the angles or the range, move the origin, or check the units: all lengths are metres",
+        )
+    return LawHolds(f"{sum(counts)} rays meet targets in {len(counts)} scenes", {"rays": sum(counts)})
 
 
 def check_number(subject: Subject) -> LawHolds:
@@ -91,25 +100,6 @@ def check_best(subject: Subject) -> LawHolds:
             hint="check metric.better and what score() compares",
         )
     return LawHolds(said, figures)
-
-
-def check_noise(subject: Subject) -> LawHolds:
-    """Noise on ranges makes scores worse, or leaves those alone that do not depend on ranges."""
-    exact, noisy = [], []
-    for number, scene in _scenes(subject):
-        returns = _dense(subject, number)
-        exact.append(subject.score(scene, returns).value)
-        disturbed = [with_noise(returns, share, np.random.default_rng([SEED, number])) for share in NOISE_SHARES]
-        noisy.append([subject.score(scene, one).value for one in disturbed])
-    value, found = float(np.mean(exact)), np.mean(noisy, axis=0)
-    metric, losses = subject.metric, [_worse(subject, float(mean), value) for mean in found]
-    steps = ", ".join(f"{mean:.4g} with {share:.0%} noise" for share, mean in zip(NOISE_SHARES, found, strict=True))
-    said = f"{value:.4g} exact, {steps} [{metric.unit}]"
-    if min(losses) < -metric.tolerance:
-        hint = "an estimate that noise makes better is biased: correct the bias, or judge by another figure"
-        raise BrokenLawError(f"noise on the ranges makes the score better: {said}", hint=hint)
-    figures = {"exact": value, "noisy": float(found[-1])}
-    return LawHolds(said if max(losses) > 0 else f"{said}: ranges do not matter", figures)
 
 
 def check_order(subject: Subject) -> LawHolds:
@@ -191,6 +181,13 @@ def _pairs(found: Information, rays: np.ndarray) -> np.ndarray:
 
 LAWS = (
     Law(
+        "targets are in reach",
+        "scenes",
+        "rays of the design space meet targets",
+        check_reach,
+        needs=("scenes are made", "conditions lie in the space"),
+    ),
+    Law(
         "scores are numbers",
         "score",
         "a finite number, or failed, for dense, sparse and random rays",
@@ -209,13 +206,6 @@ LAWS = (
         "score",
         "many exact returns score best, none worst",
         check_best,
-        needs=("scores are numbers",),
-    ),
-    Law(
-        "worse under noise",
-        "score",
-        "noise on ranges never makes a score better",
-        check_noise,
         needs=("scores are numbers",),
     ),
     Law(

@@ -13,21 +13,21 @@ from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.design.compare import outside_space
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_text, save_design
 from lidardesign.design.fit import FitResult
 from lidardesign.design.layouts.rays import certificates_of
 from lidardesign.design.sensor import CERTIFICATES, DesignSpec
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import ConfigError, DataError, names_arguments
 from lidardesign.geometry.rays import Rays
-from lidardesign.run.clock import WAIT_S, phase
-from lidardesign.run.files import is_there, run_lock
+from lidardesign.run.clock import WAIT_S, Progress, phase
+from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import write_recorded
 from lidardesign.task import scoring_settings
 from lidardesign.workflow.export import (
     DesignSource,
     Exported,
     ExportRequest,
-    check_frame_rate,
     export_target,
     exporter_of,
 )
@@ -84,9 +84,10 @@ class Design(DesignSource):
         self.result = result
 
     @classmethod
-    def fitted(cls, request: FitRequest, *, notes: Notes = log_note, progress: Notes = ignore) -> Design:
+    def fitted(cls, request: FitRequest, *, notes: Notes = log_note, progress: Progress | None = None) -> Design:
         """The design that a request comes to; it is not saved yet. `progress` is called with every step."""
-        result = fit_design(request, notes=notes, progress=progress)
+        steps = ignore if progress is None else (lambda step: progress(step, None, None))
+        result = fit_design(request, notes=notes, progress=steps)
         return cls(result.design, request.run, None, result)
 
     @property
@@ -94,22 +95,69 @@ class Design(DesignSource):
         """Its name: that of its file and of its rows."""
         return self.specification.name
 
-    def constrain(self, *, notes: Notes = log_note, progress: Notes = ignore, **options: Any) -> Design:
+    @names_arguments
+    def constrain(
+        self,
+        *,
+        sensors: int | str | None = None,
+        constraints: Constraints | Mapping[str, Any] | Path | str | None = None,
+        rays: int | None = None,
+        layout: str | None = None,
+        channels: int | None = None,
+        gates: str | None = None,
+        level: float | None = None,
+        at: Mapping[str, float] | None = None,
+        weights: Sequence[str] | Mapping[str, Any] = (),
+        parts: Sequence[str] | str | None = None,
+        like: Path | str | None = None,
+        name: str | None = None,
+        seed: int | None = None,
+        notes: Notes = log_note,
+        progress: Progress | None = None,
+    ) -> Design:
         """Fit it again in its run; what is not given stays as it is.
 
         Arguments:
+            sensors: How many, "best" or "auto".
+            constraints: Constraints, a mapping of them, or a YAML file of them.
+            rays: Rays per frame over all sensors.
+            layout: grid, density, scan, distributed, selected or spinning.
+            channels: Rings of each sensor of the layout spinning.
+            gates: "sensor" or "ray": one gate per sensor, or one per ray.
+            level: The share of rays and returns that fields of view and gates contain.
+            at: Values of conditions that the design is for, such as {"x_m": 0.37}.
+            weights: Settings of the task towards which the learned density is weighted.
+            parts: Real parts that the design is made of: names, NAME:MODE, paths of part files, or "catalog".
+            like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
+            name: The design's name; "constrained" by default.
+            seed: Seed of all random numbers; the run's by default.
             notes: Called with every note.
-            progress: Called with every step, as "choosing 361 rays".
-            options: As of `FitOptions`: constraints, sensors, rays, layout, gates, level, at, name and more.
+            progress: Called with every step, as "choosing 361 rays", and twice None.
 
         Raises:
             DataError: The run has gone.
             InfeasibleError: Constraints that contradict each other, or hold too little of the density.
         """
         run = need_run(self.run, self.name if self.path is None else self.path)
-        request = FitRequest.resolve(run, FitOptions(**options), self.specification, notes=notes)
+        options = FitOptions(
+            sensors=sensors,
+            constraints=constraints,
+            rays=rays,
+            layout=layout,
+            channels=channels,
+            gates=gates,
+            level=level,
+            at=at or {},
+            weights=weights,
+            parts=parts,
+            like=like,
+            name=name,
+            seed=seed,
+        )
+        request = FitRequest.resolve(run, options, self.specification, notes=notes)
         return Design.fitted(request, notes=notes, progress=progress)
 
+    @names_arguments
     def rays(
         self, count: int | None = None, *, at: Mapping[str, float] | None = None, seed: int = 0, notes: Notes = log_note
     ) -> Rays:
@@ -147,6 +195,7 @@ class Design(DesignSource):
         self.path = path
         return path
 
+    @names_arguments
     def export(
         self,
         path: Path | str | None = None,
@@ -171,7 +220,6 @@ class Design(DesignSource):
             robot: A robot's MuJoCo model that the sensors are put into (mjcf).
             notes: Called with every note.
         """
-        check_frame_rate(rate_hz)
         out = None if path is None else Path(path)
         exporter = exporter_of(format, out)
         target = export_target(self.path, out, exporter)
@@ -206,17 +254,22 @@ class Design(DesignSource):
 
 @phase("designs")
 def collect_designs(
-    targets: Sequence[Design | Path], runs: Sequence[RunFolder] = (), notes: Notes = log_note
-) -> tuple[list[Design], list[RunFolder]]:
-    """The designs that were named, and the runs: of folders all designs, of files the file; each once.
+    targets: Sequence[Design | Path], judge: RunFolder | None = None, notes: Notes = log_note
+) -> list[Design]:
+    """The designs that were named: of run folders all designs, of files the file; each once.
+
+    Arguments:
+        targets: Designs, design files and run folders.
+        judge: The run in whose scenes they are scored, where one was named.
+        notes: Called with every note.
 
     Raises:
-        DataError: One is not there.
+        DataError: One is not there, or there are none.
     """
     designs: list[Design] = []
     paths = [target for target in targets if isinstance(target, Path)]
     opened = {path: RunFolder.open(path) for path in paths if path.is_dir()}
-    runs = [*runs, *opened.values()]
+    runs = [judge] if judge else list(opened.values())
     reach_m = reach_beside([path for path in paths if path.is_file()], runs)
     for target in targets:
         if isinstance(target, Design):
@@ -224,7 +277,7 @@ def collect_designs(
         elif target in opened:
             run = opened[target]
             designs += [Design(read_design(path, notes), run, path) for path in run.design_paths()]
-        elif not is_there(target):
+        elif not target.exists():
             raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
         else:
             design = read_design(target, notes, reach_m)
@@ -234,7 +287,10 @@ def collect_designs(
         # they may be renamed: a user's own keep their names
         copy = Design(design.specification, design.run, design.path)
         seen.setdefault(id(design) if design.path is None else design.path.resolve(), copy)
-    return list(seen.values()), runs
+    if not seen:
+        where = str(runs[0].folder if judge else next(iter(opened)))
+        raise DataError("the run has no designs yet", where=where, hint=f"lidardesign fit {quote(where)}")
+    return list(seen.values())
 
 
 def named(designs: list[Design], names: Sequence[str]) -> list[Design]:
@@ -276,34 +332,30 @@ def name_apart(designs: list[Design]) -> list[Design]:
     return designs
 
 
-def judging_run(designs: Sequence[Design], runs: Sequence[RunFolder], notes: Notes = log_note) -> RunFolder:
-    """The run in whose scenes designs are scored: the first that was named, or else the one that they came from.
+def judging_run(designs: Sequence[Design], judge: RunFolder | None, notes: Notes = log_note) -> RunFolder:
+    """The run in whose scenes designs are scored: the one that was named, or else the one that they came from.
 
     Arguments:
         designs: The designs; of those from a run of other settings a note says whether they fit here.
-        runs: The runs that were named.
+        judge: The run that was named.
         notes: Called with every note.
 
     Raises:
-        ConfigError: There is none, or runs differ and no single one was named.
-        DataError: There are no designs.
+        ConfigError: There is none, or runs differ and none was named.
     """
-    candidates = runs or [design.run for design in designs if design.run is not None]
+    candidates = [judge] if judge else [design.run for design in designs if design.run is not None]
     if not candidates:
         raise ConfigError(
             "no design comes from a run that can be found, so the task is unknown",
-            hint="give the run folder too: lidardesign evaluate RUN DESIGN",
+            hint="name the run whose scenes are used: --in RUN",
         )
     judge = candidates[0]
     other = next((run for run in candidates if _settings(run) != _settings(judge)), None)
     if other is not None:
         raise ConfigError(
             f"{judge.folder} and {other.folder} differ in task, configuration or design space",
-            hint="name the run whose scenes are used: lidardesign evaluate RUN DESIGN ..., or compare A B --in RUN",
+            hint="name the run whose scenes are used: --in RUN",
         )
-    if not designs:
-        hint = f"lidardesign fit {quote(str(judge.folder))}"
-        raise DataError("the run has no designs yet", where=str(judge.folder), hint=hint)
     for design in designs:
         track = design.specification.track
         if track is not None and track.dimension not in judge.config.space.condition:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -11,52 +12,131 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import with_task_settings
-from lidardesign.design.compare import outside_notes
-from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.greedy import GREEDY, GreedySource, greedy_rays
-from lidardesign.evaluate.baselines.simple import ALWAYS, baseline_of, is_baseline
-from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
-from lidardesign.evaluate.cma.search import SearchBudget
-from lidardesign.evaluate.gates import check_audit, check_better, check_limit
+from lidardesign.design.sensor import MOST_RAYS
+from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
+from lidardesign.evaluate.baselines.cma import CMA, DEFAULT_SECONDS, CmaSettings
+from lidardesign.evaluate.baselines.greedy import GreedySource
+from lidardesign.evaluate.baselines.simple import ALWAYS, BASELINES, NONE, check_baseline
 from lidardesign.evaluate.last_scores import SCORES, last_scores_of
-from lidardesign.evaluate.options import ScoreOptions
-from lidardesign.evaluate.request import (
-    EvaluationRequest,
-    fired_numbers,
-    left_out,
-    numbers_alone,
-    numbers_fired,
-    usual_numbers,
-)
+from lidardesign.evaluate.mounting import MountError
+from lidardesign.evaluate.request import EvaluationRequest, numbers_alone, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
-from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.score import evaluate as score_designs
-from lidardesign.evaluate.workers.pool import check_workers, workers_of
-from lidardesign.run.clock import outermost_clock, phase, running
-from lidardesign.simulate.plan import Planner
+from lidardesign.evaluate.thresholds import check_audit, check_better, check_limit
+from lidardesign.evaluate.workers import check_workers, scorer_of
+from lidardesign.numerics import SLACK
+from lidardesign.run.clock import Progress, outermost_clock, phase, running
+from lidardesign.samples import load_samples
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.workflow.designs import Design, collect_designs, html_table, judging_run, name_apart, named
-from lidardesign.workflow.run_folder import (
-    CONFIGURATION,
-    DESIGN_FOLDER,
-    MANIFEST,
-    SAMPLES,
-    Notes,
-    RequestPlan,
-    RunFolder,
-    last_time,
-    log_note,
-    settings_texts,
-)
-from lidardesign.workflow.run_samples import Layouts, learned_density, twin_without_visibility
+from lidardesign.workflow.run_folder import DESIGN_FOLDER, Notes, RunFolder, log_note, settings_texts
+from lidardesign.workflow.run_samples import Layouts, twin_without_visibility
 from lidardesign.workflow.select_rays import gate_margin_m, selection_scenes
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.cma.candidate import Show
-    from lidardesign.evaluate.figures.scene_figure import FigureData
+    from lidardesign.evaluate.baselines.cma import Show
     from lidardesign.evaluate.report.figures import Figure
 
-MOST_NAMED = 8
+CMA_SECONDS = (0.1, 7 * 24 * 3600.0)
+# A picometre, and further than any sensor reaches.
+RANGE_TOLERANCES_MM = (SLACK, 1e9)
+RETURN_TOLERANCES = (SLACK, 1.0)
+MILLIMETRES = 1000.0
 COMMAND = "evaluate"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreOptions:
+    """What a user may choose for an evaluation.
+
+    Arguments:
+        rays: Numbers of rays per frame; the task's by default, and those of fixed patterns.
+        baselines: Further baselines beside uniform, random, bounding, silhouette and greedy, by name; ["none"] leaves
+            out all of them.
+        seed: Seed of all random numbers; the run's by default.
+        effects: auto, all, none, audit, or names of effects between commas.
+        detector: The name of a detector, or its file.
+        range_tolerance_mm: What all skipped effects together may change of ranges.
+        return_tolerance: Share of returns that all skipped effects together may change.
+        settings: Settings of the task to judge by other scenes than were learned.
+        workers: Processes that score scenes, or the address of a scheduler.
+        cma_seconds: Wall time of each search of the baseline cma [s].
+        accuracy: Whether what accuracy costs will be measured, too.
+        scenes_seed: Root of the held-out scenes; `seed` by default.
+        designs: Names of the designs that are scored; all by default.
+        mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
+        fail_above: What no design may be worse than, in the metric's unit; `Scores.check` sees to it.
+        fail_unless_better: A baseline or design that every other design must be better than; so does this.
+
+    Raises:
+        ConfigError: One of them says nothing that can be done.
+    """
+
+    rays: Sequence[int] | None = None
+    baselines: Sequence[str] = ()
+    seed: int | None = None
+    effects: str = "auto"
+    detector: str = "ideal"
+    range_tolerance_mm: float | None = None
+    return_tolerance: float | None = None
+    settings: Sequence[str] | Mapping[str, Any] = ()
+    workers: int | str = 1
+    cma_seconds: float | None = None
+    accuracy: bool = False
+    scenes_seed: int | None = None
+    designs: Sequence[str] = ()
+    mount_error: str | None = None
+    fail_above: float | None = None
+    fail_unless_better: str | None = None
+
+    def __post_init__(self) -> None:
+        check_workers(str(self.workers))
+        self.misplacement()
+        if NONE in self.baselines:
+            if len(self.baselines) > 1 or self.fail_unless_better in BASELINES:
+                raise ConfigError("none together with another baseline", where="--baseline", allowed="none alone")
+        else:
+            for name in self.baselines:
+                check_baseline(name, where="--baseline")
+        limits = {
+            "cma_seconds": CMA_SECONDS,
+            "range_tolerance_mm": RANGE_TOLERANCES_MM,
+            "return_tolerance": RETURN_TOLERANCES,
+            "seed": (0, MAX_SEED),
+            "scenes_seed": (0, MAX_SEED),
+        }
+        for name, (low, high) in limits.items():
+            if getattr(self, name) is not None:
+                check_number(getattr(self, name), f"--{name.replace('_', '-')}", low, high, whole="seed" in name)
+        if self.fail_above is not None and not math.isfinite(self.fail_above):
+            raise ConfigError(f"{self.fail_above}", where="--fail-above", allowed="a finite number")
+        for count in self.rays or ():
+            check_number(count, "--rays", 1, MOST_RAYS, whole=True)
+        if self.cma_seconds is not None and CMA not in self.baselines:
+            raise ConfigError(
+                "there is no search", where="--cma-seconds", hint=f"add --baseline {CMA}, or leave it out"
+            )
+
+    def misplacement(self) -> MountError | None:
+        """How carelessly sensors are mounted in further rows."""
+        return None if self.mount_error is None else MountError.parse(self.mount_error)
+
+    def planner(self) -> tuple[Planner, bool]:
+        """How effects are chosen, and whether the choice is audited.
+
+        Raises:
+            ConfigError: An unknown effect or detector.
+        """
+        audit = self.effects.strip() == "audit"
+        choice = parse_effects("auto" if audit else self.effects)
+        detector = load_detector(self.detector)
+        tolerance = Tolerance.of(detector)
+        if self.range_tolerance_mm is not None:
+            tolerance = replace(tolerance, range_m=self.range_tolerance_mm / MILLIMETRES)
+        if self.return_tolerance is not None:
+            tolerance = replace(tolerance, lost=self.return_tolerance)
+        return Planner(detector, choice, tolerance), audit
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +170,7 @@ class ScoreRequest:
         cls,
         targets: Sequence[Design | Path],
         options: ScoreOptions,
-        runs: Sequence[RunFolder] = (),
+        judge: RunFolder | None = None,
         notes: Notes = log_note,
     ) -> ScoreRequest:
         """The request of a user's choices.
@@ -98,7 +178,7 @@ class ScoreRequest:
         Arguments:
             targets: Designs, design files, and run folders, which stand for all their designs.
             options: The choices.
-            runs: Runs that were opened for it; the first one's task judges.
+            judge: The run in whose scenes they are scored; the one that they came from by default.
             notes: Called with every note.
 
         Raises:
@@ -106,14 +186,15 @@ class ScoreRequest:
             DataError: A design or a run is not there, or damaged.
         """
         planner, audit = options.planner()
-        designs, opened = collect_designs(targets, runs, notes)
-        designs = named(designs, options.designs)
-        run = learned = judging_run(name_apart(designs), opened, notes)
+        designs = named(collect_designs(targets, judge, notes), options.designs)
+        run = learned = judging_run(name_apart(designs), judge, notes)
         for note in learned.input_notes():
             notes(note)
         rival = options.fail_unless_better
         _check_rival(rival, [design.name for design in designs])
-        baselines = [*ALWAYS, *options.baselines, *([rival] if rival and is_baseline(rival) else [])]
+        baselines = [*ALWAYS, *options.baselines, *([rival] if rival in BASELINES else [])]
+        if NONE in options.baselines:
+            baselines = []
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
         if options.accuracy:
             # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes
@@ -138,59 +219,6 @@ class ScoreRequest:
             options,
         )
 
-    def plan(self, outputs: Mapping[str, Path | None] | None = None) -> RequestPlan:
-        """What the evaluation would do.
-
-        Arguments:
-            outputs: Files that are to be written, by the option that says so; None for those that are not.
-
-        Raises:
-            ConfigError: No design can fire any of the numbers of rays.
-        """
-        run, options = self.run, self.options
-        specifications = [design.specification for design in self.designs]
-        counts = fired_numbers(specifications, self.rays)
-        shared = [count for count in counts if count not in self.alone]
-        fired = [count for design in specifications for count in numbers_fired(design, counts, self.alone)]
-        choosable, notes = greedy_rays(run.task, len(run.conditions()), shared)
-        baselines = [name for name in self.baselines if name != GREEDY or choosable]
-        rows = len(fired) + len(baselines) * len(shared)
-        matched = sum(count in shared for count in fired) * len(baselines)
-        names = [design.name for design in specifications]
-        listed = ", ".join(names[:MOST_NAMED])
-        listed += f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-        settings = {
-            "--effects": options.effects,
-            "--detector": options.detector,
-            "--set": list(settings_texts(options.settings)) or None,
-            "--mount-error": options.mount_error,
-            "--accuracy": options.accuracy,
-        }
-        given = [f"{name} {value}" for name, value in settings.items() if isinstance(value, str)]
-        given += [*(f"--set {text}" for text in settings["--set"] or ()), *["--accuracy"] * options.accuracy]
-        written = [
-            f"{path}/" if option == "--plots" else path for option, path in (outputs or {}).items() if path is not None
-        ]
-        return RequestPlan(
-            COMMAND,
-            [
-                f"score {listed} in the held-out scenes of task {run.task.name}, with {', '.join(map(str, counts))} "
-                "rays per frame",
-                f"against {', '.join(baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
-                *left_out(specifications, self.rays, self.alone),
-                *notes,
-                *(line for design in specifications for line in outside_notes(design, run.config.space)),
-                *([f"with {', '.join(given)}"] if given else []),
-            ],
-            [
-                *(design.name if design.path is None else design.path for design in self.designs),
-                *(run.folder / name for name in (CONFIGURATION, MANIFEST, *([SAMPLES] if run.has_samples else ()))),
-            ],
-            [*written, run.folder / MANIFEST],
-            {"designs": names, "rays": counts, "baselines": list(self.baselines), **settings},
-            last_time(run.folder, COMMAND),
-        )
-
     @property
     def alone(self) -> list[int]:
         """See `EvaluationRequest`."""
@@ -210,7 +238,7 @@ class ScoreRequest:
         request = evaluation_request(
             self.run, self.designs, self.rays, self.baselines, self.seed, self.options.scenes_seed, self.learned
         )
-        cma = CmaSettings(SearchBudget(self.cma_seconds), searching)
+        cma = CmaSettings(self.cma_seconds, show=searching)
         misplaced = self.options.misplacement()
         return replace(
             request, planner=self.planner, audit=self.audit, cma=cma, mount_error=misplaced, alone=self.alone
@@ -220,7 +248,7 @@ class ScoreRequest:
         """Score every design and baseline on every held-out scene.
 
         Arguments:
-            progress: Called with the scenes done, all scenes, and the name of the scene.
+            progress: Called with the name of the scene, the scenes done, and all scenes.
             searching: Called with how the searches of the baseline cma stand.
 
         Raises:
@@ -229,11 +257,8 @@ class ScoreRequest:
         """
         with nullcontext(outermost_clock()) if outermost_clock() else running() as clock:
             request = self.evaluation_request(searching)
-            with workers_of(check_workers(str(self.options.workers)), most=len(request.test)) as scorer:
-                if scorer is not None:
-                    scorer.prepare(request)
-                scoring = request if scorer is None else replace(request, scorer=scorer)
-                evaluation = score_designs(scoring, progress=progress)
+            with scorer_of(check_workers(str(self.options.workers)), request.task, len(request.test)) as scorer:
+                evaluation = score_designs(replace(request, scorer=scorer), progress=progress)
             timings = clock.timings()
         return Scores(evaluation, replace(request, cma=replace(request.cma, show=None)), self.learned, timings, self)
 
@@ -288,12 +313,7 @@ class Scores:
             ThresholdError: One is worse than `fail_above`, or not better than `fail_unless_better`; or skipped effects
                 change a score by more than the metric's tolerance, where that was audited.
         """
-        options = self.request.options
-        if options.fail_above is not None:
-            check_limit(self.evaluation, options.fail_above)
-        if options.fail_unless_better is not None:
-            check_better(self.evaluation, options.fail_unless_better)
-        check_audit(self.evaluation)
+        names_arguments(check_scores)(self)
 
     def last_scores(self) -> dict[str, Any]:
         """What the run's manifest keeps of them: the scores of the designs that lie in the run."""
@@ -305,7 +325,7 @@ class Scores:
         """The scores, with what accuracy costs on this machine; takes minutes.
 
         Arguments:
-            progress: Called with the sweeps done, all sweeps, and the name of the sweep.
+            progress: Called with the name of the sweep, the sweeps done, and all sweeps.
 
         Raises:
             DataError: The run is unfinished or damaged.
@@ -329,35 +349,19 @@ class Scores:
         write_csv(self.evaluation, Path(path))
         return Path(path)
 
-    def figure_data(self) -> FigureData:
-        """What pictures and reports draw in addition to the scores."""
-        from lidardesign.evaluate.figures.scene_figure import figure_data
-
-        clock = outermost_clock()
-        times = {**self.run.command_times(), COMMAND: self.timings if clock is None else clock.timings()}
-        return figure_data(self.evaluation, self.evaluation_request, times)
-
     @phase("writing")
-    def plots(self, folder: Path | str, pictured: FigureData | None = None) -> list[Path]:
-        """Write pictures for papers into a folder, as PNG and SVG."""
-        from lidardesign.evaluate.figures.plots import write_plots
-
-        return write_plots(self.evaluation, Path(folder), self.figure_data() if pictured is None else pictured)
-
-    @phase("writing")
-    def report(self, path: Path | str, command: Sequence[str] = (), pictured: FigureData | None = None) -> Path:
+    def report(self, path: Path | str, command: Sequence[str] = ()) -> Path:
         """Write one HTML page: tables, curves, a 3D view, and how to get the same figures again.
 
         Arguments:
             path: The file.
             command: What the page says that it was made by; this program's arguments by default.
-            pictured: What `figure_data` gave, to be used again.
         """
         from lidardesign.evaluate.report.report import evaluation_report, write_report
 
-        pictured = self.figure_data() if pictured is None else pictured
-        run, request = self.run, self.evaluation_request
-        page = evaluation_report(self.evaluation, request, run.folder, run.config, pictured, command or sys.argv)
+        run, request, clock = self.run, self.evaluation_request, outermost_clock()
+        times = {**run.command_times(), COMMAND: self.timings if clock is None else clock.timings()}
+        page = evaluation_report(self.evaluation, request, run.folder, run.config, times, command or sys.argv)
         write_report(page, Path(path))
         return Path(path)
 
@@ -389,17 +393,25 @@ class Scores:
         return html_table(caption, headings, rows)
 
 
+def check_scores(scores: Scores) -> None:
+    """As `Scores.check`, with errors that name options."""
+    options = scores.request.options
+    if options.fail_above is not None:
+        check_limit(scores.evaluation, options.fail_above)
+    if options.fail_unless_better is not None:
+        check_better(scores.evaluation, options.fail_unless_better)
+    check_audit(scores.evaluation)
+
+
 def _check_rival(name: str | None, designs: Sequence[str]) -> None:
     """Refuse a rival that nothing can be better than."""
     where = "--fail-unless-better"
-    if name is None:
+    if name is None or name in BASELINES:
         return
-    if is_baseline(name):
-        baseline_of(name, where=where)
-    elif name not in designs:
+    if name not in designs:
         allowed = f"a baseline, or a design: {', '.join(designs)}"
         raise ConfigError(f"no baseline or design {name!r}", where=where, allowed=allowed)
-    elif len(designs) == 1:
+    if len(designs) == 1:
         raise ConfigError(f"there is no other design to compare {name} with", where=where, hint="name a baseline")
 
 
@@ -441,6 +453,6 @@ def evaluation_request(
         scenes_seed=scenes_seed,
         lay_out=layouts,
         without_visibility=(lambda: twin_without_visibility(from_runs[0][0], learned, layouts)) if from_runs else None,
-        density=cache(lambda: learned_density(learned)),
+        density=cache(lambda: load_samples(learned.folder, learned.config.space) if learned.has_samples else None),
         greedy=GreedySource(partial(selection_scenes, run, seed), gate_margin_m(run)),
     )

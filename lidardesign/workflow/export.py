@@ -10,27 +10,14 @@ from typing import Any
 from lidardesign.design.layouts.rays import lay_out, layout_of, own_count
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import BackgroundNote, ConfigError, check_number
-from lidardesign.estimates import Estimate, as_documents
+from lidardesign.errors import BackgroundNote, ConfigError
 from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
 from lidardesign.mujoco_model import RobotFile
 from lidardesign.run.clock import phase
-from lidardesign.run.files import STDIO, is_input
-from lidardesign.workflow.run_folder import (
-    CONFIGURATION,
-    MANIFEST,
-    Notes,
-    RequestPlan,
-    RunFolder,
-    folder_of,
-    last_time,
-    log_note,
-)
+from lidardesign.workflow.run_folder import Notes, RunFolder, folder_of, log_note
 from lidardesign.workflow.run_samples import RunTarget, Weighting, may_need_samples, weighted_samples
 
-# Of frames: slower than any survey, faster than any pulse.
-RATES_HZ = (1e-3, 1e6)
 # Formats that hold sensors only, so that the number of rays may stay open.
 WITHOUT_RAYS = ("sensors-csv", "stl")
 
@@ -135,7 +122,6 @@ class Exported:
         sensors: How many sensors.
         bytes: The size of what was written; None for what is no file, as a pipe.
         notes: What the format cannot hold.
-        rounding: What its numbers lose, found by reading the file back.
     """
 
     path: Path
@@ -144,7 +130,6 @@ class Exported:
     sensors: int
     bytes: int | None
     notes: tuple[str, ...] = ()
-    rounding: Mapping[str, Estimate] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form; the path of the design is for the caller to add."""
@@ -154,7 +139,6 @@ class Exported:
             "rays": self.rays,
             "bytes": self.bytes,
             "notes": list(self.notes),
-            "error_estimates": as_documents(self.rounding),
         }
 
 
@@ -190,38 +174,6 @@ class ExportRequest:
             raise ConfigError(f"{name} holds sensors, not rays", where="--rays", hint="leave it out")
         self.exporter.check_rate(self.rate_hz)
 
-    def plan(self) -> RequestPlan:
-        """What the export would do.
-
-        Raises:
-            ConfigError: The design is nowhere at such a condition, leaves its rays open without a run, or so many were
-                not chosen.
-        """
-        source, design, exporter = self.source, self.source.specification, self.exporter
-        if self.at or design.track is not None:
-            placed(design, self.at)
-        count = None if exporter.name in WITHOUT_RAYS else self.rays
-        if count is None and exporter.name not in WITHOUT_RAYS:
-            count = source.largest_budget() if source.leaves_rays_open else own_count(design)
-        if count is not None and layout_of(design).chosen_on_scenes:
-            # refuses a number of rays that was not chosen
-            lay_out(design, count, at=self.at or None)
-        content = "its sensors" if count is None else f"its {count} rays"
-        place = "".join(f" at {key} = {value:g}" for key, value in self.at.items())
-        run = [] if source.folder is None else [source.folder / CONFIGURATION, source.folder / MANIFEST]
-        robot = self._robot()
-        return RequestPlan(
-            "export",
-            [
-                f"write {content}{place} as {exporter.name}: {exporter.summary}",
-                "read the file back, and say what was lost",
-            ],
-            [design.name if source.path is None else source.path, *run, *([robot.path] if robot else [])],
-            [f"{self.target}/" if exporter.folder else self.target],
-            {"format": exporter.name, "rays": count, "at": dict(self.at)},
-            last_time(source.folder, "export"),
-        )
-
     def _robot(self) -> RobotFile | None:
         """The robot's model, and what the run of a mounted design says of it."""
         mounted = self.source.specification.mount is not None
@@ -233,7 +185,7 @@ class ExportRequest:
         return path and RobotFile(path, getattr(task, "folder", None), getattr(task, "groups", None))
 
     def write(self, file: Path | None = None, notes: Notes = log_note) -> Exported:
-        """Write the design and read it back.
+        """Write the design.
 
         Arguments:
             file: What is written instead of the target, which it is copied to later.
@@ -244,13 +196,11 @@ class ExportRequest:
         design, rays = self.source.lay_out(self.rays, self.at, self.seed, may_stay_open=open_rays, notes=notes)
         with phase("writing"):
             lost = tuple(exporter.write(design, rays, file, self.rate_hz, self._robot()))
-        with phase("reading back"):
-            rounding = exporter.rounding(design, rays, file)
         for note in lost:
             notes(note)
         written = [path for path in (file, *file.rglob("*")) if path.is_file()]
         size = sum(path.stat().st_size for path in written) if written or file.is_dir() else None
-        return Exported(self.target, exporter.name, len(rays), len(design.sensors), size, lost, rounding)
+        return Exported(self.target, exporter.name, len(rays), len(design.sensors), size, lost)
 
 
 def exporter_of(name: str | None, path: Path | None = None) -> Exporter:
@@ -273,29 +223,13 @@ def export_target(path: Path | None, out: Path | None, exporter: Exporter) -> Pa
     """Where to write a design: where a user says, or beside its file.
 
     Raises:
-        ConfigError: Over the design, to standard output a folder, or nowhere that is known.
+        ConfigError: Over the design, or nowhere that is known.
     """
-    if out is None and path is not None and is_input(path):
-        raise ConfigError(
-            "a design from standard input has no folder to write to", where="DESIGN -", hint="give --out PATH"
-        )
     if out is None and path is None:
         raise ConfigError(
             "a design without a file has no folder to write to", hint="save it, or say where to write the export"
         )
     target = out if out is not None else path.with_suffix(exporter.suffix)
-    if str(target) == STDIO and exporter.folder:
-        raise ConfigError(f"{exporter.name} is a folder of files", where="--out -", hint="give --out FOLDER")
     if path is not None and target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
     return target
-
-
-def check_frame_rate(rate_hz: float | None) -> None:
-    """Refuse a frame rate that is none.
-
-    Raises:
-        ConfigError: So it is.
-    """
-    if rate_hz is not None:
-        check_number(rate_hz, "--rate-hz", *RATES_HZ)

@@ -10,27 +10,19 @@ from typing import Any, get_args
 
 from lidardesign.config import with_task_settings
 from lidardesign.design.constraints.document import MOST_FITTED, Constraints
-from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import is_mounted, snap_to_space
 from lidardesign.design.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
-from lidardesign.design.fit import check_options
 from lidardesign.design.layouts.layout import Layout
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, layout_of
 from lidardesign.design.sensor import FITTED_LAYOUTS, LEVELS, MOST_RAYS, DesignSpec, Gates
 from lidardesign.errors import MAX_SEED, ConfigError, check_choice, check_number
-from lidardesign.run.manifest import verify
 from lidardesign.run.overrides import apply_override, parse_override
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
-from lidardesign.selection.information import MOST_SELECTED, informs_rays
+from lidardesign.selection.information import informs_rays
 from lidardesign.task import Task
 from lidardesign.workflow.run_folder import (
-    CONFIGURATION,
-    MANIFEST,
-    SAMPLES,
     Notes,
-    RequestPlan,
     RunFolder,
-    last_time,
     log_note,
     reach_of,
     read_design,
@@ -52,8 +44,7 @@ class FitOptions:
     """What a user may choose for a fit; what is left out follows from an earlier design, the constraints or the task.
 
     Arguments:
-        sensors: How many sensors, "best": as many as score best on training scenes, or "auto": as many as held-out
-            likelihood says. A scan has one per ray.
+        sensors: How many sensors, or "best": as many as score best on training scenes. A scan has one per ray.
         constraints: Constraints, a mapping of them, or a YAML file of them.
         layout: grid, density, scan, distributed, selected or spinning.
         rays: Rays per frame over all sensors.
@@ -93,8 +84,8 @@ class FitOptions:
             check_choice(self.layout, "--layout", FITTED_LAYOUTS)
         if self.gates is not None:
             check_choice(self.gates, "--gates", get_args(Gates))
-        if self.sensors not in (None, BEST, "auto", *range(1, MOST_FITTED + 1)):
-            allowed = f"a whole number from 1 to {MOST_FITTED}, best or auto"
+        if self.sensors not in (None, BEST, *range(1, MOST_FITTED + 1)):
+            allowed = f"a whole number from 1 to {MOST_FITTED}, or best"
             raise ConfigError(repr(self.sensors), where="--sensors", allowed=allowed)
         limits = {"rays": (1, MOST_RAYS), "channels": (1, MOST_FITTED), "seed": (0, MAX_SEED)}
         for name, (low, high) in limits.items():
@@ -132,7 +123,6 @@ class FitRequest:
     channels: int | None = None
     names: Sequence[str] = ()
     command: str = "fit"
-    files: Sequence[Path] = ()
 
     @classmethod
     def resolve(
@@ -141,7 +131,6 @@ class FitRequest:
         options: FitOptions,
         base: DesignSpec | None = None,
         *,
-        files: Sequence[Path] = (),
         notes: Notes = log_note,
     ) -> FitRequest:
         """The request of a user's choices.
@@ -150,7 +139,6 @@ class FitRequest:
             run: The run.
             options: The choices.
             base: An earlier design, which says what the user does not.
-            files: Files that were read for the request.
             notes: Called with every note.
 
         Raises:
@@ -218,77 +206,7 @@ class FitRequest:
             channels,
             names,
             "fit" if asked is None else "constrain",
-            tuple(files) if options.like is None else (*files, Path(options.like)),
         )
-
-    def plan(self) -> RequestPlan:
-        """What the fit would do.
-
-        Raises:
-            ConfigError: A name that is not a condition of the density.
-            DataError: The run has no samples yet, or they are not those that were recorded.
-            InfeasibleError: The constraints contradict each other.
-        """
-        run, choices = self.run, self.choices
-        self._check_choices()
-        verify(run.folder, SAMPLES)
-        settings = {
-            **choices,
-            **({} if self.channels is None else {"channels": self.channels}),
-            "name": self.name,
-            "seed": self.seed,
-            "at": dict(self.at),
-            "weights": list(self.weighting.settings),
-            "constraints": None if self.constraints is None else self.constraints.as_document(),
-        }
-        return RequestPlan(
-            self.command,
-            self._steps(settings["constraints"]),
-            [*self.files, *(run.folder / name for name in (CONFIGURATION, MANIFEST, SAMPLES))],
-            [run.design_path(self.name), run.folder / MANIFEST],
-            settings,
-            last_time(run.folder, self.command),
-        )
-
-    def _check_choices(self) -> None:
-        """Refuse at once what the fit would refuse before it computes anything."""
-        choices, space = self.choices, self.run.config.space.at(self.at)
-        constraints, count = self.constraints or Constraints(), choices["sensors"]
-        layout, count = LAYOUTS[choices["layout"]], count if isinstance(count, int) else None
-        if constraints.parts is None and layout.chosen_on_scenes:
-            check_chosen(self.run.task, layout.name)
-        if layout.name == "spinning":
-            from lidardesign.selection.spinning import CHANNELS, ring_grid
-
-            channels = CHANNELS if self.channels is None else self.channels
-            ring_grid(space, choices["rays"], 1 if count is None else count, channels)
-        elif layout.name == "selected" and choices["rays"] is not None:
-            check_number(choices["rays"], "--rays", 1, MOST_SELECTED)
-        elif constraints.parts is None and not layout.chosen_on_scenes:
-            check_options(constraints, space, count, layout, choices["rays"])
-        check_feasible(constraints, space, sensors=count, rays=choices["rays"])
-
-    def _steps(self, constraints: Mapping[str, Any] | None) -> list[str]:
-        choices = self.choices
-        rays = "rays left open" if choices["rays"] is None else f"{choices['rays']} rays"
-        counted = {
-            None: "as many sensors as follow",
-            BEST: "as many sensors as score best on training scenes",
-            "auto": "as many sensors as the held-out likelihood favours",
-        }
-        sensors = counted.get(choices["sensors"], f"{choices['sensors']} sensors")
-        sensors = "one sensor per ray" if LAYOUTS[choices["layout"]].one_sensor_per_ray else sensors
-        place = "".join(f", {key} = {value:g}" for key, value in self.at.items())
-        if self.constraints is not None and self.constraints.parts is not None:
-            return [f"choose at most {sensors} among parts, with their poses, on training scenes, seed {self.seed}"]
-        layout = choices["layout"] + ("" if self.channels is None else f" with {self.channels} channels")
-        how = f"layout {layout}, {rays}, level {choices['level']:g}{place}, seed {self.seed}"
-        steps = [f"fit {sensors}, {how}"]
-        if self.weighting.settings:
-            steps.append(f"weight the density with {', '.join(self.weighting.settings)}")
-        if constraints:
-            steps.append(f"satisfy the constraints of {', '.join(constraints)}; check them on the finished file")
-        return steps
 
 
 def check_chosen(task: Task, layout: str) -> None:

@@ -12,36 +12,24 @@ from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import RunConfig, load_run_config, resolve, save_run_config
-from lidardesign.errors import ConfigError, DataError, LidardesignError, check_choice
+from lidardesign.errors import BackgroundNote, ConfigError, DataError, ThresholdError, check_choice, check_number
 from lidardesign.registry import distribution_of, load_task, plugin_guard, task_names
 from lidardesign.run.clock import WAIT_S, Clock, outermost_clock, phase
 from lidardesign.run.files import is_temporary, run_lock, writer
-from lidardesign.run.manifest import note, read_manifest, start_manifest
-from lidardesign.run.yaml import dump_yaml, leaves, load_yaml, parse_yaml
+from lidardesign.run.manifest import note, start_manifest
+from lidardesign.run.outputs import check_writable
+from lidardesign.run.yaml import leaves, load_yaml
 from lidardesign.task import FolderConfig, Task, notes_of
-from lidardesign.workflow.learning_budget import (
-    GOAL,
-    MISPLACED_KEY,
-    STEPS_KEY,
-    Goal,
-    Learner,
-    checked_goal,
-    resumed_goal,
-)
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
     DESIGN_FOLDER,
     INPUTS,
     MANIFEST,
     SAMPLES,
-    EarlierRun,
     Notes,
-    RequestPlan,
     RunFolder,
-    files_of,
     input_hashes,
     input_paths,
-    last_time,
     log_note,
     settings_texts,
 )
@@ -58,8 +46,12 @@ CHECKPOINTS = "checkpoint*"
 LEARNED_FILES = (
     CONFIGURATION, MANIFEST, "progress.jsonl", "checkpoint.safetensors", "flow.safetensors", SAMPLES, "snapshots/",
 )  # fmt: skip
-# The sections that learning takes its time from; a seed changes nothing of that.
-TIME_SECTIONS = ("task_name", "task", "space", "density", "learning")
+# A misplaced share that can be told apart from nothing and from all; a longer time is a mistake in the unit.
+TOLERANCES, TIME_BUDGETS_S = (1e-4, 0.9999), (1.0, 366 * 24 * 3600.0)
+# A tolerance is met where the measured share is at most so many standard errors above it.
+STANDARD_ERRORS = 2.0
+# Of a run that ends by the clock; config.yaml has the steps that it took once it has ended.
+MOST_STEPS = 100_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,9 +67,12 @@ class LearnOptions:
         device: auto, cpu or cuda.
         resume: Continue an interrupted run.
         overwrite: Replace a run that is in the folder, once the new one is learned.
-        tolerance: Learn until at most this share of the density's mass is in the wrong place.
-        time_budget_s: Learn as long as all of it ends within this time [s].
+        tolerance: The setting learning.misplaced, which has to be reached.
+        time_budget_s: Steps are taken until this time has passed, however many they are [s].
         command: What the manifest says that the run was made by.
+
+    Raises:
+        ConfigError: A device, a tolerance or a time that cannot be.
     """
 
     out: Path | str | None = None
@@ -92,6 +87,20 @@ class LearnOptions:
     time_budget_s: float | None = None
     command: Sequence[str] = field(default_factory=lambda: tuple(sys.argv))
 
+    def __post_init__(self) -> None:
+        check_choice(self.device, "--device", ("auto", "cpu", "cuda"))
+        if self.tolerance is not None:
+            check_number(self.tolerance, "--tolerance", *TOLERANCES)
+        if self.time_budget_s is not None:
+            check_number(self.time_budget_s, "--time-budget", *TIME_BUDGETS_S)
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """The settings, and those that a time budget and a tolerance stand for."""
+        endless = () if self.time_budget_s is None else (f"learning.steps={MOST_STEPS}", "learning.misplaced=0")
+        reached = () if self.tolerance is None else (f"learning.misplaced={self.tolerance}",)
+        return (*endless, *settings_texts(self.settings), *reached)
+
 
 @dataclass(frozen=True, eq=False)
 class LearnRequest:
@@ -101,23 +110,17 @@ class LearnRequest:
         task: The task.
         folder: The run folder.
         settings: The whole configuration.
-        goal: What decides the number of steps, where the configuration does not.
-        device: auto, cpu or cuda.
+        options: The user's choices.
         begun: Whether a run is gone on with.
         replaces: Whether a run is in the folder, to be replaced once the new one is learned.
-        config_file: The configuration file that was given.
-        command: What the manifest says that the run was made by.
     """
 
     task: Task
     folder: Path
     settings: RunConfig
-    goal: Goal
-    device: str = "auto"
+    options: LearnOptions
     begun: bool = False
     replaces: bool = False
-    config_file: Path | None = None
-    command: Sequence[str] = ()
 
     @classmethod
     def resolve(cls, task: str | None, options: LearnOptions, notes: Notes = log_note) -> LearnRequest:
@@ -127,15 +130,13 @@ class LearnRequest:
             ConfigError: An unknown task, impossible settings, or a folder that is not empty.
             DataError: There is no run to resume.
         """
-        check_choice(options.device, "--device", ("auto", "cpu", "cuda"))
         config_file = None if options.config is None else Path(options.config)
         choices = {
             "preset": options.preset,
             "config_file": config_file,
-            "overrides": settings_texts(options.settings),
+            "overrides": options.overrides,
             "seed": options.seed,
         }
-        goal = checked_goal(options.tolerance, options.time_budget_s, choices)
         task = task or _task_named(config_file, Path(options.out) if options.resume and options.out else None)
         plugin = load_task(task)
         folder = Path("runs") / task if options.out is None else Path(options.out)
@@ -145,14 +146,15 @@ class LearnRequest:
             raise DataError("there is no run to resume", where=str(place), hint="leave out --resume to start one")
         begun = options.resume and not _was_killed_before_it_began(place)
         if begun:
-            goal = resumed_goal(goal, place)
             plugin, settings = _resumed_settings(plugin, place, choices)
+            if settings.learning.steps == MOST_STEPS and options.time_budget_s is None:
+                raise ConfigError("the run ends by the clock", where="--resume", hint="add --time-budget SECONDS")
         else:
             if options.resume:
                 notes("the run has nothing to resume from yet; it starts from the beginning")
             check_can_start(place)
-            settings = _with_inputs(goal.applied(resolve(plugin, **choices)))
-        request = cls(plugin, folder, settings, goal, options.device, begun, replaces, config_file, options.command)
+            settings = _with_inputs(resolve(plugin, **choices))
+        request = cls(plugin, folder, settings, options, begun, replaces)
         if replaces:
             notes(f"once it is learned it replaces the run {folder}{request._lost_designs()}")
         for line in RunFolder(place, plugin, settings).input_notes() if begun else ():
@@ -193,63 +195,30 @@ class LearnRequest:
 
         return scale_notes(training_scenes(self.task, self.settings), self.settings)
 
-    def plan(self) -> RequestPlan:
-        """What learning would do."""
-        settings, learning, goal = self.settings, self.settings.learning, self.goal
-        length = f"{learning.steps:,} steps of {learning.batch:,} points"
-        if goal.time_budget_s is not None:
-            length = f"as many steps as end within {goal.time_budget_s:g} s"
-        elif learning.misplaced:
-            length = f"until at most {learning.misplaced:g} of its mass is in the wrong place, at most {length}"
-        steps = [
-            f"{'go on with' if self.has_checkpoint else 'learn'} task {self.task.name}, preset {settings.preset}, "
-            f"seed {settings.seed}, on {self.device}",
-            length,
-            f"draw {learning.samples:,} samples for fit and constrain, and measure how good they are",
-        ]
-        if self.replaces:
-            steps.append(f"replace the run {self.folder}{self._lost_designs()}")
-        reads = [] if self.config_file is None else [self.config_file]
-        reads += [file for path in input_paths(settings.task) for file in ([path] if path.is_dir() else files_of(path))]
-        if self.begun:
-            reads += sorted(path for path in self.place.iterdir() if path.is_file() and not path.name.startswith("."))
-        # as other runs' files have it
-        document = parse_yaml(dump_yaml(settings.as_document()), where=CONFIGURATION).mapping
-        return RequestPlan(
-            "learn",
-            steps,
-            reads,
-            [f"{self.folder / name}/" if name.endswith("/") else self.folder / name for name in LEARNED_FILES],
-            document,
-            None if self.begun else _time_of_twin(self.folder, {name: document[name] for name in TIME_SECTIONS}),
-        )
-
-    def forecast(self, remark: Notes | None = None) -> dict[str, Any]:
-        """How long learning will take here and how much memory, from its preparation and a few steps.
+    def plan(self, remark: Notes | None = None) -> dict[str, Any]:
+        """The document of `--dry-run --json`: what would be learned and written, how long it takes and how much memory.
 
         Arguments:
             remark: Called with what is wrong with lengths.
 
         Raises:
-            ConfigError, DataError: Unusable settings or scenes.
+            ConfigError, DataError: Unusable settings or scenes, or a folder that cannot be written.
         """
         with phase("libraries"):
             from lidardesign.density.learn import prepare_training_data
             from lidardesign.density.training.forecast import forecast
 
-        clock, goal = outermost_clock() or Clock(), self.goal
-        data = prepare_training_data(self.task, self.settings, remark)
-        found = forecast(
-            data,
-            self.settings,
-            self.place,
-            self.device,
-            lambda: clock.seconds,
-            resume=self.has_checkpoint,
-            tolerance=goal.tolerance,
-            time_budget_s=goal.time_budget_s,
-        )
-        return found.as_dict()
+        settings, writes = self.settings, [f"{self.folder}/{name}" for name in LEARNED_FILES]
+        for path in writes:
+            check_writable(Path(path), is_folder=path.endswith("/"))
+        data = prepare_training_data(self.task, settings, remark)
+        return {
+            "dry_run": True,
+            "reads": [str(path) for path in (self.options.config, *input_paths(settings.task)) if path],
+            "writes": writes,
+            "settings": settings.as_document(),
+            "forecast": forecast(data, settings, self.place, self.options.device, self.options.time_budget_s),
+        }
 
     def run(self, progress: Callable[[LearnProgress], None] | None = None, remark: Notes | None = None) -> LearnResult:
         """Learn into the folder; what failed before anything was learned is taken away again.
@@ -263,34 +232,51 @@ class LearnRequest:
             DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
         """
         clock = outermost_clock() or Clock()
-        result = self._learned(Learner(self.task, self.place, self.device, progress, clock, remark))
+        result = self._learned(clock, progress, remark)
         if not self.replaces:
             return result
         put_in_place(self.folder)
         note(self.folder, learn={"run": str(self.folder)})
         return replace(result, run=str(self.folder))
 
-    def _learned(self, learner: Learner) -> LearnResult:
-        folder = self.place
+    def _learned(
+        self, clock: Clock, progress: Callable[[LearnProgress], None] | None, remark: Notes | None
+    ) -> LearnResult:
+        with phase("libraries"):
+            from lidardesign.density.learn import learn
+
+        folder, settings, budget_s = self.place, self.settings, self.options.time_budget_s
         with _new_folder(folder), run_lock(folder):
             if not self.begun:
                 check_can_start(folder)  # another process may have been faster
             with self._undone_on_failure():
                 if not self.begun:
                     # Write what the run is before anything is learned; the configuration last
-                    start_manifest(folder, command=list(self.command), seed=self.settings.seed)
-                    if not self.goal.is_none:
-                        note(folder, **{GOAL: self.goal.as_dict()})
-                    note(folder, plugin=distribution_of(self.task.name), **{INPUTS: input_hashes(self.settings.task)})
-                    save_run_config(self.settings, folder)
+                    start_manifest(folder, command=list(self.options.command), seed=settings.seed)
+                    note(folder, plugin=distribution_of(self.task.name), **{INPUTS: input_hashes(settings.task)})
+                    save_run_config(settings, folder)
                 try:
-                    return learner.learn(self.settings, self.goal, resume=self.has_checkpoint)
+                    result = learn(
+                        self.task,
+                        settings,
+                        folder,
+                        resume=self.has_checkpoint,
+                        device=self.options.device,
+                        progress=progress,
+                        is_over=None if budget_s is None else lambda _: clock.seconds >= budget_s,
+                        remark=remark,
+                    )
                 except DataError as error:
                     # of errors about data, those that only ended the writing: a full disk
                     if not isinstance(error.__cause__, OSError):
                         raise
                     hint = f"{error.hint}; {self.resume_hint()}"
                     raise type(error)(error.message, where=error.where, hint=hint) from error.__cause__
+        if budget_s is None:
+            return result
+        learning = settings.learning.model_copy(update={"steps": result.steps})
+        save_run_config(replace(settings, learning=learning), folder)
+        return replace(result, notes=(*result.notes, BackgroundNote(f"{result.steps} steps in {budget_s:g} s")))
 
     def resume_hint(self) -> str:
         """What an interruption leaves, and how to go on from there."""
@@ -300,6 +286,8 @@ class LearnRequest:
         else:
             return "before the first checkpoint; nothing was kept"
         again = f"--out {quote(str(self.folder))} {'--overwrite ' if self.replaces else ''}--resume"
+        for option, value in (("--tolerance", self.options.tolerance), ("--time-budget", self.options.time_budget_s)):
+            again += "" if value is None else f" {option} {value:g}"
         return f"{rest}\n  continue with: lidardesign learn {self.task.name} {again}"
 
     @contextlib.contextmanager
@@ -321,7 +309,7 @@ class LearnRequest:
 
 def result_document(result: LearnResult) -> dict[str, Any]:
     """What `lidardesign learn --json` prints of a result."""
-    figures = ("task", "seconds", "steps", "ess", "kl_nats", "log_z", "coverage", "misplaced", "goal")
+    figures = ("task", "seconds", "steps", "ess", "kl_nats", "log_z", "coverage", "misplaced")
     return {
         "run": str(result.run),
         **{name: getattr(result, name) for name in figures},
@@ -329,6 +317,25 @@ def result_document(result: LearnResult) -> dict[str, Any]:
         "notes": list(result.notes),
         "error_estimates": result.as_dict()["error_estimates"],
     }
+
+
+def check_tolerance(result: LearnResult, tolerance: float | None) -> None:
+    """Exit 1 where a tolerance was not reached.
+
+    Raises:
+        ThresholdError: With what was reached.
+    """
+    error = result.error_estimates["misplaced"].error
+    # without coverage nothing knows what the density dropped
+    if tolerance is None or (result.coverage > 0 and result.misplaced <= tolerance + STANDARD_ERRORS * (error or 0.0)):
+        return
+    doubt = "" if error is None else f" +- {error:.2g}"
+    raise ThresholdError(
+        f"{result.misplaced:.3g}{doubt} of the density's mass is in the wrong place after {result.steps} steps",
+        where="--tolerance",
+        allowed=f"at most {tolerance:g}",
+        hint="a larger learning.steps, or --preset fine; the run is finished and can be used as it is",
+    )
 
 
 def _task_named(config_file: Path | None, run: Path | None) -> str:
@@ -348,17 +355,6 @@ def _task_named(config_file: Path | None, run: Path | None) -> str:
             hint="lidardesign learn TASK, or task_name: TASK in the file of --config",
         )
     return next(str(name) for name in named if name)
-
-
-def _time_of_twin(run: Path, settings: Mapping[str, Any]) -> EarlierRun | None:
-    """How long learning took in another run in the same folder, whose configuration has the same sections."""
-    for manifest in sorted(run.absolute().parent.glob(f"*/{MANIFEST}")):
-        before = last_time(manifest.parent, "learn")
-        with contextlib.suppress(LidardesignError):
-            sections = load_yaml(manifest.with_name(CONFIGURATION)).mapping
-            if before is not None and all(sections.get(name) == value for name, value in settings.items()):
-                return EarlierRun(before.seconds, f"learning {manifest.parent.name}, which has the same settings,")
-    return None
 
 
 def check_can_start(run: Path) -> None:
@@ -452,11 +448,6 @@ def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tu
         seed=stored.seed if choices["seed"] is None else choices["seed"],
     )
     old, new = dict(leaves(stored.as_document())), dict(leaves(wanted.as_document()))
-    if read_manifest(run).get(GOAL):
-        # what the goal set is not in the user's file; what the user sets now is compared
-        asked = {text.partition("=")[0].strip() for text in choices["overrides"]}
-        paths = [tuple(key.split(".")) for key in (MISPLACED_KEY, STEPS_KEY) if key not in asked]
-        new.update((path, old[path]) for path in paths)
     for path in [*old, *new]:
         # what was there at first is no setting of a user's
         if path[:2] != ("task", INPUTS) and old.get(path) != new.get(path):

@@ -1,7 +1,4 @@
-"""Run folders and the designs in and beside them: opened, read, and traced back to where they came from.
-
-Also what a request on them would do, read and write, and how long it took before: what `--dry-run` prints.
-"""
+"""Run folders and the designs in and beside them: opened, read, and traced back to where they came from."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import json
 import logging
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,10 +17,9 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
-from lidardesign.run.files import STDIO, is_input, is_there, readable, sha256_file
+from lidardesign.run.files import sha256_file
 from lidardesign.run.inputs import MESH
 from lidardesign.run.manifest import changed_since_recorded, read_manifest
-from lidardesign.run.outputs import check_writable
 from lidardesign.scene import Scene
 from lidardesign.space import RANGE, DesignSpace
 from lidardesign.task import FolderConfig, Metric, Split, Task, conditions_of, metric_of, scenes_of
@@ -178,7 +174,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = None) -> DesignSpec:
-    """A design file or a rig of others, or standard input for `-`.
+    """A design file or a rig of others.
 
     One of a run that is not as it was written says so: it may be cut, or mended by hand. A rig says what its file
     does not.
@@ -193,8 +189,7 @@ def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = Non
     """
     difference = _difference(path)
     try:
-        with readable(path) as file:
-            design = load_design(file, reach_m)
+        design = load_design(path, reach_m)
     except (ConfigError, DataError) as error:
         if difference is None:
             raise
@@ -229,7 +224,7 @@ def open_target(path: Path, notes: Notes = log_note) -> tuple[RunFolder | None, 
     """
     if path.is_dir():
         return RunFolder.open(path), None
-    if not is_there(path):
+    if not path.exists():
         raise DataError("no such run or design", where=str(path), hint="give a run folder or a design file")
     design = read_design(path, notes)
     return run_of(design, path), design
@@ -281,7 +276,7 @@ def reach_beside(files: Iterable[Path], runs: Sequence[RunFolder]) -> float | No
     for path in files:
         # whoever reads it for good says what is wrong with it
         with contextlib.suppress(LidardesignError):
-            run = None if is_input(path) else run_of(load_design(path), path)
+            run = run_of(load_design(path), path)
             if run is not None:
                 return reach_of([run])
     return None
@@ -293,86 +288,3 @@ def settings_texts(settings: Sequence[str] | Mapping[str, Any]) -> tuple[str, ..
         return tuple(settings)
     texts = {key: value if isinstance(value, str | Path) else json.dumps(value) for key, value in settings.items()}
     return tuple(f"{key}={value}" for key, value in texts.items())
-
-
-@dataclass(frozen=True)
-class EarlierRun:
-    """How long something like a request took before.
-
-    Arguments:
-        seconds: Wall time [s].
-        name: What took it.
-    """
-
-    seconds: float
-    name: str
-
-
-@dataclass(frozen=True)
-class RequestPlan:
-    """What a request would do.
-
-    Arguments:
-        command: The command that does the same.
-        steps: What it would do, one line each, in order.
-        reads: Files and folders that it would read.
-        writes: Files and folders that it would write; a folder's name ends in a stroke.
-        settings: What it would do it with, as plain values.
-        before: How long that took before, where that is known.
-        forecast: How long it will take and how much memory, as plain values, where that was measured.
-    """
-
-    command: str
-    steps: Sequence[str]
-    reads: Sequence[Path | str] = ()
-    writes: Sequence[Path | str] = ()
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    before: EarlierRun | None = None
-    forecast: Mapping[str, Any] | None = None
-
-    def as_dict(self) -> dict[str, Any]:
-        """The document of `--dry-run --json`."""
-        return {
-            "dry_run": True,
-            "command": self.command,
-            "steps": list(self.steps),
-            "reads": [_read_entry(path) for path in self.reads],
-            "writes": [{"path": str(path), "replaces": _is_file(path)} for path in self.writes],
-            "settings": dict(self.settings),
-            "before": None if self.before is None else {"seconds": self.before.seconds, "of": self.before.name},
-            "forecast": None if self.forecast is None else dict(self.forecast),
-        }
-
-    def check_writable(self) -> None:
-        """Refuse places where nothing can be written.
-
-        Raises:
-            DataError: A file stands where a folder would be, a folder where a file would, or writing is forbidden.
-        """
-        for path in map(str, self.writes):
-            if path != STDIO:
-                check_writable(Path(path), is_folder=path.endswith("/"))
-
-
-def _read_entry(path: Path | str) -> dict[str, Any]:
-    """A file that is read and its size, or a folder with the number of its files and the size of all."""
-    if _is_file(path):
-        return {"path": str(path), "bytes": os.path.getsize(path)}
-    if str(path) != STDIO and os.path.isdir(path):
-        sizes = [entry.stat().st_size for entry in os.scandir(path) if entry.is_file()]
-        return {"path": str(path), "bytes": sum(sizes), "files": len(sizes)}
-    return {"path": str(path), "bytes": None}
-
-
-def _is_file(path: Path | str) -> bool:
-    return str(path) != STDIO and os.path.isfile(path)
-
-
-def last_time(run: Path | None, command: str) -> EarlierRun | None:
-    """How long a command took the last time on a run, as its manifest has it; None where it does not."""
-    try:
-        entry = {} if run is None else read_manifest(run).get("timings", {}).get(command)
-    except DataError:  # whoever needs the manifest says what is wrong with it
-        return None
-    seconds = entry.get("seconds") if isinstance(entry, dict) else None
-    return EarlierRun(seconds, f"the last {command} of {run}") if isinstance(seconds, int | float) else None

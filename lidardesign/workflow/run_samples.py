@@ -21,7 +21,6 @@ from lidardesign.workflow.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from lidardesign.density.target.target import Target
-    from lidardesign.evaluate.baselines.catalog import Density
 
 KEY = "weighting"
 FIT_AGAIN = "fit the design again: an earlier version refined it, or its file was changed by hand"
@@ -173,10 +172,3 @@ def twin_without_visibility(design: DesignSpec, run: RunFolder, layouts: Layouts
     if not len(samples):
         raise DataError("no ray of the design space comes near a target", where=f"--baseline {TWIN_NAME}")
     return fitted_twin(design, samples, name=TWIN_NAME, retarget=layouts.targets[TWIN_NAME]), samples
-
-
-def learned_density(run: RunFolder) -> Density | None:
-    """What a run has learned; None where it has no samples."""
-    from lidardesign.evaluate.baselines.catalog import Density
-
-    return Density(load_samples(run.folder, run.config.space), RunTarget(run)) if run.has_samples else None

@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.errors import DataError, LidardesignError
+from lidardesign.errors import DataError, LidardesignError, names_arguments
+from lidardesign.run.clock import Progress
 from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
 from lidardesign.workflow.designs import Design, html_table
 from lidardesign.workflow.fit import FitOptions, FitRequest
-from lidardesign.workflow.learn import LearnOptions, LearnRequest
-from lidardesign.workflow.learning_budget import check_met
+from lidardesign.workflow.learn import LearnOptions, LearnRequest, check_tolerance
 from lidardesign.workflow.run_folder import (
     MANIFEST,
     Notes,
     RunFolder,
     folder_of,
-    ignore,
     log_note,
     reach_of,
     read_design,
 )
 
 if TYPE_CHECKING:
-    from lidardesign.density.learn import LearnProgress
     from lidardesign.density.learned import LearnedDensity
     from lidardesign.density.verdict import Verdict
     from lidardesign.workflow.evaluate import Scores
@@ -121,6 +119,7 @@ class Run(RunFolder):
 
         return LearnedDensity(self.folder, self.task, self.config)
 
+    @names_arguments
     def fit(
         self,
         *,
@@ -128,50 +127,59 @@ class Run(RunFolder):
         constraints: Constraints | Mapping[str, Any] | Path | str | None = None,
         rays: int | None = None,
         layout: str | None = None,
+        channels: int | None = None,
+        gates: str | None = None,
+        level: float | None = None,
         at: Mapping[str, float] | None = None,
+        weights: Sequence[str] | Mapping[str, Any] = (),
+        parts: Sequence[str] | str | None = None,
+        like: Path | str | None = None,
         name: str | None = None,
         seed: int | None = None,
         notes: Notes = log_note,
-        progress: Notes = ignore,
-        **further: Any,
+        progress: Progress | None = None,
     ) -> Design:
         """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
 
         Arguments:
-            sensors: How many, "best": as many as score best on training scenes, or "auto": as many as the
-                held-out likelihood favours; "best" by default.
+            sensors: How many, or "best" (the default): as many as score best on training scenes.
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
             layout: grid, density, scan, distributed, selected or spinning; by default selected, where the task
                 has a method `informs`.
+            channels: Rings of each sensor of the layout spinning.
+            gates: "sensor" or "ray": one gate per sensor, or one per ray.
+            level: The share of rays and returns that fields of view and gates contain.
             at: Values of conditions that the design is for, such as {"x_m": 0.37}.
+            weights: Settings of the task towards which the learned density is weighted.
+            parts: Real parts that the design is made of: names, NAME:MODE, paths of part files, or "catalog".
+            like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
             name: The design's name.
             seed: Seed of all random numbers; the run's by default.
             notes: Called with every note; they are logged by default.
-            progress: Called with every step, as "choosing 361 rays".
-            further: channels, gates, level, weights and like, as of `FitOptions`.
+            progress: Called with every step, as "choosing 361 rays", and twice None.
 
         Raises:
             ConfigError: Choices that do not fit together.
             DataError: The density is too rough to fit to.
             InfeasibleError: Constraints that contradict each other, or hold too little of the density.
         """
-        request = self.fit_request(
+        options = FitOptions(
             sensors=sensors,
             constraints=constraints,
             rays=rays,
             layout=layout,
+            channels=channels,
+            gates=gates,
+            level=level,
             at=at or {},
+            weights=weights,
+            parts=parts,
+            like=like,
             name=name,
             seed=seed,
-            notes=notes,
-            **further,
         )
-        return Design.fitted(request, notes=notes, progress=progress)
-
-    def fit_request(self, *, notes: Notes = log_note, **options: Any) -> FitRequest:
-        """What `fit` would do with the same choices; its `plan()` says it in words."""
-        return FitRequest.resolve(self, FitOptions(**options), notes=notes)
+        return Design.fitted(FitRequest.resolve(self, options, notes=notes), notes=notes, progress=progress)
 
     def designs(self) -> list[Design]:
         """The designs that are saved in the run, by name."""
@@ -220,6 +228,7 @@ class Run(RunFolder):
             f"lidardesign export {quote(best['path'])} --format csv --rays {rays} --out rays.csv",
         ]
 
+    @names_arguments
     def evaluate(
         self,
         designs: Sequence[Design | Path | str] | None = None,
@@ -227,27 +236,42 @@ class Run(RunFolder):
         rays: Sequence[int] | None = None,
         baselines: Sequence[str] = (),
         seed: int | None = None,
+        scenes_seed: int | None = None,
         effects: str = "auto",
         detector: str = "ideal",
+        range_tolerance_mm: float | None = None,
+        return_tolerance: float | None = None,
         settings: Sequence[str] | Mapping[str, Any] = (),
-        progress: Callable[[int, int, str], None] | None = None,
+        mount_error: str | None = None,
+        workers: int | str = 1,
+        cma_seconds: float | None = None,
+        accuracy: bool = False,
+        fail_above: float | None = None,
+        fail_unless_better: str | None = None,
+        progress: Progress | None = None,
         notes: Notes = log_note,
-        **further: Any,
     ) -> Scores:
         """Score designs on held-out scenes against uniform, random, bounding, silhouette and greedy.
 
         Arguments:
             designs: Designs and design files, of other runs too; all that are saved in the run by default.
             rays: Numbers of rays per frame; the task's by default.
-            baselines: Further baselines: "lloyd", "occupancy", "no-visibility", "cma" or "catalog:NAME".
+            baselines: Further baselines: "lloyd", "occupancy", "no-visibility" or "cma"; ["none"] leaves out all.
             seed: Seed of all random numbers; the run's by default.
+            scenes_seed: Seed of the held-out scenes; `seed` by default.
             effects: Physical effects: "auto", "all", "none", "audit" or names separated by commas.
             detector: The name of a detector, or a YAML file.
+            range_tolerance_mm: What all skipped effects together may change of ranges [mm].
+            return_tolerance: Share of returns that all skipped effects together may change.
             settings: Settings of the task, to score in scenes other than the learned ones.
-            progress: Called with the scenes done, all scenes, and the name of the scene.
+            mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
+            workers: Processes that score scenes, or the address of a dask scheduler, tcp://HOST:PORT.
+            cma_seconds: Wall time of each search of the baseline cma [s].
+            accuracy: Whether what accuracy costs is measured, too; takes minutes.
+            fail_above: What no design may be worse than, in the metric's unit; `Scores.check()` sees to it.
+            fail_unless_better: A baseline or design that every other design must be better than; so does this.
+            progress: Called with the name of the scene, the scenes done, and all scenes.
             notes: Called with every note.
-            further: range_tolerance_mm, return_tolerance, workers, cma_seconds, accuracy, scenes_seed, fail_above and
-                fail_unless_better, as of `ScoreOptions`; `Scores.check()` holds designs against the last two.
 
         Raises:
             ConfigError: Choices that cannot be.
@@ -259,14 +283,22 @@ class Run(RunFolder):
             rays=rays,
             baselines=baselines,
             seed=seed,
+            scenes_seed=scenes_seed,
             effects=effects,
             detector=detector,
+            range_tolerance_mm=range_tolerance_mm,
+            return_tolerance=return_tolerance,
             settings=settings,
-            **further,
+            mount_error=mount_error,
+            workers=workers,
+            cma_seconds=cma_seconds,
+            accuracy=accuracy,
+            fail_above=fail_above,
+            fail_unless_better=fail_unless_better,
         )
         chosen = self.designs() if designs is None else designs
         targets = [design if isinstance(design, Design) else Path(design) for design in chosen]
-        scores = ScoreRequest.resolve(targets, options, [self], notes).score(progress)
+        scores = ScoreRequest.resolve(targets, options, self, notes).score(progress)
         return scores.with_accuracy(progress) if options.accuracy else scores
 
     def __repr__(self) -> str:
@@ -311,6 +343,7 @@ def open_run(folder: Path | str) -> Run:
     return Run.open(folder)
 
 
+@names_arguments
 def learn(
     task: str | None = None,
     *,
@@ -321,9 +354,11 @@ def learn(
     config: Path | str | None = None,
     device: str = "auto",
     resume: bool = False,
-    progress: Callable[[LearnProgress], None] | None = None,
+    overwrite: bool = False,
+    tolerance: float | None = None,
+    time_budget_s: float | None = None,
+    progress: Progress | None = None,
     notes: Notes = log_note,
-    **further: Any,
 ) -> Run:
     """Learn where rays are worth firing for a task, into a run folder.
 
@@ -336,16 +371,27 @@ def learn(
         config: A YAML file of settings.
         device: auto, cpu or cuda.
         resume: Continue an interrupted run.
-        progress: Called about every tenth step.
+        overwrite: Replace a run that is in the folder, once the new one is learned.
+        tolerance: Learn until at most this share of the density's mass is in the wrong place.
+        time_budget_s: Learn as long as all of it ends within this time [s].
+        progress: Called about every tenth step with "learning", the steps done, and all steps, where that is known.
         notes: Called with every note; they are logged by default.
-        further: tolerance or time_budget_s, which decide the number of steps; overwrite, which replaces a run.
 
     Raises:
         ConfigError: An unknown task, impossible settings, or a folder that is not empty.
         ThresholdError: The tolerance was not reached; the run is finished and can be opened.
     """
     options = LearnOptions(
-        preset=preset, out=out, seed=seed, settings=settings, config=config, device=device, resume=resume, **further
+        preset=preset,
+        out=out,
+        seed=seed,
+        settings=settings,
+        config=config,
+        device=device,
+        resume=resume,
+        overwrite=overwrite,
+        tolerance=tolerance,
+        time_budget_s=time_budget_s,
     )
     request = LearnRequest.resolve(task, options, notes)
     said: list[str] = []
@@ -357,10 +403,10 @@ def learn(
 
     for note in request.task_notes():
         remark(note)
-    result = request.run(progress, remark)
+    result = request.run(progress and (lambda now: progress("learning", now.step, now.steps)), remark)
     for note in (*result.notes, f"the density is {result.verdict.text(request.settings.preset)}"):
         remark(note)
-    check_met(result, request.goal)
+    check_tolerance(result, options.tolerance)
     return open_run(request.folder)
 
 

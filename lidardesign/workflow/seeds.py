@@ -14,17 +14,16 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import ConfigError, DataError, names_arguments
 from lidardesign.evaluate.request import usual_numbers
-from lidardesign.evaluate.scene_scores import Progress
 from lidardesign.evaluate.seeds import over_seeds
-from lidardesign.run.clock import outermost_clock, running
+from lidardesign.run.clock import Progress, outermost_clock, running
 from lidardesign.workflow.designs import Design
 from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest, Scores
-from lidardesign.workflow.run_folder import Notes, RequestPlan, RunFolder, log_note, read_design
+from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, read_design
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.cma.candidate import Show
+    from lidardesign.evaluate.baselines.cma import Show
 
 FEWEST_RUNS = 2
 SEED = "seed"
@@ -46,29 +45,70 @@ def differing_seeds(targets: Sequence[Path], notes: Notes = log_note) -> list[Ru
     return runs if other is None and len(seeds) > 1 else []
 
 
+@names_arguments
 def evaluate_seeds(
     runs: Sequence[RunFolder | Path | str],
     *,
+    designs: Sequence[str] = (),
+    rays: Sequence[int] | None = None,
+    baselines: Sequence[str] = (),
+    scenes_seed: int | None = None,
+    effects: str = "auto",
+    detector: str = "ideal",
+    range_tolerance_mm: float | None = None,
+    return_tolerance: float | None = None,
+    settings: Sequence[str] | Mapping[str, Any] = (),
+    mount_error: str | None = None,
+    workers: int | str = 1,
+    cma_seconds: float | None = None,
+    fail_above: float | None = None,
+    fail_unless_better: str | None = None,
     progress: Progress | None = None,
     notes: Notes = log_note,
-    **options: Any,
 ) -> Scores:
     """Score the designs that have the same name in all runs, over seeds and held-out scenes.
 
     Arguments:
         runs: Two or more runs of one task that differ only in their seed, or their folders.
-        progress: Called with the scenes done, all scenes, and the name of the scene.
+        designs: Names of designs; all that the runs have in common by default.
+        rays: Numbers of rays per frame; the task's by default.
+        baselines: Further baselines, as of `Run.evaluate`.
+        scenes_seed: Seed of the held-out scenes; the first run's by default.
+        effects: Physical effects: "auto", "all", "none" or names separated by commas.
+        detector: The name of a detector, or a YAML file.
+        range_tolerance_mm: What all skipped effects together may change of ranges [mm].
+        return_tolerance: Share of returns that all skipped effects together may change.
+        settings: Settings of the task, to score in scenes other than the learned ones.
+        mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
+        workers: Processes that score scenes, or the address of a dask scheduler, tcp://HOST:PORT.
+        cma_seconds: Wall time of each search of the baseline cma [s].
+        fail_above: What no design may be worse than, in the metric's unit; `Scores.check()` sees to it.
+        fail_unless_better: A baseline or design that every other design must be better than; so does this.
+        progress: Called with the name of the scene, the scenes done, and all scenes.
         notes: Called with every note.
-        options: designs (names; all that are common by default), scenes_seed (the first run's by default), and rays,
-            baselines, effects, detector, settings, range_tolerance_mm, return_tolerance, mount_error, workers and
-            cma_seconds, fail_above and fail_unless_better, as of `ScoreOptions`.
 
     Raises:
         ConfigError: Runs that differ in more than their seed, a run given twice, or no design of one name.
         DataError: A run is missing or damaged.
     """
     opened = [run if isinstance(run, RunFolder) else RunFolder.open(run) for run in runs]
-    return SeedsRequest.resolve(opened, ScoreOptions(**options), notes).score(progress)
+    options = ScoreOptions(
+        designs=designs,
+        rays=rays,
+        baselines=baselines,
+        scenes_seed=scenes_seed,
+        effects=effects,
+        detector=detector,
+        range_tolerance_mm=range_tolerance_mm,
+        return_tolerance=return_tolerance,
+        settings=settings,
+        mount_error=mount_error,
+        workers=workers,
+        cma_seconds=cma_seconds,
+        fail_above=fail_above,
+        fail_unless_better=fail_unless_better,
+    )
+    return SeedsRequest.resolve(opened, options, notes).score(progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +148,7 @@ class SeedsRequest:
             scenes_seed=runs[0].config.seed if options.scenes_seed is None else options.scenes_seed,
         )
         return cls(
-            [ScoreRequest.resolve(of_run, shared, [run], notes) for of_run, run in zip(designs, runs, strict=True)]
+            [ScoreRequest.resolve(of_run, shared, run, notes) for of_run, run in zip(designs, runs, strict=True)]
         )
 
     @property
@@ -121,27 +161,11 @@ class SeedsRequest:
         """Wall time of each search of the baseline cma [s]."""
         return self.requests[0].cma_seconds
 
-    def plan(self, outputs: Mapping[str, Path | None] | None = None) -> RequestPlan:
-        """What the evaluation would do.
-
-        Arguments:
-            outputs: Files that are to be written, by the option that says so; None for those that are not.
-        """
-        plans = [request.plan(outputs) for request in self.requests]
-        seeds = [request.seed for request in self.requests]
-        heading = f"for each of the seeds {', '.join(map(str, seeds))}, in the scenes of seed {self._scenes_seed}:"
-        return replace(
-            plans[0],
-            steps=[heading, *plans[0].steps],
-            reads=list(dict.fromkeys(path for plan in plans for path in plan.reads)),
-            settings={**plans[0].settings, "seeds": seeds, "--scenes-seed": self._scenes_seed},
-        )
-
     def score(self, progress: Progress | None = None, searching: Show | None = None) -> Scores:
         """Score every run's designs and baselines, and take means over seeds.
 
         Arguments:
-            progress: Called with the scenes done, all scenes of all seeds, and the name of the scene.
+            progress: Called with the name of the scene, the scenes done, and all scenes of all seeds.
             searching: Called with how the searches of the baseline cma stand.
 
         Raises:
@@ -167,7 +191,7 @@ class SeedsRequest:
 def _part(progress: Progress | None, number: int, parts: int) -> Progress | None:
     if progress is None:
         return None
-    return lambda done, total, name: progress(number * total + done, parts * total, name)
+    return lambda name, done, total: progress(name, number * total + done, parts * total)
 
 
 def _check_runs(runs: Sequence[RunFolder]) -> None:

@@ -159,19 +159,19 @@ CASES = [
     # options
     ("fit run --rays 0", 2, "rays"),
     ("fit run --rays -5", 2, "rays"),
-    ("fit run --sensors 0", 2, "from 1 to 1000, best or auto"),
-    ("fit run --sensors -2", 2, "from 1 to 1000, best or auto"),
-    ("fit run --sensors 2.5", 2, "from 1 to 1000, best or auto"),
-    ("fit run --sensors many", 2, "from 1 to 1000, best or auto"),
-    ("fit run --sensors 1001", 2, "from 1 to 1000, best or auto"),
-    (f"fit run --sensors {'9' * 5000}", 2, "from 1 to 1000, best or auto"),
+    ("fit run --sensors 0", 2, "from 1 to 1000, or best"),
+    ("fit run --sensors -2", 2, "from 1 to 1000, or best"),
+    ("fit run --sensors 2.5", 2, "from 1 to 1000, or best"),
+    ("fit run --sensors many", 2, "from 1 to 1000, or best"),
+    ("fit run --sensors 1001", 2, "from 1 to 1000, or best"),
+    (f"fit run --sensors {'9' * 5000}", 2, "from 1 to 1000, or best"),
     ("fit run --seed 9223372036854775808", 2, "seed"),
     ("fit run --layout spinning --channels 4000000000", 2, "--channels"),
     ("fit run --level 1", 2, "0.01 to 0.999999"),
     ("fit run --weight train=", 2, "train has no value"),
-    ("fit run --weight train=many --dry-run", 2, "--weight train=many"),
-    ("fit run --rays 6000 --dry-run", 2, "1 to 5000"),
-    ("fit run --layout spinning --channels 16 --rays 8 --dry-run", 2, "16 channels"),
+    ("fit run --weight train=many", 2, "--weight train=many"),
+    ("fit run --rays 6000", 2, "1 to 5000"),
+    ("fit run --layout spinning --channels 16 --rays 8", 2, "16 channels"),
     ("fit equal --layout grid --sensors 2", 3, "its 1000 samples count as only 1"),
     ("fit elsewhere --layout grid --sensors 2", 3, "belong to another design space: range_m"),
     ("fit millimetres --layout grid --sensors 2", 3, "1000 of 1000 points outside"),
@@ -229,7 +229,9 @@ CASES = [
     ("show rows.csv", 3, "rows.csv:1"),
     ("show short.csv", 3, "short.csv:1"),
     ("show garbage.yaml", 2, "garbage.yaml"),
-    ("evaluate run good.yaml --baseline best", 2, "uniform"),
+    ("evaluate good.yaml --in run --baseline best", 2, "uniform"),
+    ("evaluate good.yaml --in run --baseline none --baseline lloyd", 2, "none alone"),
+    ("evaluate good.yaml --in run --baseline none --fail-unless-better greedy", 2, "none alone"),
 ]
 
 
@@ -330,7 +332,7 @@ DESIGNS = [
 ]
 
 
-@pytest.mark.parametrize("command", ["show", "evaluate run", "export --format csv"])
+@pytest.mark.parametrize("command", ["show", "evaluate --in run", "export --format csv"])
 @pytest.mark.parametrize(
     ("path", "value", "words"), DESIGNS, ids=[f"{'.'.join(map(str, d[0]))}={d[1]}" for d in DESIGNS]
 )

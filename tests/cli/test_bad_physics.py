@@ -16,7 +16,7 @@ from lidardesign.cli.output import EXIT_INTERRUPTED, Output, describe_error
 from lidardesign.errors import PluginError
 from lidardesign.registry import plugin_guard
 from lidardesign.scene import Ambient, Body, Medium, Mesh, Receiver, Scene, Sphere
-from lidardesign.simulate.light_transport import process as light_transport_process
+from lidardesign.simulate.light_transport import transport as light_transport_process
 
 LONG = "x" * 300
 BILLION_LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
@@ -92,7 +92,7 @@ CASES = [
         for option in ("--range-tolerance-mm", "--return-tolerance")
         for value in ("0", "-1", "nan", "inf")
     ),
-    ("evaluate run good.yaml far.yaml --rays 8", 2, "sensors[0].gate_m.end is 1e+300"),
+    ("evaluate good.yaml far.yaml --in run --rays 8", 2, "sensors[0].gate_m.end is 1e+300"),
     ("evaluate bare --effects audit", 3, "no designs yet"),
     ("evaluate bare --effects audit,all", 2, "--effects"),
     *(

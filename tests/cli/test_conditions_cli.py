@@ -76,8 +76,8 @@ def test_without_a_layout_rays_are_chosen_along_the_condition(lidardesign, run):
     [("--weight variation=1.5", "scan"), ("--at x_m=0.37", "scan"), ("--at x_m=0.37 --sensors 2", "grid")],
 )
 def test_where_rays_cannot_be_chosen_each_is_a_sensor_unless_sensors_are_counted(lidardesign, run, arguments, layout):
-    planned = lidardesign("fit", run, "--rays", 3, *arguments.split(), "--dry-run", "--json")
-    assert planned.json["settings"]["layout"] == layout
+    assert lidardesign("fit", run, "--rays", 3, *arguments.split()).code == 0
+    assert load_design(run / "designs" / "fit.yaml").layout == layout
 
 
 def test_constraints_hold_along_a_track_and_at_a_value(lidardesign, run):
@@ -143,7 +143,7 @@ MISTAKES = [
     ("fit run --layout density --rays 4", 2, "--at x_m=VALUE"),
     ("fit run --layout distributed --rays 4", 2, "--at x_m=VALUE"),
     ("fit run --layout scan --rays 4 --sensors 2", 2, "--sensors"),
-    ("constrain run --layout scan --rays 4 --sensors auto", 2, "--sensors"),
+    ("constrain run --layout scan --rays 4 --sensors best", 2, "--sensors"),
     ("constrain run --layout grid", 2, "--at x_m=VALUE"),
     ("constrain run --at x_m=-0.1", 2, "0 to 1"),
     ("constrain run --layout scan --set origin.fixed_m=[0.5,0,0]", 4, "--at x_m=0.5"),
@@ -252,17 +252,13 @@ def test_a_distributed_design_by_hand_is_evaluated_with_the_gates_of_its_layout(
     np.testing.assert_array_equal(found.origin_m, expected.origin_m)
 
 
-def test_the_seed_of_an_export_draws_its_layout(lidardesign, run, tmp_path):
+def test_an_export_draws_its_layout_anew(lidardesign, run, tmp_path):
     from lidardesign.samples import load_samples
 
     made = ("--at", "x_m=0.37", "--layout", "density", "--rays", 8, "--sensors", 1)
     assert lidardesign("fit", run, *made).code == 0
-    path, found = run / "designs" / "fit.yaml", []
-    for seed in (0, 5):
-        result = lidardesign("export", path, "--format", "npz", "--rays", 30, "--seed", seed, "--out", "r.npz")
-        assert result.code == 0, result.err
-        with np.load(tmp_path / "r.npz") as arrays:
-            found.append(arrays["azimuth_rad"].copy())
-        expected = lay_out(load_design(path), 30, load_samples(run), seed=seed, retarget=log_target)
-        np.testing.assert_allclose(np.cos(found[-1]), expected.direction[:, 0], atol=1e-12)
-    assert not np.array_equal(*found)
+    path = run / "designs" / "fit.yaml"
+    assert lidardesign("export", path, "--format", "npz", "--rays", 30, "--out", "r.npz").code == 0
+    expected = lay_out(load_design(path), 30, load_samples(run), retarget=log_target)
+    with np.load(tmp_path / "r.npz") as arrays:
+        np.testing.assert_allclose(np.cos(arrays["azimuth_rad"]), expected.direction[:, 0], atol=1e-12)

@@ -62,7 +62,7 @@ def test_learning_says_what_it_cost_and_how_far_its_figures_may_be_off(lidardesi
 def test_fits_say_what_they_cost_and_write_the_same_bytes_whatever_the_time(lidardesign, flat):
     designs = []
     for name in ("one", "one"):
-        done = lidardesign(f"fit {flat} --layout grid --rays 30 --name {name} --json")
+        done = lidardesign(f"fit run --layout grid --rays 30 --name {name} --json")
         designs.append((flat / "designs" / "one.yaml").read_bytes())
         document = done.json
         assert adds_up(document) >= document["seconds"] - 0.01
@@ -73,19 +73,19 @@ def test_fits_say_what_they_cost_and_write_the_same_bytes_whatever_the_time(lida
     for name in ("log_likelihood", "ess", "admissible_mass"):
         assert estimates[name]["value"] == pytest.approx(document[name])
     assert estimates["rays"]["kind"] == "rounding"
-    lidardesign(f"constrain {flat} --layout grid --set gate.width_m.max=0.4 --name two")
+    lidardesign("constrain run --layout grid --set gate.width_m.max=0.4 --name two")
     assert set(read_manifest(flat)["timings"]) == {"fit", "constrain"}
 
 
 def test_reading_commands_keep_their_times_in_the_run_and_change_nothing_else_there(lidardesign, flat, tmp_path):
-    lidardesign(f"fit {flat} --layout grid --sensors 2 --rays 20 --name one")
+    lidardesign("fit run --layout grid --sensors 2 --rays 20 --name one")
     before = files_under(flat)
-    evaluated = lidardesign(f"evaluate {flat} --rays 20 --set test=3 --json").json
+    evaluated = lidardesign("evaluate run --rays 20 --set test=3 --json").json
     adds_up(evaluated)
     assert {"designs", "scenes", "rays", "held-out scenes", "held-out scenes/metric"} <= set(evaluated["timings"])
-    exported = lidardesign(f"export {flat}/designs/one.yaml --format npz --out {tmp_path}/rays.npz --json").json
+    exported = lidardesign("export run/designs/one.yaml --format npz --out rays.npz --json").json
     adds_up(exported)
-    shown = lidardesign(f"show {flat}/designs/one.yaml --json").json
+    shown = lidardesign("show run/designs/one.yaml --json").json
     adds_up(shown)
     after = files_under(flat)
     assert {name for name in after if after[name] != before.get(name)} == {"manifest.json"}
@@ -96,9 +96,9 @@ def test_reading_commands_keep_their_times_in_the_run_and_change_nothing_else_th
 
 
 def test_a_run_that_cannot_be_written_is_still_read(lidardesign, flat, tmp_path):
-    lidardesign(f"fit {flat} --layout grid --sensors 2 --rays 20 --name one")
+    lidardesign("fit run --layout grid --sensors 2 --rays 20 --name one")
     with run_lock(flat):
-        done = lidardesign(f"export {flat}/designs/one.yaml --format csv --out {tmp_path}/rays.csv")
+        done = lidardesign("export run/designs/one.yaml --format csv --out rays.csv")
     assert done.code == 0
     assert "the times of export are not kept" in done.err
     assert "writing this run" in done.err
@@ -106,17 +106,17 @@ def test_a_run_that_cannot_be_written_is_still_read(lidardesign, flat, tmp_path)
 
 
 def test_the_time_is_a_line_a_table_with_verbose_and_nothing_with_quiet(lidardesign, flat):
-    usual = lidardesign(f"fit {flat} --layout grid --sensors 2 --name one")
+    usual = lidardesign("fit run --layout grid --sensors 2 --name one")
     assert re.search("^took .* s$", usual.out, re.MULTILINE)
     assert TITLE not in usual.out
-    loud = lidardesign(f"fit {flat} --layout grid --sensors 2 --name one --verbose")
+    loud = lidardesign("fit run --layout grid --sensors 2 --name one --verbose")
     assert TITLE in loud.out
     assert "fitting" in loud.out
     assert "log-likelihood" in loud.out
     assert "+-" in loud.out
-    assert lidardesign(f"fit {flat} --layout grid --sensors 2 --name one --quiet").out == f"{flat}/designs/one.yaml\n"
+    assert lidardesign("fit run --layout grid --sensors 2 --name one --quiet").out == "run/designs/one.yaml\n"
     # what only looks something up does not tell people how long that took
-    assert TITLE not in lidardesign(f"show {flat}/designs/one.yaml").out
+    assert TITLE not in lidardesign("show run/designs/one.yaml").out
     assert TITLE not in lidardesign("tasks list").out
     assert TITLE not in lidardesign("export --list").out
 

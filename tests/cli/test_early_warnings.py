@@ -157,9 +157,7 @@ def test_a_rig_in_millimetres_is_told_wherever_it_meets_a_run(capsys, monkeypatc
     name = rig(flat, f"rig{factor}.csv", factor).name
     commands = (
         ("show", name, "--in", flat),
-        ("compare", name, name, "--in", flat, "--rays", 9),
-        ("evaluate", flat, name, "--rays", 9),
-        ("evaluate", flat, name, "--rays", 9, "--dry-run"),
+        ("evaluate", name, "--in", flat, "--rays", 9),
     )
     for arguments in commands:
         result = call(*arguments)
@@ -181,4 +179,4 @@ def test_an_evaluation_says_what_its_task_says_of_the_configuration(capsys, monk
     name = rig(flat, "other.csv", 1).name
     kind = type(load_task("flatland"))
     monkeypatch.setattr(kind, "notes", lambda self, config, space: ["one mesh is all there is"], raising=False)
-    assert "one mesh is all there is" in call("evaluate", flat, name, "--rays", 9, "--json").json["notes"]
+    assert "one mesh is all there is" in call("evaluate", name, "--in", flat, "--rays", 9, "--json").json["notes"]

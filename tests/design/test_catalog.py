@@ -28,15 +28,17 @@ from lidardesign.design.catalog.library import (
     side_by_side,
 )
 from lidardesign.design.catalog.part import Part, conditions_of, disagreements, even_subset, to_angles, to_directions
+from lidardesign.design.catalog.shapes import PartShape, gate_inside, shapes_of
 from lidardesign.design.catalog.statements import FIELDS, PartFile, Statement
 from lidardesign.design.files import design_document, design_from_document, load_design, save_design
 from lidardesign.design.layouts.grid import grid_rows
 from lidardesign.design.layouts.rays import LAYOUTS, lay_out
+from lidardesign.design.mixture.features import Axes
 from lidardesign.design.sensor import boresight_frame
 from lidardesign.errors import ConfigError
 from lidardesign.run.validation import check_model
 from lidardesign.run.yaml import parse_yaml
-from lidardesign.space import direction
+from lidardesign.space import DesignSpace, direction
 
 LIBRARY = load_library()
 PARTS = {part.name: part for part in LIBRARY.every_mode()}
@@ -340,20 +342,6 @@ def test_a_subset_leaves_smaller_gaps_than_one_drawn_at_random():
     assert gap(kept) < 0.7 * gap(drawn)
 
 
-def test_rays_that_are_worth_firing_are_taken_first_and_others_fill_up():
-    part = PARTS["vlp-16"]
-
-    def forward(directions):
-        return directions[:, 0] > math.cos(math.radians(10))
-
-    there = int(forward(part.directions).sum())
-    few = part_rays(part, Pose(), 100, wanted=forward)
-    assert forward(few.direction).all()
-    many = part_rays(part, Pose(), there + 50, wanted=forward)
-    assert forward(many.direction).sum() == there
-    assert len(many) == there + 50
-
-
 @pytest.mark.parametrize(("count", "parts", "shares"), [(64, 1, [64]), (65, 2, [33, 32]), (196, 4, [49, 49, 49, 49])])
 def test_more_rays_than_a_part_has_take_more_parts_that_share_them(count, parts, shares):
     part = PARTS["vl53l8cx"]
@@ -654,3 +642,23 @@ def test_the_program_of_the_guide_runs():
     assert len(made["rays"]) == 64
     assert len(made["design"].sensors) == 4
     assert np.allclose(made["sensor"].boresight, [-1, 0, 0])
+
+
+def test_a_shape_is_where_its_component_looks_upright_and_turned():
+    space = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
+    upright, turned = shapes_of(find_part("tmf8828"), space)
+    axes = Axes.of(space)
+    for shape in (upright, turned):
+        pose = shape.pose(np.zeros(3), 0.3, 0.2, 0.1, axes)
+        np.testing.assert_allclose(pose.frame[0], direction(0.3, 0.2), atol=1e-12)
+    across = turned.pose(np.zeros(3), 0.0, 0.0, 0.0, axes)
+    np.testing.assert_allclose(across.frame[1], [0, 0, 1], atol=1e-12)
+
+
+def test_a_part_whose_range_does_not_meet_the_spaces_has_no_shape():
+    near = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 0.5))
+    assert shapes_of(find_part("vlp-16"), near) == []
+    assert isinstance(shapes_of(find_part("vl53l5cx"), near)[0], PartShape)
+    held = DesignSpace((0, 0, 0, -0.5, -0.5, 0.3), (0, 0, 0, 0.5, 0.5, 0.3))
+    assert gate_inside(find_part("vl53l5cx"), held) == find_part("vl53l5cx").range_m
+    assert gate_inside(find_part("vlp-16"), held) is None

@@ -1,4 +1,4 @@
-"""Two designs beside each other: sensor by sensor, and by their scores in the same scenes."""
+"""Two designs beside each other, sensor by sensor, and what a design costs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from support.command_line import make_run
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.compare import angle_between, paired_sensors, readout_of
-from lidardesign.design.files import load_design, save_design
+from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.space import direction
@@ -98,30 +98,22 @@ def run(tmp_path_factory):
     return folder
 
 
-def test_scores_of_two_designs_pair_as_evaluate_pairs_them(call, run):
-    few, more = (run / "designs" / f"{name}.yaml" for name in ("few", "more"))
-    found = call("compare", few, more, "--rays", "16", "--json").json
-    expected = call("evaluate", few, more, "--rays", "16", "--json").json
-    paired = [pair for pair in expected["paired"] if (pair["a"], pair["b"]) == ("few", "more")]
-    assert found["paired"] == paired
-    values = {row["design"]: row["value"] for row in expected["rows"]}
-    assert {row["design"]: row["value"] for row in found["rows"]} == {name: values[name] for name in ("few", "more")}
-
-
-def test_designs_of_other_numbers_of_rays_are_also_compared_as_they_are(call, run):
-    few, more = (run / "designs" / f"{name}.yaml" for name in ("few", "more"))
-    found = call("compare", few, more, "--json").json
-    first = found["paired"][0]
-    assert (first["rays"], first["rays_b"]) == (8, 12)
-    rows = {(row["design"], row["rays"]): row["value"] for row in found["rows"]}
-    assert first["difference"] == pytest.approx(rows["few", 8] - rows["more", 12])
-    text = call("compare", few, more).out
-    assert "at 8 and 12 rays" in text
-    assert "at 8 and 12 rays" in call("compare", few, more, "--quiet").out.splitlines()[0]
-    assert "second minus first" in text
-    itself = call("compare", few, few, "--json").json
-    assert [design["name"] for design in itself["designs"]] == ["few (first)", "few (second)"]
-    assert itself["paired"][0]["difference"] == 0
+def test_two_designs_differ_in_what_is_shown(call, run):
+    constrained = call("constrain", run, *GRID, "--rays", "8", "--set", "gate.width_m.max=0.2", "--name", "tight")
+    assert constrained.code == 0, constrained.err
+    few, more, tight = (run / "designs" / f"{name}.yaml" for name in ("few", "more", "tight"))
+    found = call("show", few, tight, "--json").json
+    assert [design["name"] for design in found["designs"]] == ["few", "tight"]
+    assert found["constraints"] == {"gate.width_m.max": [None, 0.2]}
+    assert found["sensors"] == [
+        pair.as_dict() for pair in paired_sensors(*(load_design(path) for path in (few, tight)))
+    ]
+    assert "gate.width_m.max" in call("show", few, tight).out
+    assert [design["bandwidth"]["rays"] for design in call("show", few, more, "--json").json["designs"]] == [8, 12]
+    itself = call("show", few, few, "--json").json
+    assert itself["constraints"] == {}
+    assert not any(value for pair in itself["sensors"] for value in pair["difference"].values())
+    assert call("show", few, run).code == 3
 
 
 def test_what_rounding_leaves_of_no_difference_is_shown_as_none(call, run, tmp_path):
@@ -129,21 +121,9 @@ def test_what_rounding_leaves_of_no_difference_is_shown_as_none(call, run, tmp_p
     rows = "".join(f"{angle / 7},{angle / 9},2\n" for angle in range(3))
     (tmp_path / "rays.csv").write_text("azimuth_rad,elevation_rad,gate_end_m\n" + rows)
     assert call("export", "rays.csv", "--format", "mjcf", "--out", "rays.xml").code == 0
-    result = call("compare", "rays.csv", "rays.xml")
+    result = call("show", "rays.csv", "rays.xml")
     assert result.code == 0, result.err
     assert "e-" not in result.out
-
-
-def test_without_a_run_there_are_no_scores_and_with_one_there_are(call, run, tmp_path):
-    for name in ("one", "two"):
-        save_design(replace(load_design(run / "designs" / "few.yaml"), provenance={}), tmp_path / f"{name}.yaml")
-    bare = call("compare", "one.yaml", "two.yaml", "--json")
-    assert bare.json["rows"] == []
-    assert "--in RUN" in bare.err
-    assert call("compare", "one.yaml", "two.yaml", "--rays", "8").code == 2
-    found = call("compare", "one.yaml", "two.yaml", "--in", run, "--json").json
-    assert [row["rays"] for row in found["rows"]] == [8, 8]
-    assert "no difference between one and two was found" in call("compare", "one.yaml", "two.yaml", "--in", run).out
 
 
 def test_a_shown_design_says_how_tight_its_constraints_are(call, run):

@@ -231,15 +231,6 @@ def test_rays_of_another_number_keep_out_with_and_without_samples(count, tmp_pat
             assert not starting_in(PILLAR, lay_out(one, count, samples))
 
 
-def test_the_number_of_sensors_is_found_between_boxes():
-    result = fit(
-        SAMPLES, sensors="auto", em_samples=1500, restarts=1,
-        constraints=Constraints.from_mapping({"origin": {"exclude": [SLAB]}, "sensors": {"max": 4}}),
-    )  # fmt: skip
-    assert_outside(result.design, [SLAB])
-    assert result.satisfied
-
-
 @pytest.mark.parametrize("height", [0.5, 1.5])
 def test_in_a_plane_only_boxes_that_it_cuts_are_in_the_way(height):
     space = DesignSpace((-1, -1, height, *ROOM.low[3:]), (1, 1, height, *ROOM.high[3:]))

@@ -118,7 +118,7 @@ def test_a_file_that_may_not_be_read_is_a_bad_file_like_one_that_is_not_there(ca
         ["show", "rig.csv"],
         ["export", "rig.csv", "--format", "npz", "--out", "o"],
         ["evaluate", "rig.csv"],
-        ["compare", "rig.csv", "rig.csv"],
+        ["show", "rig.csv", "rig.csv"],
         ["constrain", "rig.csv"],
         ["fit", run, "--like", "rig.csv"],
     ):
@@ -132,12 +132,12 @@ def test_files_that_only_their_endings_tell_apart_are_called_by_them(call, tmp_p
     run = make_run(tmp_path / "run", count=300)
     (tmp_path / "rig.csv").write_text(GOOD)
     (tmp_path / "rig.sdf").write_text(SDF)
-    planned = call("evaluate", run, "rig.csv", "rig.sdf", "--rays", 2, "--dry-run", "--json")
-    assert planned.code == 0, planned.err
-    assert planned.json["settings"]["designs"] == ["rig.csv", "rig.sdf"]
+    scored = call("evaluate", "rig.csv", "rig.sdf", "--in", run, "--rays", 2, "--json")
+    assert scored.code == 0, scored.err
+    assert [row["design"] for row in scored.json["rows"]][:2] == ["rig.csv", "rig.sdf"]
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "rig.csv").write_text(GOOD)
-    planned = call("evaluate", run, "rig.csv", "rig.sdf", "other/rig.csv", "--rays", 2, "--dry-run", "--json")
-    names = planned.json["settings"]["designs"]
+    scored = call("evaluate", "rig.csv", "rig.sdf", "other/rig.csv", "--in", run, "--rays", 2, "--json")
+    names = [row["design"] for row in scored.json["rows"]][:3]
     assert len(set(names)) == 3
     assert names[2] == "other/rig"

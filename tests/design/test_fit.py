@@ -74,19 +74,6 @@ def test_without_a_ray_count_the_bandwidth_chooses_one():
     assert 0.45 < value <= 0.5
 
 
-def test_the_automatic_count_finds_separate_clusters():
-    generator = np.random.default_rng(1)
-    points = np.zeros((6000, 6))
-    which = generator.integers(3, size=6000)
-    points[:, 3] = np.array([-0.4, 0.0, 0.4])[which] + 0.02 * generator.standard_normal(6000)
-    points[:, 4] = 0.02 * generator.standard_normal(6000)
-    points[:, 5] = np.array([0.4, 0.6, 0.8])[which] + 0.02 * generator.standard_normal(6000)
-    samples = Samples(points, np.zeros(6000), np.zeros(6000), FACE)
-    assert len(fit(samples, sensors="auto", em_samples=3000).design.sensors) == 3
-    limited = fit(samples, sensors="auto", em_samples=3000, constraints=constrained(sensors={"max": 2}))
-    assert len(limited.design.sensors) == 2
-
-
 def test_each_entry_rules_its_own_sensor():
     rules = constrained(each=[{"boresight": {"azimuth_deg": {"max": -2}}}, {"boresight": {"azimuth_deg": {"min": 2}}}])
     result = fit(FIXED, em_samples=2000, constraints=rules)

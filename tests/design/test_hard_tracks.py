@@ -66,7 +66,7 @@ def test_thousands_of_knots_are_read_and_met_exactly(lidardesign, tmp_path):
 def test_a_track_that_ends_too_early_is_refused_by_name_before_anything_is_scored(lidardesign, tmp_path):
     run = make_conditioned_run(tmp_path / "run", count=3000)
     (tmp_path / "short.yaml").write_text(dump_yaml(written(knots_m=[0.4, 0.6])))
-    result = lidardesign("evaluate", run, "short.yaml", "--rays", 1, "--json")
+    result = lidardesign("evaluate", "short.yaml", "--in", run, "--rays", 1, "--json")
     assert result.code == 2, result.err
     assert "design short" in result.err
     assert "x_m=0.4 to 0.6" in result.err

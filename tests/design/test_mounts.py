@@ -71,12 +71,6 @@ def test_fewer_sensors_take_the_mounts_that_see_most_together():
     assert chosen[0][0] < 0 < chosen[1][0]
 
 
-def test_the_number_of_mounts_that_see_enough_is_found():
-    constraints = Constraints.from_mapping({"origin": {"mounts_m": MOUNTS}})
-    result = fit(SAMPLES, sensors="auto", constraints=constraints, retarget=log_target, em_samples=2000, restarts=1)
-    assert 2 <= len(result.design.sensors) <= 4
-
-
 def test_the_order_of_the_mounts_does_not_matter():
     first, *others = [
         places(fitted(sensors={"count": 2}, origin={"mounts_m": list(order)}))

@@ -10,14 +10,9 @@ from support.tables import each_row
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines import simple as baselines
-from lidardesign.evaluate.baselines.candidates import BaselineLayout, opened_gate
+from lidardesign.evaluate.baselines.candidates import opened_gate
 from lidardesign.evaluate.baselines.even import even_placement
-from lidardesign.evaluate.baselines.simple import (
-    Family,
-    baseline_of,
-    is_baseline,
-)
+from lidardesign.evaluate.baselines.simple import check_baseline
 from lidardesign.evaluate.baselines.views import unrolled
 from lidardesign.scene import Body, Box, Scene, rigid
 from lidardesign.simulate.simulate import simulate
@@ -173,51 +168,10 @@ def test_an_unknown_baseline_names_the_known_ones():
         build_baseline("bouncing", FIXED, [], 3, seed=0)
 
 
-@pytest.fixture
-def of_axis(monkeypatch):
-    """A family whose argument names the axis that all its rays look along."""
-
-    def build(source, argument):
-        return [BaselineLayout(argument, lambda count, _: np.tile(AXES[argument], (count, 1)), np.array([0.1, 1.0]))]
-
-    def check(argument):
-        if argument not in AXES:
-            raise ConfigError(f"no axis {argument!r}", allowed=", ".join(AXES))
-
-    monkeypatch.setitem(baselines.BASELINES, "axis", Family(build, "AXIS", check=check))
-
-
-AXES = {"x": [0, 0, 0, 0, 0], "y": [0, 0, 0, math.pi / 2, 0]}
-
-
-def test_what_follows_the_colon_reaches_the_family_and_keeps_its_layouts_apart(of_axis):
-    source = Rivals(FIXED, [], seed=0)
-    for name, looking in (("axis:x", [1, 0, 0]), ("axis:y", [0, 1, 0])):
-        (rays,) = source.positions(name, 3)
-        np.testing.assert_allclose(rays.direction, np.tile(looking, (3, 1)), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("axis", "needs a value after its name"),
-        ("axis:", "needs a value after its name"),
-        ("axis:z", "no axis 'z'"),
-        ("uniform:3", "takes no value after its name"),
-        ("uniform:", "takes no value after its name"),
-        ("axes:x", "axis:AXIS"),
-        ("", "axis:AXIS"),
-    ],
-)
-def test_a_name_that_no_family_takes_is_refused_with_what_is_allowed(of_axis, name, message):
-    with pytest.raises(ConfigError, match=message):
-        baseline_of(name)
-
-
-def test_a_name_with_a_familys_name_before_its_colon_is_a_baselines(of_axis):
-    assert [is_baseline(name) for name in ("axis:x", "axis:z", "uniform", "axes", "my axis")] == [
-        True, True, True, False, False,
-    ]  # fmt: skip
+@each_row("name", ["catalog:vl53l5cx", "uniform:3", "uniform:", ""])
+def test_a_name_that_is_no_baselines_is_refused(name):
+    with pytest.raises(ConfigError, match="unknown baseline"):
+        check_baseline(name)
 
 
 @pytest.mark.parametrize("axes", [1, 2, 3, 5])

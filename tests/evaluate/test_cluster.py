@@ -15,11 +15,9 @@ import pytest
 from support.workers import make_request, results
 
 from lidardesign.errors import ConfigError
+from lidardesign.evaluate import workers
 from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.workers import cluster as worker_cluster
-from lidardesign.evaluate.workers import pool
-from lidardesign.evaluate.workers.pool import WorkerScorer, workers_of
-from lidardesign.evaluate.workers.worker import SceneFailure
+from lidardesign.evaluate.workers import scorer_of
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -69,7 +67,13 @@ class LocalScheduler:
 
 def after_one_scene(kill):
     """Progress that kills once the first scene is there."""
-    return lambda done, total, name: kill() if done == 1 else None
+    return lambda name, done, total: kill() if done == 1 else None
+
+
+def score_by(address):
+    request = make_request()
+    with scorer_of(address, request.task, 6) as scorer:
+        evaluate(replace(request, scorer=scorer))
 
 
 @pytest.fixture
@@ -87,8 +91,7 @@ def test_a_cluster_scores_as_this_process_does_though_a_worker_is_lost(scheduler
     expected = results(evaluate(request))
     lost = scheduler.add_worker()
     scheduler.add_worker()
-    with workers_of(scheduler.address, 1) as scorer:
-        scorer.prepare(request)
+    with scorer_of(scheduler.address, request.task, 6) as scorer:
         assert results(evaluate(replace(request, scorer=scorer), progress=after_one_scene(lost.kill))) == expected
         assert lost.wait(PATIENCE_S) == -signal.SIGKILL
         assert results(evaluate(replace(request, scorer=scorer))) == expected
@@ -98,63 +101,58 @@ def test_a_scheduler_that_is_lost_ends_the_evaluation_with_its_address(scheduler
     request = make_request()
     scheduler.add_worker()
     with (
-        workers_of(scheduler.address, 1) as scorer,
         pytest.raises(ConfigError, match=f"the scheduler at {scheduler.address} was lost"),
+        scorer_of(scheduler.address, request.task, 6) as scorer,
     ):
         evaluate(replace(request, scorer=scorer), progress=after_one_scene(scheduler.scheduler.kill))
 
 
 def test_a_scheduler_without_workers_is_refused(scheduler, monkeypatch):
-    monkeypatch.setattr(worker_cluster, "WORKER_SECONDS", 0.5)
+    monkeypatch.setattr(workers, "WORKER_SECONDS", 0.5)
     with pytest.raises(ConfigError, match=f"the scheduler at {scheduler.address} had no worker"):
-        WorkerScorer(worker_cluster.Cluster(scheduler.address))
+        score_by(scheduler.address)
 
 
 def test_an_address_where_nothing_answers_is_refused(monkeypatch):
-    monkeypatch.setattr(worker_cluster, "SCHEDULER_SECONDS", 0.5)
+    monkeypatch.setattr(workers, "SCHEDULER_SECONDS", 0.5)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     with pytest.raises(ConfigError, match=f"no scheduler answers at {address}"):
-        worker_cluster.Cluster(address)
+        score_by(address)
 
 
 def test_an_address_where_something_else_listens_is_refused(monkeypatch):
-    monkeypatch.setattr(worker_cluster, "SCHEDULER_SECONDS", 0.5)
+    monkeypatch.setattr(workers, "SCHEDULER_SECONDS", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(ConfigError, match="is not a dask scheduler"):
-            worker_cluster.Cluster(address)
+            score_by(address)
 
 
 def test_without_dask_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match=r"lidardesign\[cluster\]"):
-        worker_cluster.Cluster("tcp://127.0.0.1:1")
+        score_by("tcp://127.0.0.1:1")
 
 
-def test_a_cluster_without_this_program_or_with_another_version_is_refused(scheduler, monkeypatch):
+def test_a_cluster_of_another_version_is_refused(scheduler, monkeypatch):
     scheduler.add_worker()
-    monkeypatch.setattr(worker_cluster, "__version__", "9.9")
-    with pytest.raises(ConfigError, match=r"the scheduler has version .* of it, not 9\.9"):
-        worker_cluster.Cluster(scheduler.address)
+    monkeypatch.setattr(workers, "__version__", "9.9")
+    with pytest.raises(ConfigError, match=r"the cluster has lidardesign [^9].*\n  allowed: lidardesign 9\.9"):
+        score_by(scheduler.address)
 
 
 def test_a_cluster_that_lost_its_last_worker_is_given_up(scheduler, monkeypatch):
-    monkeypatch.setattr(pool, "LOOK_SECONDS", 0.1)
     request = make_request()
     only = scheduler.add_worker()
-    with workers_of(scheduler.address, 1) as scorer:
-        monkeypatch.setattr(worker_cluster, "WORKER_SECONDS", 1.0)
-        with pytest.raises(ConfigError, match="has had no worker for 1 s"):
-            evaluate(replace(request, scorer=scorer), progress=after_one_scene(only.kill))
 
+    def kill():
+        monkeypatch.setattr(workers, "WORKER_SECONDS", 1.0)
+        only.kill()
 
-def test_long_jobs_are_sent_and_nonsense_is_answered(scheduler):
-    scheduler.add_worker()
-    cluster = worker_cluster.Cluster(scheduler.address)
-    try:
-        answers = [cluster.submit(job).result(PATIENCE_S) for job in (bytes(12_000_000), b"")]
-    finally:
-        cluster.close()
-    assert all(isinstance(answer, SceneFailure) for answer in answers)
+    with (
+        pytest.raises(ConfigError, match="no worker within 1 s"),
+        scorer_of(scheduler.address, request.task, 6) as scorer,
+    ):
+        evaluate(replace(request, scorer=scorer), progress=after_one_scene(kill))

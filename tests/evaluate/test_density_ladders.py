@@ -16,13 +16,11 @@ from support.references import shape_distance
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings, LearningSettings, resolve, save_run_config
-from lidardesign.density.fields.distance import TableField, build_field
-from lidardesign.density.fields.grids import Grid
+from lidardesign.density.fields.distance import build_field
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learn import learn
 from lidardesign.density.learned import (
-    FlowSamples,
     LearningSteps,
     gradient,
     in_arithmetic,
@@ -34,8 +32,8 @@ from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.errors import NumericalError
 from lidardesign.evaluate.accuracy import fields, visibility
-from lidardesign.evaluate.accuracy import steps as learning_steps
-from lidardesign.evaluate.accuracy.fields import ExactField, InterpolatedField, fresh_table
+from lidardesign.evaluate.accuracy import training as learning_steps
+from lidardesign.evaluate.accuracy.fields import ExactField, fresh_table
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest, draw_probes, few_columns, with_frames
 from lidardesign.evaluate.accuracy.visibility import LOG_OPAQUE, opaque_target
 from lidardesign.evaluate.request import EvaluationRequest
@@ -192,16 +190,6 @@ class TestVisibilitySweep:
         assert off.error > 0.05 > quadrature.error or off.error > quadrature.error > cast.error
         assert cast.error < 0.02
 
-    @pytest.mark.parametrize("kind", [Box, Mesh])
-    def test_midpoints_fall_towards_the_integral(self, cases, kind):
-        sweep = visibility.points_sweep(cases[kind], 64)
-        assert sweep.falls
-        assert [measurement.setting for measurement in sweep.measurements] == ["16", "32", "64", "128", "256"]
-        assert sweep.default.setting == "64"
-        assert sweep.measurements[-1].error < sweep.measurements[0].error / 2
-        # the points of a refined quadrature are a measurement of their own
-        assert kind is Box or visibility.points_sweep(cases[kind], 100).default.setting == "100"
-
     def test_where_nothing_is_seen_there_is_nothing_to_choose(self, monkeypatch):
         monkeypatch.setattr(visibility, "PROBES", 512)
         wall, _ = hidden_wall((1.5, 0, 0)).bodies
@@ -247,30 +235,6 @@ class TestComparedFields:
         assert np.array_equal(fresh.table, cached.table[:, :2])
         assert np.array_equal(fresh.grid.low, cached.grid.low)
 
-    def linear_table(self):
-        grid = Grid(np.full(3, -0.8), 0.1, np.array([17, 17, 17]))
-        slopes = np.array([[1.0, -0.5], [0.2, 0.3], [-0.1, 0.7]])
-        return TableField((grid.points() @ slopes).astype(np.float32), grid, np.zeros(2)), slopes
-
-    @pytest.mark.parametrize("order", [1, 3])
-    def test_a_linear_function_is_read_exactly(self, order):
-        table, slopes = self.linear_table()
-        # the spline's ends are mirrored: a few cells from them a linear function is one again
-        inside = self.POINTS[(np.abs(self.POINTS) < 0.3).all(axis=1)]
-        found = InterpolatedField.of(table, order).distances(inside)
-        assert found == pytest.approx(inside @ slopes, abs=1e-3)
-
-    def test_the_first_order_is_that_of_learning_inside_and_outside(self):
-        table = fresh_table(balls(2), balls(2), 16, 0.1)
-        points = self.POINTS + np.array([2.0, 0, 0])
-        assert InterpolatedField.of(table, 1).distances(points) == pytest.approx(table.distances(points), abs=1e-6)
-
-    def test_the_nearest_grid_point_is_read_as_it_is(self):
-        table, _ = self.linear_table()
-        inner = np.flatnonzero((np.abs(table.grid.points()) < 0.75).all(axis=1))[::97]
-        found = InterpolatedField.of(table, 0).distances(table.grid.points()[inner] + 0.03)
-        assert np.array_equal(found, table.table[inner])
-
 
 class TestFieldSweeps:
     @pytest.fixture(scope="class")
@@ -299,13 +263,6 @@ class TestFieldSweeps:
         sweep = fields.resolution_sweep(case)
         assert [measurement.setting for measurement in sweep.measurements] == ["8", "12", "24"]
         assert "48 and more points would take long" in sweep.note
-
-    def test_splines_err_less_than_lines_and_lines_less_than_steps(self, case):
-        sweep = fields.interpolation_sweep(case)
-        nearest, trilinear, tricubic, exact = sweep.measurements
-        assert nearest.error > trilinear.error > tricubic.error > exact.error == 0
-        assert trilinear.default
-        assert exact.reference
 
     def test_meshes_that_move_have_a_grid_in_their_own_frame(self, monkeypatch):
         monkeypatch.setattr(fields, "PROBES", 512)
@@ -415,22 +372,14 @@ class TestGradients:
 
 
 class TestPrecisionSweep:
-    def test_a_float64_flow_finds_its_samples_densities_again(self, steps):
-        drawn = FlowSamples.of(steps.flow, 500, 0)
-        assert drawn.log_densities(steps.flow) == pytest.approx(drawn.log_prob, abs=1e-8)
-        assert drawn.round_trip_nats(steps.flow) < 1e-8
-
     def test_rounding_is_far_below_the_noise_of_a_batch(self, steps, monkeypatch):
         monkeypatch.setattr(learning_steps, "DTYPE_BATCHES", 4)
-        monkeypatch.setattr(learning_steps, "SAMPLES", 500)
         sweep = learning_steps.dtype_sweep(steps, 0)
         rough, exact = sweep.measurements
         assert (rough.setting, exact.setting) == ("float32", "float64")
         assert rough.default
         assert exact.reference
         assert 0 < rough.error < sweep.tolerance
-        assert 0 < rough.values["densities_misplaced"] < 1e-3
-        assert exact.values["densities_misplaced"] < 1e-9
 
 
 class TestScenesSweep:
@@ -474,7 +423,7 @@ class TestRuns:
     @pytest.mark.parametrize(
         ("sweeps", "count"),
         [
-            (visibility.sweeps, 2),
+            (visibility.sweeps, 1),
             (fields.sweeps, 0),
             (learning_steps.dtype_sweeps, 1),
             (learning_steps.frames_sweeps, 1),
@@ -483,8 +432,6 @@ class TestRuns:
     def test_have_sweeps_whose_errors_fall(self, request_of, sweeps, count, monkeypatch):
         monkeypatch.setattr(visibility, "PROBES", 2048)
         monkeypatch.setattr(visibility, "BODY_PROBES", 256)
-        monkeypatch.setattr(visibility, "REFERENCE_POINTS", 128)
-        monkeypatch.setattr(visibility, "POINTS", (16, 32))
         monkeypatch.setattr(learning_steps, "DTYPE_BATCHES", 4)
         monkeypatch.setattr(learning_steps, "FRAMES_BATCHES", 4)
         found = sweeps(request_of)

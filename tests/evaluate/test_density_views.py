@@ -8,7 +8,7 @@ import pytest
 from scipy.special import ndtr
 
 from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, Track
-from lidardesign.evaluate.figures.density_views import (
+from lidardesign.evaluate.report.density_views import (
     PERCENT,
     density_view,
     marginals,

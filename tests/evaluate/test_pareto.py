@@ -2,18 +2,21 @@
 
 import itertools
 import math
-from dataclasses import replace
 
 import plotly.graph_objects as go
-from support.evaluations import make_evaluation
 from support.tables import each_row
 
-from lidardesign.evaluate.accuracy.settings import Accuracy, Measurement, Sweep
-from lidardesign.evaluate.figures.canvas import picture, picture_style
-from lidardesign.evaluate.figures.pareto import label_places, panels, pareto_picture
-from lidardesign.evaluate.figures.plots import pictures
-from lidardesign.evaluate.figures.scene_figure import FigureData
-from lidardesign.evaluate.report.figures import accuracy_tables, pareto_figures
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
+from lidardesign.evaluate.report.pareto import (
+    ABOVE_PX,
+    BELOW_PX,
+    LINE_PX,
+    PANEL_PX,
+    accuracy_tables,
+    label_places,
+    panels,
+    pareto_figures,
+)
 
 NASTY = "</script><img src=x onerror=alert(1)>$x^2"
 
@@ -26,11 +29,6 @@ def make_sweep(measurements=None, knob="density.points", tolerance=0.02, unit=""
         Measurement("256", 0.0, 0.0, 0.2, reference=True),
     ]
     return Sweep(knob, "what is wrong", unit, "the finest", tolerance, "a reason", "one step", measurements, note)
-
-
-def drawn(sweeps):
-    with picture_style():
-        return picture(pareto_picture(sweeps), "svg")
 
 
 def test_every_rung_stands_inside_its_panel():
@@ -66,33 +64,26 @@ def test_figures_without_a_logarithm_are_drawn_too(measurements, tolerance):
     (panel,) = panels([sweep])
     ends = (*panel.seconds, *panel.errors, *(value for mark in panel.marks for value in (mark.x, mark.y, mark.low)))
     assert all(math.isfinite(value) and value > 0 for value in ends)
-    assert drawn([sweep]).startswith(b"<?xml")
+    assert go.Figure(pareto_figures([sweep])[0]).data
 
 
 def test_settings_that_would_meet_are_written_above_each_other():
     measurements = [Measurement(f"without effect {i}", 0.1 * (1 + i / 100), 0.0, 1.0 + i / 100) for i in range(6)]
     (panel,) = panels([make_sweep(measurements)])
-    height, line = 100.0, 9.0
+    height = PANEL_PX - ABOVE_PX - BELOW_PX
     spread = math.log(panel.errors[1] / panel.errors[0])
     places = [
         height * math.log(mark.y / panel.errors[0]) / spread + up
-        for mark, (_, up, _) in zip(panel.marks, label_places(panel, height, line), strict=True)
+        for mark, (_, up, _) in zip(panel.marks, label_places(panel), strict=True)
     ]
-    assert min(b - a for a, b in itertools.pairwise(sorted(places))) >= line * (1 - 1e-9)
+    assert min(b - a for a, b in itertools.pairwise(sorted(places))) >= LINE_PX * (1 - 1e-9)
 
 
 def test_ladders_of_one_rung_have_tables_and_no_panel():
     single = make_sweep([Measurement("40", 0.3, 0.1, 2.0, default=True)])
     assert panels([single]) == []
-    assert pareto_picture([single]) is None
+    assert pareto_figures([single]) == []
     assert "40 (run)" in accuracy_tables([single])
-
-
-def test_plots_hold_the_picture_where_accuracy_was_measured():
-    evaluation = replace(make_evaluation(), accuracy=Accuracy([make_sweep()], {"visibility": 1.0}))
-    assert pictures(make_evaluation(), FigureData())["accuracy"]() is None
-    with picture_style():
-        assert len(pictures(evaluation, FigureData())["accuracy"]().axes) == 1
 
 
 def test_every_ladder_has_a_figure_with_all_its_rungs():
@@ -108,7 +99,6 @@ def test_no_name_becomes_markup():
     sweep = make_sweep(measurements, knob=NASTY, unit=NASTY, note=NASTY)
     assert "<img" not in accuracy_tables([sweep])
     assert "<img" not in str(pareto_figures([sweep]))
-    assert b"<img" not in drawn([sweep])
 
 
 def test_tables_name_what_to_choose_and_what_the_run_does():

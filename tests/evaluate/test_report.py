@@ -25,8 +25,8 @@ from support.report_pages import (
 from support.tables import each_row
 
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.evaluate.figures.canvas import series
-from lidardesign.evaluate.figures.drawing import (
+from lidardesign.evaluate.entries import StrongestRival
+from lidardesign.evaluate.report.drawing import (
     FEWEST_STEPS,
     MOST_FACES,
     STEPS,
@@ -38,10 +38,11 @@ from lidardesign.evaluate.figures.drawing import (
     round_steps,
     thinned,
 )
-from lidardesign.evaluate.figures.scene_figure import MOST_RAY_STEPS, MOST_STEPS, SceneFigure
 from lidardesign.evaluate.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure
 from lidardesign.evaluate.report.markup import asset, script_safe
 from lidardesign.evaluate.report.report import report_html, write_report
+from lidardesign.evaluate.report.scene_figure import MOST_RAY_STEPS, MOST_STEPS, SceneFigure
+from lidardesign.evaluate.report.series import series
 from lidardesign.evaluate.report.tables import (
     CommandTimes,
     constraints_table,
@@ -59,7 +60,6 @@ from lidardesign.evaluate.report.view import (
     view_notes,
 )
 from lidardesign.evaluate.results import Evaluation, leading_detail, verdict
-from lidardesign.evaluate.rivals import StrongestRival
 from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.task import Metric

@@ -12,8 +12,8 @@ from support.report_pages import NASTY, make_row, make_sensor
 from support.tables import each_row
 
 from lidardesign.design.sensor import CERTIFICATES, DesignSpec
-from lidardesign.evaluate.figures.canvas import series
 from lidardesign.evaluate.report.choice import choice_section, correlation_sentence
+from lidardesign.evaluate.report.series import series
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.task import Metric
 

@@ -6,13 +6,14 @@ One browser and one page for all tests; where there is no browser they are skipp
 from __future__ import annotations
 
 import io
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from support.browsers import opened_browser
 from support.report_pages import FRAMES, NASTY, PLACES, make_report
 
-from lidardesign.evaluate.figures.drawing import body_triangles, frustum_lines, origin_lines, scene_bounds
+from lidardesign.evaluate.report.drawing import body_triangles, frustum_lines, origin_lines, scene_bounds
 from lidardesign.evaluate.report.report import report_html
 from lidardesign.geometry.rays import Outcome
 
@@ -357,3 +358,20 @@ def test_a_narrow_window_shows_everything_without_scrolling_sideways(page, width
     ]""")
     page.evaluate("() => { for (const fold of all('details')) fold.open = false; }")
     assert found == [width, 0, 0]
+
+
+def test_every_figure_downloads_as_svg_with_its_legend(opened):
+    page, heard, path = opened
+    figures = page.locator(".js-plotly-plot")
+    assert page.locator(".modebar-btn").count() == figures.count() > 1
+    figures.first.scroll_into_view_if_needed()
+    figures.first.hover()
+    with page.expect_download() as download:
+        figures.first.locator(".modebar-btn").click()
+    assert download.value.suggested_filename == "curve-rays.svg"
+    picture = ElementTree.parse(download.value.path())
+    words = {"".join(node.itertext()) for node in picture.iter("{http://www.w3.org/2000/svg}text")}
+    assert "rays" in words
+    assert any(word.startswith("</script>") for word in words)  # the legend has names as they are
+    assert [url for url in heard["requests"] if not url.startswith(("data:", "blob:"))] == [path.as_uri()]
+    assert heard["errors"] == []

@@ -11,9 +11,14 @@ from support.scoring import HitTask, MissTask, design, make_request, scenes
 from support.tables import each_row
 
 from lidardesign.evaluate.baselines.greedy import GreedySource
-from lidardesign.evaluate.entries import entries_of
+from lidardesign.evaluate.entries import (
+    FEWEST_RIVAL_SCENES,
+    LARGEST_RIVAL_SHARE,
+    MOST_RIVAL_SCENES,
+    entries_of,
+    mean_rival,
+)
 from lidardesign.evaluate.results import middle_rays
-from lidardesign.evaluate.rivals import FEWEST_SCENES, LARGEST_SHARE, MOST_SCENES, mean_rival
 from lidardesign.evaluate.score import evaluate
 from lidardesign.evaluate.seeds import over_seeds
 from lidardesign.geometry.raycast import SceneCaster
@@ -79,15 +84,15 @@ def test_held_out_scenes_have_no_say():
 
 @each_row(
     ("tests", "rays", "scenes_used"),
-    [(1, (9,), FEWEST_SCENES), (100, (25,), 12), (40, (9, 100), MOST_SCENES)],
+    [(1, (9,), FEWEST_RIVAL_SCENES), (100, (25,), 12), (40, (9, 100), MOST_RIVAL_SCENES)],
 )
 def test_it_costs_a_tenth_of_the_rays_or_few_scenes(tests, rays, scenes_used):
     request = with_held_back(test=scenes(2, tests), rays=rays, equal_bandwidth=False)
     found = evaluate(request).strongest_rival
     assert found.scenes == scenes_used
     fired = sum(entry.rays for entry in entries_of(request)) * tests
-    if found.scenes > FEWEST_SCENES:
-        assert found.scenes * found.rays * len(found.values) <= LARGEST_SHARE * fired
+    if found.scenes > FEWEST_RIVAL_SCENES:
+        assert found.scenes * found.rays * len(found.values) <= LARGEST_RIVAL_SHARE * fired
 
 
 def test_without_rivals_there_is_none():

@@ -13,14 +13,13 @@ from lidardesign.cli.tables.scores import show_evaluation
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.evaluate.baselines import candidates
-from lidardesign.evaluate.figures.scores import curve_picture, differences_picture
-from lidardesign.evaluate.gates import worse_than_threshold
+from lidardesign.evaluate.entries import FEWEST_RIVAL_SCENES
 from lidardesign.evaluate.report.figures import scores_figure
 from lidardesign.evaluate.report.tables import paired_tables
 from lidardesign.evaluate.results import csv_text, verdict
-from lidardesign.evaluate.rivals import FEWEST_SCENES
 from lidardesign.evaluate.score import evaluate
 from lidardesign.evaluate.statistics import mean_interval, paired_difference
+from lidardesign.evaluate.thresholds import worse_than_threshold
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score
 
@@ -203,8 +202,6 @@ def test_scenes_of_one_group_give_no_interval_and_no_verdict():
     assert "None" not in console.file.getvalue()
     assert "over other scenes" not in console.file.getvalue()
     assert paired_tables(evaluation)
-    assert curve_picture(evaluation, "rays")
-    assert differences_picture(evaluation)
     assert scores_figure(evaluation, "rays")
 
 
@@ -219,7 +216,7 @@ def test_rows_that_fire_the_same_rays_are_scored_once():
     evaluate(make_request(task=Counting(), baselines=("uniform",), rays=(25, 25), test=scenes(2, 2)))
     # one design and one baseline at 25 rays, and the baseline at the design's bandwidth, in two scenes each; and the
     # baseline in the training scenes that the strongest rival is found on
-    assert len(calls) == 6 + FEWEST_SCENES
+    assert len(calls) == 6 + FEWEST_RIVAL_SCENES
 
 
 class BrokenTask(MissTask):

@@ -1,4 +1,4 @@
-"""The sweep of training: what a run had reached at its snapshots, and what runs of other presets beside it reach."""
+"""The sweep of training: the density that a run had reached at its snapshots."""
 
 from __future__ import annotations
 
@@ -14,12 +14,9 @@ from support.tables import each_row
 from lidardesign.config import load_run_config, resolve, save_run_config
 from lidardesign.density.learn import learn
 from lidardesign.density.learned import load_flow, remeasured, seconds_at
-from lidardesign.density.training import schedule as budget
 from lidardesign.density.training import training as steps
-from lidardesign.density.training.checkpoint import save_arrays
 from lidardesign.density.training.quality import draw_probes
 from lidardesign.density.training.training import Trainer
-from lidardesign.design.fit import fit
 from lidardesign.errors import DataError, NumericalError
 from lidardesign.evaluate.accuracy import sweeps as accuracy
 from lidardesign.evaluate.accuracy import training
@@ -27,8 +24,7 @@ from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Accuracy
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
-from lidardesign.run.manifest import note, read_manifest, record, start_manifest
-from lidardesign.samples import load_samples
+from lidardesign.run.manifest import record, start_manifest
 from lidardesign.task import random_generator, scenes_of
 from lidardesign.workflow import evaluate as scoring
 
@@ -54,17 +50,14 @@ def learned(folder, preset, steps, *further):
 def runs(tmp_path_factory):
     place = tmp_path_factory.mktemp("runs")
     mine = learned(place / "mine", "draft", 64)
-    learned(place / "longer", "standard", 96)
-    learned(place / "other_density", "fine", 8, "density.sigma_m=0.08")
-    (place / "nothing").mkdir()
     return mine
 
 
-def request_for(run, designs=()):
+def request_for(run):
     task, config = load_run_config(run)
     train, test = (scenes_of(task, config.task, split, config.seed, config.space) for split in ("train", "test"))
     asked = EvaluationRequest(
-        task=task, config=config.task, space=config.space, seed=config.seed, designs=designs, rays=[12],
+        task=task, config=config.task, space=config.space, seed=config.seed, designs=(), rays=[12],
         train=list(train), test=list(test),
     )  # fmt: skip
     return AccuracyRequest(config, run, asked, None)
@@ -72,7 +65,7 @@ def request_for(run, designs=()):
 
 @pytest.fixture(scope="module")
 def sweeps(runs):
-    return training.sweeps(request_for(runs, [fit(load_samples(runs), sensors=2, restarts=1).design]))
+    return training.steps_sweeps(request_for(runs))
 
 
 def test_every_snapshot_and_the_flow_itself_are_measurements_with_errors_and_seconds(sweeps):
@@ -86,21 +79,10 @@ def test_every_snapshot_and_the_flow_itself_are_measurements_with_errors_and_sec
     assert steps.measurements[-1].error < steps.measurements[0].error
 
 
-def test_measurements_carry_ess_kl_coverage_and_the_score_of_a_quick_fit(sweeps):
-    values = sweeps[0].measurements[-1].values
-    assert {"ess", "kl_nats", "coverage", "ess_error", "kl_nats_error"} <= values.keys()
-    assert any(name.startswith("score") for name in values)
-    differences = [v for name, v in values.items() if name.endswith("difference_error")]
-    assert differences == [0.0]
-    assert "quick fits" in sweeps[0].note
-
-
-def test_runs_of_other_presets_are_measurements_and_runs_of_other_densities_are_not(sweeps):
-    presets = sweeps[1]
-    assert presets.knob == "preset"
-    assert [measurement.setting for measurement in presets.measurements] == ["draft", "standard"]
-    assert [measurement.default for measurement in presets.measurements] == [True, False]
-    assert presets.measurements[0].error == sweeps[0].measurements[-1].error
+def test_measurements_carry_ess_kl_and_coverage(sweeps):
+    assert set(sweeps[0].measurements[-1].values) == {
+        name + end for name in ("ess", "kl_nats", "coverage") for end in ("", "_error")
+    }
 
 
 def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs, sweeps):
@@ -137,18 +119,6 @@ def test_progress_that_is_none_is_told(runs, tmp_path, text):
     record(tmp_path / "run", ["progress.jsonl"])
     with pytest.raises(DataError, match=r"progress.jsonl: does not hold the progress"):
         seconds_at(tmp_path / "run")
-
-
-def test_runs_beside_this_one_that_cannot_be_measured_are_left_out(runs, tmp_path, sweeps):
-    place = tmp_path / "runs"
-    shutil.copytree(runs.parent, place)
-    manifest = read_manifest(place / "longer")
-    note(place / "longer", learn=None)
-    assert "preset" not in [sweep.knob for sweep in training.sweeps(request_for(place / "mine"))]
-    note(place / "longer", learn=manifest["learn"])
-    weights = {"weights": np.zeros(3)}
-    save_arrays(place / "longer", "flow.safetensors", weights, {})
-    assert "preset" not in [sweep.knob for sweep in training.sweeps(request_for(place / "mine"))]
 
 
 @pytest.fixture
@@ -192,20 +162,14 @@ def flatland(lidardesign, out, *options):
 @each_row(
     ("options", "message"),
     [
-        ("--tolerance 0.1 --time-budget 60", "both set"),
         ("--tolerance 0", "from 0.0001 to 0.9999"),
         ("--tolerance nan", "a finite number"),
         ("--time-budget -3", "from 1 to 31622400"),
         ("--time-budget inf", "a finite number"),
         ("--time-budget 1e300", "from 1 to 31622400"),
-        ("--tolerance 0.1 --set learning.misplaced=0.2", "the tolerance sets learning.misplaced"),
-        ("--time-budget 60 --set learning.misplaced=0.2", "the time budget sets learning.misplaced"),
-        ("--time-budget 60 --set learning.steps=7", "the time budget sets learning.steps"),
-        ("--time-budget 60 --config other.yaml", "other.yaml:2:10: the time budget sets learning.steps"),
     ],
 )
 def test_goals_that_make_no_sense_are_config_errors(lidardesign, options, message):
-    Path("other.yaml").write_text("learning:\n  steps: 30\n")
     done = flatland(lidardesign, "run", *options.split())
     assert done.code == 2
     assert message in done.err
@@ -217,20 +181,18 @@ def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_r
     assert done.code == 1
     document = done.json
     assert document["steps"] == 8
-    assert document["goal"] == {"tolerance": 1e-4, "target_misplaced": 0.0, "met": False}
     assert f"{document['misplaced']:.3g}" in done.err
     assert "--tolerance" in done.err
     assert lidardesign("fit", "run", "--layout", "grid", "--sensors", "2").code == 0
     again = lidardesign("learn", "flatland", "--out", "run", "--resume", "--tolerance", "0.3")
     assert again.code == 2
-    assert "started with tolerance = 0.0001" in again.err
+    assert "learning.misplaced = 0.0001, not 0.3" in again.err
 
 
 def test_a_tolerance_that_is_met_stops_there_and_resuming_changes_nothing(lidardesign, tmp_path, monkeypatch):
     monkeypatch.setattr(steps, "STRETCH", 10)
     done = flatland(lidardesign, "run", "--set", "learning.steps=64", "--tolerance", "0.95", "--json")
     assert done.code == 0
-    assert done.json["goal"]["met"]
     assert done.json["steps"] == 36  # the first that may be the last
     learning = load_run_config(tmp_path / "run")[1].learning
     assert (learning.misplaced, learning.steps) == (0.95, 64)
@@ -246,17 +208,26 @@ def test_a_failure_before_the_first_checkpoint_leaves_nothing_behind(lidardesign
     assert not (tmp_path / "run").exists()
 
 
-def test_a_time_budget_writes_its_steps_into_the_configuration(lidardesign, tmp_path, monkeypatch):
-    with monkeypatch.context() as patched:
-        patched.setattr(budget.Timekeeper, "is_over", lambda self, trainer: trainer.step >= 130)
-        done = flatland(lidardesign, "run", "--time-budget", "100000", "--json")
+def test_a_time_budget_ends_at_the_clock_and_writes_its_steps_into_the_configuration(lidardesign, tmp_path):
+    done = flatland(lidardesign, "run", "--time-budget", "1", "--json")
     assert done.code == 0
-    assert done.json["goal"] == {"time_budget_s": 100000.0, "steps": 130}
-    assert load_run_config(tmp_path / "run")[1].learning.steps == done.json["steps"] == 130
-    soon = flatland(lidardesign, "soon", "--time-budget", "1")
-    assert soon.code == 2
-    assert "at least" in soon.err
-    assert not (tmp_path / "soon").exists()
+    learning = load_run_config(tmp_path / "run")[1].learning
+    assert (learning.misplaced, learning.steps) == (0.0, done.json["steps"])
+    assert done.json["steps"] >= 2 * learning.pathwise_steps
+    flatland(lidardesign, "plain", "--set", f"learning.steps={learning.steps}", "--set", "learning.misplaced=0")
+    flows = [(tmp_path / run / "flow.safetensors").read_bytes() for run in ("run", "plain")]
+    assert flows[0] == flows[1]
+
+
+def test_a_run_that_ends_by_the_clock_is_resumed_by_one_and_says_so(lidardesign, tmp_path, monkeypatch):
+    monkeypatch.setattr("lidardesign.density.training.training.PROGRESS_STEPS", 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_report", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        stopped = flatland(lidardesign, "run", "--time-budget", "60")
+    assert stopped.code == 130
+    assert "--resume --time-budget 60" in stopped.err
+    assert lidardesign("learn", "--out", "run", "--resume").code == 2
+    assert lidardesign("learn", "--out", "run", "--resume", "--time-budget", "1").code == 0
 
 
 def test_what_was_scored_is_written_before_accuracy_is_measured(fitted, lidardesign, monkeypatch):

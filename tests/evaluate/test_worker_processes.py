@@ -1,7 +1,8 @@
-"""Workers that are processes of this machine: lost ones are replaced, and none outlives the program."""
+"""Workers that are processes of this machine: a lost one ends the evaluation, and none outlives the program."""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -12,62 +13,29 @@ from multiprocessing.context import SpawnProcess
 
 import pytest
 from support.command_line import make_run, program
-from support.workers import make_request, random_rays, results, without_times
+from support.workers import make_request, results, without_times
 
 from lidardesign.errors import ConfigError, NumericalError, PluginError
 from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.workers.pool import MOST_TRIES, Processes, WorkerScorer
+from lidardesign.evaluate.workers import scorer_of
 from lidardesign.registry import load_task
 
 
-@pytest.fixture
-def pool():
-    """Starts worker processes; all are gone afterwards."""
-    engines = []
-
-    def start(count):
-        engines.append(Processes(count))
-        return engines[-1]
-
-    yield start
-    for engine in engines:
-        known = list(engine._running)
-        engine.close()
-        assert not any(process.is_alive() for process in known)
+def test_processes_score_as_this_one_does_and_end():
+    request, before = make_request(), multiprocessing.active_children()
+    with scorer_of(2, request.task, 6) as scorer:
+        assert results(evaluate(replace(request, scorer=scorer))) == results(evaluate(request))
+        assert len(multiprocessing.active_children()) == len(before) + 2
+    assert multiprocessing.active_children() == before
 
 
-def test_processes_score_as_this_one_does_though_some_are_lost(pool):
-    request = make_request()
-    expected = results(evaluate(request))
-    engine = pool(2)
-    with WorkerScorer(engine) as scorer:
-        scorer.prepare(request)
-        assert results(evaluate(replace(request, scorer=scorer))) == expected
-        first = list(engine._running)
-        assert len(first) == 2
-        # one that is lost between two passes, and one in the middle of one
-        first[0].kill()
-
-        def kill_once(done, total, name):
-            if done == 2:
-                engine._running[1].kill()
-
-        assert results(evaluate(replace(request, scorer=scorer), progress=kill_once)) == expected
-        assert not {process.pid for process in first} & {process.pid for process in engine._running}
-
-
-@pytest.mark.parametrize(
-    ("end", "how"), [("os.kill(os.getpid(), 9)", "was ended by SIGKILL"), ("os._exit(7)", "ended with exit code 7")]
-)
-def test_a_scene_that_kills_its_workers_is_named(install, pool, end, how):
+@pytest.mark.parametrize("end", ["os.kill(os.getpid(), 9)", "os._exit(7)"])
+def test_a_worker_that_dies_ends_the_evaluation_with_what_to_do(install, end):
     task = install(f"import os\n{BROKEN}".replace('raise RuntimeError("the map of test 1 is lost")', end))
     request = make_request(task=task)
-    scenes = request.scene_pass(lambda number: [(random_rays(3, number),)], request.planner)
-    with (
-        WorkerScorer(pool(1)) as scorer,
-        pytest.raises(NumericalError, match=f"the worker of held-out scene 1 {how}, {MOST_TRIES} times"),
-    ):
-        scorer(scenes, None)
+    with pytest.raises(NumericalError, match="died") as raised, scorer_of(2, task, 6) as scorer:
+        evaluate(replace(request, scorer=scorer))
+    assert "memory" in raised.value.hint
 
 
 def test_a_system_that_allows_fewer_processes_leaves_none(monkeypatch):
@@ -80,8 +48,11 @@ def test_a_system_that_allows_fewer_processes_leaves_none(monkeypatch):
         started.append(self)
 
     monkeypatch.setattr(SpawnProcess, "start", limited)
-    with pytest.raises(ConfigError, match="only 1 of 3 processes could be started: Resource"):
-        WorkerScorer(Processes(3)).prepare(make_request())
+    with (
+        pytest.raises(ConfigError, match="3 processes could not be started: Resource"),
+        scorer_of(3, make_request().task, 6),
+    ):
+        pass
     assert not started[0].is_alive()
 
 
@@ -90,10 +61,9 @@ def test_a_script_is_not_run_again_by_its_workers(tmp_path):
     script.write_text(
         "print('begun', flush=True)\n"
         "from support.workers import make_request\n"
-        "from lidardesign.evaluate.workers.pool import workers_of\n"
-        "with workers_of(2, 2) as scorer:\n"
-        "    request = make_request()\n"
-        "    scorer.prepare(request)\n"
+        "from lidardesign.evaluate.workers import scorer_of\n"
+        "request = make_request()\n"
+        "with scorer_of(2, request.task, 2) as scorer:\n"
         "    print(len(scorer(request.scene_pass(lambda number: [], request.planner), None)))\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
@@ -108,7 +78,6 @@ class BrokenTask(FlatlandTask):
     name = "broken"
 
     def score(self, scene, returns):
-        print("scored", scene.name)
         if scene.name == "test 1":
             raise RuntimeError("the map of test 1 is lost")
         return super().score(scene, returns)
@@ -140,19 +109,17 @@ def broken(install):
     return install(BROKEN)
 
 
-def test_what_a_plugin_prints_and_raises_in_a_worker_arrives_whole(broken, pool, capfd):
-    request = make_request(task=broken)
-    told = []
-    for scorer in (None, WorkerScorer(pool(2))):
-        judged = request if scorer is None else replace(request, scorer=scorer)
-        with pytest.raises(PluginError, match="the map of test 1 is lost") as raised:
-            evaluate(judged)
-        told.append(raised.value.as_dict())
-    assert told[0] == told[1]
+def test_what_a_plugin_raises_in_a_worker_arrives_whole(broken):
+    request, said = make_request(task=broken), []
+    for count in (1, 2):
+        with (
+            pytest.raises(PluginError, match="the map of test 1 is lost") as raised,
+            scorer_of(count, broken, 6) as scorer,
+        ):
+            evaluate(replace(request, scorer=scorer))
+        said.append(raised.value.as_dict())
+    assert said[0] == said[1]
     assert "broken_task.py" in str(raised.value.__cause__)
-    captured = capfd.readouterr()
-    assert captured.out == ""
-    assert "scored test 1" in captured.err
 
 
 @pytest.fixture

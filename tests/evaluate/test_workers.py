@@ -1,88 +1,27 @@
-"""Held-out scenes scored by workers: the same rows for any number of them, in any order, whoever is lost."""
+"""Held-out scenes scored by workers: the same rows for any number of them, in any order."""
 
 from __future__ import annotations
 
-import math
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from dataclasses import replace
+from functools import partial
 from multiprocessing.reduction import ForkingPickler
+from types import MappingProxyType
 
-import numpy as np
 import pytest
 from lidardesign_tasks.flatland import FlatlandTask
 from support.scoring import MissTask
 from support.tables import each_row
-from support.workers import SEED, make_request, random_rays, results
+from support.workers import make_request, random_rays, results
 
 from lidardesign import errors
 from lidardesign.errors import ConfigError, LidardesignError, PluginError
-from lidardesign.evaluate.scene_scores import SceneScores
+from lidardesign.evaluate import workers
 from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.workers import worker
-from lidardesign.evaluate.workers.pool import WorkerScorer, check_workers, workers_of
-from lidardesign.evaluate.workers.worker import (
-    SceneFailure,
-    SceneJob,
-    make_scenes,
-    same_outline,
-    scene_outline,
-    score_job,
-)
-from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
-from lidardesign.simulate.detector.files import detector_names, load_detector
-from lidardesign.simulate.plan import Planner, Tolerance
-from lidardesign.simulate.simulate import build_casters
+from lidardesign.evaluate.workers import check_workers, scorer_of
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.plan import Planner
 from lidardesign.task import Score
-
-
-class ShuffledEngine:
-    """Does all jobs in this process, in a random order."""
-
-    def __init__(self, seed):
-        self._generator = np.random.default_rng(seed)
-        self._threads, self._waiting = ThreadPoolExecutor(1), []
-        self.closed, self.asked = False, 0
-
-    def prepare(self, source):
-        make_scenes(source)
-
-    def at_once(self):
-        return 100
-
-    def submit(self, job):
-        future = Future()
-        self.asked += 1
-        self._waiting.append((future, job))
-        self._threads.submit(self._answer)
-        return future
-
-    def _answer(self):
-        future, job = self._waiting.pop(self._generator.integers(len(self._waiting)))
-        future.set_result(score_job(arrived(job)))
-
-    def check(self):
-        pass
-
-    def close(self):
-        self._threads.shutdown()
-        self.closed = True
-
-
-class BackwardEngine(ShuffledEngine):
-    """Does the last of two jobs first."""
-
-    def at_once(self):
-        return 2
-
-    def submit(self, job):
-        future = Future()
-        self.asked += 1
-        self._waiting.append((future, job))
-        if len(self._waiting) == 2:
-            for other, asked in reversed(self._waiting):
-                other.set_result(score_job(asked))
-            self._waiting.clear()
-        return future
 
 
 def arrived(thing):
@@ -90,133 +29,97 @@ def arrived(thing):
     return ForkingPickler.loads(ForkingPickler.dumps(thing))
 
 
-@each_row("name", detector_names())
-@each_row("choice", ["auto", "all", frozenset({"jitter", "footprint"})])
-def test_jobs_and_scores_arrive_to_the_last_bit(name, choice):
-    request = make_request(planner=Planner(load_detector(name), choice, Tolerance(1e-3 / 3, 0.1)))
-    scene = Scene((Body(Sphere(0.4), poses=rigid(translation_m=(2, 0, 0))),))
-    plan = Planner(load_detector(name)).plan(scene, [random_rays(5, 0)], build_casters(scene))
-    sets = [(random_rays(2, 1), random_rays(2, 2)), (random_rays(0, 3),)]
-    job = SceneJob.of(request.scene_pass(lambda number: sets, request.planner, [plan]), 0)
-    again = arrived(job)
-    assert (again.source, again.number, again.outline) == (job.source, job.number, job.outline)
-    assert (again.planner, again.plan) == (job.planner, job.plan)
-    for positions, others in zip(job.sets, again.sets, strict=True):
-        for rays, other in zip(positions, others, strict=True):
-            for field in ("origin_m", "direction", "gate_m", "sensor", "time_s"):
-                assert getattr(rays, field).tobytes() == getattr(other, field).tobytes()
-    details = {"seen": np.float32(0.1), "n": 3, "far": -math.inf}
-    scores = arrived(SceneScores(plan, 0.1 / 3, [(Score(1 / 3, False, details), 0.25)]))
-    assert (scores.plan, scores.planning_seconds) == (plan, 0.1 / 3)
-    assert scores.scores == [(Score(1 / 3, False, details), 0.25)]
+class BackwardExecutor(Executor):
+    """Does the last of all the jobs that it has first, in this process."""
+
+    def __init__(self):
+        self.asked, self._waiting = 0, []
+
+    def submit(self, function, /, *arguments):
+        future = Future()
+        self.asked += 1
+        self._waiting.append((future, partial(function, *map(arrived, arguments))))
+        if len(self._waiting) == 2:
+            for other, job in reversed(self._waiting):
+                try:
+                    other.set_result(arrived(job()))
+                except LidardesignError as error:
+                    other.set_exception(arrived(error))
+            self._waiting.clear()
+        return future
 
 
-def test_an_outline_tells_scenes_apart_but_not_roundings():
+@pytest.fixture
+def executor():
+    return BackwardExecutor()
+
+
+@pytest.fixture
+def scorer(executor):
+    return partial(workers._score_by, executor, lambda: 2)
+
+
+def test_rows_do_not_depend_on_who_scores_or_in_which_order(scorer):
     request = make_request()
-    mesh = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]), "unsigned")
-    base = Scene((Body(mesh), Body(Sphere(0.3), "ball")), "mixed")
-    assert same_outline(scene_outline(base), scene_outline(base))
-    for scene in request.test[1:]:
-        assert not same_outline(scene_outline(request.test[0]), scene_outline(scene))
+    assert results(evaluate(replace(request, scorer=scorer))) == results(evaluate(request))
 
-    def moved(by_m):
-        shifted = Mesh(mesh.vertices + np.array([by_m, 0, 0]), mesh.faces, "unsigned")
-        return scene_outline(Scene((Body(shifted), Body(Sphere(0.3), "ball")), "mixed"))
 
-    assert same_outline(scene_outline(base), moved(1e-12))
-    assert not same_outline(scene_outline(base), moved(1e-3))
-    renamed = replace(base, name="other")
-    assert not same_outline(scene_outline(base), scene_outline(renamed))
+@each_row("name", ["single-photon", "consumer-8x8"])
+def test_effects_are_planned_and_audited_by_workers_as_they_are_here(name):
+    planner = Planner(load_detector(name))
+    request = make_request(planner=planner, audit=name == "single-photon", rays=(8,), equal_bandwidth=False)
+    request = replace(request, test=request.test[:2])
+    scorer = partial(workers._score_by, BackwardExecutor(), lambda: 0)
+    assert results(evaluate(replace(request, scorer=scorer))) == results(evaluate(request))
 
 
 @each_row("kind", ["ConfigError", "DataError", "PluginError", "NumericalError", "InfeasibleError"])
-def test_errors_arrive_whole_with_the_workers_traceback(kind):
-    def failing():
-        raise getattr(errors, kind)("found", where="here", allowed="this", hint="that")
-
-    with pytest.raises(LidardesignError) as first:
-        failing()
-    with pytest.raises(type(first.value)) as raised:
-        arrived(SceneFailure.of(first.value)).reraise()
-    assert raised.value.as_dict() == first.value.as_dict()
-    assert str(raised.value) == str(first.value)
-    assert "in failing" in str(raised.value.__cause__)
+def test_errors_arrive_whole(kind):
+    error = getattr(errors, kind)("found", where="here", allowed="this", hint="that")
+    assert arrived(error).as_dict() == error.as_dict()
+    assert (type(arrived(error)), str(arrived(error))) == (type(error), str(error))
 
 
-@pytest.mark.parametrize(("error", "kind"), [(MemoryError("full"), MemoryError), (KeyError("x"), RuntimeError)])
-def test_errors_of_other_kinds_keep_their_name(error, kind):
-    with pytest.raises(kind, match=type(error).__name__):
-        arrived(SceneFailure.of(error)).reraise()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_rows_do_not_depend_on_the_order_of_answers(seed):
-    request = make_request()
-    engine = ShuffledEngine(seed)
-    with WorkerScorer(engine) as scorer:
-        scorer.prepare(request)
-        assert results(evaluate(replace(request, scorer=scorer))) == results(evaluate(request))
-    assert engine.closed
-
-
-def test_effects_are_planned_and_audited_by_workers_as_they_are_here():
-    request = make_request(
-        planner=Planner(load_detector("single-photon")), audit=True, rays=(8,), equal_bandwidth=False
+def test_details_of_any_mapping_arrive(monkeypatch, scorer):
+    monkeypatch.setattr(
+        FlatlandTask, "score", lambda self, scene, returns: Score(0.5, details=MappingProxyType({"seen": 3.0}))
     )
-    request = replace(request, test=request.test[:2])
-    with WorkerScorer(ShuffledEngine(0)) as scorer:
-        assert results(evaluate(replace(request, scorer=scorer))) == results(evaluate(request))
+    evaluation = evaluate(replace(make_request(), scorer=scorer))
+    assert evaluation.rows[0].details == {"seen": 3.0}
 
 
-def test_progress_counts_scenes_and_never_goes_back():
-    told = []
-    request = make_request()
-    with WorkerScorer(ShuffledEngine(1)) as scorer:
-        evaluate(replace(request, scorer=scorer), progress=lambda done, total, name: told.append((done, total)))
-    assert [total for _, total in told] == [6] * len(told)
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
-    assert told[0][0] == 0
-    assert told[-1][0] == 6
+def test_progress_counts_scenes_and_never_goes_back(scorer):
+    counted = []
+    evaluate(
+        replace(make_request(), scorer=scorer), progress=lambda name, done, total: counted.append((name, done, total))
+    )
+    assert counted[0] == ("test 0", 0, 6)
+    assert counted[1:] == [(f"test {number}", number + 1, 6) for number in range(6)]
 
 
-def test_the_first_scenes_error_is_raised_and_no_further_scene_is_begun(monkeypatch):
+def test_the_first_scenes_error_is_raised_and_no_further_scene_is_begun(monkeypatch, scorer, executor):
     def score(self, scene, returns):
-        if scene.name in ("test 2", "test 3"):
+        if scene.name in ("test 0", "test 1"):
             raise ValueError(f"no score of {scene.name}")
         return Score(1.0)
 
     monkeypatch.setattr(FlatlandTask, "score", score)
-    engine = BackwardEngine(0)
     scenes = make_request().scene_pass(lambda number: [(random_rays(3, number),)], Planner())
-    with WorkerScorer(engine) as scorer, pytest.raises(PluginError, match="no score of test 2"):
+    with pytest.raises(PluginError, match="no score of test 0"):
         scorer(scenes, None)
-    assert engine.asked < 6
+    assert executor.asked < 6
 
 
-def test_scenes_that_a_worker_makes_otherwise_are_refused():
-    request = make_request()
-    other = replace(request, test=request.task.scenes(request.config, "test", SEED + 1))
-    with WorkerScorer(ShuffledEngine(0)) as scorer, pytest.raises(PluginError, match="another scene 'test 0'"):
-        evaluate(replace(other, scorer=scorer))
+def test_a_worker_of_another_version_is_refused():
+    scenes = make_request().scene_pass(lambda number: [], Planner())
+    with pytest.raises(ConfigError, match="the cluster has lidardesign"):
+        workers._score_there("lidardesign 9.9", scenes.task)
 
 
-def test_a_worker_of_another_version_is_refused(monkeypatch):
-    request = make_request()
-    job = SceneJob.of(request.scene_pass(lambda number: [], Planner()), 0)
-    make_scenes.cache_clear()
-    monkeypatch.setattr(worker, "__version__", "9.9")
-    with pytest.raises(ConfigError, match=r"has lidardesign 9\.9"):
-        score_job(job).reraise()
-
-
-def test_a_task_that_is_not_installed_is_refused_before_any_worker_is_asked():
-    class Engine(ShuffledEngine):
-        def prepare(self, source):
-            raise AssertionError("asked")
-
-    for task in (type("Other", (FlatlandTask,), {})(), MissTask()):
-        with pytest.raises(ConfigError, match=f"{task.name}"):
-            WorkerScorer(Engine(0)).prepare(make_request(task=task))
+@each_row("task", [type("Other", (FlatlandTask,), {})(), MissTask()])
+def test_a_task_that_is_not_installed_is_refused_before_any_worker_is_asked(task):
+    with pytest.raises(ConfigError, match=task.name), scorer_of("tcp://127.0.0.1:1", task, 6):
+        pass
 
 
 GOOD = {"1": 1, " 4 ": 4, "1024": 1024, "tcp://10.0.0.7:8786": "tcp://10.0.0.7:8786", "tcp://[::1]:1": "tcp://[::1]:1"}
@@ -235,7 +138,7 @@ def test_workers_that_are_neither_are_refused(text):
         check_workers(text)
 
 
-def test_one_process_is_no_worker():
-    for wanted, most in ((1, 9), (8, 1)):
-        with workers_of(wanted, most) as scorer:
-            assert scorer is None
+@each_row(("count", "scenes"), [(1, 9), (8, 1)])
+def test_one_process_is_this_one(count, scenes):
+    with scorer_of(count, MissTask(), scenes) as scorer:
+        assert scorer is workers.score_here

@@ -268,7 +268,7 @@ GAZEBO_GRIDS = {
 
 
 @each_row("case", GAZEBO_GRIDS)
-def test_notes_say_how_far_gazebos_pixels_are_from_the_rays(tmp_path, case):
+def test_gazebos_pixels_are_no_farther_from_the_rays_than_the_note_says(tmp_path, case):
     (columns, rows), azimuth, elevation, side = GAZEBO_GRIDS[case]
     local = even(columns, rows, azimuth, elevation)
     rays = Rays(
@@ -284,18 +284,10 @@ def test_notes_say_how_far_gazebos_pixels_are_from_the_rays(tmp_path, case):
     assert found_side == side
     beside = np.degrees(2 * np.arcsin(np.linalg.norm(read - local, axis=1) / 2)).max()
     [told] = [note for note in notes if "pixels of a picture" in note]
-    assert abs(float(told.split(" deg")[0].split()[-1]) - beside) <= 0.05 * beside
+    assert beside <= float(told.split(" deg")[0].split()[-1])
     # half a diagonal of the pixel in the middle of a face
     assert 0.4 < beside / np.degrees(np.sqrt(2) / side) <= 1.01
     assert float(sensor.findtext("lidar/range/min")) > 0
-
-
-def test_a_grid_that_no_gpu_draws_is_told(tmp_path):
-    local = even(16_385, 1, (-1.0, 1.0), (0.0, 0.0))
-    count = len(local)
-    rays = Rays(np.zeros((count, 3)), local, np.tile([0.0, 9.0], (count, 1)), np.zeros(count), np.zeros(count))
-    notes = EXPORTERS["sdf"].write(ONE, rays, tmp_path / "out.sdf")
-    assert any(note.startswith("1 of 1 sensors have more than 16384 columns or rows") for note in notes)
 
 
 # Robotec GPU Lidar --------------------------------------------------------------------------------------------------
@@ -321,18 +313,6 @@ def test_rgl_takes_patterns_ranges_and_rates_at_their_ends(tmp_path, rate_hz):
     assert size % 48 == 0
     # the plugin counts whole microseconds between frames
     assert int(1e6 / SINGLE(plugin.findtext("update_rate"))) >= 1
-
-
-# Mitsuba ------------------------------------------------------------------------------------------------------------
-
-
-def test_a_film_that_mitsuba_cannot_hold_is_told(tmp_path):
-    def told(end_m):
-        notes = EXPORTERS["mitsuba"].write(ONE, rays_with_gates(np.array([[0.0, end_m]] * 4)), tmp_path / "out")
-        return any("more than Mitsuba holds" in note for note in notes)
-
-    assert not told(1e7)
-    assert told(2e7)
 
 
 # CloudCompare and Blender -------------------------------------------------------------------------------------------

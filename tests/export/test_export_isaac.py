@@ -1,10 +1,9 @@
-"""Isaac Sim's profiles as JSON and USD, and CARLA's attributes: fields, types, lengths, and where rays go."""
+"""Isaac Sim's sensors as USD, and CARLA's attributes: fields, types, lengths, and where rays go."""
 
 import json
 
 import numpy as np
 import pytest
-from jsonschema import Draft202012Validator
 from support.rigs import farthest_nearest, rig, spinning
 from support.tables import each_row
 
@@ -14,47 +13,6 @@ from lidardesign.export.registry import EXPORTERS
 DESIGN, RAYS = rig()
 COUNTS = np.bincount(RAYS.sensor)
 
-NUMBER, COUNT = {"type": "number"}, {"type": "integer", "minimum": 1}
-PROFILE = {
-    "scanType": {"const": "solidState"},
-    "intensityProcessing": {"const": "normalization"},
-    "rotationDirection": {"enum": ["CW", "CCW"]},
-    "rayType": {"const": "IDEALIZED"},
-    "nearRangeM": NUMBER, "farRangeM": NUMBER, "minDistBetweenEchos": NUMBER, "rangeResolutionM": NUMBER,
-    "rangeAccuracyM": NUMBER, "effectiveApertureSize": NUMBER, "focusDistM": NUMBER, "avgPowerW": NUMBER,
-    "minReflectance": NUMBER, "minReflectanceRange": NUMBER, "wavelengthNm": NUMBER, "pulseTimeNs": NUMBER,
-    "maxReturns": COUNT, "scanRateBaseHz": NUMBER, "reportRateBaseHz": COUNT, "numberOfEmitters": COUNT,
-    "numberOfChannels": COUNT, "rangeCount": COUNT,
-    "ranges": {"type": "array", "minItems": 1, "items": {
-        "type": "object", "required": ["min", "max"], "additionalProperties": False,
-        "properties": {"min": NUMBER, "max": NUMBER}}},
-    "azimuthErrorMean": NUMBER, "azimuthErrorStd": NUMBER, "elevationErrorMean": NUMBER, "elevationErrorStd": NUMBER,
-    "stateResolutionStep": COUNT, "numLines": COUNT, "numRaysPerLine": {"type": "array", "items": COUNT},
-    "emitterStateCount": {"const": 1},
-    "emitterStates": {"type": "array", "minItems": 1, "maxItems": 1, "items": {
-        "type": "object", "additionalProperties": False,
-        "required": ["azimuthDeg", "elevationDeg", "fireTimeNs", "channelId", "rangeId", "bank"],
-        "properties": {
-            **{name: {"type": "array", "items": NUMBER} for name in ("azimuthDeg", "elevationDeg")},
-            **{name: {"type": "array", "items": {"type": "integer", "minimum": 0}}
-               for name in ("fireTimeNs", "channelId", "rangeId", "bank")},
-        }}},
-    "intensityMappingType": {"const": "LINEAR"},
-}  # fmt: skip
-SCHEMA = {
-    "type": "object",
-    "required": ["class", "type", "name", "driveWorksId", "profile"],
-    "additionalProperties": False,
-    "properties": {
-        "class": {"const": "sensor"},
-        "type": {"const": "lidar"},
-        "name": {"type": "string"},
-        "driveWorksId": {"const": "GENERIC"},
-        "profile": {
-            "type": "object", "properties": PROFILE, "required": list(PROFILE), "additionalProperties": False,
-        },
-    },
-}  # fmt: skip
 # Attributes of OmniSensorGenericLidarCoreAPI and its emitter states, with the types of USD.
 CORE_TYPES = {
     **dict.fromkeys(("scanType", "rayType", "elementsCoordsType", "outputFrameOfReference"), "token"),
@@ -81,14 +39,6 @@ CARLA = {
     "dropoff_intensity_limit": float, "dropoff_zero_intensity": float, "sensor_tick": float, "noise_stddev": float,
     "role_name": str,
 }  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def profiles(tmp_path_factory):
-    path = tmp_path_factory.mktemp("isaac") / "rig.isaac"
-    EXPORTERS["isaac-json"].write(DESIGN, RAYS, path)
-    mounts = json.loads((path / "mounts.json").read_text())["sensors"]
-    return path, mounts, [json.loads((path / f"{one['config']}.json").read_text()) for one in mounts]
 
 
 @pytest.fixture(scope="module")
@@ -119,34 +69,6 @@ def check_emitters(state, ranges, rays, turn):
     times = np.array(state["fireTimeNs"], dtype=np.int64)
     assert (np.abs(times - rays.time_s * 1e9) <= 1).all()
     assert times.max() < 100_000_000
-
-
-def test_profiles_have_the_fields_and_types_of_nvidias(profiles):
-    _, mounts, found = profiles
-    assert [one["name"] for one in mounts] == [one["name"] for one in found] == [one.name for one in DESIGN.sensors]
-    for profile, count in zip(found, COUNTS, strict=True):
-        assert list(Draft202012Validator(SCHEMA).iter_errors(profile)) == []
-        body = profile["profile"]
-        state = body["emitterStates"][0]
-        assert {len(values) for values in state.values()} == {count}
-        assert body["numberOfEmitters"] == body["numberOfChannels"] == sum(body["numRaysPerLine"]) == count
-        assert len(body["numRaysPerLine"]) == body["numLines"] == 1
-        assert sorted(state["channelId"]) == list(range(count))
-        assert len(body["ranges"]) == body["rangeCount"] == max(state["rangeId"]) + 1
-        # both by NVIDIA's documentation of profiles
-        assert 0 == body["minDistBetweenEchos"] < body["nearRangeM"]
-        assert body["rangeResolutionM"] > 0
-
-
-def test_profiles_hold_every_ray_with_its_gate(profiles):
-    _, mounts, found = profiles
-    for index, (mount, profile) in enumerate(zip(mounts, found, strict=True)):
-        body, mine = profile["profile"], RAYS.subset(RAYS.sensor == index)
-        ranges = [(one["min"], one["max"]) for one in body["ranges"]]
-        check_emitters(body["emitterStates"][0], ranges, mine, turn_of(*mount["orientation_wxyz"]))
-        np.testing.assert_allclose(mount["translation_m"], mine.origin_m.mean(axis=0), atol=1e-12)
-        assert body["nearRangeM"] == max(mine.gate_m[:, 0].min(), 0.001)
-        assert body["farRangeM"] == mine.gate_m[:, 1].max()
 
 
 def test_usd_has_an_omnilidar_per_sensor_with_the_schemas_types(stage):
@@ -189,12 +111,11 @@ def test_usd_places_every_ray_with_its_gate(stage):
         check_emitters(core, ranges, mine, turn)
 
 
-@each_row("name", ["isaac-json", "isaac-usd"])
-def test_frames_are_whole_numbers_per_second(tmp_path, name):
+def test_frames_are_whole_numbers_per_second(tmp_path):
     with pytest.raises(ConfigError, match=r"0\.3 frames per second"):
-        EXPORTERS[name].write(DESIGN, RAYS, tmp_path / "slow", 0.3)
+        EXPORTERS["isaac-usd"].write(DESIGN, RAYS, tmp_path / "slow", 0.3)
     assert list(tmp_path.iterdir()) == []
-    notes = EXPORTERS[name].write(DESIGN, RAYS, tmp_path / "out", 12.6)
+    notes = EXPORTERS["isaac-usd"].write(DESIGN, RAYS, tmp_path / "out", 12.6)
     assert any("12.6 Hz is 13 Hz" in note for note in notes)
 
 

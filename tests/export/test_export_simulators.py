@@ -13,7 +13,7 @@ from support.tables import each_row
 
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.export.common.poses import mounts
+from lidardesign.export.mounts import mounts
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.geometry.rays import Rays
 
@@ -22,20 +22,9 @@ MINE = ("helios", "osi", "rgl", "mitsuba", "ply", "stl")
 NASTY = ("</script><!-- \"&'", "größe 測 \n\t\x07", "../../etc/passwd", "con", "CON", "]]>%s{0}\\")
 PIXEL_M = 0.0149896229
 
-# What reading back may show, and what a format holds of the three: float32 has 24 bits, a microsecond is a half off.
-EXACT = 1e-14
-FLOAT32 = 1e-6
-TOLERANCES = {
-    "csv": {"origin_m": 0, "direction_rad": 0, "gate_m": 0, "time_s": 0},
-    "npz": {"origin_m": 0, "direction_rad": 0, "gate_m": 0, "time_s": 0},
-    "sensors-csv": {"origin_m": 0, "direction_rad": EXACT, "range_m": EXACT},
-    "helios": {"origin_m": EXACT, "direction_rad": EXACT, "gate_m": 0},
-    "osi": {"origin_m": 0, "direction_rad": EXACT, "time_s": 0.5e-6 + EXACT},
-    "rgl": {"origin_m": FLOAT32, "direction_rad": FLOAT32, "gate_m": FLOAT32, "time_s": 1e-8},
-    "mitsuba": {"origin_m": 0, "direction_rad": EXACT},
-    "ply": {"origin_m": 0, "direction_rad": 0, "gate_m": 0, "time_s": 0},
-    "stl": {"origin_m": EXACT, "direction_rad": 1e-12},
-}
+EXACT, FLOAT32 = 1e-14, 1e-6
+# Of any rays, with gates and places of their own.
+FORMATS = ("csv", "npz", "sensors-csv", *MINE)
 
 
 def design(names=NASTY, roll=True):
@@ -82,23 +71,13 @@ def written(tmp_path_factory):
     root = tmp_path_factory.mktemp("exports")
     found = {}
     for number, (case, rays) in enumerate(CASES.items()):
-        for name in TOLERANCES:
+        for name in FORMATS:
             path = root / f"{number}{EXPORTERS[name].suffix}"
             found[name, case] = path, EXPORTERS[name].write(DESIGN, rays, path)
     return found
 
 
-@each_row("case", CASES)
-@each_row("name", TOLERANCES)
-def test_what_a_format_can_hold_comes_back_equal(written, name, case):
-    path, _ = written[name, case]
-    errors = EXPORTERS[name].rounding(DESIGN, CASES[case], path)
-    for kind, most in TOLERANCES[name].items():
-        assert errors[kind].error <= most, kind
-    assert ("time_s" in errors) == ("time_s" in TOLERANCES[name])
-
-
-@each_row("name", TOLERANCES)
+@each_row("name", FORMATS)
 def test_every_format_says_that_it_does_not_hold_the_constraints(written, name):
     for case in CASES:
         assert any("constraints" in note for note in written[name, case][1])
@@ -118,34 +97,6 @@ def test_sensors_that_fire_nothing_are_left_out_and_told(tmp_path, name):
     rays = CASES["mounted"].subset(CASES["mounted"].sensor % 2 == 0)
     notes = EXPORTERS[name].write(DESIGN, rays, tmp_path / "out")
     assert "3 of 6 sensors fire no ray and are left out" in notes
-    errors = EXPORTERS[name].rounding(DESIGN, rays, tmp_path / "out")
-    assert errors["direction_rad"].error <= TOLERANCES[name]["direction_rad"]
-
-
-@each_row("name", EXPORTERS)
-def test_another_or_a_damaged_file_is_no_round_trip(tmp_path, name):
-    exporter, path, rays = EXPORTERS[name], tmp_path / "out", NARROW
-    with pytest.raises(DataError):
-        exporter.rounding(DESIGN, rays, path)
-    exporter.write(DesignSpec("one", DESIGN.sensors[:1]), rays.subset(rays.sensor == 0), path)
-    with pytest.raises(DataError):
-        exporter.rounding(DESIGN, rays, path)
-    exporter.write(DESIGN, rays, path)
-    for file in sorted(path.iterdir()) if exporter.folder else [path]:
-        if file.name in ("platforms.xml", "beams.ply", "frusta.ply"):
-            continue
-        whole = file.read_bytes()
-        for damage in (b"", b"nonsense", whole[: len(whole) // 2 + 1]):
-            file.write_bytes(damage)
-            with pytest.raises(DataError):
-                exporter.rounding(DESIGN, rays, path)
-        file.unlink()
-        with pytest.raises(DataError):
-            exporter.rounding(DESIGN, rays, path)
-        file.write_bytes(whole)
-    found = exporter.rounding(DESIGN, rays, path)
-    assert {"origin_m", "direction_rad"} <= set(found)
-    assert all(estimate.kind == "rounding" and np.isfinite(estimate.error) for estimate in found.values())
 
 
 @each_row("name", [name for name in EXPORTERS if name not in ("csv", "npz", "galvo", "sensors-csv")])
@@ -158,8 +109,6 @@ def test_formats_made_of_rays_refuse_a_design_without_them_and_others_take_it(tm
         return
     notes = exporter.write(DESIGN, none, tmp_path / "out")
     assert ("6 of 6 sensors fire no ray and are left out" in notes) == (name not in ("ply", "stl"))
-    most = EXACT * 100 if name in ("ply", "stl") else 0
-    assert all(one.error <= most for one in exporter.rounding(DESIGN, none, tmp_path / "out").values())
 
 
 @each_row("name", EXPORTERS)
@@ -169,13 +118,11 @@ def test_a_format_holds_its_frame_rate_or_refuses_one(tmp_path, name):
         with pytest.raises(ConfigError, match="cannot hold a frame rate"):
             exporter.write(DESIGN, rays, path, 25.0)
         return
-    exporter.write(DESIGN, rays, path, 25.0)
-    found = exporter.rounding(DESIGN, rays, path)
-    # the rays were laid out for ten frames a second: firing times shrink with the frame
-    most = {"isaac-json": 1.01e-9, "isaac-usd": 1.01e-9, "osi": 0.5e-6 + EXACT, "rgl": 1e-8}
-    assert ("time_s" in found) == (name in most)
-    if name in most:
-        assert found["time_s"].error < most[name]
+    found = []
+    for rate_hz in (10.0, 25.0):
+        exporter.write(DESIGN, rays, path, rate_hz)
+        found.append([file.read_bytes() for file in (sorted(path.iterdir()) if exporter.folder else [path])])
+    assert found[0] != found[1]
 
 
 def test_files_that_an_earlier_export_left_in_a_folder_are_told(tmp_path):
@@ -343,7 +290,6 @@ def test_osi_times_follow_the_frame_rate(tmp_path):
     assert whole["updateCycleTime"] == {"seconds": "2", "nanos": 500_000_000}
     times_us = sorted(time for lidar in whole["lidarSensorViewConfiguration"] for time in lidar["timings"])
     np.testing.assert_allclose(times_us, rays.time_s * 1e6 * 25, atol=0.5)
-    assert EXPORTERS["osi"].rounding(DESIGN, rays, path)["time_s"].error <= 0.5e-6 + EXACT
 
 
 @each_row("rate_hz", [0.001, 10.0, 30.0, 1e6])
@@ -397,7 +343,6 @@ def test_rgl_times_follow_the_frame_rate(tmp_path):
     EXPORTERS["rgl"].write(DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=40.0)
     times_ms = np.concatenate([np.fromfile(file, "<f4") for file in (tmp_path / "out").glob("*.time1f")])
     np.testing.assert_allclose(np.sort(times_ms), CASES["mounted"].time_s * 1e3 / 4, rtol=1e-6)
-    assert EXPORTERS["rgl"].rounding(DESIGN, CASES["mounted"], tmp_path / "out")["time_s"].error < 1e-8
 
 
 def test_rgl_says_how_much_wider_the_plugins_gates_are(written):
@@ -494,6 +439,10 @@ def test_mitsuba_films_are_as_long_as_the_gates_that_they_stand_for(written):
         end = (film["start_opl"] + film["temporal_bins"] * film["bin_width_opl"]) / 2
         assert gate[:, 1].max() <= end < gate[:, 1].max() + PIXEL_M
         assert film["width"] == len(gate)
+        meters = ElementTree.parse(file).findall("sensor/sensor")
+        for tag, expected in (("point", rays.origin_m), ("vector", rays.direction)):
+            values = [[float(meter.find(tag).get(axis)) for axis in "xyz"] for meter in meters]
+            np.testing.assert_array_equal(values, expected[mount.ray])
     assert any(f"{wider} of {len(rays)} rays have gates of their own" in note for note in notes)
 
 
@@ -607,8 +556,6 @@ def test_names_that_look_like_the_format_do_not_become_part_of_it(tmp_path):
     for name in MINE:
         path = tmp_path / f"out{EXPORTERS[name].suffix}"
         EXPORTERS[name].write(some, rays, path)
-        errors = EXPORTERS[name].rounding(some, rays, path)
-        assert errors["direction_rad"].error <= TOLERANCES[name]["direction_rad"]
     assert len(trimesh.load(tmp_path / "out.stl", file_type="stl_ascii").geometry) == 4
     header = (tmp_path / "out.ply.d" / "rays.ply").read_bytes().partition(b"end_header\n")[0]
     assert max(map(len, header.splitlines())) < 1024

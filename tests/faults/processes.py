@@ -22,7 +22,7 @@ LATE = (
     "lidardesign.density.fields.body_kernels", "lidardesign.density.fields.table_kernels", "lidardesign.density.learn",
     "lidardesign.density.flow.spline_kernels", "lidardesign.design.mixture.support", "lidardesign.design.fit",
     "lidardesign.evaluate.metrics", "lidardesign.evaluate.report.report", "lidardesign.evaluate.score",
-    "lidardesign.evaluate.results", "lidardesign.evaluate.workers.pool", "lidardesign_tasks.flatland", "plotly.io",
+    "lidardesign.evaluate.results", "lidardesign.evaluate.workers", "lidardesign_tasks.flatland", "plotly.io",
     "rich.table", "torch._dynamo",
 )  # fmt: skip
 # Every step by which files come, change their names and go: what is on the disk changes only here.

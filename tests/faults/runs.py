@@ -26,13 +26,13 @@ LEARN += [word for setting in SETTINGS for word in ("--set", setting)]
 TO_TOLERANCE = [*LEARN, "--tolerance", "0.01"]
 FINISHED = (0, 1)
 # Of evaluate, what shows how long things took.
-TIMES = ("manifest.json", "page.html", "plots/times.png", "plots/times.svg")
+TIMES = ("manifest.json", "page.html")
 COMMANDS = {
     "learn": LEARN,
     "fit": ["fit", "run", "--layout", "grid", "--sensors", "2", "--quiet"],
     # half of its time it writes
     "evaluate": ["evaluate", "run", "--rays", "8", "--csv", "run/rows.csv", "--report", "run/page.html",
-                 "--plots", "run/plots", "--quiet"],
+                 "--quiet"],
 }  # fmt: skip
 STATE = "checkpoint.safetensors"
 SAMPLES = "samples.npz"

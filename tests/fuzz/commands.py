@@ -144,7 +144,7 @@ COMMANDS = tuple(
          command("constrain run --layout grid --constraints INPUT --name made --json")),
         ("evaluate DESIGN", 20, DESIGNS, mutate_yaml, command("evaluate run INPUT --rays 20 --json")),
         ("evaluate --detector", 20, corpus.detectors, mutate_yaml,
-         command("evaluate run good.yaml --detector INPUT --rays 20 --json")),
+         command("evaluate good.yaml --in run --detector INPUT --rays 20 --json")),
         ("capture FILE", 30, corpus.captures_npz, mutate_npz,
          command("capture INPUT good.yaml --rays 20 --json", ".npz")),
         ("capture LIST", 30, corpus.steering_lists, TEXTS,

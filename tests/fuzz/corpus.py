@@ -21,7 +21,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.rigs.ray_lists import QUERY_COLUMN, write_sensor_csv
 from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, Track
-from lidardesign.export import galvo, ray_lists
+from lidardesign.export.galvo import write_galvo
 from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, read_manifest
@@ -220,20 +220,11 @@ def captures_hdf5(_: Path) -> list[bytes]:
     return found
 
 
-def _exported(write: Callable[..., object], name: str, index: int) -> Callable[[Path], list[bytes]]:
-    """The rays of a design as a list."""
-
-    def good(folder: Path) -> list[bytes]:
-        design = sample_designs()[index]
-        write(design, lay_out(design), folder / name)
-        return [(folder / name).read_bytes()]
-
-    return good
-
-
-steering_lists = _exported(galvo.write_galvo, "rays.galvo.csv", 0)
-ray_tables = _exported(ray_lists.write_csv, "rays.csv", 1)
-ray_archives = _exported(ray_lists.write_npz, "rays.npz", 1)
+def steering_lists(folder: Path) -> list[bytes]:
+    """The rays of a design as a scanner's list."""
+    design, path = sample_designs()[0], folder / "rays.galvo.csv"
+    write_galvo(design, lay_out(design), path)
+    return [path.read_bytes()]
 
 
 def robots(_: Path) -> list[bytes]:
@@ -257,7 +248,7 @@ def robots(_: Path) -> list[bytes]:
 def manifests(folder: Path) -> list[bytes]:
     """The manifest of a run that was learned."""
     run = make_run(folder / "run", count=50)
-    note(run, learn={"ess": 0.5, "notes": []}, visibility="raycast", timings={"learn": 1.0}, goal={"steps": 10})
+    note(run, learn={"ess": 0.5, "notes": []}, visibility="raycast", timings={"learn": 1.0})
     return [json.dumps(read_manifest(run)).encode()]
 
 

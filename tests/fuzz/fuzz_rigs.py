@@ -208,6 +208,6 @@ def open_run_folders(folder: Path) -> Read:
             archive.extractall(run)
         request = ScoreRequest.resolve([run], ScoreOptions(rays=[9]))
         samples = load_samples(run)
-        return request.plan().as_dict()["settings"], samples.points, request.run.command_times()
+        return request.rays, samples.points, request.run.command_times()
 
     return read

@@ -115,7 +115,6 @@ def _own(place: str) -> Callable[[Path], object]:
 
 read_detector = _own("simulate.detector.files:load_detector")
 read_steering = _own("export.galvo:read_galvo")
-read_ray_table, read_ray_archive = _own("export.ray_lists:read_csv"), _own("export.ray_lists:read_npz")
 
 
 def read_mesh(path: Path) -> object:
@@ -173,8 +172,6 @@ TARGETS = (
     Target("capture (MATLAB 5)", 60, corpus.captures_matlab, mutate_matlab, of_file(".mat", read_capture)),
     Target("capture (MATLAB 7.3)", 1_500, corpus.captures_hdf5, mutate_hdf5, of_file(".mat", read_capture)),
     Target("steering list (CSV)", 2_000, corpus.steering_lists, TEXTS, of_file(".galvo.csv", read_steering)),
-    Target("ray list (CSV)", 1_000, corpus.ray_tables, TEXTS, of_file(".csv", read_ray_table)),
-    Target("ray list (npz)", 1_000, corpus.ray_archives, mutate_npz, of_file(".npz", read_ray_archive)),
     Target("robot (MJCF)", 1_500, corpus.robots, TEXTS, of_file(".xml", read_robot)),
     Target("manifest (JSON)", 2_500, corpus.manifests, mutate_json, open_manifests),
     Target("samples (npz)", 1_500, corpus.samples, mutate_npz, open_samples),
@@ -183,8 +180,8 @@ TARGETS = (
     Target("distance field (npy)", 250, corpus.distance_fields, mutate_bytes, open_fields),
     Target("rig (SDF)", 2_000, fuzz_rigs.rigs("sdf"), TEXTS, of_file(".sdf", read_design)),
     Target("rig (MJCF)", 2_000, fuzz_rigs.rigs("mjcf"), TEXTS, of_file(".xml", read_design)),
-    Target("rig (CSV)", 2_000, fuzz_rigs.rigs("csv"), TEXTS, of_file(".csv", read_design)),
-    Target("rig (npz)", 1_500, fuzz_rigs.rigs("npz"), mutate_npz, of_file(".npz", read_design)),
+    Target("rig (CSV)", 3_000, fuzz_rigs.rigs("csv"), TEXTS, of_file(".csv", read_design)),
+    Target("rig (npz)", 2_500, fuzz_rigs.rigs("npz"), mutate_npz, of_file(".npz", read_design)),
     Target("robot (MuJoCo)", 1_500, fuzz_rigs.models, TEXTS, of_file(".xml", fuzz_rigs.read_model)),
     Target("recording (CSV)", 1_500, fuzz_rigs.recordings_csv, TEXTS, fuzz_rigs.open_recordings(".csv")),
     Target("recording (npz)", 1_500, fuzz_rigs.recordings_npz, mutate_npz, fuzz_rigs.open_recordings(".npz")),

@@ -14,7 +14,7 @@ from support.meshes import BOX_FACES, BOX_VERTICES, write_box
 from support.tables import each_row
 
 from lidardesign.errors import DataError
-from lidardesign.geometry.mesh_formats import fans
+from lidardesign.geometry.mesh_formats import read_off
 from lidardesign.meshio import load_mesh
 
 POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
@@ -69,8 +69,8 @@ TEXTS = {
     "obj two coordinates": ("obj", POINTS.replace("1 0 0", "1 0") + FACES, ":2: has 2 values"),
     "obj without faces": ("obj", POINTS, "no faces"),
     "obj without vertices": ("obj", FACES, ":1: a face names vertex 1"),
-    "obj of a long line": ("obj", POINTS + FACES + "f " + "1 2 3 " * 100_000, ":9: has a line of 600003 characters"),
-    "obj of long blanks": ("obj", POINTS + "f 0 1 2" + " " * 200_000, ":5: has a line of"),
+    "obj of a long line": ("obj", POINTS + FACES + "f " + "1 2 3 " * 100_000, ":9: has a line of 600001 characters"),
+    "obj of long blanks": ("obj", POINTS + "f 0 1 2" + " " * 200_000, ":5: a face names vertex 0"),
     "obj of blanks": ("obj", POINTS + (" " * 9000 + "x\n") * 1000 + "f 0 1 2\n", ":1005: a face names vertex 0"),
     "obj of backslashes": ("obj", POINTS + "\\" * 200_000, ":5: has a line of"),
     "off of a long line": ("off", "OFF 1 1 0 " + "1 " * 100_000, ":1: has a line of"),
@@ -88,6 +88,7 @@ TEXTS = {
     "off face of two": ("off", "OFF\n4 1 0\n" + OFF_POINTS + "2 0 1\n", ":7: the face is"),
     "off nan": ("off", "OFF\n4 1 0\n" + OFF_POINTS.replace("1 0 0", "nan 0 0") + "3 0 1 2\n", ":4: the vertex is"),
     "off fraction": ("off", "OFF\n4 1 0\n" + OFF_POINTS + "3 0 1 2.5\n", ":7: the face is '3 0 1 2.5'"),
+    "obj cut short in a line": ("obj", POINTS + FACES + "f 1 \\\n2 3 \\", ":9: a corner of the face is"),
     "off empty": ("off", "OFF\n", "counts|lines"),
     "off of nothing": ("off", "\n\n#\n", "not an OFF text file"),
     "ply index beyond": ("ply", ply(indices="3 0 1 4\n" * 4), "triangle 0 of 4 names the vertices 0, 1, 4"),
@@ -106,15 +107,16 @@ TEXTS = {
     "stl nan": ("stl", "solid\n" + FACET.format(z="nan") + "endsolid\n", ":6: the vertex is"),
     "stl words": ("stl", "solid\n" + FACET.format(z="x") + "endsolid\n", ":6: the vertex is"),
     "stl of two corners": (
-        "stl", "solid\n" + FACET.replace("vertex 0 0 0\n", "") + "endsolid\n", ":4: a facet does not have 3 corners",
+        "stl", "solid\n" + FACET.format(z=0).replace("vertex 0 0 0\n", "") + "endsolid\n", ":7: a facet does not",
     ),
-    "stl of broken corners": ("stl", "solid\n" + FACET.replace("vertex ", "vertex/") + "endsolid\n", ":4: "),
+    "stl of broken corners": ("stl", "solid\n" + FACET.replace("vertex ", "vertex/") + "endsolid\n", ":4: the vertex"),
+    "stl of other words": ("stl", "solid\n" + FACET.replace("vertex 1", "vertexx 1") + "endsolid\n", ":5: "),
     "stl cut short": ("stl", "solid\n" + FACET.format(z=0), "ends early"),
     "stl of four numbers": ("stl", "solid\n" + FACET.format(z="0 1") + "endsolid\n", ":6: has 4 values"),
     "binary stl of more": ("stl", bytes(80) + struct.pack("<I", 4_000_000_000) + bytes(50), "promises 4000000000"),
     "binary stl of fewer": ("stl", bytes(80) + struct.pack("<I", 1) + bytes(500), "promises 1 triangles"),
     "binary stl nan": (
-        "stl", bytes(80) + struct.pack("<I", 1) + struct.pack("<12f", *[0] * 11, float("nan")) + bytes(2), "triangle 0",
+        "stl", bytes(80) + struct.pack("<I", 1) + struct.pack("<12f", *[0] * 11, float("nan")) + bytes(2), "NaN",
     ),
 }  # fmt: skip
 
@@ -300,4 +302,9 @@ def test_fans_of_polygons_are_those_of_a_loop():
         polygon = vertices[start : start + count]
         expected += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, count - 1)]
         start += count
-    np.testing.assert_array_equal(fans(vertices, corners), expected)
+    faces = "".join(
+        f"{count} {' '.join(map(str, one))}\n"
+        for count, one in zip(corners, np.split(vertices, corners.cumsum()[:-1]), strict=True)
+    )
+    text = f"OFF\n1000 {len(corners)} 0\n" + 1000 * "0 0 0\n" + faces
+    np.testing.assert_array_equal(read_off(text.encode(), "text")[1], expected)

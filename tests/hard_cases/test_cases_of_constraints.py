@@ -451,11 +451,10 @@ class TestBudgetsThatDoNotDivide:
 
     @each_row("rays", [1, 2, 3, 4, 5])
     def test_a_fit_gives_every_sensor_a_ray_where_their_number_is_open(self, rays):
-        for sensors in (None, "auto"):
-            result = fit(SAMPLES, sensors=sensors, rays=rays, em_samples=1200, restarts=1)
-            shares = [sensor.rays for sensor in result.design.sensors]
-            assert sum(shares) == rays
-            assert len(shares) <= rays
+        result = fit(SAMPLES, rays=rays, em_samples=1200, restarts=1)
+        shares = [sensor.rays for sensor in result.design.sensors]
+        assert sum(shares) == rays
+        assert len(shares) <= rays
 
     def test_fewer_rays_than_sensors_that_were_asked_for_are_refused(self):
         for values, asked in (

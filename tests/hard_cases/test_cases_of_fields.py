@@ -26,7 +26,7 @@ from lidardesign.density.target.surfaces import SceneTable, near_pairs
 from lidardesign.density.target.target import Target, build_target
 from lidardesign.density.target.visibility import NoVisibility, Optics
 from lidardesign.errors import DataError
-from lidardesign.evaluate.accuracy.fields import ExactField, InterpolatedField
+from lidardesign.evaluate.accuracy.fields import ExactField
 from lidardesign.meshio import SUFFIXES, check_mesh, load_mesh, signed_volume_m3, unique_rows
 from lidardesign.scene import Body, Box, Capsule, Mesh, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
@@ -312,13 +312,10 @@ def asked_of(name):
     if name == "frames":
         bodies = collect_bodies([moving], lambda body: True, resolution=32, padding_m=0.1)
         return lambda p: near_pairs(bodies, p, np.zeros(2), 1.0, 1e9).distances[::2]
-    if name == "exact":
-        return lambda p: ExactField([ball], lambda body: True).distances(p)[:, 0]
-    field = InterpolatedField.of(field_of(ball), {"nearest": 0, "tricubic": 3}[name])
-    return lambda p: field.distances(p)[:, 0]
+    return lambda p: ExactField([ball], lambda body: True).distances(p)[:, 0]
 
 
-WAYS = ("primitive", "table", "table without kernels", "moving", "frames", "exact", "nearest", "tricubic")
+WAYS = ("primitive", "table", "table without kernels", "moving", "frames", "exact")
 
 
 @hard_case(

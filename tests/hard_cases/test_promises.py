@@ -407,15 +407,6 @@ class TestEveryFigureHasItsError:
             assert estimate["unit"] == unit
             assert estimate["error"] == pair["half_width"]
 
-    def test_every_number_in_an_exported_file_has_the_error_of_its_rounding(self, lidardesign, flat):
-        assert lidardesign("fit", flat, "--rays", 8, *DENSITY, "--name", "one").code == 0
-        for kind in ("csv", "npz"):
-            document = lidardesign("export", flat / "designs" / "one.yaml", "--format", kind, "--json").json
-            assert set(document["error_estimates"]) == {"origin_m", "direction_rad", "gate_m", "time_s"}
-            for estimate in document["error_estimates"].values():
-                self.complete(estimate)
-                assert estimate["kind"] == "rounding"
-
     def test_tables_print_errors_and_units_beside_the_figures(self, lidardesign, flat):
         assert "+-" in lidardesign("fit", flat, *GRID, "--name", "one", "-v").out
         table = lidardesign("evaluate", flat, "--rays", 8, "--set", "test=4").out

@@ -155,7 +155,6 @@ DAMAGE = {
     "garbage manifest": (lambda run, _: (run / "manifest.json").write_text("{"), "cannot be read"),
     "newer": (changed(schema_version=2), "schema version 2"),
     "timings": (changed(timings=[5]), "the manifest's 'timings' is damaged"),
-    "goal": (changed(goal=[5]), "the manifest's 'goal' is damaged"),
     "learn": (changed(learn=[5]), "the manifest's 'learn' is damaged"),
     "visibility": (changed(visibility="words"), "visibility 'words'"),
     "number of visibility": (changed(visibility=[5]), "visibility \\[5\\]"),

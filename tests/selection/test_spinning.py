@@ -119,8 +119,8 @@ class TestDesigns:
         design = open_run(run).fit(layout="spinning", channels=3, rays=150, name="spun")
         exported = design.export(tmp_path / "spun", format=form)
         assert any("every channel is a sensor of its own" in note for note in exported.notes)
-        assert exported.rounding["direction_rad"].error < 1e-9
-        assert exported.rounding["rays"].error == 0
+        # and none of rays that had to move, or were added
+        assert not any("even grids" in note for note in exported.notes)
 
     def test_keep_their_channels_when_they_are_constrained(self, run):
         design = open_run(run).fit(layout="spinning", channels=2, rays=60, name="spun")

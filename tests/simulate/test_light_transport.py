@@ -25,7 +25,7 @@ from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Pla
 from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.shadowing import visible_echoes
 from lidardesign.simulate.light import Beams, Echoes, direct_echoes
-from lidardesign.simulate.light_transport import process
+from lidardesign.simulate.light_transport import transport as process
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient
 
 # float32 intersections against float64 ones: 1e-7 of lengths, some ten times that where surfaces are curved or grazed
@@ -298,23 +298,22 @@ def test_a_simulator_that_is_too_old_is_not_used(monkeypatch):
 
 
 @each_row(
-    ("code", "words", "timeout_s"),
+    ("work", "words", "limit_s"),
     [
-        (
-            "import os, sys; print('LLVM ERROR: Cannot select', file=sys.stderr, flush=True); os.abort()",
-            ("SIGABRT", "LLVM ERROR: Cannot select", "libllvm19"), 60,
-        ),
-        ("import os; print('ready', flush=True); input(); os._exit(3)", ("exit code 3",), 60),
-        ("import time; print('ready', flush=True); time.sleep(600)", ("no answer within",), 0.5),
+        ("aborts", ("crashes while it renders (Aborted)", "LLVM ERROR: Cannot select", "libllvm19"), 60),
+        ("leaves", ("exit code 3",), 60),
+        ("hangs", ("no answer within", "fewer rays"), 0.1),
     ],
-)  # fmt: skip
-def test_a_process_that_dies_or_takes_too_long_is_reported_with_what_it_said(tmp_path, code, words, timeout_s):
-    worker = process.Worker([sys.executable, "-c", code], {})
-    for _ in range(2 if "_exit" in code else 1):
+)
+def test_a_process_that_dies_or_takes_too_long_is_reported_with_what_it_said(monkeypatch, work, words, limit_s):
+    process.end_worker()
+    monkeypatch.setattr(process, "WORKER", f"support.work:{work}")
+    monkeypatch.setattr(process, "missing", lambda: None)
+    for _ in range(2):
         with pytest.raises(NumericalError) as caught:
-            worker.ask(tmp_path, timeout_s)
+            process.ask({}, {}, limit_s=limit_s)
         assert all(word in str(caught.value) for word in words)
-    assert not worker.alive
+        assert not process._running
 
 
 @needs_simulator

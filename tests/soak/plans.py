@@ -195,7 +195,7 @@ def _fit_options(generator: np.random.Generator, layout: str, sensors: int) -> t
     options = ["--layout", layout, "--level", f"{_pick(generator, [0.5, 0.9, 0.95, 0.99])}"]
     if layout == "scan":
         return (*options, "--rays", str(sensors))
-    options += ["--sensors", _pick(generator, [str(sensors)] * 5 + ["auto"])]
+    options += ["--sensors", _pick(generator, [str(sensors)] * 5 + ["best"])]
     if layout != "grid" or generator.random() < 0.5:
         options += ["--rays", str(int(generator.integers(MOST_SENSORS, 65)))]
         if generator.random() < 0.3:

@@ -9,9 +9,9 @@ import numpy as np
 from lidardesign.design.constraints.check import ConstraintCheck
 from lidardesign.design.constraints.slack import constraint_slack
 from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.evaluate.figures.density_views import density_view
-from lidardesign.evaluate.figures.scene_figure import scene_figure
+from lidardesign.evaluate.report.density_views import density_view
 from lidardesign.evaluate.report.report import Report
+from lidardesign.evaluate.report.scene_figure import scene_figure
 from lidardesign.evaluate.report.tables import CommandTimes, Reproduction
 from lidardesign.evaluate.results import Evaluation, Paired, Row
 from lidardesign.geometry.raycast import SceneCaster

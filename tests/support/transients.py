@@ -11,7 +11,7 @@ import pytest
 from lidardesign.geometry.frames import receiver_axes
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Receiver
-from lidardesign.simulate.light_transport import process
+from lidardesign.simulate.light_transport import transport as process
 from lidardesign.simulate.light_transport.transport import Lights, Transients
 from support.rays import rays_along
 

@@ -16,11 +16,10 @@ from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import load_task
 from lidardesign.scene import Body, Medium, Mesh, Scene, Sphere
 from lidardesign.task import mount_of
-from lidardesign.testing import BrokenLawError, Limits, check_task, contract_of
+from lidardesign.testing import BrokenLawError, check_task, contract_of
 from lidardesign.testing.contract import LAWS
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
-from lidardesign.testing.geometry import target_fields
-from lidardesign.testing.watch import Watch
+from lidardesign.testing.law import restore_random_states
 
 METRIC = 'Metric("radius error", "mm", "lower", worst=100.0, tolerance=0.5)'
 DEFAULTS = 'Defaults(density={"sigma_m": 0.05})'
@@ -86,7 +85,7 @@ BROKEN = {
     ],
     "splits are disjoint": [("split, i)", "i)", "is the held-out scene 'test 0'")],
     "scenes are picklable": [('{"at": centre}', '{"at": centre, "f": lambda: 0}', "cannot be pickled")],
-    "targets are in reach": [(CENTRE, CENTRE.replace("0.0]", "90.0]"), "none of 3000 rays")],
+    "targets are in reach": [(CENTRE, CENTRE.replace("0.0]", "90.0]"), "no ray from the design space")],
     "scores are numbers": [
         (VALUE, "        return 3.0\n", "score returned float"),
         (VALUE, "        return Score(float('inf'))\n", "score returned inf"),
@@ -98,9 +97,6 @@ BROKEN = {
     "best on the truth": [
         (METRIC, METRIC.replace("lower", "higher").replace("100.0", "0.0"), "does not reward seeing the targets"),
         (VALUE, "        return Score(100.0)\n", "100 of 400 rays at targets, 100 of 12, 100 of none"),
-    ],
-    "worse under noise": [
-        (VALUE, "        return Score(max(60 - 1000 * off, 1) + 50 / len(points))\n", "noise on the ranges makes"),
     ],
     "order does not matter": [
         (VALUE, "        return Score(20 + abs(points[0, 1]))\n", "rays in another order change the score by"),
@@ -129,28 +125,13 @@ BROKEN = {
         (VALUE, "        np.random.uniform()\n" + VALUE, "numpy's random in score"),
         (VALUE, "        import random; random.random()\n" + VALUE, "Python's random in score"),
     ],
-    "nothing is written": [
-        (VALUE, "        try: open('left.txt', 'a')\n        except OSError: pass\n" + VALUE, "left.txt"),
-        (VALUE, "        import os\n        try: os.mkdir('left')\n        except OSError: pass\n" + VALUE, "left"),
-    ],
-    "nothing else is changed": [
-        (VALUE, "        import os; os.environ['MINE'] = '1'\n" + VALUE, "the environment (MINE) in score"),
-        (VALUE, "        import signal; signal.signal(signal.SIGINT, lambda *_: None)\n" + VALUE, "who handles SIGINT"),
-        (VALUE, "        import locale; locale.setlocale(locale.LC_ALL, 'C.UTF-8')\n" + VALUE, "the locale in score"),
-        (VALUE, "        np.seterr(all='ignore')\n" + VALUE, "numpy's error settings in score"),
-    ],
 }  # fmt: skip
 # Laws whose breakers replace several words at once.
 TOGETHER = ("space is fixed", "seeds differ")
 # Laws that are broken below, not by words of a task.
 OTHERWISE = {
     "scenes repeat elsewhere",
-    "fields are finite",
-    "fields have the right sign",
-    "gradients have length 1",
-    "fields and rays agree",
     "within time",
-    "within memory",
 }
 
 
@@ -231,43 +212,8 @@ def test_the_shipped_tasks_keep_the_contract(name):
             assert finding.outcome != "fail", finding
 
 
-class Bent:
-    """A field that is changed by a function of its values."""
-
-    def __init__(self, field, distance=lambda d: d, slope=1.0):
-        self.field, self.columns, self.distance, self.factor = field, field.columns, distance, slope
-
-    def distances(self, points):
-        return self.distance(self.field.distances(points))
-
-    def gradient(self, points, weights):
-        return self.factor * self.field.gradient(points, weights)
-
-
-@each_row(
-    ("law", "distance", "slope"),
-    [
-        ("fields are finite", lambda d: np.where(d < 0.5, np.nan, d), 1.0),
-        ("fields are finite", lambda d: d, np.inf),
-        ("fields have the right sign", lambda d: -d, 1.0),
-        ("fields have the right sign", np.abs, 1.0),
-        ("gradients have length 1", lambda d: d, 1.4),
-        ("fields and rays agree", lambda d: d + 0.01, 1.0),
-        ("fields and rays agree", lambda d: 1.1 * d, 1.0),
-    ],
-)
-def test_a_field_that_is_wrong_is_noticed(law, distance, slope):
-    contract = contract_of(task_of(GOOD))
-    assert contract.finding("targets are in reach").outcome == "pass"
-    ground = target_fields(contract.subject)
-    ground.field = Bent(ground.field, distance, slope)
-    assert contract.finding(law).outcome == "fail"
-
-
-def test_limits_of_time_and_memory_are_kept():
-    contract = contract_of(task_of(GOOD), limits=Limits(seconds=1e-9, memory_bytes=1))
-    assert "took" in contract.finding("within time").detail
-    assert contract.finding("within memory").outcome == "fail"
+def test_the_limit_of_time_is_kept():
+    assert "took" in contract_of(task_of(GOOD), limit_s=1e-9).finding("within time").detail
 
 
 def test_scenes_that_hang_on_the_hashes_of_a_process_are_noticed(tmp_path, monkeypatch):
@@ -284,7 +230,7 @@ def test_scenes_that_hang_on_the_hashes_of_a_process_are_noticed(tmp_path, monke
 
 def test_laws_that_need_a_broken_one_are_not_tried_and_say_so():
     contract = contract_of(task_of(GOOD.replace(SCENES, SCENES + "        1 / 0\n")))
-    finding = contract.finding("worse under noise")
+    finding = contract.finding("order does not matter")
     assert (finding.outcome, finding.detail) == ("skip", "needs: scores are numbers")
 
 
@@ -322,32 +268,13 @@ def test_a_fingerprint_is_of_the_content_alone():
         fingerprint(loop)
 
 
-def test_what_is_watched_is_refused_outside_and_put_back(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    (tmp_path / "temporary").mkdir()
-    (tmp_path / "here").mkdir()
-    (tmp_path / "there.txt").write_text("as it was")
-    watch, state = Watch(), np.random.get_state()[1].copy()  # noqa: NPY002
-    with watch.during("a test"):
-        (tmp_path / "temporary" / "fine.txt").write_text("allowed")
-        for attempt in (
-            lambda: (tmp_path / "there.txt").write_text("changed"),
-            lambda: (tmp_path / "there.txt").unlink(),
-            lambda: (tmp_path / "there.txt").rename(tmp_path / "here" / "moved.txt"),
-            lambda: os.mkdir(tmp_path / "made"),
-            lambda: os.rmdir(tmp_path / "here"),
-            lambda: os.symlink(tmp_path, tmp_path / "link"),
-        ):
-            with pytest.raises(PermissionError):
-                attempt()
-        np.random.seed(3)  # noqa: NPY002
-        os.chdir(tmp_path)
-    assert (tmp_path / "there.txt").read_text() == "as it was"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["here", "temporary", "there.txt"]
+def test_global_random_states_are_put_back():
+    drawn, state = [], np.random.get_state()[1].copy()  # noqa: NPY002
+    for _ in range(2):
+        with restore_random_states(drawn, "a test"):
+            np.random.seed(3)  # noqa: NPY002
     assert (np.random.get_state()[1] == state).all()  # noqa: NPY002
-    assert watch.drawn == ["numpy's random in a test"]
-    assert watch.changed == ["the working folder in a test"]
-    (tmp_path / "after.txt").write_text("nobody watches")
+    assert drawn == ["numpy's random in a test"]
 
 
 def test_sensors_are_on_a_body_with_a_name_or_in_the_world():

@@ -45,7 +45,7 @@ def environment(tmp_path_factory):
     python = root / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
     # what is installed for these tests, this package too, is there as it is here
     own = Path(sysconfig.get_paths(vars={"base": str(root / "venv"), "platbase": str(root / "venv")})["purelib"])
-    lines = [f"import site; site.addsitedir({place!r})" for place in site.getsitepackages()]
+    lines = [f"import site; site.addsitedir({place!a})" for place in site.getsitepackages()]
     (own / "installed_for_tests.pth").write_text("\n".join(lines) + "\n")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", "--python", str(python), "install"]
     done(*pip, "--no-deps", "--no-build-isolation", *map(str, folders.values()), cwd=root)

@@ -186,6 +186,46 @@ def test_choices_that_cannot_be_are_refused_with_the_errors_of_commands(run, cho
         run.fit(**choices)
 
 
+@pytest.mark.parametrize(
+    ("call", "where"),
+    [
+        (lambda run: run.fit(layout="spiral"), "layout"),
+        (lambda run: run.fit(sensors=2, rays=0), "rays"),
+        (lambda run: run.evaluate(baselines=["best"]), "baselines"),
+        (lambda run: run.evaluate(baselines=["none", "lloyd"]), "baselines"),
+        (lambda run: run.evaluate(range_tolerance_mm=-1.0), "range_tolerance_mm"),
+        (lambda run: run.evaluate(workers=0), "workers"),
+        (lambda run: lidardesign.evaluate_seeds([run, run], scenes_seed=-1), "scenes_seed"),
+        (lambda run: lidardesign.learn("flatland", out="new", time_budget_s=-1.0), "time_budget_s"),
+        (lambda run: lidardesign.learn("flatland", out="new", device="tpu"), "device"),
+    ],
+)
+def test_errors_name_arguments(run, call, where):
+    with pytest.raises(ConfigError) as raised:
+        call(run)
+    assert raised.value.where == where
+    assert "--" not in str(raised.value)
+
+
+def test_conflicts_name_arguments(run):
+    with pytest.raises(InfeasibleError) as raised:
+        run.fit(sensors=2, rays=16, constraints={"budget": {"rays": 8}})
+    assert raised.value.conflicts == ("rays", "budget.rays")
+
+
+def test_one_kind_of_progress_says_how_far_everything_has_come(tmp_path):
+    said = []
+    run = lidardesign.learn(
+        "flatland", preset="draft", out=tmp_path / "run", settings=SMALL, progress=lambda *now: said.append(now)
+    )
+    assert said[-1][0] == "learning"
+    assert 0 < said[-1][1] <= said[-1][2]
+    design = run.fit(layout="selected", sensors=1, rays=8, progress=lambda *now: said.append(now))
+    assert said[-1] == ("choosing 8 rays", None, None)
+    run.evaluate([design], rays=[8], baselines=["none"], progress=lambda *now: said.append(now))
+    assert said[-1][1:] == (2, 2)
+
+
 def test_a_tolerance_that_is_missed_leaves_a_run(tmp_path):
     with pytest.raises(ThresholdError):
         lidardesign.learn(

@@ -76,12 +76,6 @@ def test_all_seeds_are_scored_in_the_same_scenes_by_workers_too(runs):
     assert [row.per_scene.tolist() for row in here.rows] == [row.per_scene.tolist() for row in there.rows]
 
 
-def test_a_dry_run_says_which_seeds(lidardesign, runs):
-    found = json.loads(lidardesign("evaluate", *runs, *SMALL, "--dry-run", "--json").out)
-    assert found["steps"][0] == "for each of the seeds 1, 2, 3, in the scenes of seed 1:"
-    assert {str(run / "designs" / "two.yaml") for run in runs} <= {entry["path"] for entry in found["reads"]}
-
-
 def test_names_choose_among_designs_of_one_run_too(lidardesign, runs):
     found = json.loads(lidardesign("evaluate", runs[0], *SMALL, "--designs", "one", "--json").out)
     assert [row["design"] for row in found["rows"]][:2] == ["one", "uniform"]

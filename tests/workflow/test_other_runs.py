@@ -16,9 +16,9 @@ from lidardesign.config import load_run_config, save_run_config, with_task_setti
 from lidardesign.design.compare import outside_space
 from lidardesign.design.files import load_design
 from lidardesign.errors import ConfigError
+from lidardesign.evaluate.thresholds import difference_text
 from lidardesign.geometry.rays import Rays
 from lidardesign.space import DIMENSIONS, direction
-from lidardesign.workflow.compare import compare_designs
 
 LAYOUTS = ("grid", "selected")
 OPTIONS = {"rays": [8], "baselines": ["lloyd", "occupancy", "no-visibility"]}
@@ -72,38 +72,44 @@ def test_scores_are_those_of_a_run_that_was_learned_there(runs, layout):
 def test_the_command_takes_the_run_that_is_named(lidardesign, runs):
     own, other = runs
     design = own / "designs" / "grid.yaml"
-    found = lidardesign("evaluate", other, design, "--rays", 8, "--json")
+    found = lidardesign("evaluate", design, "--in", other, "--rays", 8, "--json")
     assert found.code == 0, found.err
     assert f"grid of {own} is scored in the scenes of {other}" in " ".join(found.err.split())
     scores = package.open_run(other).evaluate([design], rays=[8])
     assert without_times(json.loads(found.out)) == without_times(json.loads(json.dumps(scores.as_dict())))
     # the run that judges has a design of the name, too
     package.open_run(other).fit(layout="grid", sensors=1, rays=8, name="grid").save()
-    both = lidardesign("evaluate", other, design, "--rays", 8, "--json").json
+    both = lidardesign("evaluate", other, design, "--in", other, "--rays", 8, "--json").json
     values = {row["design"]: row["value"] for row in both["rows"]}
     assert values["own/grid"] == found.json["rows"][0]["value"]
     assert "other/grid" in values
 
 
-def test_comparisons_are_those_of_evaluate(runs):
+def test_without_baselines_designs_score_and_pair_as_beside_them(lidardesign, runs):
     own, other = runs
-    files = tuple(own / "designs" / f"{layout}.yaml" for layout in LAYOUTS)
-    found = compare_designs(files, other)
+    files = [own / "designs" / f"{layout}.yaml" for layout in LAYOUTS]
+    options = (*files, "--in", other, "--rays", 8, "--baseline", "none")
+    found = lidardesign("evaluate", *options, "--json").json
     scores = package.open_run(other).evaluate(files, rays=[8])
+    assert [(row["design"], row["value"]) for row in found["rows"]] == [
+        (row.design, row.value) for row in scores.rows[:2]
+    ]
     assert found["paired"] == [scores.paired[0].as_dict()]
-    assert [row["value"] for row in found["rows"]] == [row.value for row in scores.rows[:2]]
+    assert (found["equal_bandwidth"], found["strongest_rival"]) == ([], None)
+    verdict = difference_text(scores.paired[0], scores.evaluation.metric.better, scores.evaluation.metric.unit)
+    assert verdict in lidardesign("evaluate", *options).out
+    assert "scene by scene" in lidardesign("evaluate", *options, "--report", "page.html", "-v").out
 
 
 def test_designs_of_two_runs_need_one_that_judges(lidardesign, runs):
     own, other = runs
     package.open_run(other).fit(layout="grid", sensors=1, rays=8, name="flat").save()
     files = own / "designs" / "grid.yaml", other / "designs" / "flat.yaml"
-    for command in ("evaluate", "compare"):
-        refused = lidardesign(command, *files)
+    for named in (files, (own, other)):
+        refused = lidardesign("evaluate", *named)
         assert refused.code == 2
-        assert "name the run whose scenes are used" in " ".join(refused.err.split())
-    assert lidardesign("evaluate", own, other).code == 2
-    assert lidardesign("compare", *files, "--in", own, "--rays", 8).code == 0
+        assert "--in RUN" in refused.err
+    assert lidardesign("evaluate", *files, "--in", own, "--rays", 8).code == 0
 
 
 def test_runs_that_differ_in_their_seed_alone_have_no_note(runs, tmp_path):

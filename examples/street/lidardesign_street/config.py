@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidardesign.task import TaskConfig
+from lidardesign import TaskConfig
 from pydantic import Field
 
 Point = tuple[float, float, float]

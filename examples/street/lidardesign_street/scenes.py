@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from lidardesign.scene import Body, Box, Capsule, Plane, Scene, rigid
+from lidardesign import Body, Box, Capsule, Plane, Scene, rigid
 
 from lidardesign_street.config import StreetConfig
 

@@ -11,10 +11,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
-from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Returns
-from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
+from lidardesign import Defaults, DesignSpace, Information, Metric, Returns, Scene, Score, Split, random_generator
 
 from lidardesign_street.config import StreetConfig
 from lidardesign_street.scenes import BANDS_M, build_scene

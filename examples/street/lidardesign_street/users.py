@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from lidardesign.scene import Scene
+from lidardesign import Scene
 
 # So many returns, and a road user is found.
 FEWEST_RETURNS = 5

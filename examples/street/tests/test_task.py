@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lidardesign.simulate.returns import Rays
+from lidardesign import Rays
 from lidardesign.simulate.simulate import simulate
 
 from lidardesign_street.scenes import BANDS_M, OWN, SIZES_M, User, scene_of, user_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from lidardesign.scene import Scene
+from lidardesign import Scene
 
 # Whatever rises this far above the ground is a hazard [m].
 RAISED_M = 0.1

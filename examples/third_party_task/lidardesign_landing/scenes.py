@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from lidardesign.scene import Body, Box, Plane, Scene, rigid
+from lidardesign import Body, Box, Plane, Scene, rigid
 
 from lidardesign_landing.config import LandingConfig
 

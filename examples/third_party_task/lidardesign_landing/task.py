@@ -11,10 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import numpy as np
-from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Returns
-from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
+from lidardesign import Defaults, DesignSpace, Information, Metric, Returns, Scene, Score, Split, random_generator
 
 from lidardesign_landing.config import LandingConfig
 from lidardesign_landing.hazards import FEWEST_RETURNS, Seen, on_hazards, seen

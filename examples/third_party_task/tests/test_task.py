@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from lidardesign.scene import Body, Box, Plane, Scene, rigid
-from lidardesign.simulate.returns import Rays
+from lidardesign import Body, Box, Plane, Rays, Scene, rigid
 from lidardesign.simulate.simulate import simulate
 
 from lidardesign_landing.hazards import seen

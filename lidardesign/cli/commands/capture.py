@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli import options
+from lidardesign.cli.completion import words
 from lidardesign.cli.output import Output, command, keep_times
-from lidardesign.cli.output_files import claim_outputs, written_file
+from lidardesign.cli.output_files import claim_outputs
 from lidardesign.cli.tables.grids import RichConsole, number, print_table
 from lidardesign.errors import ConfigError, DataError, check_choice
 from lidardesign.run.clock import phase
-from lidardesign.run.files import is_input, is_there
 from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
@@ -46,7 +46,10 @@ def capture(
     estimator: Annotated[
         str,
         typer.Option(
-            "--estimator", metavar="peak|matched", help="Range from the highest bin, or from the log-matched filter."
+            "--estimator",
+            metavar="peak|matched",
+            help="Range from the highest bin, or from the log-matched filter.",
+            autocompletion=words("peak|matched"),
         ),
     ] = "peak",
     false_alarm: Annotated[
@@ -63,7 +66,8 @@ def capture(
         ),
     ] = None,
     outlier_mm: Annotated[
-        float, typer.Option("--outlier-mm", metavar="MM", help="Returns that are off by more are outliers.")
+        float,
+        typer.Option("--outlier-mm", metavar="MM", help="Returns that are off by more are outliers."),
     ] = 10.0,
     reference: Annotated[
         Path | None,
@@ -78,14 +82,12 @@ def capture(
         Path | None,
         typer.Option("--csv", metavar="FILE", help="Write every ray's range and point as CSV.", show_default=False),
     ] = None,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Score designs by a captured scan: with their gates, without them, and next to even rays."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    """Score designs by a captured scan."""
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         claim_outputs(output, csv=csv)
         check_outputs({"--csv": csv}, [file, *designs, *([] if reference is None else [reference])])
         if not 0 < false_alarm < 1:
@@ -101,7 +103,7 @@ def capture(
             from lidardesign.evaluate.captures.score import CaptureSettings, evaluate_capture, write_csv
 
         place = options.parse_at(at)
-        scanned = [_rays_and_run(path, rays, place, seed or 0, output) for path in designs]
+        scanned = [_rays_and_run(path, rays, place, output) for path in designs]
         named = list(zip(_distinct_names(designs), (fired for fired, _ in scanned), strict=True))
         with phase("capture"):
             captured = load_capture(file)
@@ -124,23 +126,21 @@ def capture(
             for folder in dict.fromkeys(folder for _, folder in scanned if folder is not None):
                 rest.callback(keep_times, folder, "capture", output)
             if csv is not None:
-                with phase("writing"), written_file(csv) as table:
-                    write_csv(evaluation, table)
+                with phase("writing"):
+                    write_csv(evaluation, csv)
                 written.append(csv)
 
 
-def _rays_and_run(
-    path: Path, count: int | None, at: dict[str, float], seed: int, output: Output
-) -> tuple[Rays, Path | None]:
+def _rays_and_run(path: Path, count: int | None, at: dict[str, float], output: Output) -> tuple[Rays, Path | None]:
     """The rays of a design file, or of what was exported of it for a scanner, at least one; and its run's folder."""
     from lidardesign.export.galvo import is_galvo_file, read_galvo
     from lidardesign.workflow.export import DesignSource
     from lidardesign.workflow.run_folder import folder_of, read_design
 
     folder = None
-    if not is_there(path):
+    if not path.exists():
         raise DataError("no such design", where=str(path), hint="give design files or files of export --format galvo")
-    if not is_input(path) and is_galvo_file(path):
+    if is_galvo_file(path):
         if count is not None or at:
             raise ConfigError(
                 "holds its rays already",
@@ -151,8 +151,8 @@ def _rays_and_run(
         rays = read_galvo(path)
     else:
         specification = read_design(path, output.remark)
-        rays = DesignSource(specification, path=path).lay_out(count, at, seed, notes=output.remark)[1]
-        folder = None if is_input(path) else folder_of(specification, path)
+        rays = DesignSource(specification, path=path).lay_out(count, at, notes=output.remark)[1]
+        folder = folder_of(specification, path)
     if not len(rays):
         raise DataError("fires no ray", where=str(path), hint="give --rays N" if not count else None)
     return rays, folder
@@ -190,8 +190,8 @@ def _show(document: dict[str, Any], evaluation: CaptureEvaluation, rich: RichCon
 def _standard_errors(evaluation: CaptureEvaluation) -> str:
     designs = [row.estimates() for row in evaluation.rows if not row.baseline]
     parts = []
-    for name, words in (("outliers_percent", "outliers"), ("range_error_mm", "range errors")):
+    for name, what in (("outliers_percent", "outliers"), ("range_error_mm", "range errors")):
         known = [row[name] for row in designs if name in row]
         if known:
-            parts.append(f"{words} up to {number(max(each.error or 0.0 for each in known), 2)} {known[0].unit}")
+            parts.append(f"{what} up to {number(max(each.error or 0.0 for each in known), 2)} {known[0].unit}")
     return f"standard errors over other rays: {', '.join(parts) or 'none, as no return can be judged'}"

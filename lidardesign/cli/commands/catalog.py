@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli import options
+from lidardesign.cli import completion, options
 from lidardesign.cli.output import Output, command
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
@@ -50,24 +50,10 @@ catalog_app = typer.Typer(help="List real parts, or show one and write a design 
 
 
 @catalog_app.callback()
-def catalog(
-    context: typer.Context,
-    own: Own = None,
-    reflectance: Reflectance = None,
-    klux: Klux = None,
-    seed: options.Seed = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-    debug: options.Debug = False,
-) -> None:
+def catalog(context: typer.Context) -> None:
     """List real parts, or show one and write a design of it."""
     if context.invoked_subcommand is None:
-        list_(own=own, reflectance=reflectance, klux=klux, seed=seed, json=json, quiet=quiet, debug=debug)
-    elif own or reflectance is not None or klux is not None:
-        with command(json=json, quiet=quiet, debug=debug):
-            raise ConfigError(
-                "options of a subcommand go after it", where="catalog", hint="lidardesign catalog list --help"
-            )
+        list_()
 
 
 @catalog_app.command("list")
@@ -75,13 +61,11 @@ def list_(
     own: Own = None,
     reflectance: Reflectance = None,
     klux: Klux = None,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """List all parts in all their modes: pattern, field of view, range and what reading them costs."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    """List all parts in all their modes. Pattern, field of view, range and what reading them costs are shown."""
+    with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.cli.tables.parts import part_entry, show_parts
             from lidardesign.design.catalog.library import load_library
@@ -100,7 +84,12 @@ def list_(
 
 @catalog_app.command("show")
 def show(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A part's name, NAME:MODE, or a part file.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME", help="A part's name, NAME:MODE, or a part file.", autocompletion=completion.parts
+        ),
+    ],
     own: Own = None,
     reflectance: Reflectance = None,
     klux: Klux = None,
@@ -139,15 +128,14 @@ def show(
             metavar="interleaved|beside",
             help="Several parts see the same, with interleaved rays, or have fields of view side by side.",
             show_default="interleaved",
+            autocompletion=completion.words("interleaved|beside"),
         ),
     ] = None,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Show a part: every figure, its conditions and its source; with --out also write a design of it."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    """Show a part, or write a design of it. Every figure has its conditions and its source."""
+    with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.cli.tables.parts import part_document, show_part
             from lidardesign.design.catalog.library import find_part

@@ -9,8 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from lidardesign.cli import options
+from lidardesign.cli.completion import tasks, words
 from lidardesign.cli.output import Output, command
-from lidardesign.cli.output_files import is_output, note_new_folders, put_on_stdout
+from lidardesign.cli.output_files import note_new_folders
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_writable
@@ -20,24 +21,24 @@ Out = Annotated[
     typer.Option("--out", metavar="FILE", help="New file to write; none is overwritten.", show_default="stdout"),
 ]
 
-config_app = typer.Typer(
-    help="Write a configuration file to begin with, or the schema of a file.", no_args_is_help=True
-)
+config_app = typer.Typer(help="Write a configuration file, or the schema of a file.", no_args_is_help=True)
 
 
 @config_app.command("init")
 def init(
-    task: Annotated[str, typer.Argument(metavar="TASK", help="Name of a task; `lidardesign tasks` lists them.")],
+    task: Annotated[
+        str,
+        typer.Argument(metavar="TASK", help="Name of a task; `lidardesign tasks` lists them.", autocompletion=tasks),
+    ],
     preset: options.Preset = None,
     overrides: options.Overrides = None,
     out: Out = None,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Write a configuration file for TASK: every key with its default, its bounds and what it is."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    """Write a configuration file for TASK. Every key is there with its default, its bounds and what it is."""
+    with command(json=json, quiet=quiet) as output:
         _check_new(out)
         with phase("libraries"):
             from lidardesign.registry import load_task
@@ -50,7 +51,14 @@ def init(
 
 @config_app.command("schema")
 def schema(
-    kind: Annotated[str, typer.Argument(metavar="config|constraints|design|evaluate", help="What the schema is of.")],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="config|constraints|design|evaluate",
+            help="What the schema is of.",
+            autocompletion=words("config|constraints|design|evaluate"),
+        ),
+    ],
     task: Annotated[
         str | None,
         typer.Option(
@@ -58,13 +66,11 @@ def schema(
         ),
     ] = None,
     out: Out = None,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Print the JSON Schema of a configuration, a constraint file, a design file, or what `evaluate --json` prints."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    """Print a JSON Schema. KIND is config, constraints, design, or evaluate for what `evaluate --json` prints."""
+    with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.registry import load_task
             from lidardesign.workflow.config_reference import SCHEMA_KINDS, schema_of
@@ -79,7 +85,7 @@ def schema(
 
 
 def _check_new(out: Path | None) -> None:
-    if out is None or is_output(out):
+    if out is None:
         return
     check_writable(out)
     if out.is_file():
@@ -89,14 +95,13 @@ def _check_new(out: Path | None) -> None:
 def _write(text: str, document: dict[str, Any], out: Path | None, output: Output) -> None:
     from lidardesign.run.files import write_atomic
 
-    file = None if out is None or is_output(out) else out
-    if file is not None:
-        note_new_folders([file], output)
+    if out is not None:
+        note_new_folders([out], output)
         with phase("writing"):
-            write_atomic(file, text)
+            write_atomic(out, text)
     if output.json:
-        output.result({**document, "out": None if file is None else str(file)}, lambda rich: None)
-    elif file is not None:
-        output.note(f"wrote {file}")
+        output.result({**document, "out": out}, lambda rich: None)
+    elif out is not None:
+        output.note(f"wrote {out}")
     else:
-        put_on_stdout(text.encode(errors="backslashreplace"))
+        print(text, end="")

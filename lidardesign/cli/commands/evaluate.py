@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,29 +11,26 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
-from lidardesign.cli.output_files import claim_outputs, is_output, written_file
+from lidardesign.cli.completion import detectors, words
+from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output_files import claim_outputs
 from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
-from lidardesign.errors import MAX_SEED
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
     from lidardesign.cli.progress import ProgressDisplay
-    from lidardesign.evaluate.cma.candidate import Show
-    from lidardesign.evaluate.cma.search import Progress
-    from lidardesign.evaluate.figures.scene_figure import FigureData
+    from lidardesign.evaluate.baselines.cma import Show
     from lidardesign.workflow.evaluate import ScoreRequest, Scores
     from lidardesign.workflow.seeds import SeedsRequest
 
 BASELINE_HELP = (
     "A baseline in addition to uniform, random, bounding, silhouette and greedy: lloyd (like silhouette, denser where "
-    "returns are frequent and surfaces large), occupancy (rays towards cells that targets occupy) or no-visibility "
+    "returns are frequent and surfaces large), occupancy (rays towards cells that targets occupy), no-visibility "
     "(the first design refitted to the density without its occlusion term; takes some seconds), "
-    "catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres and "
-    "degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on "
-    "training scenes, for --cma-seconds). Repeatable."
+    "or cma (direct optimisation of the first design's sensors on training scenes, for --cma-seconds). Repeatable. "
+    "none: no baselines at all."
 )
 
 
@@ -44,11 +40,11 @@ def evaluate(
         typer.Argument(
             metavar="RUN|DESIGN",
             readable=False,
-            help="Run folders (all their designs) and design files. Designs of other runs are scored in the scenes of "
-            "the run that is named. Of runs that differ only in their seed, designs of one name are one row, with "
-            "intervals over seeds and scenes.",
+            help="Run folders (all their designs) and design files. Of runs that differ only in their seed, designs "
+            "of one name are one row, with intervals over seeds and scenes.",
         ),
     ],
+    space_of: options.SpaceOf = None,
     designs: Annotated[
         list[str] | None,
         typer.Option("--designs", metavar="NAME", help="Only designs of this name; repeatable.", show_default="all"),
@@ -66,15 +62,21 @@ def evaluate(
         ),
     ] = None,
     baseline: Annotated[
-        list[str] | None, typer.Option("--baseline", metavar="NAME", help=BASELINE_HELP, show_default=False)
+        list[str] | None,
+        typer.Option(
+            "--baseline",
+            metavar="NAME",
+            help=BASELINE_HELP,
+            show_default=False,
+            autocompletion=words("lloyd|occupancy|no-visibility|cma"),
+        ),
     ] = None,
     cma_seconds: Annotated[
         float | None,
         typer.Option(
             "--cma-seconds",
             metavar="SECONDS",
-            help="Wall time of each search of `--baseline cma`: one per number of rays, and one per bandwidth of the "
-            "first design.",
+            help="Wall time of each search of `--baseline cma`, one per number of rays.",
             show_default="60",
         ),
     ] = None,
@@ -86,6 +88,7 @@ def evaluate(
             help="Physical effects: auto for those that matter in each scene, all, none, or names separated by "
             "commas; audit: like auto, and every row under all effects too (exit 1 if a score moves by more than the "
             "metric's tolerance).",
+            autocompletion=words("auto|all|none|audit"),
         ),
     ] = "auto",
     detector: Annotated[
@@ -94,6 +97,7 @@ def evaluate(
             "--detector",
             metavar="NAME|FILE",
             help="The detector: ideal, single-photon, consumer-8x8, or a YAML file.",
+            autocompletion=detectors,
         ),
     ] = "ideal",
     range_tolerance_mm: Annotated[
@@ -128,16 +132,6 @@ def evaluate(
         Path | None,
         typer.Option(
             "--report", metavar="FILE.html", help="Write one HTML page: tables, curves, 3D view.", show_default=False
-        ),
-    ] = None,
-    plots: Annotated[
-        Path | None,
-        typer.Option(
-            "--plots",
-            metavar="DIR",
-            help="Write pictures for papers into this folder, as PNG and SVG: scene, density, scores, differences, "
-            "constraints, effects, accuracy, times.",
-            show_default=False,
         ),
     ] = None,
     csv: Annotated[
@@ -189,15 +183,12 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
-    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     scenes_seed: Annotated[
         int | None,
         typer.Option(
             "--scenes-seed",
             metavar="N",
-            min=0,
-            max=MAX_SEED,
             help="Seed of the held-out scenes.",
             show_default="--seed, or the (first) run's",
         ),
@@ -205,13 +196,13 @@ def evaluate(
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Score designs on held-out scenes against the baselines uniform, random, bounding, silhouette and greedy."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
-        claim_outputs(output, dry_run=dry_run, csv=csv, report=report, plots=plots)
+    """Score designs on held-out scenes against baselines."""
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
+        claim_outputs(output, csv=csv, report=report)
         with phase("libraries"):
-            from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
+            from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest, check_scores
+            from lidardesign.workflow.run_folder import RunFolder
             from lidardesign.workflow.seeds import SeedsRequest, differing_seeds
 
         chosen = ScoreOptions(
@@ -232,17 +223,15 @@ def evaluate(
             fail_above=fail_above,
             fail_unless_better=fail_unless_better,
         )
-        runs = differing_seeds(targets, output.remark)
+        judge = None if space_of is None else RunFolder.open(space_of)
+        runs = differing_seeds(targets, output.remark) if judge is None else []
         request: ScoreRequest | SeedsRequest = (
             SeedsRequest.resolve(runs, chosen, output.remark)
             if runs
-            else ScoreRequest.resolve(targets, chosen, notes=output.remark)
+            else ScoreRequest.resolve(targets, chosen, judge, output.remark)
         )
-        files = {"--report": report, "--plots": plots, "--csv": csv}
-        plan = request.plan(files)
-        check_outputs(files, plan.reads, ("--plots",))
-        if dry_run:
-            return show_plan(plan, output)
+        files = {"--report": report, "--csv": csv}
+        check_outputs(files, targets)
         scores = _score(request, output)
         written: dict[Path, None] = {}
 
@@ -261,59 +250,52 @@ def evaluate(
             rest.callback(show_result)
             rest.callback(keep_times, request.run.folder, "evaluate", output, further=scores.last_scores())
             # accuracy takes minutes: what was scored by then is written already
-            _write_files(scores, written, *(None if accuracy and is_output(path) else path for path in files.values()))
+            _write_files(scores, written, *files.values())
             if accuracy:
                 scores = _with_accuracy(scores, output)
                 _write_files(scores, written, *files.values())
-        scores.check()
+        check_scores(scores)
 
 
 def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
     with output.progress("evaluating") as progress:
         return request.score(
-            lambda done, total, scene="": progress.show(done, total), search_display(request, progress)
+            lambda scene, done, total: progress.show(done, total), search_display(request, progress)
         )
 
 
 def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDisplay) -> Show:
     """What shows the best score of each search, in a line of its own."""
 
-    def show(label: str, now: Progress) -> None:
-        best = f"best {now.best:.4g} {request.run.metric.unit}"
-        left_s = (1 - now.share) * request.cma_seconds
-        progress.show(now.share, 1.0, label=label, detail=best, left_s=left_s, line=label)
+    def show(label: str, share: float, best: float) -> None:
+        found = f"best {best:.4g} {request.run.metric.unit}"
+        left_s = (1 - share) * request.cma_seconds
+        progress.show(share, 1.0, label=label, detail=found, left_s=left_s, line=label)
 
     return show
 
 
 def _with_accuracy(scores: Scores, output: Output) -> Scores:
     with output.progress("measuring accuracy") as progress:
-        return scores.with_accuracy(lambda done, total, sweep: progress.show(done, total, detail=sweep))
+        return scores.with_accuracy(lambda sweep, done, total: progress.show(done, total, detail=sweep))
 
 
 @phase("writing")
-def _write_files(
-    scores: Scores, written: dict[Path, None], report: Path | None, plots: Path | None, csv: Path | None
-) -> None:
-    """Write what was asked for, each whatever becomes of the others; what is there then is added to `written`."""
-    pictured = functools.cache(scores.figure_data)
+def _write_files(scores: Scores, written: dict[Path, None], report: Path | None, csv: Path | None) -> None:
+    """Write what was asked for, each whatever becomes of the other; what is there then is added to `written`."""
     with ExitStack() as rest:
         if report is not None:
-            rest.callback(_write_report, scores, written, report, pictured)
-        if plots is not None:
-            rest.callback(lambda: written.update(dict.fromkeys(scores.plots(plots, pictured()))))
+            rest.callback(_write_report, scores, written, report)
         if csv is not None:
-            with written_file(csv) as file:
-                scores.to_csv(file)
+            scores.to_csv(csv)
             written[csv] = None
 
 
 def _kind(path: Path, files: Mapping[str, Path | None]) -> str:
-    """What a written file is: of pictures its name."""
-    return next((option.removeprefix("--") for option, given in files.items() if given == path), path.name)
+    """The option, without its dashes, that a written file was asked for by."""
+    return next(option.removeprefix("--") for option, given in files.items() if given == path)
 
 
-def _write_report(scores: Scores, written: dict[Path, None], path: Path, pictured: Callable[[], FigureData]) -> None:
-    with written_file(path) as file:
-        scores.report(file, ("lidardesign", *sys.argv[1:]), pictured())
+def _write_report(scores: Scores, written: dict[Path, None], path: Path) -> None:
+    scores.report(path, ("lidardesign", *sys.argv[1:]))
     written[path] = None

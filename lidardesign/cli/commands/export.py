@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
-from lidardesign.cli.output_files import claim_stdout, note_new_folders, written_file
+from lidardesign.cli.completion import formats
+from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output_files import note_new_folders, written_file
 from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
@@ -18,8 +19,6 @@ from lidardesign.run.outputs import check_outputs
 
 # Where a note begins to explain itself.
 EXPLANATION = re.compile(r"[:;] .*", re.DOTALL)
-# Below it rounding is told with --verbose alone, whether of metres, radians or seconds.
-LEAST_ERROR = 1e-4
 
 
 def export(
@@ -31,7 +30,13 @@ def export(
     ] = None,
     format_: Annotated[
         str | None,
-        typer.Option("--format", metavar="NAME", help="Format; --list shows them.", show_default=False),
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="Format; --list shows them.",
+            show_default=False,
+            autocompletion=formats,
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -58,41 +63,32 @@ def export(
         ),
     ] = None,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
-    dry_run: options.DryRun = False,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
     """Write a design in another program's format."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.workflow.export import (
                 DesignSource,
                 ExportRequest,
-                check_frame_rate,
                 export_target,
                 exporter_of,
             )
             from lidardesign.workflow.run_folder import read_design
 
-        check_frame_rate(rate_hz)
         if list_formats:
             return _list(output)
-        claim_stdout(output, dry_run=dry_run, out=out)
         place = options.parse_at(at)
         if design is None:
             raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
         exporter = exporter_of(format_)
         source = DesignSource(read_design(design, output.remark), path=design)
         target = export_target(design, out, exporter)
-        request = ExportRequest(source, exporter, target, rays, place, rate_hz, seed or 0, robot)
+        request = ExportRequest(source, exporter, target, rays, place, rate_hz, robot=robot)
         note_new_folders([target], output)
-        plan = request.plan()
-        check_outputs({"--out": target}, plan.reads, ("--out",) if exporter.folder else ())
-        if dry_run:
-            return show_plan(plan, output)
+        check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if exporter.folder else ())
         notes: list[str] = []
         with written_file(target, exporter.suffix) as file:
             exported = request.write(file, notes.append)
@@ -107,14 +103,7 @@ def export(
 
         def show(rich: RichConsole) -> None:
             content = f"{exported.rays} rays" if exported.rays else f"{exported.sensors} sensors"
-            least = 0.0 if output.verbose else LEAST_ERROR
-            lost = [
-                f"{name.removesuffix(f'_{estimate.unit}')} {estimate.error:.2g} {estimate.unit}".rstrip()
-                for name, estimate in exported.rounding.items()
-                if estimate.error and estimate.error > least
-            ]
-            off = f"; read back, they are off by at most {', '.join(lost)}" if lost else ""
-            rich.print(f"wrote {target} ({content}{off})", soft_wrap=True)
+            rich.print(f"wrote {target} ({content})", soft_wrap=True)
 
         document = {"design": str(design), **exported.as_dict()}
         output.result(document, show, files={"wrote": target} if output.quiet else None, says_time=True)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
+from lidardesign.cli.completion import constraint_keys
+from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.cli.tables.designs import show_fit
 from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.errors import LidardesignError
@@ -33,15 +34,13 @@ def fit(
     parts: options.Parts = None,
     like: options.Like = None,
     name: options.Name = "fit",
-    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
     """Fit sensors to the density of RUN."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.workflow.fit import FitOptions, FitRequest
             from lidardesign.workflow.run_folder import RunFolder
@@ -60,10 +59,7 @@ def fit(
             name=name,
             seed=seed,
         )
-        request = FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark)
-        if dry_run:
-            return show_plan(request.plan(), output)
-        run_fit(request, output)
+        run_fit(FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark), output)
 
 
 def run_fit(request: FitRequest, output: Output) -> None:
@@ -76,7 +72,7 @@ def run_fit(request: FitRequest, output: Output) -> None:
     check_writable(path)
     check_lock(request.run.folder)
     with output.progress("fitting") as progress:
-        design = Design.fitted(request, notes=output.remark, progress=lambda step: progress.show(label=step))
+        design = Design.fitted(request, notes=output.remark, progress=lambda step, *_: progress.show(label=step))
     try:
         design.save()
     except LidardesignError:
@@ -105,7 +101,11 @@ def constrain(
     overrides: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="KEY=VALUE", help="One constraint: gate.width_m.max=0.1; repeatable.", show_default=False
+            "--set",
+            metavar="KEY=VALUE",
+            help="One constraint: gate.width_m.max=0.1; repeatable.",
+            show_default=False,
+            autocompletion=constraint_keys,
         ),
     ] = None,
     sensors: options.Sensors = None,
@@ -119,15 +119,13 @@ def constrain(
     parts: options.Parts = None,
     like: options.Like = None,
     name: options.Name = "constrained",
-    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
     """Fit sensors again under constraints; nothing is learned again."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
             from lidardesign.design.constraints.document import Constraints
             from lidardesign.workflow.fit import FitOptions, FitRequest, load_constraints
@@ -149,8 +147,4 @@ def constrain(
             seed=seed,
         )
         run, design = open_target(target, output.remark)
-        files = [path for path in (target if design else None, constraints) if path is not None]
-        request = FitRequest.resolve(need_run(run, target), chosen, design, files=files, notes=output.remark)
-        if dry_run:
-            return show_plan(request.plan(), output)
-        run_fit(request, output)
+        run_fit(FitRequest.resolve(need_run(run, target), chosen, design, notes=output.remark), output)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import command, keep_times, show_plan
+from lidardesign.cli.completion import tasks, words
+from lidardesign.cli.output import command, keep_times
 from lidardesign.cli.tables.grids import RichConsole, duration, text_table
 from lidardesign.run.clock import WAIT_S, phase
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from lidardesign.cli.progress import ProgressDisplay
     from lidardesign.density.learn import LearnProgress, LearnResult
 
+BYTES_PER_MEGABYTE = 1e6
 FIGURES = (
     ("ESS", "ess", "", "share of the samples that count"),
     ("KL", "kl_nats", " nats", "between the learned density and the target"),
@@ -34,6 +35,7 @@ def learn(
         typer.Argument(
             metavar="TASK",
             help="Name of a task; `lidardesign tasks` lists them.",
+            autocompletion=tasks,
             show_default="that of --config, or of the run that is resumed",
         ),
     ] = None,
@@ -48,7 +50,10 @@ def learn(
     device: Annotated[
         str,
         typer.Option(
-            "--device", metavar="auto|cpu|cuda", help="Where the flow is trained; auto takes a GPU when there is one."
+            "--device",
+            metavar="auto|cpu|cuda",
+            help="Where the flow is trained; auto takes a GPU when there is one.",
+            autocompletion=words("auto|cpu|cuda"),
         ),
     ] = "auto",
     resume: Annotated[
@@ -65,8 +70,8 @@ def learn(
         typer.Option(
             "--tolerance",
             metavar="SHARE",
-            help="Learn until at most this share of the density's mass is in the wrong place, with at most four times "
-            "the steps of the preset; exit 1 if that is not enough.",
+            help="Set learning.misplaced: learn until at most this share of the density's mass is in the wrong place; "
+            "exit 1 if all steps are not enough.",
             show_default=False,
         ),
     ] = None,
@@ -75,21 +80,22 @@ def learn(
         typer.Option(
             "--time-budget",
             metavar="SECONDS",
-            help="Learn as long as lets the command end within this time, however good the density is.",
+            help="Take steps until this time has passed, however good the density is; measuring comes after.",
             show_default=False,
         ),
     ] = None,
-    dry_run: options.DryRun = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Check everything, say what would be written and how long it takes, and stop."),
+    ] = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
-    debug: options.Debug = False,
 ) -> None:
     """Learn where rays are worth firing for TASK, into a run folder."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
+    with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
-            from lidardesign.workflow.learn import LearnOptions, LearnRequest, result_document
-            from lidardesign.workflow.learning_budget import check_met
+            from lidardesign.workflow.learn import LearnOptions, LearnRequest, check_tolerance, result_document
 
         chosen = LearnOptions(
             out=out,
@@ -114,11 +120,9 @@ def learn(
         for note in request.task_notes():
             remark(note)
         if dry_run:
-            plan = request.plan()
-            plan.check_writable()
             with output.progress("timing a few steps"):
-                plan = replace(plan, forecast=request.forecast(remark))
-            return show_plan(plan, output)
+                document = request.plan(remark)
+            return output.result(document, partial(_show_plan, document), show_costs=False)
         output.when_interrupted = request.resume_hint
         with output.progress("learning") as progress:
             result = request.run(partial(_show_progress, progress), remark)
@@ -133,7 +137,17 @@ def learn(
             _show(result, request.settings.preset, rich)
 
         output.result(result_document(result), show, files={"run": Path(result.run)}, says_time=True)
-        check_met(result, request.goal)
+        check_tolerance(result, tolerance)
+
+
+def _show_plan(document: dict[str, Any], rich: RichConsole) -> None:
+    found = document["forecast"]
+    lines = [f"{verb}  {path}" for verb in ("reads", "writes") for path in document[verb]]
+    each = f"{1e3 * found['pathwise_s']:.0f} and {1e3 * found['balancing_s']:.0f} ms"
+    lines.append(f"time   at most about {duration(found['seconds'])}: at most {found['steps']:,} steps of {each}")
+    for name, held in (("memory", found["peak_memory_bytes"]), ("memory on the GPU", found["gpu_memory_bytes"])):
+        lines += [] if held is None else [f"{name} about {held / BYTES_PER_MEGABYTE:,.0f} MB"]
+    rich.print("\n".join((*lines, "nothing was done: leave out --dry-run to do it")), soft_wrap=True)
 
 
 def _show_progress(progress: ProgressDisplay, now: LearnProgress) -> None:

@@ -1,8 +1,8 @@
-"""`lidardesign show` and `compare`: a run or a design for people, and two designs beside each other."""
+"""`lidardesign show`: a run or a design for people, or what differs between two designs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +17,7 @@ from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
     from lidardesign.design.compare import BandwidthUse
+    from lidardesign.design.sensor import DesignSpec
 
 
 def show(
@@ -24,16 +25,18 @@ def show(
         Path,
         typer.Argument(metavar="RUN|DESIGN", readable=False, help="A run folder, a design file, or the file of a rig."),
     ],
+    other: Annotated[
+        Path | None,
+        typer.Argument(metavar="OTHER", readable=False, help="A design: only what differs in it.", show_default=False),
+    ] = None,
     at: options.At = None,
     space_of: options.SpaceOf = None,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Show what a run has and what can be done next, or a design: its sensors, rays, bandwidth and constraints."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
-        if design.is_dir():
+    """Show a run and what to do next, a design, or how two differ."""
+    with command(json=json, quiet=quiet) as output:
+        if design.is_dir() and other is None:
             return _show_run(design, {"--at": at, "--in": space_of}, output)
         with phase("libraries"):
             from lidardesign.design.compare import outside_notes, readout_of
@@ -41,11 +44,18 @@ def show(
             from lidardesign.design.constraints.slack import room_of
             from lidardesign.design.files import design_document, track_document
             from lidardesign.design.layouts.track import placed
-            from lidardesign.workflow.run_folder import RunFolder, reach_of, read_design, run_of
+            from lidardesign.workflow.run_folder import RunFolder, reach_beside, reach_of, read_design, run_of
 
         condition = options.parse_at(at)
         run = None if space_of is None else RunFolder.open(space_of)
-        specification = read_design(design, output.remark, reach_of([run]) if run else None)
+        given = [run] if run else []
+        files = [design] if other is None else [design, other]
+        reach_m = reach_of(given) if other is None else reach_beside(files, given)
+        read = [read_design(path, output.remark, reach_m) for path in files]
+        shown = [placed(one, condition) if condition else one for one in read]
+        if other is not None:
+            return _show_differences(files, shown, output)
+        specification = read[0]
         try:
             run = run or run_of(specification, design)
         except LidardesignError as error:  # its run is not needed to show a design
@@ -56,7 +66,7 @@ def show(
             checks = check_design(design_document(specification), specification.constraints, space)
         for line in () if space is None else outside_notes(specification, space):
             output.remark(line)
-        specification = placed(specification, condition) if condition else specification
+        specification = shown[0]
         readout = readout_of(specification)
         document = {
             "design": str(design),
@@ -155,47 +165,37 @@ DESIGN_COLUMNS, VALUE_COLUMNS = ("design", "layout", "sensors", "rays"), ("value
 IDEAL = "ideal"
 # What rounding leaves of no difference is none.
 DECIMALS = 6
-SCORE_COLUMNS = ("design", "rays", "value", "95 % interval", "failures", "Mbit/s")
 SENSOR_COLUMNS = (
     "first", "second", "place [m]", "looks [deg]", "roll [deg]", "field of view [deg]", "gate start [m]",
-    "gate end [m]", "weight",
+    "gate end [m]", "weight", "rays",
 )  # fmt: skip
 
 
-def compare(
-    first: Annotated[
-        Path, typer.Argument(metavar="DESIGN", readable=False, help="A design file, or the file of a rig.")
-    ],
-    second: Annotated[Path, typer.Argument(metavar="OTHER", readable=False, help="The design to compare it with.")],
-    space_of: options.SpaceOf = None,
-    rays: Annotated[
-        list[int] | None,
-        typer.Option(
-            "--rays",
-            metavar="N",
-            min=1,
-            max=1_000_000,
-            help="Rays per frame at which scores are compared; repeatable.",
-            show_default="both as they are, else the task's",
-        ),
-    ] = None,
-    seed: options.Seed = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-    verbose: options.Verbose = False,
-    debug: options.Debug = False,
-) -> None:
-    """Compare two designs: what differs in their sensors, and in their scores on held-out scenes of a run."""
-    with command(json=json, quiet=quiet, verbose=verbose, debug=debug) as output:
-        with phase("libraries"):
-            from lidardesign.workflow.compare import compare_designs
+def _show_differences(files: Sequence[Path], designs: Sequence[DesignSpec], output: Output) -> None:
+    """The sensors of two designs in pairs, what both cost, and the constraints that only one has or that differ."""
+    from lidardesign.design.compare import paired_sensors, readout_of
+    from lidardesign.run.yaml import leaves
 
-        document = compare_designs((first, second), space_of, rays, seed, output.remark)
-        show = _show_verdicts if output.quiet else _show
-        output.result(document, lambda rich: show(document, rich))
+    ours, theirs = (dict(leaves(design.constraints)) for design in designs)
+    keys = [key for key in {**ours, **theirs} if key and ours.get(key) != theirs.get(key)]
+    document = {
+        "designs": [
+            {
+                "design": str(path),
+                "name": design.name,
+                "layout": design.layout,
+                "sensors": len(design.sensors),
+                "bandwidth": readout_of(design).as_dict(),
+            }
+            for path, design in zip(files, designs, strict=True)
+        ],
+        "sensors": [pair.as_dict() for pair in paired_sensors(*designs)],
+        "constraints": {".".join(map(str, key)): [ours.get(key), theirs.get(key)] for key in keys},
+    }
+    output.result(document, lambda rich: _show_pair(document, rich), show_costs=False)
 
 
-def _show(document: dict[str, Any], rich: RichConsole) -> None:
+def _show_pair(document: dict[str, Any], rich: RichConsole) -> None:
     for place, design in zip(("first", "second"), document["designs"], strict=True):
         sensors = "1 sensor" if design["sensors"] == 1 else f"{design['sensors']} sensors"
         cost = design["bandwidth"]
@@ -209,6 +209,7 @@ def _show(document: dict[str, Any], rich: RichConsole) -> None:
             _signed(apart["roll_deg"]),
             f"{_signed(apart['horizontal_deg'])} x {_signed(apart['vertical_deg'])}",
             *(_signed(apart[name], 3) for name in ("gate_start_m", "gate_end_m", "weight")),
+            "-" if apart["rays"] is None else f"{apart['rays']:+d}",
         ]
         for pair in document["sensors"]
         if (apart := pair["difference"]) is not None
@@ -218,37 +219,12 @@ def _show(document: dict[str, Any], rich: RichConsole) -> None:
         alone = [pair[key] for pair in document["sensors"] if pair[other] is None]
         if alone:
             rich.print(f"only in the {place}: {', '.join(alone)}", soft_wrap=True)
-    metric = document["metric"]
-    if metric is None:
-        return
-    title = (
-        f"{metric['name']} [{metric['unit']}] on {document['scenes']} held-out scenes ({metric['better']} is better)"
-    )
-    rows = [
-        [
-            row["design"],
-            number(row["rays"]),
-            *value_cells(row),
-            *(number(row[name], 3) for name in ("failures", "bandwidth_mbps")),
-        ]
-        for row in document["rows"]
+    rules = [
+        (key, *("-" if one is None else str(one) for one in pair)) for key, pair in document["constraints"].items()
     ]
-    print_table(title, SCORE_COLUMNS, rows, rich)
-    _show_verdicts(document, rich)
-
-
-def _show_verdicts(document: dict[str, Any], rich: RichConsole) -> None:
-    for pair in document["paired"]:
-        rich.print(_verdict(pair, document["metric"]), soft_wrap=True)
+    if rules:
+        print_table("constraints that differ", ("constraint", "first", "second"), rules, rich, text=("constraint",))
 
 
 def _signed(value: float, decimals: int = 2) -> str:
     return f"{round(value, decimals) + 0.0:+.{decimals}f}"
-
-
-def _verdict(pair: dict[str, Any], metric: dict[str, Any]) -> str:
-    from lidardesign.evaluate.gates import difference_text
-    from lidardesign.evaluate.results import Paired
-
-    found = Paired(**{name: value for name, value in pair.items() if name != "half_width"})
-    return difference_text(found, metric["better"], metric["unit"])

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lidardesign.cli import options
+from lidardesign.cli import completion, options
 from lidardesign.cli.output import command
 from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.run.clock import phase
@@ -20,27 +20,19 @@ tasks_app = typer.Typer(help="List, show, check or start tasks.", invoke_without
 
 
 @tasks_app.callback()
-def tasks(
-    context: typer.Context,
-    seed: options.Seed = None,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
-    debug: options.Debug = False,
-) -> None:
+def tasks(context: typer.Context) -> None:
     """List, show, check or start tasks."""
     if context.invoked_subcommand is None:
-        list_(seed=seed, json=json, quiet=quiet, debug=debug)
+        list_()
 
 
 @tasks_app.command("list")
 def list_(
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
     """List the installed tasks; a broken one with its reason."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.registry import list_tasks
 
@@ -63,14 +55,12 @@ def _show_list(entries: list[dict[str, Any]], rich: RichConsole) -> None:
 
 @tasks_app.command("show")
 def show(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a task.")],
-    seed: options.Seed = None,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a task.", autocompletion=completion.tasks)],
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Show a task: its metric, its design space and the keys of its configuration."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    """Show a task. It has a metric, a design space and keys of its configuration."""
+    with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.registry import load_task
             from lidardesign.workflow.config_reference import describe_task
@@ -124,29 +114,26 @@ def _yaml_value(value: Any) -> str:
 
 @tasks_app.command("check")
 def check(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of an installed task.")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Name of an installed task.", autocompletion=completion.tasks)
+    ],
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seconds: Annotated[
         float,
         typer.Option("--seconds", metavar="S", min=0.1, max=86_400, help="Longest time of one call of the task."),
     ] = 60.0,
-    memory_mb: Annotated[
-        int, typer.Option("--memory-mb", metavar="MB", min=256, max=1_000_000, help="Most memory that it may use.")
-    ] = 4096,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Check that a task keeps the contract: every law, with figures; exit 6 where one does not hold."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    """Check that a task keeps the contract. Every law is tried; exit 6 where one does not hold."""
+    with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.testing.contract import LAWS, refuse_broken
-            from lidardesign.testing.law import Limits
             from lidardesign.testing.process import CheckRequest, check_in_process
 
-        request = CheckRequest(name, config, tuple(overrides or ()), seed, Limits(seconds, memory_mb * 2**20))
+        request = CheckRequest(name, config, tuple(overrides or ()), seed, seconds)
         findings = []
         with output.progress("contract") as progress, phase("contract"):
             for finding in check_in_process(request):
@@ -186,13 +173,11 @@ def new(
         Path | None,
         typer.Option("--out", metavar="DIR", help="Where to, a new folder.", show_default="lidardesign-NAME"),
     ] = None,
-    seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
-    debug: options.Debug = False,
 ) -> None:
-    """Write an installable package of a new task, which keeps the contract and passes its own tests as it is."""
-    with command(json=json, quiet=quiet, debug=debug) as output:
+    """Write an installable package of a new task. It keeps the contract and passes its own tests as it is."""
+    with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.testing.scaffold import new_task
 

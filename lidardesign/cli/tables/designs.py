@@ -22,7 +22,6 @@ ERROR_DIGITS = 2
 # Relative errors below what `number` shows of a figure are left out.
 SMALLEST_ERROR = 1e-4
 SPACE_MARK = ".space."
-SNAP_FIGURES = ("loss\n[nats]", "field of view\n[deg]", "gate\n[m]", "rays", "Mbit/s")
 
 
 def with_error(estimate: dict[str, Any]) -> str:

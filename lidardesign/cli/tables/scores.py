@@ -37,6 +37,8 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
     """A row of every design, against the strongest rival; what else was asked for in a line each."""
+    from lidardesign.evaluate.thresholds import difference_text
+
     rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
     rival = evaluation.strongest_rival
     shown = [row.as_dict() for row in (*rows.values(), *evaluation.rival_rows)]
@@ -64,6 +66,10 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
     print_table(None, ("design", *columns), list(zip(names, *columns.values(), strict=True)), rich)
     if pairs:
         rich.print(sentence(evaluation, list(pairs.values())), soft_wrap=True)
+    elif rival is None:
+        for pair in evaluation.paired:
+            if pair.rays == rows[pair.a].rays:
+                rich.print(difference_text(pair, metric.better, metric.unit), soft_wrap=True)
     if "mounting" in document:
         _show_mounting(document, rich, [row in rows.values() for row in evaluation.rows])
     if "audit" in document:
@@ -75,8 +81,8 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
 
 def sentence(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
     """What designs are against the strongest rival, in one sentence."""
-    from lidardesign.evaluate.gates import difference_text
     from lidardesign.evaluate.results import verdict
+    from lidardesign.evaluate.thresholds import difference_text
 
     metric, rival = evaluation.metric, pairs[0].b
     if len(pairs) == 1:
@@ -102,10 +108,10 @@ def _show_all(document: Entry, rich: RichConsole) -> None:
     _show_rows(document, rich)
     _show_errors(document, rich)
     designs = {row["design"] for row in document["rows"]} - {row["design"] for row in matched}
-    against = [pair for pair in document["paired"] if pair["b"] not in designs]
+    against = [pair for pair in document["paired"] if pair["b"] not in designs] or document["paired"]
     if "mounting" in document:
         _show_mounting(document, rich, [True] * len(document["rows"]))
-    title = f"difference to each baseline [{metric['unit']}], scene by scene, with its 95 % interval"
+    title = f"differences [{metric['unit']}], scene by scene, with their 95 % intervals"
     cells = list(map(difference_cell, against))
     _show_grid(title, [(pair["a"], pair["rays"], pair["b"]) for pair in against], cells, rich)
     title = f"baselines with as much bandwidth as the design: value [{metric['unit']}] (rays)"

@@ -1,113 +1,58 @@
-"""How long learning will take and how much memory: from its real preparation and a few real steps, without a trace."""
+"""Time and memory that learning will take here, from its real preparation and a few steps on the untrained flow."""
 
 from __future__ import annotations
 
-import math
+import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from lidardesign.config import RunConfig
-from lidardesign.density.learn import TrainingData, choose_device
-from lidardesign.density.training.checkpoint import load_arrays
-from lidardesign.density.training.schedule import WRITING_S, StepTimes, Timekeeper
-from lidardesign.density.training.training import CHECKPOINT, STRETCH, least_balancing_steps
+from lidardesign.density.learn import TrainingData, choose_device, make_trainer, on_one_thread
+from lidardesign.density.training.sampling import draw_samples
+from lidardesign.density.training.training import Trainer
 from lidardesign.run.clock import peak_memory_bytes, phase
 
-UNTRAINED = "how long balancing steps and the measurement take on a learned density; an untrained one was timed"
-GOOD_ENOUGH = "after how many steps the density is good enough"
-FINER = "whether the tolerance asks for finer distance fields"
-
-
-@dataclass(frozen=True)
-class Forecast:
-    """What learning will take on this machine, as far as a few steps tell.
-
-    Arguments:
-        seconds: The whole command, where learning stops as soon as it may [s].
-        longest_seconds: The whole command with all steps [s].
-        preparing_s: Scenes, fields and proposals [s].
-        pathwise_s, balancing_s: One step of each phase [s].
-        finishing_s: Measuring [s].
-        steps: The most that are taken.
-        peak_memory_bytes: The most that was held until then; None where the system does not tell.
-        gpu_memory_bytes: The most that was held on the GPU; None without one.
-        unknown: What a few steps do not tell.
-    """
-
-    seconds: float
-    longest_seconds: float
-    preparing_s: float
-    pathwise_s: float
-    balancing_s: float
-    finishing_s: float
-    steps: int
-    peak_memory_bytes: int | None
-    gpu_memory_bytes: int | None
-    unknown: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """For `--dry-run --json`."""
-        values = {key: round(value, 4) if isinstance(value, float) else value for key, value in asdict(self).items()}
-        return {**values, "unknown": list(self.unknown)}
+TIMED_STEPS = 6
+TIMED_POINTS = 2048
 
 
 @phase("planning")
+@on_one_thread()
 def forecast(
-    data: TrainingData,
-    config: RunConfig,
-    run: Path,
-    device: str,
-    elapsed_s: Callable[[], float],
-    *,
-    resume: bool = False,
-    tolerance: float | None = None,
-    time_budget_s: float | None = None,
-) -> Forecast:
-    """What learning will take.
+    data: TrainingData, config: RunConfig, run: Path, device: str, time_budget_s: float | None
+) -> dict[str, Any]:
+    """Time of single steps, the most that all take with the samples after them [s], and the memory held [bytes].
 
-    Arguments:
-        data: What was prepared for it.
-        config: The configuration.
-        run: The folder that it would be learned in.
-        device: auto, cpu or cuda.
-        elapsed_s: How long the command has been running.
-        resume: Whether it goes on from the checkpoint there.
-        tolerance, time_budget_s: What decides beside the configuration.
-
-    Raises:
-        ConfigError: The time budget is too short to learn anything useful.
+    Nothing is written. A balancing step on a learned density may take longer than on the untrained one that is timed.
     """
-    prepared, place, learning = elapsed_s(), choose_device(device), config.learning
-    times = StepTimes.measured(data, config, run, place)
-    state = load_arrays(run, CHECKPOINT)[1] if resume else {"step": 0}
-    done = int(state["step"])
-    begun, pathwise = max(done, learning.pathwise_steps), max(learning.pathwise_steps - done, 0)
-    # the first time that it is measured how good the density is: behind a whole number of stretches of balancing
-    least, balanced = least_balancing_steps(learning.pathwise_steps), begun - learning.pathwise_steps
-    stretches = max(math.ceil(least / STRETCH), balanced // STRETCH + 1)
-    steps = done if state.get("stopped") else learning.steps
-    if time_budget_s is not None and not state.get("stopped"):
-        keeper = Timekeeper(time_budget_s, lambda: prepared, config)
-        keeper.check(times)
-        steps = begun + times.balancing_within(keeper.left_s, pathwise)
-    fewest = min(learning.pathwise_steps + STRETCH * stretches, steps) if learning.misplaced else steps
-    # what a budget keeps in reserve for writing is more than writing takes
-    times = replace(times, finishing_s=times.finishing_s - WRITING_S)
-    taken = [times.of(pathwise, max(most - begun, 0)) for most in (fewest, steps)]
-    unknown = [UNTRAINED, *([GOOD_ENOUGH] if fewest < steps else []), *([FINER] if tolerance is not None else [])]
-    return Forecast(
-        prepared + taken[0],
-        prepared + taken[1],
-        prepared,
-        times.pathwise_s,
-        times.balancing_s,
-        times.finishing_s,
-        max(steps - done, 0),
-        peak_memory_bytes(),
-        torch.cuda.max_memory_allocated(place) if place.type == "cuda" else None,
-        tuple(unknown),
-    )
+    place, learning = choose_device(device), config.learning
+    trainer, pathwise = make_trainer(data, config, run, place), learning.pathwise_steps
+    pathwise_s = _seconds(lambda: _try_step(trainer, 0)) if pathwise else 0.0
+    balancing_s = _seconds(lambda: _try_step(trainer, pathwise))
+    sampling_s = _seconds(lambda: draw_samples(trainer.learned(), TIMED_POINTS)) * learning.samples / TIMED_POINTS
+    steps_s = pathwise * pathwise_s + (learning.steps - pathwise) * balancing_s
+    return {
+        "steps": learning.steps,
+        "pathwise_s": pathwise_s,
+        "balancing_s": balancing_s,
+        "seconds": (steps_s if time_budget_s is None else min(steps_s, time_budget_s)) + sampling_s,
+        "peak_memory_bytes": peak_memory_bytes(),
+        "gpu_memory_bytes": torch.cuda.max_memory_allocated(place) if place.type == "cuda" else None,
+    }
+
+
+def _try_step(trainer: Trainer, step: int) -> None:
+    trainer.step = step
+    trainer.find_gradient()
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    """Mean time of a call [s], without the first one, which may have to compile."""
+    call()
+    started = time.perf_counter()
+    for _ in range(TIMED_STEPS):
+        call()
+    return (time.perf_counter() - started) / TIMED_STEPS

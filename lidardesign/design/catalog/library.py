@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -207,9 +207,6 @@ def read_part(path: Path) -> PartFile:
     return check_model(PartFile, document.mapping, document.locate)
 
 
-Wanted = Callable[[np.ndarray], np.ndarray]
-
-
 @dataclass(frozen=True, eq=False)
 class Pose:
     """Where a part stands and how it is turned; its forward axis looks along the boresight.
@@ -244,9 +241,7 @@ def parts_for(part: Part, count: int) -> int:
     return max(-(-count // part.rays), 1)
 
 
-def part_rays(
-    part: Part, poses: Pose | Sequence[Pose], count: int | None = None, *, wanted: Wanted | None = None
-) -> Rays:
+def part_rays(part: Part, poses: Pose | Sequence[Pose], count: int | None = None) -> Rays:
     """The rays of parts at poses, in the order in which each fires.
 
     Arguments:
@@ -254,8 +249,6 @@ def part_rays(
         poses: One part stands at each.
         count: Rays in all; None is every ray of every part. The parts share them equally, the first ones take what
             is left over, and each fires an evenly spread subset of its pattern.
-        wanted: Which unit vectors (N, 3) of the world are worth firing, bool (N,): the subset is taken among those
-            where there are enough, and other rays fill it up.
 
     Raises:
         ConfigError: No pose; more rays than the parts have, or than any design may.
@@ -273,7 +266,10 @@ def part_rays(
             hint=f"{parts_for(part, total)} parts have enough",
         )
     shares = [total // len(poses) + (index < total % len(poses)) for index in range(len(poses))]
-    looking = [_chosen(part.directions @ pose.frame, share, wanted) for pose, share in zip(poses, shares, strict=True)]
+    looking = []
+    for pose, share in zip(poses, shares, strict=True):
+        directions = part.directions @ pose.frame
+        looking.append(directions[even_subset(directions, share)])
     sensor = np.repeat(np.arange(len(poses)), shares)
     # all parts run at once, each over its own frame
     return Rays(
@@ -283,18 +279,6 @@ def part_rays(
         sensor,
         np.concatenate([np.arange(share) / (max(share, 1) * part.rate_hz) for share in shares]),
     )
-
-
-def _chosen(directions: np.ndarray, count: int, wanted: Wanted | None) -> np.ndarray:
-    """An evenly spread subset of a part's rays, of the wanted ones first, shape (count, 3)."""
-    if count == len(directions) or wanted is None:
-        return directions[even_subset(directions, count)]
-    mask = np.asarray(wanted(directions), dtype=bool)
-    first, other = np.flatnonzero(mask), np.flatnonzero(~mask)
-    if len(first) >= count:
-        return directions[first[even_subset(directions[first], count)]]
-    rest = other[even_subset(directions[other], count - len(first))]
-    return directions[np.sort(np.concatenate([first, rest]))]
 
 
 def part_sensor(
@@ -340,7 +324,6 @@ def part_design(
     *,
     name: str | None = None,
     level: float = DEFAULT_LEVEL,
-    wanted: Wanted | None = None,
 ) -> DesignSpec:
     """A design of real parts at poses, with the explicit rays of their patterns; see `part_rays`.
 
@@ -350,7 +333,7 @@ def part_design(
         ConfigError: See `part_rays`.
     """
     poses = [poses] if isinstance(poses, Pose) else list(poses)
-    rays = part_rays(part, poses, count, wanted=wanted)
+    rays = part_rays(part, poses, count)
     shares = np.bincount(rays.sensor, minlength=len(poses))
     sensors = tuple(
         part_sensor(part, pose, name=f"s{index}", weight=1 / len(poses), rays=int(shares[index]), level=level)

@@ -1,6 +1,6 @@
 """What a layout of rays is, where its rays go, and how its sensors are fitted as components of a mixture.
 
-The fit of sensors: their samples, how many they are, and the budget that they keep.
+The fit of sensors: their samples, their number, and the budget that they keep.
 """
 
 from __future__ import annotations
@@ -48,11 +48,6 @@ from lidardesign.samples import Samples
 from lidardesign.task import random_generator
 
 DEFAULT_SENSORS = 4
-# `auto` tries up to this many sensors.
-MOST_SENSORS = 12
-# It stops after this many counts in a row that gain less than one standard error.
-PATIENCE = 2
-HELD_OUT_SHARE = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +59,7 @@ class FitProblem:
         constraints: The constraint file.
         rules: What each sensor keeps: of the file, or with origins that the fit has chosen.
         budget: Rays and bandwidth.
-        sensors: How many; `auto` chooses; None takes the constraints' or the usual number.
+        sensors: How many; None takes the constraints' or the usual number.
         seed: Root of the random streams.
         restarts: Seeds that are tried.
         em_samples: Samples that the fit works on.
@@ -78,7 +73,7 @@ class FitProblem:
     constraints: Constraints
     rules: tuple[SensorRules, ...]
     budget: BandwidthBudget
-    sensors: int | str | None
+    sensors: int | None
     seed: int
     restarts: int
     em_samples: int
@@ -106,14 +101,11 @@ class FittedSensors(NamedTuple):
 
 def fit_sensors(request: FitProblem) -> FittedSensors:
     """Sensors that keep the constraints and the budget."""
-    counts = _sensor_counts(request)
+    count = _sensor_count(request)
     if is_mounted(request.rules):
-        fixed, counts = choose_mounts(request.rules, request.samples, counts, request.retarget, request.seed)
+        fixed = choose_mounts(request.rules, request.samples, count, request.retarget, request.seed)
         request = replace(request, rules=fixed)
-    supports = admitted_samples(request, counts[-1])
-    count = counts[0] if len(counts) == 1 else _best_count(request, supports, counts)
-    if len(supports) != len(sensor_groups(request.rules, request.samples.space, count)):
-        supports = admitted_samples(request, count)
+    supports = admitted_samples(request, count)
     fitted = fit_groups(group_samples(request, supports, count), request.seed, request.restarts)
     ensemble, rays = fit_within_budget(fitted, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), request.budget)
     sensors = add_couplings(ensemble, sensors_of(ensemble, request.samples.space, request.level))
@@ -121,21 +113,17 @@ def fit_sensors(request: FitProblem) -> FittedSensors:
     return FittedSensors(sensors, rays, ensemble, supports)
 
 
-def _sensor_counts(request: FitProblem) -> list[int]:
-    """The numbers of sensors to try: one where it is said, a range for `auto`; none without a ray if that can be."""
-    constraints, sensors = request.constraints, request.sensors
-    asked = constraints.sensors
-    if isinstance(sensors, int) or asked.count is not None:
-        return [sensors if isinstance(sensors, int) else int(asked.count or 1)]
+def _sensor_count(request: FitProblem) -> int:
+    """The number of sensors: as asked for, else the usual one within the constraints, none without a ray."""
+    constraints, asked = request.constraints, request.constraints.sensors
+    if request.sensors is not None or asked.count is not None:
+        return int(request.sensors or asked.count or 1)
     low = max(asked.min or 1, len(constraints.each), 1)
     mounted = most_mounted(request.rules)
-    high = max(MOST_SENSORS, mounted or 0) if asked.max is None else asked.max
-    for limit in (mounted, request.budget.rays, most_rays(constraints)):
-        high = high if limit is None else min(high, limit)
-    if sensors == "auto":
-        return list(range(low, max(low, high) + 1))
+    limits = (asked.max, mounted, request.budget.rays, most_rays(constraints))
+    high = min((limit for limit in limits if limit is not None), default=math.inf)
     usual = mounted or len(constraints.each) or DEFAULT_SENSORS
-    return [min(max(usual, low), max(low, high))]
+    return int(min(max(usual, low), max(low, high)))
 
 
 @phase("support")
@@ -183,28 +171,6 @@ def group_samples(request: FitProblem, supports: list[Support], count: int) -> l
         bounds = bounds_of(request.rules, space, group.sensors, interval_factor(request.level))
         parts.append(GroupSamples(group, float(shares[index]), features, bounds))
     return parts
-
-
-def _best_count(request: FitProblem, supports: list[Support], counts: list[int]) -> int:
-    """The smallest number of sensors within one standard error of the best held-out log-likelihood."""
-    scores: dict[int, tuple[float, float]] = {}
-    waiting, best = 0, -math.inf
-    for count in counts:
-        if len(sensor_groups(request.rules, request.samples.space, count)) != len(supports):
-            continue
-        train, test = [], []
-        for index, part in enumerate(group_samples(request, supports, count)):
-            draw = random_generator(request.seed, "held out", index).uniform(size=len(part.features))
-            train.append(replace(part, features=part.features.subset(draw >= HELD_OUT_SHARE)))
-            test.append(replace(part, features=part.features.subset(draw < HELD_OUT_SHARE)))
-        mean, error = fit_groups(train, request.seed, request.restarts).held_out(test)
-        scores[count] = mean, error
-        waiting = 0 if mean > best + error else waiting + 1
-        best = max(best, mean)
-        if waiting >= PATIENCE:
-            break
-    top = max(scores, key=lambda count: scores[count][0])
-    return min(count for count, (mean, _) in scores.items() if mean >= scores[top][0] - scores[top][1])
 
 
 class FittedDesign(NamedTuple):

@@ -28,7 +28,7 @@ from lidardesign.design.mixture.bounds import Bounds, Floors, Group, pins_of
 from lidardesign.design.mixture.em import EMResult, fit_mixture, run_em
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.m_step import maximise
-from lidardesign.design.mixture.mixture import Mixture, expect, log_density, responsibilities
+from lidardesign.design.mixture.mixture import Mixture, expect, responsibilities
 from lidardesign.design.mixture.support import Retarget, reaim_samples
 from lidardesign.design.sensor import Coupling, Sensor, tangent_coordinates
 from lidardesign.errors import InfeasibleError
@@ -40,8 +40,6 @@ from lidardesign.task import random_generator
 
 # So many samples tell apart mounts whose shares differ by a hundredth.
 MOUNT_SAMPLES = 4000
-# `auto` takes as few mounts as together see this share of what all see together.
-ENOUGH_SHARE = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,16 +111,6 @@ class Ensemble:
             results.append(replace(run_em(start, part.features, bounds), notes=result.notes))
         return Ensemble(self.parts, tuple(results))
 
-    def held_out(self, parts: Sequence[GroupSamples]) -> tuple[float, float]:
-        """Mean log density of other samples of the same groups, and its standard error [nats]."""
-        mean, variance = 0.0, 0.0
-        for part, result in zip(parts, self.results, strict=True):
-            values, weights = log_density(result.mixture, part.features), part.features.weights
-            centre = float(weights @ values)
-            mean += part.share * centre
-            variance += part.share**2 * float(np.square(weights) @ np.square(values - centre))
-        return mean, variance**0.5
-
 
 @phase("mixture")
 def fit_groups(parts: Sequence[GroupSamples], seed: int, restarts: int) -> Ensemble:
@@ -184,17 +172,14 @@ def _sensor(part: GroupSamples, mixture: Mixture, row: int, space: DesignSpace, 
 
 
 def choose_mounts(
-    rules: Sequence[SensorRules], samples: Samples, counts: list[int], retarget: Retarget | None, seed: int
-) -> tuple[tuple[SensorRules, ...], list[int]]:
-    """The rules with every mounted sensor fixed at the mount chosen for it, and the counts that are left.
-
-    Where sensors beyond `each` are mounted and their number is open, it is the least of the counts whose mounts
-    see 95 % of what those of the largest count see together.
+    rules: Sequence[SensorRules], samples: Samples, count: int, retarget: Retarget | None, seed: int
+) -> tuple[SensorRules, ...]:
+    """The rules with every mounted sensor fixed at the mount chosen for it.
 
     Arguments:
         rules: Feasible rules of all sensors.
         samples: Samples of the density.
-        counts: Numbers of sensors that may be chosen, ascending.
+        count: Number of sensors.
         retarget: log p* of design points, (N, 6) to (N,).
         seed: Root of the draw of samples.
 
@@ -202,22 +187,15 @@ def choose_mounts(
         ConfigError: There is a choice, but no way to evaluate the target density.
         InfeasibleError: No mount sees any of the density.
     """
-    entries, common = len(rules) - 1, mounts_of(rules[-1])
-    count = counts[-1] if common else entries
+    entries = len(rules) - 1
+    count = count if mounts_of(rules[-1]) else entries
     options = [mounts_of(rules_of(rules, sensor)) for sensor in range(count)]
-    open_count = bool(common) and len(counts) > 1
-    if not open_count and not entries and len(options[0]) == len(options):
+    if not entries and len(options[0]) == len(options):
         # alike sensors at all the mounts, in the file's order
         chosen = dict(enumerate(options[0]))
     else:
-        views = _views(rules, samples, options, retarget, seed)
-        chosen, together = _greedy(views, options)
-        if open_count:
-            seen = {n: _greedy(views, options[:n]) for n in counts}
-            count = min(n for n in counts if seen[n][1] >= ENOUGH_SHARE * together)
-            chosen = seen[count][0]
-    places = [chosen.get(sensor) for sensor in range(count)]
-    return fix_origins(rules, places), [count] if common else counts
+        chosen = _greedy(_views(rules, samples, options, retarget, seed), options)
+    return fix_origins(rules, [chosen.get(sensor) for sensor in range(count)])
 
 
 def _views(
@@ -248,8 +226,8 @@ def _views(
     return views
 
 
-def _greedy(views: dict[tuple[int, Mount], np.ndarray], options: list[list[Mount]]) -> tuple[dict[int, Mount], float]:
-    """The mount of each mounted sensor, and how much of the density they see together."""
+def _greedy(views: dict[tuple[int, Mount], np.ndarray], options: list[list[Mount]]) -> dict[int, Mount]:
+    """The mount of each mounted sensor, of those that see most of the density together."""
     seen = np.zeros(len(next(iter(views.values()))))
     left = {sensor: list(mounts) for sensor, mounts in enumerate(options) if mounts}
     chosen: dict[int, Mount] = {}
@@ -265,7 +243,7 @@ def _greedy(views: dict[tuple[int, Mount], np.ndarray], options: list[list[Mount
         seen = np.maximum(seen, views[sensor, mount])
         del left[sensor]
         left = {other: [m for m in mounts if m != mount] for other, mounts in left.items()}
-    return chosen, float(seen.mean())
+    return chosen
 
 
 # A regression on five covariates means nothing from fewer effective samples.

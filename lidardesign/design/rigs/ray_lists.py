@@ -24,6 +24,7 @@ import numpy as np
 from lidardesign.design.rigs.rig import MOST_SENSORS, Rig, RigSensor, number_of
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Sensor
 from lidardesign.errors import DataError
+from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.arrays import NUMERIC_KINDS, csv_rows, read_npz
 from lidardesign.run.files import write_atomic
@@ -245,6 +246,35 @@ def read_ray_npz(path: Path) -> Rig:
     return rig_of_columns(RayColumns(numbers, sensor.reshape(-1), sensor_names, locate), "rays NPZ")
 
 
+# Of sensors, in every list of rays.
+LOST = ["names, weights, spreads and origin covariances of the sensors are lost: rows have their numbers"]
+
+
+def ray_columns(rays: Rays) -> dict[str, np.ndarray]:
+    """Columns by name, each of shape (N,), in the order in which they are written."""
+    azimuth, elevation = angles(rays.direction)
+    columns = (*rays.origin_m.T, *rays.direction.T, azimuth, elevation, *rays.gate_m.T, rays.sensor, rays.time_s)
+    return dict(zip((*ORIGIN, *VECTOR, *RADIANS, START, END, SENSOR, TIME), columns, strict=True))
+
+
+def write_csv(_: DesignSpec, rays: Rays, path: Path) -> list[str]:
+    """Write one ray per row, every number with all its digits; returns notes of what the format cannot hold."""
+    columns = ray_columns(rays)
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
+    write_atomic(path, "\n".join(lines) + "\n")
+    return list(LOST)
+
+
+def write_npz(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+    """Write an array per column, and the sensors' names; returns notes of what the format cannot hold."""
+    buffer = io.BytesIO()
+    names = np.array([sensor.name for sensor in design.sensors], dtype=np.str_)
+    np.savez(buffer, **ray_columns(rays), **{NAMES: names})
+    write_atomic(path, buffer.getvalue())
+    return list(LOST)
+
+
 SENSOR_COLUMNS = (
     "origin_x", "origin_y", "origin_z", "azimuth_mean", "elevation_mean", "time_mean",
     "orig_cov_xx", "orig_cov_xy", "orig_cov_xz", "orig_cov_yy", "orig_cov_yz", "orig_cov_zz",
@@ -377,7 +407,7 @@ def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
         "couplings are lost: direction and range are read back as independent of the origin":
             any(sensor.coupling is not None for sensor in design.sensors),
     }  # fmt: skip
-    notes = ["names, ray counts, layout, constraints and provenance are lost; readers assume level 0.95"]
+    notes = ["names, ray counts, layout and provenance are lost; readers assume level 0.95"]
     notes += [note for note, applies in lost.items() if applies]
     for sensor in design.sensors:
         azimuth_sigma, elevation_sigma = sensor.spread_horizontal_rad, sensor.spread_vertical_rad
@@ -403,3 +433,9 @@ def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
         writer.writerow([repr(float(value)) for value in row])
     write_atomic(Path(path), buffer.getvalue())
     return notes
+
+
+def write_sensors_csv(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+    """Write the sensors of an export, not its rays; returns notes of what the format cannot hold."""
+    notes = write_sensor_csv(design, path)
+    return [*notes, f"the {len(rays)} rays are lost"] if len(rays) else notes

@@ -1,10 +1,6 @@
-"""What distance fields of meshes cost: grid points along their longest side, and how one reads between them.
+"""Accuracy and cost of distance fields of meshes by their grid points along the longest side.
 
 Bodies that are primitives are exact at any cost and need no field.
-
-Distances by other means than learning's, to compare it with: exact queries, nearest and tricubic interpolation.
-
-All give distances alone, without gradients, in the form of `fields.Field`.
 
 Settings of a target from its quick sweep: the coarsest distance fields that misplace little enough of its mass.
 
@@ -18,11 +14,10 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
-from lidardesign.config import DensitySettings, RunConfig
+from lidardesign.config import DensitySettings
 from lidardesign.density.fields.bodies import place_bodies
 from lidardesign.density.fields.distance import BodyField, Field, TableField, scene_columns
 from lidardesign.density.fields.grids import distance_grid, grid_around
@@ -35,17 +30,14 @@ from lidardesign.density.target.visibility import (
     RayBatch,
 )
 from lidardesign.evaluate.accuracy.probes import (
-    BECAUSE,
-    ERROR_OF,
-    TOLERANCE,
     AccuracyRequest,
     Probes,
+    density_sweep,
     draw_probes,
     few_columns,
 )
-from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
 from lidardesign.numerics import logsumexp
-from lidardesign.run.clock import phase
 from lidardesign.scene import Body, Mesh, Scene, inverse_rigid
 from lidardesign.space import DesignSpace
 
@@ -118,53 +110,6 @@ def target_meshes(scene: Scene) -> list[Mesh]:
     return [b.shape.transformed(b.pose()) for b in scene.bodies if b.is_target and isinstance(b.shape, Mesh)]
 
 
-@dataclass(frozen=True, eq=False)
-class InterpolatedField:
-    """A table read with splines of another order than 1.
-
-    Arguments:
-        table: Whose distances, or spline coefficients of them, are read.
-        order: 0 for the nearest grid point, 3 for tricubic splines.
-    """
-
-    table: TableField
-    order: int
-
-    @classmethod
-    def of(cls, table: TableField, order: int) -> InterpolatedField:
-        """The same distances, with the coefficients that splines of an order need."""
-        from scipy.ndimage import spline_filter
-
-        if order < 2:
-            return cls(table, order)
-        columns = [
-            spline_filter(column.reshape(table.grid.counts), order, output=np.float32, mode="nearest").ravel()
-            for column in table.table.T
-        ]
-        return cls(TableField(np.stack(columns, axis=1), table.grid, table.shell_m), order)
-
-    def distances(self, points: np.ndarray) -> np.ndarray:
-        """See `Field`; a lower bound outside the grid, as that of learning is."""
-        from scipy.ndimage import map_coordinates
-
-        grid = self.table.grid
-        place = (points - grid.low) / grid.step
-        clamped = np.clip(place, 0.0, grid.counts - 1.0)
-        squared = np.square((place - clamped) * grid.step).sum(axis=1)
-        inner = np.stack(
-            [
-                map_coordinates(
-                    column.reshape(grid.counts), clamped.T, order=self.order, mode="nearest", prefilter=False
-                )
-                for column in self.table.table.T
-            ],
-            axis=1,
-        ).astype(np.float64)
-        outside = squared > 0
-        inner[outside] = np.sqrt(squared[outside, None] + np.square(np.maximum(inner[outside], 0.0)))
-        return inner
-
-
 RESOLUTIONS = (16, 24, 32, 48, 64, 96, 128)
 # The more scenes, the more their errors average out; so many can be built anew at every resolution.
 COLUMNS = 12
@@ -173,9 +118,6 @@ PROBES = 16_384
 LONGEST_SECONDS = 20.0
 # A coarse field has its surfaces elsewhere: probes must meet them there too.
 WIDENING = 3.0
-TIMED_POINTS = 1024
-ORDERS = {"nearest": 0, "trilinear": 1, "tricubic": 3}
-DEFAULT_ORDER = "trilinear"
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,16 +183,13 @@ class FieldCase:
 
 
 def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """Resolution and interpolation; empty where no target is a mesh, or no ray meets one."""
+    """One sweep; empty where no target is a mesh, or no ray meets one."""
     scenes, config = list(request.request.train), request.config
     if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
         return []
     visibility = request.decided_visibility or config.density.visibility
     case = FieldCase.of(scenes, config.space, config.density, config.seed, visibility)
-    if case is None:
-        return []
-    ways = [interpolation_sweep] if isinstance(case.target.surfaces.field, TableField) else []
-    return [sweep(case) for sweep in (resolution_sweep, *ways)]
+    return [] if case is None else [resolution_sweep(case)]
 
 
 def resolution_sweep(case: FieldCase) -> Sweep:
@@ -269,16 +208,13 @@ def resolution_sweep(case: FieldCase) -> Sweep:
         error, uncertainty, values = case.errors(field)
         of_all = _bytes(field, case)
         measurements.append(Measurement(str(count), error, uncertainty, seconds, of_all, count == own, values=values))
-    return Sweep(
+    return density_sweep(
         knob="density.field_resolution",
-        error_of=ERROR_OF,
-        unit="",
         against="exact distances to the triangles",
-        tolerance=TOLERANCE,
-        because=BECAUSE,
         work="building the field of one scene",
         measurements=measurements,
-        note=_part(case, f"memory is that of all scenes' fields{left_out}"),
+        note=f"measured on {len(case.few)} of {len(case.scenes)} training scenes; memory is that of all scenes' "
+        f"fields{left_out}",
     )
 
 
@@ -292,34 +228,6 @@ def _bytes(field: Field, case: FieldCase) -> int:
 def _meshes(scenes: list[Scene]) -> int:
     bodies = [body for scene in scenes for body in scene.bodies if body.is_target]
     return len({body.shape.content_hash for body in bodies if isinstance(body.shape, Mesh)})
-
-
-def interpolation_sweep(case: FieldCase) -> Sweep:
-    """How distances between grid points are found, at the run's own resolution."""
-    table, points = case.target.surfaces.field, case.observed[:TIMED_POINTS]
-    exact = ExactField(case.few, lambda body: body.is_target)
-    _, exact_seconds, exact_memory = timed(lambda: exact.distances(points))
-    measurements = []
-    for name, order in ORDERS.items():
-        default = name == DEFAULT_ORDER
-        field = table if default else InterpolatedField.of(table, order)
-        _, seconds, memory = timed(partial(field.distances, points))
-        error, uncertainty, values = case.errors(field)
-        measurements.append(Measurement(name, error, uncertainty, seconds, memory, default, values=values))
-    reference = Measurement(
-        "exact", 0.0, 0.0, exact_seconds, exact_memory, reference=True, values={"distance_error_mm": 0.0}
-    )
-    return Sweep(
-        knob="interpolation of fields",
-        error_of=ERROR_OF,
-        unit="",
-        against="exact distances to the triangles",
-        tolerance=TOLERANCE,
-        because=BECAUSE,
-        work=f"distances of {len(points)} points in {table.columns} scenes",
-        measurements=[*measurements, reference],
-        note=_part(case, f"with {case.settings.field_resolution} grid points along the longest side"),
-    )
 
 
 def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: DensitySettings) -> Field:
@@ -343,50 +251,3 @@ def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: Dens
     return BodyField(place_bodies(entries, len(columns), build))
 
 
-def _part(case: FieldCase, note: str) -> str:
-    return f"measured on {len(case.few)} of {len(case.scenes)} training scenes; {note}"
-
-
-# Of the whole tolerance: the rest is for learning, whose every halving costs more than that of the fields.
-FIELD_SHARE = 0.2
-
-
-@dataclass(frozen=True)
-class FieldChoice:
-    """Fields for a tolerance.
-
-    Arguments:
-        density: Settings with their resolution.
-        misplaced: The share of the target's mass that they misplace; 0 where distances are exact.
-        note: What was chosen and why, or "".
-    """
-
-    density: DensitySettings
-    misplaced: float
-    note: str = ""
-
-
-@phase("fields")
-def fields_within(scenes: list[Scene], config: RunConfig, tolerance: float, *, fixed: bool) -> FieldChoice:
-    """The coarsest fields that misplace at most a fifth of a tolerance, the finest of the sweep where none does.
-
-    Arguments:
-        scenes: The training scenes.
-        config: The run's configuration.
-        tolerance: The whole tolerance of the density.
-        fixed: Only measure the configuration's own resolution.
-    """
-    density = config.density
-    if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
-        return FieldChoice(density, 0.0)
-    case = FieldCase.of(scenes, config.space, density, config.seed, density.visibility)
-    if case is None:
-        return FieldChoice(density, 0.0)
-    misplaced = 0.0
-    for resolution in (density.field_resolution,) if fixed else RESOLUTIONS:
-        density = density.model_copy(update={"field_resolution": resolution})
-        misplaced, _, _ = case.errors(fresh(case.few, case.scenes, resolution, density))
-        if misplaced <= FIELD_SHARE * tolerance:
-            break
-    note = f"fields of {density.field_resolution} grid points misplace {misplaced:.2g} of the target's mass"
-    return FieldChoice(density, misplaced, note)

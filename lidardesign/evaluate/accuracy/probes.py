@@ -15,6 +15,7 @@ from lidardesign.density.target.prepare import prepare_target
 from lidardesign.density.target.proposals import independent_points
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.quality import misplaced_share
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.run.manifest import read_manifest
@@ -103,6 +104,20 @@ def draw_probes(target: Target, count: int, seed: int, label: str, *, widening: 
     order = np.argsort(first)
     first, times = first[order], times[order]
     return Probes(points[first], log_proposal[first] - np.log(times))
+
+
+def density_sweep(
+    knob: str,
+    against: str,
+    work: str,
+    measurements: Sequence[Measurement],
+    note: str,
+    *,
+    tolerance: float = TOLERANCE,
+    because: str = BECAUSE,
+) -> Sweep:
+    """A sweep whose errors are misplaced shares of a density; see `Sweep`."""
+    return Sweep(knob, ERROR_OF, "", against, tolerance, because, work, measurements, note)
 
 
 def few_columns(scenes: Sequence[Scene], most: int) -> list[Scene]:

@@ -3,43 +3,41 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
-from lidardesign.evaluate.accuracy import fields, held_out, mixture, physics, steps, training, visibility
+from lidardesign.evaluate.accuracy import evaluation, fields, training, visibility
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Accuracy, Sweep
-from lidardesign.run.clock import phase
+from lidardesign.run.clock import Progress, phase
 
 # In the order of the pipeline: the phase, its name for progress, and what gives the sweeps, none where the choice does
 # not arise.
 SWEEPS = (
     ("visibility", "visibility", visibility.sweeps),
     ("fields", "distance fields", fields.sweeps),
-    ("precision", "arithmetic", steps.dtype_sweeps),
-    ("scenes", "scenes per step", steps.frames_sweeps),
-    ("training", "training", training.sweeps),
-    ("mixture", "samples and seeds of the fit", mixture.sweeps),
-    ("physics", "effects of light", physics.sweeps),
-    ("held_out", "held-out scenes", held_out.sweeps),
+    ("precision", "arithmetic", training.dtype_sweeps),
+    ("scenes", "scenes per step", training.frames_sweeps),
+    ("training", "training", training.steps_sweeps),
+    ("physics", "effects of light", evaluation.physics_sweeps),
+    ("held_out", "held-out scenes", evaluation.scenes_sweeps),
 )
 
 
-def measure_accuracy(request: AccuracyRequest, progress: Callable[[int, int, str], None] | None = None) -> Accuracy:
+def measure_accuracy(request: AccuracyRequest, progress: Progress | None = None) -> Accuracy:
     """Measure every sweep that applies.
 
     Arguments:
         request: What to measure on.
-        progress: Called with the kinds of sweeps done, all kinds, and the label of the next.
+        progress: Called with the label of the next kind of sweeps, the kinds done, and all kinds.
     """
     measured: list[Sweep] = []
     seconds: dict[str, float] = {}
     for done, (name, label, sweeps) in enumerate(SWEEPS):
         if progress:
-            progress(done, len(SWEEPS), label)
+            progress(label, done, len(SWEEPS))
         started = time.perf_counter()
         with phase(name):
             measured += sweeps(request)
         seconds[name] = round(time.perf_counter() - started, 3)
     if progress:
-        progress(len(SWEEPS), len(SWEEPS), "")
+        progress("", len(SWEEPS), len(SWEEPS))
     return Accuracy(measured, seconds)

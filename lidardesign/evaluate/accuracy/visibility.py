@@ -1,4 +1,4 @@
-"""What visibility costs: none, quadrature or ray casting against opaque geometry; and midpoints of the quadrature.
+"""Accuracy and cost of visibility: none, quadrature or ray casting against opaque geometry.
 
 Visibility by opaque geometry: T = 1 up to the margin in front of the first hit, 0 behind it.
 
@@ -8,7 +8,7 @@ The closed form that ways to compute visibility are compared with; it has no gra
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -26,11 +26,9 @@ from lidardesign.density.target.visibility import (
     Visibility,
 )
 from lidardesign.evaluate.accuracy.probes import (
-    BECAUSE,
-    ERROR_OF,
-    TOLERANCE,
     AccuracyRequest,
     Probes,
+    density_sweep,
     draw_probes,
     few_columns,
 )
@@ -67,8 +65,6 @@ class Opaque(Visibility):
         return Opaque(self._exact.take(columns))
 
 
-POINTS = (16, 32, 64, 128, 256)
-REFERENCE_POINTS = 512
 # Errors of cheap ways, of the quadrature on a common table, and of that over bodies one by one.
 PROBES, TABLE_PROBES, BODY_PROBES = 32_768, 8192, 2048
 BODY_BATCH = 256
@@ -143,7 +139,7 @@ class VisibilityCase:
 
 
 def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """Ways against opaque geometry, and points of the quadrature against many; empty where no ray sees a target."""
+    """One sweep; empty where no ray sees a target."""
     scenes, config = list(request.request.train), request.config
     few = affordable_scenes(scenes)
     case = VisibilityCase.of(few, config.space, config.density, config.seed, config.learning.batch)
@@ -153,21 +149,17 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     default, points = request.decided_visibility or config.density.visibility, config.density.quadrature_points
     if default == "quadrature":
         points = request.target.visibility.one_way.points
-    part = _part(few, scenes)
-    by_ways = replace(visibility_sweep(case, points, default), note=part)
-    if default == "quadrature":
-        return [by_ways, replace(points_sweep(case, points), note=part)]
-    note = f"this run's visibility is {default}" + (f"; {part}" if part else "")
-    return [by_ways, replace(points_sweep(case, None), note=note)]
+    return [visibility_sweep(case, points, default, _part(few, scenes))]
 
 
-def visibility_sweep(case: VisibilityCase, points: int, default: str) -> Sweep:
+def visibility_sweep(case: VisibilityCase, points: int, default: str, note: str = "") -> Sweep:
     """No visibility, the quadrature with its own points, and ray casting.
 
     Arguments:
         case: What they are measured on.
         points: Of the quadrature.
         default: off, quadrature or raycast: what the run uses.
+        note: What a reader should know.
     """
     exact = case.exact
     ways = {
@@ -175,34 +167,12 @@ def visibility_sweep(case: VisibilityCase, points: int, default: str) -> Sweep:
         "quadrature": (case.quadrature(points), exact[: case.few]),
         "raycast": (case.cast, exact),
     }
-    return Sweep(
+    return density_sweep(
         knob="density.visibility",
-        error_of=ERROR_OF,
-        unit="",
         against="opaque geometry, by exact first hits",
-        tolerance=TOLERANCE,
-        because=BECAUSE,
         work=case.work,
         measurements=[case.measure(name, *way, default=name == default) for name, way in ways.items()],
-    )
-
-
-def points_sweep(case: VisibilityCase, default: int | None) -> Sweep:
-    """Midpoints of the quadrature against many of them; `default` is what the run uses, None without quadrature."""
-    exact = case.quadrature(REFERENCE_POINTS).log_density(case.probes.first(case.few).points)
-    measurements = [
-        case.measure(str(count), case.quadrature(count), exact, default=count == default)
-        for count in sorted({*POINTS, *([default] if default else [])})
-    ]
-    return Sweep(
-        knob="density.quadrature_points",
-        error_of=ERROR_OF,
-        unit="",
-        against=f"the integral with {REFERENCE_POINTS} points",
-        tolerance=TOLERANCE,
-        because=BECAUSE,
-        work=case.work,
-        measurements=measurements,
+        note=note,
     )
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -76,13 +76,11 @@ def crop_kinds(space: DesignSpace) -> dict[str, CropOf]:
 
 def _cropped(name: str, views: TrainingViews, crop_of: CropOf, gates_per_ray: bool) -> list[GatedLayout]:
     """The layouts of a kind of crop; none where there is nothing to crop to."""
-    known: dict[DesignSpace, Crop | None] = {}
 
+    @cache
     def crop_at(space: DesignSpace) -> Crop | None:
-        if space not in known:
-            observed = views.observed(space)
-            known[space] = crop_of(views, space, observed) if len(observed.points) else None
-        return known[space]
+        observed = views.observed(space)
+        return crop_of(views, space, observed) if len(observed.points) else None
 
     everywhere = crop_at(views.space)
     if everywhere is None:
@@ -133,15 +131,8 @@ def _dense_table(
     views: TrainingViews, low: np.ndarray, high: np.ndarray, directions: SphereField | None
 ) -> Callable[[], ReturnTable]:
     """What dense rays in a crop return, traced when that is first asked for."""
-    known: list[ReturnTable] = []
-
-    def table() -> ReturnTable:
-        if not known:
-            count = dense_rays(int((high > low).sum()))
-            known.append(views.returns(even_placement(low, high, count, directions)))
-        return known[0]
-
-    return table
+    count = dense_rays(int((high > low).sum()))
+    return cache(lambda: views.returns(even_placement(low, high, count, directions)))
 
 
 def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, float]:

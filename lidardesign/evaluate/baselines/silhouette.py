@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -90,13 +91,7 @@ def lloyd(views: TrainingViews) -> list[GatedLayout]:
 
 
 def _layouts(name: str, views: TrainingViews, place: PlaceRays, tail: float, sigmas: float) -> list[GatedLayout]:
-    known: dict[DesignSpace, Survey | None] = {}
-
-    def survey_at(space: DesignSpace) -> Survey | None:
-        if space not in known:
-            known[space] = survey(views, space)
-        return known[space]
-
+    survey_at = cache(partial(survey, views))
     everywhere = survey_at(views.space)
     if everywhere is None:
         return []

@@ -13,8 +13,7 @@ more candidate layouts; where there are several, the best on training scenes is 
 - `greedy`: rays chosen on training scenes without a density, see `lidardesign.evaluate.baselines.greedy`.
 - `occupancy`: see `lidardesign.evaluate.baselines.occupancy`.
 - `no-visibility`: the design fitted anew without its occlusion term, see below.
-- `catalog:NAME`: see `lidardesign.evaluate.baselines.catalog`.
-- `cma`: see `lidardesign.evaluate.cma.candidate`.
+- `cma`: see `lidardesign.evaluate.baselines.cma`.
 
 Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
 
@@ -28,13 +27,13 @@ design was weighted, what that is worth as well: the twin is not.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.fit import fit_like
+from lidardesign.design.mixture.support import Retarget
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.bounding import bounding
@@ -46,15 +45,7 @@ from lidardesign.evaluate.baselines.candidates import (
     most_within,
     whole_range,
 )
-from lidardesign.evaluate.baselines.catalog import (
-    FAMILY,
-    Density,
-    Retarget,
-    ScenePoints,
-    part_candidates,
-    scene_points,
-    split_argument,
-)
+from lidardesign.evaluate.baselines.cma import CMA
 from lidardesign.evaluate.baselines.even import even_placement
 from lidardesign.evaluate.baselines.greedy import GREEDY
 from lidardesign.evaluate.baselines.occupancy import occupancy
@@ -69,7 +60,6 @@ from lidardesign.task import random_generator
 
 Judge = Callable[[Sequence[RaysPerCondition]], Sequence[float]]
 NO_VISIBILITY = "no-visibility"
-CMA = "cma"
 
 
 class Option(NamedTuple):
@@ -90,7 +80,6 @@ class Baselines:
         conditions: The condition values that rays are laid out at.
         gates_per_ray: Whether the rays of `bounding` may have gates of their own.
         without_visibility: Makes the layout that stands for `no-visibility`; called when that is asked for.
-        density: What a run has learned, or None where it has no samples; called when a baseline looks there.
         optimised: Makes the layout that stands for `cma`; called when that is asked for.
         chosen: Makes the layout that stands for `greedy`; called when that is asked for.
     """
@@ -105,24 +94,17 @@ class Baselines:
         conditions: Sequence[Mapping[str, float]] = ({},),
         gates_per_ray: bool = False,
         without_visibility: Callable[[], Candidate] | None = None,
-        density: Callable[[], Density | None] | None = None,
-        optimised: Callable[[TrainingViews], Candidate] | None = None,
+        optimised: Callable[[], Candidate] | None = None,
         chosen: Callable[[TrainingViews], Candidate] | None = None,
     ) -> None:
         self.space, self.train, self.seed = space, train, seed
         self.spaces = [space.at(condition) for condition in conditions]
         self.views = TrainingViews(space, train)
         self.gates_per_ray = gates_per_ray
-        self.without_visibility, self.density, self.optimised = without_visibility, density, optimised
-        self.chosen = chosen
+        self.without_visibility, self.optimised, self.chosen = without_visibility, optimised, chosen
         self._judge = judge or self.views.missing_returns
         self._candidates: dict[str, list[Candidate]] = {}
         self._scores: dict[tuple[str, str, int], float] = {}
-
-    @cached_property
-    def scene_points(self) -> ScenePoints:
-        """What parts of the catalogue are to see, the same for all."""
-        return scene_points(self.views, self.seed, None if self.density is None else self.density())
 
     def options(self, name: str, count: int) -> list[Option]:
         """All candidates of a baseline at a number of rays."""
@@ -148,8 +130,8 @@ class Baselines:
             ConfigError: There is no such baseline.
         """
         if name not in self._candidates:
-            family, argument = baseline_of(name)
-            self._candidates[name] = family.build(self, argument)
+            check_baseline(name)
+            self._candidates[name] = BASELINES[name](self)
         return self._candidates[name]
 
     @phase("baselines")
@@ -175,14 +157,14 @@ def _keyed(name: str, options: Sequence[Option]) -> list[tuple[tuple[str, str, i
     return [((name, one.candidate.name, len(one.positions[0])), one) for one in options]
 
 
-def _uniform(source: Baselines, argument: str) -> list[Candidate]:
+def _uniform(source: Baselines) -> list[Candidate]:
     def place(count: int, site: LayoutSite) -> np.ndarray:
         return even_placement(site.space.low[:RAY_AXES], site.space.high[:RAY_AXES], count)
 
     return [BaselineLayout("even", place, whole_range(source.space))]
 
 
-def _random(source: Baselines, argument: str) -> list[Candidate]:
+def _random(source: Baselines) -> list[Candidate]:
     def place(count: int, site: LayoutSite) -> np.ndarray:
         # the first position draws what a space without conditions draws
         later = [site.number] if site.number else []
@@ -191,30 +173,30 @@ def _random(source: Baselines, argument: str) -> list[Candidate]:
     return [BaselineLayout("random", place, whole_range(source.space), drawn_anew=True)]
 
 
-def _bounding(source: Baselines, argument: str) -> list[Candidate]:
-    return list(bounding(source.views, gates_per_ray=source.gates_per_ray)) or _uniform(source, argument)
+def _bounding(source: Baselines) -> list[Candidate]:
+    return list(bounding(source.views, gates_per_ray=source.gates_per_ray)) or _uniform(source)
 
 
-def _silhouette(source: Baselines, argument: str) -> list[Candidate]:
-    return list(silhouette(source.views)) or _uniform(source, argument)
+def _silhouette(source: Baselines) -> list[Candidate]:
+    return list(silhouette(source.views)) or _uniform(source)
 
 
-def _lloyd(source: Baselines, argument: str) -> list[Candidate]:
-    return list(lloyd(source.views)) or _uniform(source, argument)
+def _lloyd(source: Baselines) -> list[Candidate]:
+    return list(lloyd(source.views)) or _uniform(source)
 
 
-def _greedy(source: Baselines, argument: str) -> list[Candidate]:
+def _greedy(source: Baselines) -> list[Candidate]:
     if source.chosen is None or not len(source.views.observed(source.space).points):
-        return _uniform(source, argument)
+        return _uniform(source)
     return [source.chosen(source.views)]
 
 
-def _occupancy(source: Baselines, argument: str) -> list[Candidate]:
+def _occupancy(source: Baselines) -> list[Candidate]:
     layout = occupancy(source.space, source.train, source.seed)
-    return _random(source, argument) if layout is None else [layout]
+    return _random(source) if layout is None else [layout]
 
 
-def _no_visibility(source: Baselines, argument: str) -> list[Candidate]:
+def _no_visibility(source: Baselines) -> list[Candidate]:
     if source.without_visibility is None:
         raise ConfigError(
             "there is no design to refit without occlusion",
@@ -225,81 +207,43 @@ def _no_visibility(source: Baselines, argument: str) -> list[Candidate]:
     return [source.without_visibility()]
 
 
-def _catalog(source: Baselines, argument: str) -> list[Candidate]:
-    return list(part_candidates(argument, source.space, source.seed, lambda: source.scene_points))
-
-
-def _cma(source: Baselines, argument: str) -> list[Candidate]:
+def _cma(source: Baselines) -> list[Candidate]:
     if source.optimised is None:
         raise ConfigError(
             "there is no design whose sensors can be varied",
             where=f"--baseline {CMA}",
             allowed="at least one design",
         )
-    return [source.optimised(source.views)]
+    return [source.optimised()]
 
 
-class Family(NamedTuple):
-    """A kind of baseline: its name on the command line is `NAME`, or `NAME:ARGUMENT` where it takes one.
-
-    Arguments:
-        build: The candidates to choose from, of a source and the argument (empty where there is none).
-        argument: What follows the colon, for messages; empty where nothing may.
-        check: Raises ConfigError for an argument that cannot be used, before anything is built.
-    """
-
-    build: Callable[[Baselines, str], list[Candidate]]
-    argument: str = ""
-    check: Callable[[str], object] | None = None
-
-    def named(self, name: str) -> str:
-        """How this family is asked for, for messages."""
-        return f"{name}:{self.argument}" if self.argument else name
-
-
-BASELINES: dict[str, Family] = {
-    "uniform": Family(_uniform),
-    "random": Family(_random),
-    "bounding": Family(_bounding),
-    "silhouette": Family(_silhouette),
-    "lloyd": Family(_lloyd),
-    GREEDY: Family(_greedy),
-    "occupancy": Family(_occupancy),
-    NO_VISIBILITY: Family(_no_visibility),
-    FAMILY: Family(_catalog, "NAME", check=split_argument),
-    CMA: Family(_cma),
+BASELINES: dict[str, Callable[[Baselines], list[Candidate]]] = {
+    "uniform": _uniform,
+    "random": _random,
+    "bounding": _bounding,
+    "silhouette": _silhouette,
+    "lloyd": _lloyd,
+    GREEDY: _greedy,
+    "occupancy": _occupancy,
+    NO_VISIBILITY: _no_visibility,
+    CMA: _cma,
 }
 
 
+# In the place of names: no baselines at all.
+NONE = "none"
 # What stands beside every design, asked for or not.
 ALWAYS = ("uniform", "random", "bounding", "silhouette", GREEDY)
 
 
-def baseline_of(name: str, *, where: str = "baselines") -> tuple[Family, str]:
-    """The family that a baseline's name belongs to, and its argument (empty where there is none).
+def check_baseline(name: str, *, where: str = "baselines") -> None:
+    """Refuse a name that is no baseline's.
 
     Raises:
-        ConfigError: There is no such baseline, its argument is missing or not wanted, or it cannot be used.
+        ConfigError: There is no such baseline.
     """
-    kind, colon, argument = name.partition(":")
-    family = BASELINES.get(kind)
-    if family is None:
-        known = ", ".join(one.named(kind) for kind, one in BASELINES.items())
-        raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=known)
-    if colon and not family.argument:
-        raise ConfigError(f"the baseline {kind!r} takes no value after its name", where=where, allowed=kind)
-    if not argument and (colon or family.argument):
-        raise ConfigError(
-            f"the baseline {name!r} needs a value after its name", where=where, allowed=family.named(kind)
-        )
-    if argument and family.check is not None:
-        family.check(argument)
-    return family, argument
-
-
-def is_baseline(name: str) -> bool:
-    """Whether a name is a baseline's, or would be read as one."""
-    return name.partition(":")[0] in BASELINES
+    if name not in BASELINES:
+        raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=", ".join(BASELINES))
 
 
 CLOSE_ENOUGH = 0.98  # of the bandwidth: every further step may be another fit

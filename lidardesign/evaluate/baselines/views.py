@@ -1,9 +1,9 @@
-"""What dense rays return in training scenes: where, how often, and the gates that hold it."""
+"""What rays return and score in training scenes: where, how often, the gates that hold it, and the task's metric."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -11,10 +11,15 @@ from scipy.spatial import cKDTree
 
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.evaluate.baselines.candidates import RaysPerCondition, opened_gate, whole_range
+from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.numerics import wrap_turn
 from lidardesign.scene import Scene
+from lidardesign.simulate.detector.detector import Physics
+from lidardesign.simulate.plan import Planner
+from lidardesign.simulate.simulate import build_casters
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, direction, observed_point
+from lidardesign.task import Metric, Task
 
 RAY_AXES = 5  # x, y, z, azimuth, elevation: everything but the range
 
@@ -227,3 +232,55 @@ def unrolled(azimuth_rad: np.ndarray) -> np.ndarray:
     turned = np.sort(wrap_turn(azimuth_rad))
     gaps = np.diff(np.append(turned, turned[0] + FULL_TURN))
     return wrap_turn(azimuth_rad, turned[(int(np.argmax(gaps)) + 1) % len(turned)])
+
+
+class OutOfTimeError(Exception):
+    """The time was up before all was scored."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingObjective:
+    """The task's metric on training scenes, turned so that lower is better.
+
+    Arguments:
+        task: Whose score is taken.
+        metric: What it means.
+        scenes: Training scenes.
+        planner: The detector, and how effects are chosen.
+        seed: Root of the effects' random streams.
+    """
+
+    task: Task
+    metric: Metric
+    scenes: Sequence[Scene]
+    planner: Planner
+    seed: int
+    _prepared: dict[int, tuple[list[SceneCaster], Physics | None]] = field(default_factory=dict, repr=False)
+
+    @property
+    def sign(self) -> float:
+        """What turns the metric so that lower is better."""
+        return 1.0 if self.metric.better == "lower" else -1.0
+
+    def values(self, lists: Sequence[RaysPerCondition], stop: Callable[[], bool] = lambda: False) -> np.ndarray:
+        """The score of every set of rays in every scene, lower is better, shape (scenes, sets).
+
+        Arguments:
+            lists: The sets of rays; one without rays has the metric's worst value everywhere.
+            stop: Asked before every scene but the first whether the time is up.
+
+        Raises:
+            OutOfTimeError: It was.
+        """
+        found = np.empty((len(self.scenes), len(lists)))
+        for number, scene in enumerate(self.scenes):
+            if number and stop():
+                raise OutOfTimeError
+            if number not in self._prepared:
+                # the rays that are fired first say which effects a scene calls for
+                casters = build_casters(scene)
+                plan = self.planner.plan(scene, [rays for positions in lists for rays in positions], casters)
+                self._prepared[number] = casters, self.planner.physics(plan, self.seed)
+            scores = score_lists(self.task, self.metric, scene, lists, *self._prepared[number])
+            found[number] = [self.sign * score.value for score, _ in scores]
+        return found

@@ -4,18 +4,12 @@ Names, types and sizes are looked at before any data is read: objects, cells and
 data than a stated size, packed or not.
 
 MATLAB files of versions 4 to 7, read by SciPy in a process of its own, which damaged ones may crash.
-
-Run as a program, it looks at names, shapes and classes before it reads any data, writes all arrays to a `.npz` file and
-prints what came of it as JSON: the arrays' names, what it refused, or how large they are.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import math
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -24,12 +18,14 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.run.arrays import check_kind, guarded, read_npz
+from lidardesign.run.child import ChildError, ask
 from lidardesign.run.inputs import CAPTURE, check_bytes, check_file
 
 # Numpy's types by MATLAB's classes.
 NUMBERS = {"double": "f8", "single": "f4", "logical": "?"} | {
     f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)
 }
+CONVERTER = f"{__name__}:convert"
 # A file of the largest size takes some seconds.
 PATIENCE_SECONDS = 120.0
 # Memory of the process, in times of the largest size: packed data, the same unpacked, the array, and the libraries.
@@ -43,15 +39,12 @@ def read_matlab(path: Path) -> dict[str, np.ndarray]:
     Raises:
         DataError: It is damaged, too large, or holds other things than full real arrays of numbers.
     """
-    # modules are found where this process finds them
-    program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "arrays.npz"
-        command = [sys.executable, "-c", program, str(path), str(target), str(CAPTURE.unpacked_bytes)]
+        request = {"source": str(path), "target": str(target), "most": CAPTURE.unpacked_bytes}
         try:
-            done = subprocess.run(command, capture_output=True, check=True, timeout=PATIENCE_SECONDS)
-            found = json.loads(done.stdout)
-        except (subprocess.SubprocessError, ValueError) as error:
+            found = ask(CONVERTER, request, PATIENCE_SECONDS, "while it is read")
+        except ChildError as error:
             hint = "write it again with save or savemat"
             raise DataError("is not a MATLAB file, or is damaged", where=str(path), hint=hint) from error
         if "refused" in found:
@@ -67,19 +60,15 @@ def refused(name: str, kind: str, where: str) -> DataError:
     return DataError(f"{name!r} is a MATLAB {kind}", where=where, allowed=allowed, hint=hint)
 
 
-def main() -> None:
-    """Read the file that the first argument names into the one of the second, up to the bytes of the third."""
-    source, target, most = sys.argv[1], sys.argv[2], int(sys.argv[3])
+def convert(request: dict[str, Any], _: object) -> dict[str, Any]:
+    """In that process: write the arrays of a file into another, and say their names and sizes, or what was refused."""
+    from scipy.io import loadmat, whosmat
+
+    source, target, most = request["source"], request["target"], request["most"]
     with contextlib.suppress(ImportError, ValueError, OSError):
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY_SHARE * max(most, 1 << 29), resource.RLIM_INFINITY))
-    print(json.dumps(_convert(source, target, most)))
-
-
-def _convert(source: str, target: str, most: int) -> dict[str, object]:
-    from scipy.io import loadmat, whosmat
-
     listed = whosmat(source)
     for name, _, kind in listed:
         if kind not in NUMBERS:

@@ -15,9 +15,9 @@ import numpy as np
 
 from lidardesign.design.layouts.rays import certificates_of
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.evaluate.figures.canvas import Series
 from lidardesign.evaluate.report.figures import AXIS, DASH_NAMES, LAYOUT, SYMBOLS
 from lidardesign.evaluate.report.markup import figure, folded, paragraphs, swatch
+from lidardesign.evaluate.report.series import Series
 from lidardesign.evaluate.report.tables import four_digits, table
 from lidardesign.evaluate.results import Evaluation
 

@@ -3,8 +3,7 @@
 plotly reads a little HTML in names, so every name is escaped here. Legends are in the page itself, where they can be
 switched from the keyboard too.
 
-They are the curves of scores, the learned density (marginals beside those of designs, and the field it observes), and
-what accuracy costs: error against seconds, with a table.
+They are the curves of scores, and the learned density: marginals beside those of designs, and the field it observes.
 """
 
 from __future__ import annotations
@@ -18,23 +17,9 @@ import numpy as np
 
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import check_choice
-from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
-from lidardesign.evaluate.figures.canvas import Against, Series, axis_titles, log_ticks, logarithmic, position, series
-from lidardesign.evaluate.figures.density_views import Marginal, PlaneDensity
-from lidardesign.evaluate.figures.drawing import frustum_lines
-from lidardesign.evaluate.figures.pareto import (
-    CHOSEN,
-    LINE,
-    PALE,
-    TOLERANCE,
-    Mark,
-    Panel,
-    has_fine_ticks,
-    label_places,
-    panels,
-)
-from lidardesign.evaluate.report.markup import folded
-from lidardesign.evaluate.report.tables import plain_number, table
+from lidardesign.evaluate.report.density_views import Marginal, PlaneDensity
+from lidardesign.evaluate.report.drawing import frustum_lines
+from lidardesign.evaluate.report.series import Against, Series, axis_titles, log_ticks, logarithmic, position, series
 from lidardesign.evaluate.report.view import encoded
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.geometry.rays import Rays
@@ -117,10 +102,12 @@ def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
     across = [position(row, against) for row in curve.rows]
     name = html.escape(curve.name)
     red, green, blue = (int(curve.colour[i : i + 2], 16) for i in (1, 3, 5))
+    values = [row.value for row in curve.rows]
+    low, high = zip(*(row.drawn_interval for row in curve.rows), strict=True)
     band = {
         "type": "scatter",
         "x": [*across, *across[::-1]],
-        "y": [*(row.drawn_interval[1] for row in curve.rows), *(row.drawn_interval[0] for row in reversed(curve.rows))],
+        "y": [*high, *low[::-1]],
         "fill": "toself",
         "fillcolor": f"rgba({red},{green},{blue},0.13)",
         "line": {"width": 0},
@@ -132,7 +119,15 @@ def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
     line = {
         "type": "scatter",
         "x": across,
-        "y": [row.value for row in curve.rows],
+        "y": values,
+        # a single point has no band
+        "error_y": {
+            "type": "data",
+            "symmetric": False,
+            "array": [end - value for end, value in zip(high, values, strict=True)],
+            "arrayminus": [value - end for end, value in zip(low, values, strict=True)],
+            "visible": len(values) == 1,
+        },
         "name": name,
         "legendgroup": name,
         "mode": "lines+markers",
@@ -249,179 +244,6 @@ def _steps(edges: np.ndarray, heights: np.ndarray) -> dict[str, Any]:
         "x": np.repeat(edges, 2).tolist(),
         "y": [0.0, *np.repeat(heights, 2).tolist(), 0.0],
     }
-
-
-# Of a panel; pixels of it above for its title, below for its axis, and per line of text.
-PANEL_PX = 300
-ABOVE_PX, BELOW_PX, LINE_PX = 34, 46, 11
-BYTES_PER_MB = 1e6
-
-
-def pareto_figures(sweeps: Sequence[Sweep]) -> list[dict[str, Any]]:
-    """One panel per sweep; hovering tells what a measurement is."""
-    return [_pareto_figure(panel) for panel in panels(sweeps)]
-
-
-def _pareto_figure(panel: Panel) -> dict[str, Any]:
-    line = {
-        "type": "scatter",
-        "x": [mark.x for mark in panel.front],
-        "y": [mark.y for mark in panel.front],
-        "mode": "lines",
-        "line": {"color": LINE, "width": 1.5},
-        "opacity": PALE,
-        "hoverinfo": "skip",
-    }
-    layout = {
-        **LAYOUT,
-        "margin": {"l": 62, "r": 12, "t": ABOVE_PX, "b": BELOW_PX},
-        "hovermode": "closest",
-        "annotations": [_title(panel), *_settings(panel)],
-        "xaxis": _pareto_axis(panel.seconds, "seconds"),
-        "yaxis": _pareto_axis(panel.errors, html.escape(panel.error_title)),
-    }
-    return {"data": [*([_tolerance(panel)] if panel.shows_tolerance else []), line, _marks(panel)], "layout": layout}
-
-
-def _marks(panel: Panel) -> dict[str, Any]:
-    marks = panel.marks
-    return {
-        "type": "scatter",
-        "x": [mark.x for mark in marks],
-        "y": [mark.y for mark in marks],
-        "mode": "markers",
-        "cliponaxis": False,
-        "marker": {
-            "symbol": ["triangle-down" if mark.on_edge else "circle" for mark in marks],
-            "size": [13 if mark.measurement.default else 9 for mark in marks],
-            "color": [CHOSEN if mark.chosen else LINE for mark in marks],
-            "opacity": [
-                PALE if mark.beaten and not (mark.chosen or mark.measurement.default) else 1.0 for mark in marks
-            ],
-            "line": {"color": "#222222", "width": [2.5 if mark.measurement.default else 0 for mark in marks]},
-        },
-        "error_y": {
-            "type": "data",
-            "symmetric": False,
-            "array": [mark.high - mark.y for mark in marks],
-            "arrayminus": [mark.y - mark.low for mark in marks],
-            "thickness": 1,
-            "width": 0,
-            "color": LINE,
-        },
-        "customdata": [_hover_text(mark, panel.sweep) for mark in marks],
-        "hovertemplate": "%{customdata}<extra></extra>",
-    }
-
-
-def _settings(panel: Panel) -> list[dict[str, Any]]:
-    places = label_places(panel, PANEL_PX - ABOVE_PX - BELOW_PX, LINE_PX)
-    return [
-        {
-            "text": html.escape(mark.measurement.setting),
-            "xref": "x",
-            "yref": "y",
-            "x": math.log10(mark.x),
-            "y": math.log10(mark.y),
-            "xshift": across,
-            "yshift": up,
-            "xanchor": side,
-            "yanchor": "middle",
-            "showarrow": False,
-            "bgcolor": "rgba(255,255,255,0.75)",
-            "borderpad": 0,
-            "font": {"size": 10, "color": CHOSEN if mark.chosen else "#333333"},
-        }
-        for mark, (across, up, side) in zip(panel.marks, places, strict=True)
-    ]
-
-
-def _hover_text(mark: Mark, sweep: Sweep) -> str:
-    measurement = mark.measurement
-    error = f"error {measurement.error:.3g} &#177; {measurement.uncertainty:.1g} {html.escape(sweep.unit)}"
-    lines = [f"<b>{html.escape(measurement.setting)}</b>", "the reference" if measurement.reference else error]
-    lines.append(f"{measurement.seconds:.3g} s")
-    if measurement.memory_bytes is not None:
-        lines.append(f"{measurement.memory_bytes / BYTES_PER_MB:.3g} MB")
-    lines += ["the one to choose"] if mark.chosen else []
-    lines += ["the run's own"] if measurement.default else []
-    return "<br>".join(line.strip() for line in lines)
-
-
-def _pareto_axis(ends: tuple[float, float], title: str) -> dict[str, Any]:
-    return {
-        "type": "log",
-        "gridcolor": "#e4e7eb",
-        "linecolor": "#9aa5b1",
-        "ticks": "outside",
-        "zeroline": False,
-        "dtick": "D2" if has_fine_ticks(ends) else 1,
-        "range": [math.log10(end) for end in ends],
-        "tickformat": "~g",
-        "tickfont": {"size": 10},
-        "automargin": True,
-        "title": {"text": title, "standoff": 4, "font": {"size": 11}},
-    }
-
-
-def _title(panel: Panel) -> dict[str, Any]:
-    return {
-        "text": f"<b>{html.escape(panel.sweep.knob)}</b>",
-        "xref": "x domain",
-        "yref": "y domain",
-        "x": 0,
-        "y": 1.0,
-        "yshift": 2,
-        "xanchor": "left",
-        "yanchor": "bottom",
-        "showarrow": False,
-        "font": {"size": 13},
-    }
-
-
-def _tolerance(panel: Panel) -> dict[str, Any]:
-    """A dashed line across the panel; a trace, because shapes vanish behind grid lines in the same place."""
-    return {
-        "type": "scatter",
-        "x": list(panel.seconds),
-        "y": [panel.sweep.tolerance] * 2,
-        "mode": "lines",
-        "line": {"color": TOLERANCE, "width": 1.2, "dash": "dash"},
-        "hoverinfo": "skip",
-    }
-
-
-def accuracy_tables(sweeps: Sequence[Sweep]) -> str:
-    """Every sweep with all its measurements, what its figures mean and its verdict."""
-    return "".join(_table(sweep) for sweep in sweeps)
-
-
-def _table(sweep: Sweep) -> str:
-    unit = f" [{sweep.unit}]" if sweep.unit else ""
-    limit = f"{sweep.tolerance:.3g} {sweep.unit}".rstrip()
-    about = (
-        f"Error: {sweep.error_of}, against {sweep.against}. Tolerance: {limit}, {sweep.because}. Seconds: "
-        f"{sweep.work}." + (f" Note: {sweep.note}." if sweep.note else "")
-    )
-    headings = ("setting", f"error{unit}", "standard error", "seconds", "MB", "verdict")
-    chosen = sweep.chosen
-    lines = [(_cells(one), "better" if one is chosen else "open", False) for one in sweep.measurements]
-    words = {"better": "to choose", "open": ""}
-    content = table(headings, lines, text_columns=1, words=words, caption=f"Settings of {sweep.knob}.")
-    return folded(f"{sweep.knob}: {sweep.verdict}", f"<p>{html.escape(about)}</p>{content}")
-
-
-def _cells(measurement: Measurement) -> list[str]:
-    size = measurement.memory_bytes
-    memory = "" if size is None else plain_number(size / BYTES_PER_MB, 3, tiny=1.0)
-    error = (f"{measurement.error:.3g}", f"{measurement.uncertainty:.2g}")
-    return [
-        measurement.setting + (" (run)" if measurement.default else ""),
-        *(("reference", "") if measurement.reference else error),
-        f"{measurement.seconds:.3g}",
-        memory,
-        "",
-    ]
 
 
 # More lines are no picture.

@@ -20,23 +20,21 @@ from lidardesign.config import FILE_NAME, RunConfig
 from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.design.sensor import CERTIFICATES
 from lidardesign.evaluate.accuracy.settings import Sweep
-from lidardesign.evaluate.figures.canvas import DASHES, Series, series
-from lidardesign.evaluate.figures.density_views import DensityView
-from lidardesign.evaluate.figures.scene_figure import FigureData, SceneFigure
 from lidardesign.evaluate.report.choice import choice_section
+from lidardesign.evaluate.report.density_views import DensityView, density_view
 from lidardesign.evaluate.report.figures import (
     FONT,
     MOST_DESIGNS,
-    PANEL_PX,
-    accuracy_tables,
     curve_figure,
     far_rivals,
     marginal_figure,
-    pareto_figures,
     plane_figure,
 )
 from lidardesign.evaluate.report.markup import embedded, figure, folded, page, paragraphs, section, swatch, switch
+from lidardesign.evaluate.report.pareto import PANEL_PX, accuracy_tables, pareto_figures
 from lidardesign.evaluate.report.result import result_section
+from lidardesign.evaluate.report.scene_figure import SceneFigure, constraint_slack_of, evaluated_scene
+from lidardesign.evaluate.report.series import DASHES, Series, series
 from lidardesign.evaluate.report.tables import (
     CommandTimes,
     Reproduction,
@@ -222,7 +220,7 @@ def evaluation_report(
     request: EvaluationRequest,
     folder: Path,
     config: RunConfig,
-    pictured: FigureData,
+    times: Mapping[str, Mapping[str, float]],
     command: Sequence[str],
 ) -> Report:
     """Everything that the report of an evaluation is made of.
@@ -231,14 +229,14 @@ def evaluation_report(
         evaluation: The scores.
         request: What was asked for.
         folder, config: The run whose density the designs are of.
-        pictured: What is drawn beside the scores.
+        times: Where the time of each command went, as a clock tells it.
         command: The command line that makes the page again.
     """
     manifest = read_manifest(folder)
-    density = request.density() if request.density is not None else None
-    points = None
-    if density is not None:
-        points = observed_point(density.samples.resample(DENSITY_POINTS, random_generator(config.seed, "report")))
+    samples, shown, view, points = request.density(), evaluated_scene(evaluation, request), None, None
+    if samples is not None:
+        view = density_view(samples, shown.scene, request.designs)
+        points = observed_point(samples.resample(DENSITY_POINTS, random_generator(config.seed, "report")))
     learned = manifest.get("command")
     commands = [("The run that was learned", _line(learned))] if isinstance(learned, list) and learned else []
     commands.append(("The scores and this page", _line(command)))
@@ -249,24 +247,24 @@ def evaluation_report(
         *((f"design {design.name}", _origin(design.provenance)) for design in request.designs),
         *((f"version of {name}", version) for name, version in versions().items()),
     ]
-    times = []
-    for name, phases in pictured.times.items():
+    taken = []
+    for name, phases in times.items():
         entry = (manifest.get("timings") or {}).get(name)
         entry = entry if isinstance(entry, dict) and name != COMMAND else {}
         memory = entry.get("peak_memory_bytes")
         title = f"lidardesign {name}" + (", up to this report" if name == COMMAND else "")
         seconds = {phase: float(value) for phase, value in phases.items()}
         memory = memory if isinstance(memory, int) else None
-        times.append(CommandTimes(title, str(entry.get("when", "")), seconds, memory))
+        taken.append(CommandTimes(title, str(entry.get("when", "")), seconds, memory))
     settings = folder / FILE_NAME
     return Report(
         evaluation,
-        pictured.shown,
+        shown,
         title=f"{folder.resolve().name}: {evaluation.metric.name} on {held_out_scenes(evaluation.scenes)}",
-        density=pictured.density,
+        density=view,
         density_m=points,
-        constraints=pictured.slacks,
-        times=times,
+        constraints={design.name: constraint_slack_of(design, request.space) for design in request.designs},
+        times=taken,
         reproduce=Reproduction(commands, facts, settings.read_text(encoding="utf-8") if settings.is_file() else ""),
     )
 

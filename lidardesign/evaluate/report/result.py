@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from lidardesign.design.layouts.rays import certificates_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.estimates import figure_and_interval
-from lidardesign.evaluate.gates import difference_text
 from lidardesign.evaluate.report.markup import folded, paragraphs
 from lidardesign.evaluate.report.tables import counted, held_out_scenes, table
 from lidardesign.evaluate.results import Evaluation, Paired, Row, verdict
+from lidardesign.evaluate.thresholds import difference_text
 
 MOST_SENTENCES = 3  # of designs that have one each; a table says the same of all
 MOST_NOTES = 2  # that are not folded

@@ -11,8 +11,8 @@ from typing import Any
 from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.effects import MILLIMETRES, EffectSummary
-from lidardesign.evaluate.figures.canvas import VERDICT_WORDS
 from lidardesign.evaluate.report.markup import definitions, folded
+from lidardesign.evaluate.report.series import VERDICT_WORDS
 from lidardesign.evaluate.results import (
     Audit,
     AuditRow,

@@ -20,8 +20,7 @@ import numpy as np
 
 from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.sensor import Sensor, interval_factor
-from lidardesign.evaluate.figures.canvas import OUTCOME_WORDS, Series
-from lidardesign.evaluate.figures.drawing import (
+from lidardesign.evaluate.report.drawing import (
     MOST_FACES,
     SMALLEST_SPREAD_M,
     drawn_share,
@@ -31,8 +30,9 @@ from lidardesign.evaluate.figures.drawing import (
     round_steps,
     scene_bounds,
 )
-from lidardesign.evaluate.figures.scene_figure import DrawnDesign, SceneFigure
 from lidardesign.evaluate.report.markup import embedded, swatch, switch
+from lidardesign.evaluate.report.scene_figure import DrawnDesign, SceneFigure
+from lidardesign.evaluate.report.series import OUTCOME_WORDS, Series
 from lidardesign.geometry.rays import Outcome
 from lidardesign.numerics import EPSILON_FLOAT32
 from lidardesign.scene import Body

@@ -1,8 +1,7 @@
 """The process that renders: mitsuba and mitransient live here and nowhere else.
 
-Run as `python -m lidardesign.simulate.light_transport.worker`. Every line on standard input names a folder with
-`request.json` (numbers, shapes) and `request.npz` (arrays); the answer is `result.npz` or `error.txt` in that folder
-and one line on standard output. A library that aborts takes this process down, not the program that asked.
+Every request has numbers and shapes, and names a folder with `request.npz` (arrays); the answer is `result.npz` in that
+folder, or an error. A library that aborts takes this process down, not the program that asked.
 
 Transport (intersections, scattering, several bounces, times of flight) is mitransient's `transient_path`. The two ends
 of light paths are ours, a sensor that is a list of rays and an emitter that is a list of small lights, because no stock
@@ -16,11 +15,12 @@ import json
 import sys
 import traceback
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from lidardesign.numerics import TINY_FLOAT32
+from lidardesign.run.child import write_line
 
 RAY_COLUMNS = ("origin", "direction", "cone_cosine_m1", "baseline", "dark_place", "dark_radius")
 LIGHT_COLUMNS = (
@@ -235,20 +235,8 @@ def _render(mi: Any, dr: Any, request: dict[str, Any], arrays: dict[str, np.ndar
     return {"ray": ray, "cell": cell, "radiance": binned[ray, cell], "steady": np.asarray(steady)[0, :, 0]}
 
 
-def answer(folder: Path, mi: Any, dr: Any) -> None:
-    """Render the request in a folder and leave the result or the error beside it."""
-    try:
-        request = json.loads((folder / "request.json").read_text(encoding="utf-8"))
-        with np.load(folder / "request.npz", allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        np.savez(folder / "result.npz", **_render(mi, dr, request, arrays))
-    except Exception:
-        # whatever goes wrong in here is the asking side's to report
-        (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
-
-
-def main() -> None:
-    """Serve requests until standard input ends."""
+def serve(_: object, answers: BinaryIO) -> dict[str, Any]:
+    """Answer requests, one in each line, until standard input ends."""
     import drjit as dr
     import mitsuba as mi
 
@@ -257,11 +245,15 @@ def main() -> None:
     import mitransient  # noqa: F401 (registers its integrator and film)
 
     register(mi, dr)
-    print("ready", flush=True)
     for line in sys.stdin:
-        answer(Path(line.rstrip("\n")), mi, dr)
-        print("done", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+        request, found = json.loads(line), {}
+        folder = Path(request["folder"])
+        try:
+            with np.load(folder / "request.npz", allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            np.savez(folder / "result.npz", **_render(mi, dr, request, arrays))
+        except Exception as error:
+            # whatever goes wrong in here is the asking side's to report
+            found = {"error": traceback.format_exception_only(error)[-1].strip()}
+        write_line(answers, found)
+    return {}

@@ -1,7 +1,8 @@
 "use strict";
 // What the page does beside the 3D view: draws its curves, answers their switches, and makes itself ready for paper.
 
-const QUIET = { responsive: true, displaylogo: false, displayModeBar: false, plotlyServerURL: "", showTips: false };
+const QUIET = { responsive: true, displaylogo: false, plotlyServerURL: "", showTips: false };
+const LEGEND_PX = 60; // of a picture's height
 const [PAPER_PX, HALF_PX] = [680, 330]; // what fits on the width of a sheet, once and beside another
 
 // Every curve is a line and its band, and is switched in all figures of curves.
@@ -12,6 +13,17 @@ function answerCurves() {
       for (const figure of all(".curves")) Plotly.restyle(figure, { visible: input.checked }, traces);
     });
   }
+}
+
+// The mode bar's button. Legends are in the page, where the keyboard reaches them; a picture gets its own.
+function svgButton(name) {
+  const click = ({ data, layout, clientWidth: width, clientHeight }) => {
+    const named = data.some((trace) => trace.name);
+    const legend = { showlegend: named, legend: { orientation: "h", y: -0.25 }, width: null, height: null };
+    const size = { width, height: clientHeight + (named ? LEGEND_PX : 0) };
+    return Plotly.downloadImage({ data, layout: { ...layout, ...legend } }, { format: "svg", filename: name, ...size });
+  };
+  return { name: "svg", title: "Download as SVG", icon: Plotly.Icons.camera, click };
 }
 
 const figures = () => all(".js-plotly-plot");
@@ -45,7 +57,8 @@ async function drawFigures() {
   document.head.append(Object.assign(document.createElement("script"), { textContent: find("#plotly").textContent }));
   for (const data of all("script[data-figure]")) {
     const { data: traces, layout } = JSON.parse(data.textContent);
-    await Plotly.newPlot(data.dataset.figure, traces, layout, QUIET);
+    const name = data.dataset.figure;
+    await Plotly.newPlot(name, traces, layout, { ...QUIET, modeBarButtons: [[svgButton(name)]] });
   }
   answerCurves();
   window.addEventListener("beforeprint", toPaper);

@@ -20,7 +20,7 @@ from scipy.special import ndtri
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
-from lidardesign.evaluate.figures.drawing import body_triangles, drawn_share
+from lidardesign.evaluate.report.drawing import body_triangles, drawn_share
 from lidardesign.numerics import FULL_TURN, effective_count, wrap_turn
 from lidardesign.samples import Samples
 from lidardesign.scene import Plane, Scene

@@ -10,9 +10,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from lidardesign.errors import DataError
-from lidardesign.run import xml
 from lidardesign.run.files import write_atomic
-from lidardesign.run.inputs import Kind
 
 # Of what a name becomes; topics and prim paths are built of several.
 LONGEST_NAME = 64
@@ -35,11 +33,6 @@ def identifier(name: str) -> str:
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
     word = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:LONGEST_NAME].rstrip("_")
     return word if (word[:1].isalpha() and word.lower() not in RESERVED) else f"s_{word}".rstrip("_")
-
-
-def identifiers(names: Sequence[str]) -> list[str]:
-    """An identifier of each name, no two alike, whatever their case."""
-    return distinct([identifier(name) for name in names], "_")
 
 
 def distinct(names: Sequence[str], between: str, taken: Iterable[str] = ()) -> list[str]:
@@ -102,10 +95,6 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
     return [f"the folder also holds {len(others)} other files, which stay as they are: {named}"]
 
 
-# A million rays of some 300 bytes.
-EXPORT = Kind("exported XML", 1_000_000_000)
-
-
 def element(
     tag: str, attributes: Mapping[str, str] | None = None, children: Iterable[Element] = (), text: str | None = None
 ) -> Element:
@@ -144,24 +133,3 @@ def document(root: Element) -> bytes:
     """The content of a file: the declaration, then the root, indented."""
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
-
-
-def write_xml(path: Path, root: Element) -> None:
-    """Write a document, indented, atomically.
-
-    Raises:
-        DataError: The file cannot be written.
-    """
-    write_atomic(path, document(root))
-
-
-def read_xml(path: Path, tag: str) -> Element:
-    """The root of a document that `write_xml` wrote.
-
-    Raises:
-        DataError: It cannot be read, is no such document, or declares a document type.
-    """
-    root = xml.read_xml(path, f"a <{tag}> document", kind=EXPORT, most_elements=EXPORT.most_bytes)
-    if root.tag != tag:
-        raise DataError(f"is not a <{tag}> document but a <{root.tag[:40]}>", where=str(path))
-    return root

@@ -1,4 +1,4 @@
-"""Simulators of driving as JSON: CARLA and ASAM OSI.
+"""Simulators with lidars of their own: CARLA and ASAM OSI as JSON, Isaac Sim as USD.
 
 CARLA: a sensor.lidar.ray_cast per sensor, with its blueprint's attributes and its transform, as JSON.
 
@@ -13,14 +13,26 @@ ASAM OSI: a SensorViewConfiguration with one LidarSensorViewConfiguration per se
 Every sensor stands at its mounting position (x forward, y to the left, z up; yaw, then pitch, then roll), and its rays
 are unit vectors in its own frame with the microsecond in which each fires. Rays of one sensor that start at several
 places become as many configurations.
+
+Isaac Sim from version 5 on: an OmniLidar prim per sensor in USD, in its text form.
+
+A lidar has one emitter state: an emitter per ray at its azimuth (x forward, y at +90 degrees, z up) and elevation in
+degrees, its firing time in the frame, and the number of its range. Ranges are the different gates of the sensor, so
+gates of single rays are held. All emitters are one line: nothing says that rays lie in rows.
+
+Attributes have the names and types of OmniSensorGenericLidarCoreAPI. `reportRateBaseHz` became `patternFiringRateHz` in
+version 6: both are written. Each prim is posed by translate and orient ops below one Xform, in metres, z up.
+
+NVIDIA's documentation wants a sensor's near range above its range offset and its least distance between echos, which
+are 0, so gates start at a millimetre or more. What a range resolution of 0 does is not documented: 0.1 mm is
+written.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,28 +40,26 @@ import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.errors import ConfigError, DataError
-from lidardesign.estimates import Estimate
-from lidardesign.export.common.even_grid import EvenGrid, by_channel, grid_of, grid_sensor_losses
-from lidardesign.export.common.poses import (
+from lidardesign.errors import ConfigError
+from lidardesign.export.mounts import (
+    EvenGrid,
     Mount,
-    Part,
     Place,
-    ReadMount,
+    channel_mounts,
     design_losses,
     fire_times_s,
+    grid_of,
+    grid_sensor_losses,
     mounts,
-    mounts_rounding,
+    origin_losses,
     places,
-    rays_of_parts,
-    rays_rounding,
     require_rays,
 )
-from lidardesign.geometry.frames import rotation_of_rpy
+from lidardesign.export.names import renamed_note
 from lidardesign.geometry.rays import Rays
-from lidardesign.numerics import FULL_TURN, HALF_DIGITS, unit_vectors
+from lidardesign.numerics import FULL_TURN, HALF_DIGITS
 from lidardesign.run.files import write_atomic
-from lidardesign.space import angles, direction
+from lidardesign.space import angles
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 # A sweep of one column is as narrow as its field of view is written.
@@ -71,8 +81,7 @@ def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Ban
         raise ConfigError(
             f"{rate_hz:g}", where="--rate-hz", allowed=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz, the frames of CARLA"
         )
-    design, rays = by_channel(design, rays)
-    mounted = mounts(design, rays)
+    design, rays, mounted = channel_mounts(design, rays)
     document = {
         "design": design.name,
         "fixed_delta_seconds": 1 / rate_hz,
@@ -87,22 +96,6 @@ def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Ban
             f"{min(late):.3g} to {max(late):.3g} m"
         )
     return [*notes, "every frame has all rays once where the world's fixed_delta_seconds is that of the file"]
-
-
-def carla_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """How far the rays that CARLA fires are from the design's; its sensors have no gate start, so only ends count.
-
-    Raises:
-        DataError: The file holds no such sensors.
-    """
-    design, rays = by_channel(design, rays)
-    mounted = mounts(design, rays)
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        found = [_held(one, document["fixed_delta_seconds"]) for one in document["sensors"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"holds no lidars: {error!r}", where=str(path)) from error
-    return mounts_rounding(rays, mounted, found, path)
 
 
 def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
@@ -166,32 +159,6 @@ def _rotation(mount: Mount, grid: EvenGrid, field_deg: float) -> dict[str, float
     }
 
 
-def _axes(rotation: Mapping[str, float]) -> np.ndarray:
-    """The matrix of CARLA's transforms, whose columns are forward, right and up: a roll lowers the right side."""
-    pitch, yaw, roll = (math.radians(rotation[name]) for name in ("pitch", "yaw", "roll"))
-    cos_p, sin_p, cos_y, sin_y = math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
-    cos_r, sin_r = math.cos(roll), math.sin(roll)
-    return np.array(
-        [
-            [cos_p * cos_y, cos_y * sin_p * sin_r - sin_y * cos_r, -cos_y * sin_p * cos_r - sin_y * sin_r],
-            [cos_p * sin_y, sin_y * sin_p * sin_r + cos_y * cos_r, -sin_y * sin_p * cos_r + cos_y * sin_r],
-            [sin_p, -cos_p * sin_r, cos_p * cos_r],
-        ]
-    )
-
-
-def _held(sensor: Mapping[str, Any], step_s: float) -> ReadMount:
-    attributes = sensor["attributes"]
-    rows = int(attributes["channels"])
-    columns = round(float(attributes["points_per_second"]) * step_s / rows)
-    field, high, low = (math.radians(float(attributes[f"{name}_fov"])) for name in ("horizontal", "upper", "lower"))
-    swept = -field / 2 + np.arange(columns) * field / columns
-    local = direction(np.tile(swept, rows), np.repeat(np.linspace(high, low, rows), columns))
-    location = np.array([sensor["transform"]["location"][axis] for axis in "xyz"])
-    world = local @ _axes(sensor["transform"]["rotation"]).T @ MIRROR
-    return ReadMount(MIRROR @ location, world, (math.nan, float(attributes["range"])))
-
-
 MICROSECONDS_PER_S = 1e6
 NANOSECONDS_PER_S = 10**9
 
@@ -222,6 +189,7 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
     write_atomic(path, json.dumps(whole, indent=1) + "\n")
     notes = [
         "gates are lost: `range` is the end of the last one",
+        "firing times are whole microseconds",
         "names are lost: sensor_id numbers the configurations, in the order of the sensors",
     ]
     if len(found) > len(mounted):
@@ -253,37 +221,138 @@ def _vector(values: np.ndarray) -> dict[str, float]:
     return dict(zip("xyz", values.tolist(), strict=True))
 
 
-def read_osi(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
-    """The rays of a file that `write_osi` made of a design and its rays, with their own gates, and the frame rate [Hz].
+# Isaac counts nanoseconds of a frame as signed 32-bit numbers, and frames per second as whole numbers.
+SLOWEST_ISAAC_HZ = 1
+LEAST_START_M, RESOLUTION_M = 0.001, 0.0001
+# Returns of less than a tenth are lost beyond this range, or beyond the last gate.
+LEAST_REFLECTANCE, LEAST_REFLECTANCE_RANGE_M = 0.1, 270.0
+
+
+CORE = "omni:sensor:Core:"
+STATE = f"{CORE}emitterState:s001:"
+SCHEMAS = ("OmniSensorGenericLidarCoreAPI", "OmniSensorGenericLidarCoreEmitterStateAPI:s001")
+ROOT_PRIM = "Lidar"
+
+
+def write_isaac_usd(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the layer, atomically; returns notes of what the format cannot hold.
 
     Raises:
-        DataError: The file cannot be read, or holds something else.
+        ConfigError: Fewer than one frame per second.
     """
-    found = places(mounts(design, rays), rays)
-    try:
-        whole = json.loads(Path(path).read_text(encoding="utf-8"))
-        cycle = whole["updateCycleTime"]
-        rate_hz = NANOSECONDS_PER_S / (int(cycle["seconds"]) * NANOSECONDS_PER_S + int(cycle["nanos"]))
-        lidars = whole["lidarSensorViewConfiguration"]
-        parts = [_rays_of_lidar(place, lidar, rays) for place, lidar in zip(found, lidars, strict=True)]
-        times_us = np.zeros(len(rays))
-        for place, lidar in zip(found, lidars, strict=True):
-            times_us[place.ray] = lidar["timings"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"cannot be read as OSI: {error}", where=str(path), hint="export it again") from error
-    return replace(rays_of_parts(rays, parts, str(path)), time_s=times_us / MICROSECONDS_PER_S), rate_hz
+    whole_hz = round(rate_hz)
+    if whole_hz < SLOWEST_ISAAC_HZ:
+        raise ConfigError(
+            f"{rate_hz:g} frames per second", where="--rate-hz", allowed=f"at least {SLOWEST_ISAAC_HZ}, a whole number"
+        )
+    mounted = mounts(design, rays)
+    lines = [
+        "#usda 1.0",
+        "(",
+        f'    defaultPrim = "{ROOT_PRIM}"',
+        "    metersPerUnit = 1",
+        '    upAxis = "Z"',
+        ")",
+        "",
+        f'def Xform "{ROOT_PRIM}" (',
+        f"    displayName = {quoted(design.name)}",
+        ")",
+        "{",
+    ]
+    for mount in mounted:
+        lines += _prim(mount, rays, whole_hz)
+    write_atomic(path, "\n".join([*lines, "}"]) + "\n")
+    notes = [*design_losses(design, mounted), *origin_losses(mounted)]
+    if whole_hz != rate_hz:
+        notes.append(f"frame rates there are whole numbers: {rate_hz:g} Hz is {whole_hz} Hz")
+    near = sum(one.gate_m[0] < LEAST_START_M for one in mounted)
+    if near:
+        notes.append(
+            f"gates of {near} of {len(mounted)} sensors start below {LEAST_START_M:g} m: they start there, for Isaac's "
+            "near ranges are above 0"
+        )
+    notes.append("angles and lengths are kept in single precision, firing times in whole nanoseconds")
+    return [*notes, *renamed_note([one.sensor.name for one in mounted], [one.name for one in mounted])]
 
 
-def _rays_of_lidar(place: Place, lidar: dict[str, Any], rays: Rays) -> Part:
-    mounting = lidar["mountingPosition"]
-    turn = rotation_of_rpy(*(mounting["orientation"][name] for name in ("roll", "pitch", "yaw")))
-    looking = np.array([[one[axis] for axis in "xyz"] for one in lidar["directions"]]).reshape(-1, 3)
-    origin = np.tile([mounting["position"][axis] for axis in "xyz"], (len(looking), 1))
-    return place.ray, origin, unit_vectors(looking @ turn.T), rays.gate_m[place.ray]
+def quoted(text: str) -> str:
+    """Text as a string of USD's text form: printable ASCII and Unicode in double quotes, the rest escaped.
+
+    Line ends and other control characters become spaces, as one line is one attribute.
+    """
+    plain = "".join(letter if letter.isprintable() else " " for letter in text)
+    return '"' + plain.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def osi_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
-    """What the written numbers lose: times are whole microseconds; gates are not held."""
-    found, rate_hz = read_osi(path, design, rays)
-    errors = rays_rounding(replace(rays, time_s=fire_times_s(rays, rate_hz)), found, path)
-    return {name: errors[name] for name in ("origin_m", "direction_rad", "time_s")}
+def _prim(mount: Mount, rays: Rays, rate_hz: int) -> list[str]:
+    return [
+        f'    def OmniLidar "{mount.name}" (',
+        f"        displayName = {quoted(mount.sensor.name)}",
+        f"        prepend apiSchemas = {json.dumps(SCHEMAS)}",
+        "    )",
+        "    {",
+        *(f"        {kind} {name} = {value}" for kind, name, value in _attributes(mount, rays, rate_hz)),
+        f"        double3 xformOp:translate = {_tuple(mount.origin_m)}",
+        f"        quatd xformOp:orient = {_tuple(mount.quaternion)}",
+        '        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]',
+        "    }",
+    ]
+
+
+def _attributes(mount: Mount, rays: Rays, rate_hz: int) -> list[tuple[str, str, str]]:
+    """Type, name and value of what holds for all emitters of a sensor, then of the arrays of their state."""
+    count, (near, far) = len(mount.ray), np.maximum(mount.gate_m, LEAST_START_M).tolist()
+    ranges, range_id = np.unique(np.maximum(rays.gate_m[mount.ray], LEAST_START_M), axis=0, return_inverse=True)
+    fire_time_ns = np.floor(fire_times_s(rays, rate_hz)[mount.ray] * NANOSECONDS_PER_S).astype(np.int64)
+    core = [
+        ("token", "scanType", '"SOLID_STATE"'),
+        ("token", "rayType", '"IDEALIZED"'),
+        ("token", "elementsCoordsType", '"CARTESIAN"'),
+        ("token", "outputFrameOfReference", '"SENSOR"'),
+        *(("uint", name, str(rate_hz)) for name in ("scanRateBaseHz", "reportRateBaseHz", "patternFiringRateHz")),
+        *(("uint", name, str(count)) for name in ("numberOfEmitters", "numberOfChannels")),
+        ("uint", "maxReturns", "1"),
+        ("uint", "numLines", "1"),
+        ("uint[]", "numRaysPerLine", f"[{count}]"),
+        ("float", "nearRangeM", _single(near)),
+        ("float", "farRangeM", _single(far)),
+        # returns nearer than this are lost
+        ("float", "minDistBetweenEchosM", "0"),
+        ("uint", "rangeCount", str(len(ranges))),
+        ("float[]", "rangesMinM", _singles(ranges[:, 0])),
+        ("float[]", "rangesMaxM", _singles(ranges[:, 1])),
+        # a design says nothing of errors: there are none
+        *(("float", f"{axis}Error{what}", "0") for axis in ("azimuth", "elevation") for what in ("Mean", "Std")),
+        ("float", "rangeAccuracyM", "0"),
+        ("float", "rangeResolutionM", _single(RESOLUTION_M)),
+        ("float", "minReflectance", _single(LEAST_REFLECTANCE)),
+        ("float", "minReflectionRangeM", _single(max(LEAST_REFLECTANCE_RANGE_M, far))),
+    ]
+    state = [
+        ("float[]", "azimuthDeg", _singles(np.degrees(mount.azimuth_rad))),
+        ("float[]", "elevationDeg", _singles(np.degrees(mount.elevation_rad))),
+        ("uint[]", "fireTimeNs", json.dumps(fire_time_ns.tolist())),
+        # counted from 1
+        ("uint[]", "channelId", json.dumps(list(range(1, count + 1)))),
+        ("uint[]", "rangeId", json.dumps(range_id.reshape(-1).tolist())),
+        ("uint[]", "bank", json.dumps([0] * count)),
+    ]
+    return [
+        ("string", "omni:sensor:marketName", quoted(mount.sensor.name)),
+        ("float", "omni:sensor:tickRate", str(rate_hz)),
+        ("double2", "omni:sensor:frameRate", f"({rate_hz}, 1)"),
+        *((kind, CORE + name, value) for kind, name, value in core),
+        *((kind, STATE + name, value) for kind, name, value in state),
+    ]
+
+
+def _single(value: float) -> str:
+    return str(np.float32(value))
+
+
+def _singles(values: Iterable[float]) -> str:
+    return f"[{', '.join(map(_single, values))}]"
+
+
+def _tuple(values: Iterable[float]) -> str:
+    return f"({', '.join(repr(float(value)) for value in values)})"

@@ -1,4 +1,4 @@
-"""What figures show beside the scores: designs in a scene and what becomes of their rays, the density, constraints.
+"""Designs in a scene and what becomes of their rays, for the 3D view.
 
 As many rays, positions and frames are kept as a page can hold; `SceneFigure` says which are left out.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,6 @@ from lidardesign.design.files import design_document
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.entries import ordered_conditions
-from lidardesign.evaluate.figures.density_views import DensityView, density_view
 from lidardesign.evaluate.request import EvaluationRequest, numbers_fired, pattern_size
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.geometry.raycast import SceneCaster
@@ -170,40 +169,16 @@ def _first_hits(rays: Sequence[Rays], casters: Sequence[SceneCaster]) -> tuple[n
     return length_m, outcome
 
 
-@dataclass(frozen=True, eq=False)
-class FigureData:
-    """What is drawn beside the scores.
-
-    Arguments:
-        shown: The designs in a scene.
-        density: The learned density, where the run has its samples.
-        slacks: How tight each design's constraints are, by its name.
-        times: Where the time of each command went, as a clock tells it.
-    """
-
-    shown: SceneFigure | None = None
-    density: DensityView | None = None
-    slacks: Mapping[str, Sequence[ConstraintSlack]] = field(default_factory=dict)
-    times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-
-
-def figure_data(
-    evaluation: Evaluation, request: EvaluationRequest, times: Mapping[str, Mapping[str, float]]
-) -> FigureData:
-    """Everything that can be drawn of an evaluation's designs, in its first held-out scene."""
+def evaluated_scene(evaluation: Evaluation, request: EvaluationRequest) -> SceneFigure:
+    """An evaluation's designs in its first held-out scene, with the effects that the scenes call for."""
 
     def laid_out(design: DesignSpec, at: Conditions) -> Rays:
         count = design.rays or pattern_size(design) or max(numbers_fired(design, request.rays, request.alone))
         return request.lay_out(design, count, request.samples.get(design.name), at=at)
 
-    # with the physics that the scenes call for, or by geometry alone
     planner = request.planner if any(effect.on for effect in evaluation.effects) else None
-    scene, places = request.test[0], ordered_conditions(request)
-    shown = scene_figure(scene, request.designs, places, laid_out, planner=planner, seed=request.seed)
-    density = request.density() if request.density is not None else None
-    view = None if density is None else density_view(density.samples, scene, request.designs)
-    slacks = {design.name: constraint_slack_of(design, request.space) for design in request.designs}
-    return FigureData(shown, view, slacks, times)
+    places = ordered_conditions(request)
+    return scene_figure(request.test[0], request.designs, places, laid_out, planner=planner, seed=request.seed)
 
 
 def constraint_slack_of(design: DesignSpec, space: DesignSpace) -> list[ConstraintSlack]:

@@ -1,1 +1,0 @@
-"""The rival that optimises the metric directly, by CMA-ES."""

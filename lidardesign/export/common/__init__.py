@@ -1,1 +1,0 @@
-"""What several formats share: names, poses, columns, XML, and reading back."""

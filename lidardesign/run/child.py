@@ -1,0 +1,200 @@
+"""Work in a process of its own, which may crash, hang, print or close files that are not its own.
+
+The process calls a function, named as `module:function`, with a request and the stream of its answers; the function
+returns the last one. Requests and answers are lines of JSON. What the work prints is kept apart from its answers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any, BinaryIO, Literal
+
+PROGRAM = (
+    "import json, sys; path, *work = json.loads(sys.stdin.readline()); sys.path[:] = path; "
+    "from lidardesign.run.child import serve; serve(*work)"
+)
+BEGUN = b"begun\n"
+# Python and this package are loaded within this time [s].
+START_SECONDS = 60.0
+# Work that limits its own time has ended by then, and said so [s].
+GRACE_SECONDS = 2.0
+# The exit code of a process whose stream of answers was closed.
+UNANSWERED = 117
+# Of what the work printed last [bytes].
+MOST_PRINTED = 20_000
+
+
+class ChildError(Exception):
+    """A process that gave no answer, as a sentence without its subject.
+
+    Arguments:
+        message: The sentence.
+        reason: Whether it was not started, was too late, died, or others wrote into its answers.
+    """
+
+    def __init__(self, message: str, reason: Literal["unstarted", "late", "died", "foreign"]) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class Child:
+    """A process that works on a request; to be ended in any case.
+
+    Arguments:
+        function: What it calls with the request and the stream of its answers, as `module:function`.
+        request: Anything that JSON holds.
+        environment: Variables beside those of this process.
+
+    Raises:
+        OSError: No further process may be started.
+    """
+
+    def __init__(self, function: str, request: Any, environment: Mapping[str, str] | None = None) -> None:
+        self._lines: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
+        self._begun, self._printed, self.owner = False, b"", os.getpid()
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-c", PROGRAM],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            # a request that is written is gone: nothing is left over to be written to a process that died
+            bufsize=0,
+            env={**os.environ, **(environment or {})},
+            # what the work starts is ended with it, and a terminal's Ctrl-C is for this process
+            start_new_session=True,
+        )
+        for read in (self._read_answers, self._read_printed):
+            threading.Thread(target=read, daemon=True).start()
+        self.send([sys.path, function, request])
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs, and is this process's own."""
+        return self.owner == os.getpid() and self._process.poll() is None
+
+    @property
+    def printed(self) -> list[str]:
+        """The last lines that the work printed."""
+        return self._printed.decode(errors="replace").splitlines()
+
+    def send(self, document: Any) -> None:
+        """Write a line to its standard input; where it died, the next answer says so."""
+        with contextlib.suppress(OSError, ValueError):
+            self._process.stdin.write(json.dumps(document).encode() + b"\n")  # type: ignore[union-attr]
+
+    def answer(self, seconds: float, when: str) -> dict[str, Any]:
+        """The next answer, the first at the latest so long after the work began, later ones after this call.
+
+        Arguments:
+            seconds: The time that it may take [s].
+            when: What it does meanwhile, as "while it is imported".
+
+        Raises:
+            ChildError: There is none.
+        """
+        since = time.monotonic()
+        if not self._begun:
+            since, line = self._next_line(since + START_SECONDS)
+            if line != BEGUN:
+                raise ChildError("could not be started", "unstarted")
+            self._begun = True
+        deadline = since + seconds + GRACE_SECONDS
+        _, line = self._next_line(deadline)
+        if not line:
+            died_of = None if line is None else self._died_of(deadline, when)
+            raise ChildError(died_of or f"gave no answer within {seconds:g} s", "died" if died_of else "late")
+        with contextlib.suppress(ValueError):
+            found = json.loads(line)
+            if isinstance(found, dict):
+                return found
+        raise ChildError(f"writes to a stream that is not its own {when}", "foreign")
+
+    def _next_line(self, deadline: float) -> tuple[float, bytes | None]:
+        """The next line and when it came: empty at the end, None where none came in time."""
+        try:
+            found = self._lines.get(timeout=max(deadline - time.monotonic(), 0.0))
+        except queue.Empty:
+            return deadline, None
+        if not found[1]:
+            # for whoever asks again
+            self._lines.put(found)
+        return found
+
+    def _died_of(self, deadline: float, when: str) -> str | None:
+        """How it ended; None where it only closed its stream and hangs until the deadline and a little longer."""
+        try:
+            code = self._process.wait(max(deadline - time.monotonic(), 0.0) + GRACE_SECONDS)
+        except subprocess.TimeoutExpired:
+            return None
+        if code == UNANSWERED:
+            return f"closes files that it did not open {when}"
+        if code < 0:
+            return f"crashes {when} ({signal.strsignal(-code)})"
+        return f"ends the program {when} (exit code {code})"
+
+    def end(self) -> None:
+        """End the process and what it started."""
+        if self._process.returncode is None and hasattr(os, "killpg"):
+            with contextlib.suppress(OSError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.kill()
+        self._process.wait()
+        self._process.stdin.close()  # type: ignore[union-attr]
+
+    def _read_answers(self) -> None:
+        with io.BufferedReader(self._process.stdout) as pipe:  # type: ignore[arg-type]
+            while line := pipe.readline():
+                self._lines.put((time.monotonic(), line))
+        self._lines.put((time.monotonic(), b""))
+
+    def _read_printed(self) -> None:
+        with self._process.stderr as pipe:  # type: ignore[union-attr]
+            while some := pipe.read(MOST_PRINTED):
+                self._printed = (self._printed + some)[-MOST_PRINTED:]
+
+
+def ask(
+    function: str, request: Any, seconds: float, when: str, environment: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """The one answer of a process of its own, which is ended then; arguments as for `Child` and its `answer`.
+
+    Raises:
+        ChildError: There is none.
+    """
+    child = Child(function, request, environment)
+    try:
+        return child.answer(seconds, when)
+    finally:
+        child.end()
+
+
+def serve(function: str, request: Any) -> None:
+    """In that process: call the function, write its last answer, and end with all threads and exit handlers."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    module, _, name = function.partition(":")
+    work = getattr(importlib.import_module(module), name)
+    answers.write(BEGUN)
+    answers.flush()
+    write_line(answers, work(request, answers))
+    os._exit(0)
+
+
+def write_line(answers: BinaryIO, document: dict[str, Any]) -> None:
+    """Write an answer; a process that cannot is ended."""
+    try:
+        answers.write(json.dumps(document).encode() + b"\n")
+        answers.flush()
+    except OSError:
+        os._exit(UNANSWERED)
