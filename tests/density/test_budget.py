@@ -7,7 +7,6 @@ import shutil
 from dataclasses import replace
 
 import pytest
-import torch
 from support.learning import BallTask, Interrupter, config_of, result_bytes
 
 from lidardesign.density.learn import learn, prepare_training_data
@@ -16,7 +15,6 @@ from lidardesign.density.training.checkpoint import load_arrays
 from lidardesign.density.training.quality import IndependentProbes
 from lidardesign.workflow.learn import MOST_STEPS
 
-CPU = torch.device("cpu")
 STRETCH = 10
 # The flow misplaces more when balancing begins, and less after all steps.
 REACHABLE = 0.33

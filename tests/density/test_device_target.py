@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -48,6 +49,7 @@ def scenes(weighted=False):
     ]
 
 
+@cache
 def targets(space, visibility, weighted=False):
     settings = DensitySettings(sigma_m=0.03, field_resolution=24, quadrature_points=32)
     host = replace(build_target(scenes(weighted), space, settings, visibility), surface_tolerance_nats=200.0)

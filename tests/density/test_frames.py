@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from scipy import integrate, stats
 from support import references
 
 from lidardesign.config import DensitySettings
@@ -198,20 +197,6 @@ def test_a_ray_along_a_face_of_a_box_meets_it(side):
         assert range_m == pytest.approx(0.9)
         # on an edge either face is met
         assert np.abs(normal).max() == 1
-
-
-def test_points_near_a_ball_follow_its_surface_term():
-    scenes = [Scene((Body(Sphere(0.1), "ball", "target", rigid(translation_m=(0.2, 0, 0.3))),))]
-    target = build_target(scenes, CEILING, DensitySettings(sigma_m=0.05), "off")
-    points = target.surfaces.draw_near(20_000, 0.05, np.random.default_rng(0))
-    radius = np.linalg.norm(points - (0.2, 0, 0.3), axis=1)
-
-    def density(r):
-        return r**2 * math.exp(-(((r - 0.1) / 0.05) ** 2) / 2)
-
-    whole = integrate.quad(density, 0, 0.6)[0]
-    cumulated = np.vectorize(lambda r: integrate.quad(density, 0, r)[0] / whole)
-    assert stats.kstest(radius[:4000], cumulated).pvalue > 1e-3
 
 
 def test_of_bodies_far_larger_than_the_space_points_are_drawn_where_it_reaches():

@@ -43,6 +43,12 @@ def test_one_frame_per_step_is_enough_to_learn_something_finite(lidardesign):
     assert 0 < result.json["ess"] <= 1
 
 
+def test_a_space_too_narrow_for_any_ray_is_refused_before_learning(lidardesign):
+    done = learn(lidardesign, "run", "--set", "elevation_max_deg=-89.9")
+    assert done.code == 3
+    assert "no ray of the design space" in done.json["error"]["message"]
+
+
 def test_coverage_that_cannot_be_measured_counts_as_none_and_is_said(lidardesign, monkeypatch):
     draw = measure.independent_points
 

@@ -181,21 +181,6 @@ def test_where_one_scene_is_all_there_is_the_density_grows_by_the_weight_of_the_
     assert np.allclose(found, 2.0 * observed[in_front, 1] - observed[in_front, 2], atol=1e-5)
 
 
-def test_where_one_scene_dominates_the_density_grows_by_its_weight_alone():
-    near, far = (Body(Sphere(0.2), poses=rigid(translation_m=(1.2, y, 0))) for y in (-0.3, 0.3))
-    plain = build_target([Scene((near,)), Scene((far,))], SPACE, SETTINGS, "off")
-    weighted = build_target([Scene((replace(near, importance=5.0),)), Scene((far,))], SPACE, SETTINGS, "off")
-    points = SPACE.sample(4000, np.random.default_rng(4))
-    change = weighted.log_density(points) - plain.log_density(points)
-    share = np.exp(
-        build_target([Scene((near,))], SPACE, SETTINGS, "off").log_density(points) - plain.log_density(points)
-    )
-    # log(1 + 4 share), whatever the share
-    assert np.allclose(change, np.log1p(4 * np.minimum(share, 1.0)), atol=1e-5)
-    assert (change > np.log(5.0) - 0.001).sum() > 100
-    assert (change < 0.001).sum() > 100
-
-
 def test_moving_frames_count_as_a_naive_sum_over_all_of_them_does():
     scenes = moving(ball(sideways), count=4)
     target = build_target(scenes, SPACE, SETTINGS, "off")
@@ -300,23 +285,6 @@ def test_independent_proposals_find_surfaces_however_little_they_count(make, fac
     assert np.isfinite(log_density).all()
 
 
-@pytest.mark.parametrize("make", [at_rest, moving])
-def test_independent_proposals_measure_log_z_of_the_weighted_density(make):
-    factors = [3.0, 1.0, 0.2]
-    scenes = make(Sphere(0.3))
-    weighted = [
-        replace(s, bodies=(replace(s.bodies[0], importance=f), SCREEN)) for s, f in zip(scenes, factors, strict=True)
-    ]
-    log_z = []
-    for some in (scenes, weighted, *([s] for s in scenes)):
-        target = build_target(some, SPACE, SETTINGS, "off")
-        uniform = SPACE.sample(60_000, np.random.default_rng(11))
-        log_z.append(float(logsumexp(target.log_density(uniform))))
-    parts = np.array(log_z[2:])
-    assert log_z[0] == pytest.approx(float(logsumexp(parts)), abs=1e-6)
-    assert log_z[1] == pytest.approx(float(logsumexp(parts + np.log(factors))), abs=1e-6)
-
-
 @each_row(
     ("weights", "words"),
     [
@@ -413,21 +381,6 @@ def test_what_a_density_is_worth_is_measured_against_the_weighted_target(learned
     assert np.allclose(grown, np.where(samples.points[sure, 3] > 0, np.log(3.0), 0.0), atol=0.01)
     assert result.ess > 0.8
     assert result.coverage > 0.97
-
-
-def test_samples_of_the_plain_density_reweighted_are_those_of_the_weighted_one(learned):
-    _, samples, config = learned
-    scenes = PatchesTask().scenes(config.task, "train", 1)
-    target = prepare_target(scenes, config, visibility="off")[0]
-    plain = replace(target, surfaces=replace(target.surfaces, importance=None))
-    factors = plain.log_density(samples.points) - target.log_density(samples.points)
-    back = samples.retargeted(samples.log_target + factors)
-    share = float(back.weights[back.points[:, 3] > 0].sum())
-    assert share == pytest.approx(0.5, abs=0.02)
-    # shares of 3/4 and 1/4 weighted to halves: ESS = 1 / sum (1/2)^2 / share
-    halves = np.array([0.75, 0.25])
-    expected = 1.0 / (np.square(0.5 / halves) * halves).sum()
-    assert back.effective_sample_size == pytest.approx(expected * samples.effective_sample_size, abs=0.06)
 
 
 def test_settings_that_only_weigh_do_not_keep_designs_from_being_judged_together():

@@ -243,12 +243,6 @@ def test_snapshots_are_kept_when_balancing_begins_and_after_each_doubling(pathwi
     assert [step for step in range(1, steps + 1) if is_snapshot(step, settings)] == doublings
 
 
-@each_row("steps", [1, 2, 60, 100, 101, 5000])
-@each_row("pathwise", [0, 1, 50, 5000])
-def test_no_more_than_half_of_the_steps_are_path_wise(pathwise, steps):
-    assert LearningSettings(steps=steps, pathwise=pathwise).pathwise_steps == min(pathwise, steps // 2)
-
-
 def moved(trainer, balanced_steps, weights):
     """Let the average follow a flow that is at these weights after so many balancing steps."""
     trainer.step = trainer.pathwise_steps + balanced_steps

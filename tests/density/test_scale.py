@@ -20,7 +20,6 @@ from lidardesign.density.target.scale import scale_notes
 from lidardesign.registry import load_task
 from lidardesign.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
 from lidardesign.space import RANGE, DesignSpace
-from lidardesign.workflow.runs import learn
 
 # Sensors within 0.1 m of the origin look to +x.
 AHEAD = DesignSpace((-0.1, -0.1, 0, -0.6, -0.6, 0.8), (0.1, 0.1, 0, 0.6, 0.6, 2.2))
@@ -178,15 +177,6 @@ def test_the_street_needs_no_note_though_its_sigma_is_wider_than_a_pedestrian(mo
 
     config = resolve(StreetTask(), preset="draft", seed=0)
     assert scale_notes(training_scenes(StreetTask(), config), config) == []
-
-
-def test_in_python_it_is_said_once_before_the_first_step(plates):
-    said = []
-    settings = {"folder": plates, "poses": 1, "truth_points": 100, "jitter_rotation_deg": 0.1, "learning.steps": 4,
-                "learning.batch": 64, "learning.samples": 1000, "density.field_resolution": 8}  # fmt: skip
-    learn("meshes", out=plates.parent / "python", settings=settings, notes=said.append, progress=said.append)
-    (place,) = [index for index, one in enumerate(said) if isinstance(one, str) and "edge-on" in one]
-    assert place < min(index for index, one in enumerate(said) if not isinstance(one, str))
 
 
 @pytest.fixture(scope="module")

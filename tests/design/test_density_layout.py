@@ -64,38 +64,6 @@ def test_rays_keep_their_distance_as_blue_noise_does(half_angle):
     assert spacing.min() > 0.55 * spacing.mean()
 
 
-def power(points, box, frequencies):
-    """The spectrum of points (N, 2) tapered towards the edges of a box (half sizes), per point: 1 for random ones."""
-    window = np.prod(np.cos(np.pi / 2 * np.clip(points / box, -1, 1)) ** 2, axis=1)
-    # the window's own transform at these frequencies, by a fine grid
-    axis = (np.arange(200) + 0.5) / 100 - 1
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) * box
-    taper = np.prod(np.cos(np.pi / 2 * grid / box) ** 2, axis=1)
-    expected = window.sum() * (np.exp(1j * grid @ frequencies.T) * taper[:, None]).sum(axis=0) / taper.sum()
-    transform = (np.exp(1j * points @ frequencies.T) * window[:, None]).sum(axis=0)
-    return np.abs(transform - expected) ** 2 / (window**2).sum()
-
-
-def test_rays_have_little_power_at_low_frequencies_and_as_much_as_random_ones_at_high_ones():
-    half_angle, count = 0.2, 400
-    design, samples = looking_along(cap(half_angle, SAMPLES), half_angle=half_angle)
-    spacing = math.sqrt(math.pi * half_angle**2 / count)
-    inside = np.full(2, half_angle / math.sqrt(2))
-    turn = np.linspace(0, math.pi, 24, endpoint=False)
-    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-
-    def mean_power(share, directions):
-        flat = directions[:, 1:][(np.abs(directions[:, 1:]) < inside).all(axis=1)]
-        return power(flat, inside, share * 2 * math.pi / spacing * ring).mean()
-
-    rays = lay_out(design, count, samples).direction
-    random = cap(half_angle, count, seed=2)
-    low, high = np.linspace(0.3, 0.6, 4), np.linspace(2.5, 4.0, 6)
-    assert np.mean([mean_power(share, random) for share in low]) > 0.5
-    assert np.mean([mean_power(share, rays) for share in low]) < 0.1
-    assert 0.5 < np.mean([mean_power(share, rays) for share in high]) < 2.0
-
-
 def test_a_wide_field_has_as_many_rays_per_solid_angle_at_its_rim_as_in_its_middle():
     design, samples = looking_along(cap(1.5, SAMPLES), half_angle=1.5)
     rays = lay_out(design, 400, samples).direction

@@ -106,14 +106,6 @@ def test_boxes_beyond_the_space_change_nothing():
     assert far.log_likelihood == free.log_likelihood
 
 
-def test_the_order_of_the_boxes_does_not_matter():
-    right = {"low_m": [0.6, 0.2, 0], "high_m": [0.8, 0.9, 1]}
-    left = {"low_m": [-0.8, -0.9, 0], "high_m": [-0.6, -0.2, 1]}
-    orders = ([PILLAR, right, left], [left, right, PILLAR], [right, left, PILLAR])
-    first, *others = [places(fitted(origin={"exclude": boxes})) for boxes in orders]
-    assert all(other == first for other in others)
-
-
 @pytest.mark.parametrize("axis", range(3))
 def test_flat_boxes_exclude_nothing_and_it_is_said(axis):
     box = {"low_m": [-0.5, -0.5, 0.5], "high_m": [0.5, 0.5, 1.5]}
@@ -229,18 +221,6 @@ def test_rays_of_another_number_keep_out_with_and_without_samples(count, tmp_pat
     for samples in (SAMPLES, None):
         for one in (design, replace(design, ray_table=None)):
             assert not starting_in(PILLAR, lay_out(one, count, samples))
-
-
-@pytest.mark.parametrize("height", [0.5, 1.5])
-def test_in_a_plane_only_boxes_that_it_cuts_are_in_the_way(height):
-    space = DesignSpace((-1, -1, height, *ROOM.low[3:]), (1, 1, height, *ROOM.high[3:]))
-    pillar = {"low_m": [-0.6, -0.6, 0.0], "high_m": [0.6, 0.6, 1.5]}
-    result = fitted(room(space=space), count=3, origin={"exclude": [pillar]})
-    assert result.satisfied
-    if height == 0.5:
-        assert_outside(result.design, [pillar])
-    else:
-        assert places(result) == places(fitted(room(space=space), count=3))
 
 
 def test_a_pinned_coordinate_is_in_a_box_or_not():

@@ -7,14 +7,12 @@ import math
 
 import numpy as np
 import pytest
-from support.fits import FACE, FIXED, FREE, MOVING, blob, log_target
+from support.fits import FACE, FIXED, MOVING, blob, log_target
 from support.tables import each_row
 
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.errors import ConfigError
-from lidardesign.samples import Samples
-from lidardesign.space import aim
 
 
 def constrained(**values):
@@ -126,29 +124,6 @@ def test_a_thin_box_pins_one_coordinate():
     assert sensor.origin_m[2] == 0.01
     assert sensor.origin_covariance_m2[0, 0] > 1e-5
     np.testing.assert_array_equal(sensor.origin_covariance_m2[2], 0.0)
-
-
-def slanted(space, count=12000, seed=3):
-    """Samples of a slanted wall x = 0.6 + 0.5 y whose place varies by 0.03 m between scenes."""
-    generator = np.random.default_rng(seed)
-    y, z = generator.uniform(-0.2, 0.2, (2, count))
-    wall = np.column_stack([0.6 + 0.5 * y + generator.normal(0, 0.03, count), y, z])
-    low, high = np.array(space.low[:3]), np.array(space.high[:3])
-    points = space.wrap(aim(low + (high - low) * generator.uniform(size=(count, 3)), wall))
-    return Samples(points, np.zeros(count), np.zeros(count), space)
-
-
-@pytest.mark.parametrize("space", [FACE, FREE])
-def test_every_ray_of_a_scan_has_a_gate_that_covers_how_scenes_vary_along_it(space):
-    scan = fit(slanted(space), layout="scan", rays=64)
-    assert len(scan.design.sensors) == 64
-    for sensor in scan.design.sensors:
-        forward = sensor.boresight
-        crossing = (0.6 + 0.5 * sensor.origin_m[1] - sensor.origin_m[0]) / (forward[0] - 0.5 * forward[1])
-        start, end = sensor.gate_m
-        assert start < crossing - 0.03 < crossing + 0.03 < end
-    narrow = np.mean([np.diff(s.gate_m) for s in scan.design.sensors])
-    assert narrow < 0.75 * np.diff(fit(slanted(space), sensors=1).design.sensors[0].gate_m)
 
 
 @each_row("options", [{"sensors": 0}, {"sensors": "many"}, {"rays": 0}, {"layout": "scan"}])

@@ -9,7 +9,6 @@ from support.tables import each_row
 
 from lidardesign.design.files import design_from_document
 from lidardesign.design.layouts.gates import central_intervals
-from lidardesign.design.layouts.track import placed
 from lidardesign.errors import ConfigError
 from lidardesign.run.yaml import dump_yaml, load_yaml
 
@@ -50,17 +49,6 @@ def test_a_mistake_in_a_track_is_refused_in_words(mistake):
     changes, words = MISTAKES[mistake]
     with pytest.raises(ConfigError, match=words):
         design_from_document(written(**changes))
-
-
-def test_thousands_of_knots_are_read_and_met_exactly(lidardesign, tmp_path):
-    knots = np.linspace(0.0, 1.0, 4001)
-    rows = {key: [[value]] * len(knots) for key, value in (("gate_start_m", 0.1), ("gate_end_m", 1.0))}
-    rows |= {"azimuth_rad": [[1.5]] * len(knots), "elevation_rad": [[float(np.sin(9 * k))] for k in knots]}
-    document = written(knots_m=knots.tolist(), **rows)
-    (tmp_path / "long.yaml").write_text(dump_yaml(document))
-    assert lidardesign("show", "long.yaml", "--at", "x_m=0.5").code == 0
-    here = placed(design_from_document(document), {"x_m": float(knots[1234])})
-    assert here.ray_table.elevation_rad[0] == np.sin(9 * knots[1234])
 
 
 def test_a_track_that_ends_too_early_is_refused_by_name_before_anything_is_scored(lidardesign, tmp_path):

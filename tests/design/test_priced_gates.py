@@ -119,23 +119,6 @@ def test_the_unit_of_weights_does_not_matter(seed, factor):
     np.testing.assert_allclose(other, one, atol=1e-6)
 
 
-def test_a_ray_that_hears_more_gets_the_bandwidth():
-    ranges = np.concatenate([np.linspace(1, 2, 100), np.linspace(1, 2, 10)])
-    heard = RayRanges(ranges, np.ones(110), np.repeat([0, 1], [100, 10]), 2)
-    gates = gates_within(heard, free(2), 1.0, MODEL, 80)
-    widths = np.diff(gates, axis=1)[:, 0]
-    assert widths[0] > 0.9
-    assert widths[1] < 0.2
-
-
-def test_a_gate_goes_to_the_denser_of_two_surfaces():
-    ranges = np.concatenate([np.linspace(1.0, 1.1, 30), np.linspace(2.0, 2.1, 10)])
-    heard = RayRanges(ranges, np.ones(40), np.zeros(40, dtype=int), 1)
-    # both together take 74 bins, the near one 7
-    ((start, end),) = gates_within(heard, free(1), 1.0, MODEL, 60)
-    np.testing.assert_allclose([start, end], [1.0, 1.1], atol=1e-6)
-
-
 @given(
     st.integers(0, 1000),
     st.floats(0, 2.0),

@@ -210,9 +210,3 @@ def test_where_samples_are_too_few_for_so_many_rays_bandwidth_and_bounds_are_kep
         assert gates[:, 1].max() <= max(sensor.gate_m[1] for sensor in result.design.sensors)
     else:
         assert Bandwidth().mbps(lay_out(result.design)) > 0.7 * RULES[name]["budget"]["bandwidth_mbps"]
-
-
-def test_sensors_with_gates_of_their_own_keep_their_own_rays():
-    rays = lay_out(replace(DESIGN, ray_table=None), 60, SAMPLES, gates="sensor")
-    for sensor, gate in zip(rays.sensor, rays.gate_m, strict=True):
-        np.testing.assert_allclose(gate, DESIGN.sensors[sensor].gate_m)

@@ -50,42 +50,6 @@ def script(text: str, *arguments: object, **options) -> subprocess.CompletedProc
     return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False, **options)
 
 
-# Forks a writer for every step that changes a file and kills it there; says what a reader then finds.
-KILLED_WRITERS = """
-import os, signal, sys
-from pathlib import Path
-from lidardesign.run.files import write_atomic
-path, old, new = Path(sys.argv[1]), b"old " * 2000, b"new " * 3000
-STEPS = ("fsync", "replace", "unlink")
-
-def write_and_die(at):
-    done = 0
-    def counting(real):
-        def step(*arguments, **options):
-            nonlocal done
-            done += 1
-            if done == at:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return real(*arguments, **options)
-        return step
-    for name in STEPS:
-        setattr(os, name, counting(getattr(os, name)))
-    write_atomic(path, new)
-    os._exit(0)
-
-write_atomic(path, old)
-found = []
-for at in range(1, 9):
-    pid = os.fork()
-    if pid == 0:
-        write_and_die(at)
-    killed = os.WIFSIGNALED(os.waitpid(pid, 0)[1])
-    content = path.read_bytes()
-    found.append((killed, {old: "old", new: "new"}.get(content, "broken"), len(os.listdir(path.parent)) - 1))
-    write_atomic(path, old)
-    assert os.listdir(path.parent) == [path.name], os.listdir(path.parent)
-print(found)
-"""
 FULL_DISK = """
 import resource
 from pathlib import Path
@@ -124,15 +88,6 @@ def open_folder():
     "what a kill left is removed by the next writer",
 )
 class TestKillsFullDisksAndTwoWriters:
-    def test_a_kill_before_any_step_of_a_write_leaves_the_old_file_or_the_new_one(self, tmp_path):
-        ended = script(KILLED_WRITERS, tmp_path / "file")
-        assert ended.returncode == 0, ended.stderr
-        found = json.loads(ended.stdout.replace("(", "[").replace(")", "]").replace("'", '"').lower())
-        kills = [(content, strays) for killed, content, strays in found if killed]
-        assert kills[:2] == [("old", 1), ("old", 1)], "before the flush and before the rename"
-        assert set(kills[2:]) == {("new", 0)}, "the rename itself is made durable after it"
-        assert len(kills) < len(found), "no step was left out"
-
     def test_a_disk_that_fills_during_a_write_leaves_the_old_file_and_a_message(self, tmp_path):
         (tmp_path / "file").write_bytes(OLD)
         ended = script(FULL_DISK, tmp_path / "file")

@@ -19,7 +19,6 @@ from lidardesign.run.inputs import ARRAYS, MOST_COLUMNS, MOST_ROWS, TABLE
 TABLES = {
     "commas": "," * 5_000_000,
     "columns": ",".join(f"c{number}" for number in range(MOST_COLUMNS + 1)),
-    "rows": "a,b\n" * (MOST_ROWS + 1),
     "rows of nothing": "\n" * (MOST_ROWS + 1),
     "rows of commas": ",\n" * (MOST_ROWS + 1),
     "a quote that is not closed": '"' + "\n" * 10_000_000,

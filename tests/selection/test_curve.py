@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.coverages import SUMS, small
 
@@ -28,6 +28,7 @@ class TestThePriceCurve:
         free = choose(coverage, counts, passes=0)
         assert loss[-1] <= coverage.complete - (free.worth - free.harm)
 
+    @settings(max_examples=10)
     @given(seed=seeds)
     def test_no_point_is_better_than_what_a_choice_within_its_bandwidth_could_be(self, table, seed):
         coverage, counts = small(seed, gates=4, table=table), RayCounts.of_one(7, 3)

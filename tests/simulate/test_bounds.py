@@ -131,7 +131,7 @@ def test_the_union_over_bins_bounds_how_often_another_bin_wins(signal, level):
 
 
 @each_row("estimator", ["peak", "matched"])
-@each_row("signal", [1, 4, 30, 300, 10_000])
+@each_row("signal", [1, 4, 30, 300, 2000])
 @each_row("bins_per_sigma", [0.3, 1.0, 4.0])
 def test_estimated_ranges_stray_no_further_than_bounded(estimator, signal, bins_per_sigma):
     """The highest bin and the mean of n photons, drawn 2000 times, after rounding is taken off."""
@@ -411,7 +411,7 @@ def check_effect(name, bound, scene, detector, rays):
     assert added <= bound.lost + STANDARD_ERRORS * np.sqrt(max(bound.lost, 1 / returns) / returns)
 
 
-@each_row("seed", range(40))
+@each_row("seed", range(25))
 def test_no_effect_changes_more_than_its_bound(seed):
     scene, detector, rays = random_case(seed)
     found = decisions(Planner(detector).plan(scene, [rays]))
@@ -419,7 +419,7 @@ def test_no_effect_changes_more_than_its_bound(seed):
         check_effect(name, found[name].bound, scene, detector, rays)
 
 
-@each_row("seed", range(100, 130))
+@each_row("seed", range(100, 118))
 def test_planned_effects_err_as_all_do_within_the_tolerance(seed):
     scene, detector, rays = random_case(seed)
     tolerance = Tolerance(2 * Tolerance.of(detector).range_m, 0.01)

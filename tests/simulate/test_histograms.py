@@ -68,15 +68,6 @@ def test_ambient_counts_follow_radiance_aperture_and_solid_angle(illuminance):
     assert abs(found - expected) < STANDARD_ERRORS * math.sqrt(expected)
 
 
-def test_dark_counts_come_without_light():
-    detector = replace(DETECTOR, photons=replace(DETECTOR.photons, dark_hz=1e6))
-    scene = ceiling(2.0)
-    rays = rays_towards(np.tile([0.0, 0.0, -1.0], (100, 1)), (0.5, 1.5))
-    expected = 1e6 * 1e6 * 2 / SPEED_OF_LIGHT_M_S
-    found = captured(scene, rays, {"ambient"}, detector).counts.sum()
-    assert abs(found - expected) < STANDARD_ERRORS * math.sqrt(expected)
-
-
 def test_rays_that_meet_nothing_see_no_light():
     scene = ceiling(2.0, ambient=Ambient(1e5, "sun"))
     up_and_down = rays_towards([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], (0.5, 1.5))

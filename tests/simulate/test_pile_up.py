@@ -107,7 +107,7 @@ def test_dead_times_that_reach_across_pulses_agree_with_a_naive_loop_to_the_phot
 @each_row("per_bin", [0.3, 3.0, 60.0])
 @each_row("dead", [0.4, 1.0, 2.5, 7.0, 100.0])
 def test_dead_times_within_pulses_agree_with_a_naive_loop_on_average(dead, per_bin):
-    generator, pulses, repeats = np.random.default_rng(4), 50, 300 if per_bin < 10 else 60
+    generator, pulses, repeats = np.random.default_rng(4), 50, 150 if per_bin < 10 else 40
     ours, naive = np.zeros((repeats, BINS)), np.zeros((repeats, BINS))
     for ray in range(repeats):
         arrived = generator.poisson(per_bin, BINS)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -182,24 +180,3 @@ def test_costs_are_predicted_for_every_effect_and_grow_with_the_rays():
         few, many = (Planner(detector).plan(room(), [grid(side)]) for side in (5, 10))
         for one, other in zip(few.decisions, many.decisions, strict=True):
             assert 4 * one.seconds == pytest.approx(other.seconds)
-
-
-def test_planning_imports_nothing_heavy():
-    code = (
-        "import sys\n"
-        "from lidardesign.scene import Ambient, Medium\n"
-        "from lidardesign.simulate.detector.detector import IDEAL\n"
-        "from lidardesign.simulate.plan import Planner\n"
-        "from support.planning import CONSUMER, SINGLE, grid, room\n"
-        "heavy = {'mitsuba', 'drjit', 'torch', 'scipy.stats'}\n"
-        "loaded = (heavy | {'numba'}) & set(sys.modules)\n"
-        "assert not loaded, loaded\n"
-        "bright = room({'velocity_m_s': (0.0, 3.0, 0.0)}, ambient=Ambient(1e5), medium=Medium(0.1, 0.01))\n"
-        "for detector in (IDEAL, SINGLE, CONSUMER):\n"
-        "    Planner(detector).plan(bright, [grid()])\n"
-        # the rays that a plan casts run in compiled loops
-        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
-    )
-    folder = str(__import__("pathlib").Path(__file__).parents[1])
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr

@@ -39,22 +39,6 @@ def fan(count=400):
     return random_fan(count, 0.3, seed=1)
 
 
-def test_ranges_on_a_sphere_are_the_closed_form():
-    directions = fan()
-    (returns,) = simulate(Scene((ball(),)), make_rays((0, 0, 0), directions))
-    along = directions @ [3.0, 0.0, 0.0]
-    discriminant = along**2 - (9.0 - 0.25)
-    hit = discriminant > 0
-    assert np.array_equal(returns.returned, hit)
-    # both sides round a root of numbers near 9: a few ulp, magnified near the silhouette
-    expected = along[hit] - np.sqrt(discriminant[hit])
-    np.testing.assert_allclose(returns.range_m[hit], expected, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(returns.points_m - [3, 0, 0], axis=1), 0.5, atol=1e-9)
-    assert np.isnan(returns.range_m[~hit]).all()
-    assert (returns.body[~hit] == -1).all()
-    assert (returns.body[hit] == 0).all()
-
-
 def test_a_moving_body_gives_one_set_of_returns_per_frame():
     poses = np.stack([rigid(translation_m=(x, 0.0, 0.0)) for x in (2.0, 3.0, 4.0)])
     scene = Scene((Body(Sphere(0.5), "ball", "both", poses),))

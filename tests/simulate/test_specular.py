@@ -100,14 +100,6 @@ def test_panes_add_up_until_beams_are_given_up():
             assert not len(behind)
 
 
-def test_a_ball_of_glass_is_crossed_through_both_of_its_sides():
-    ball = Body(Sphere(0.5), poses=rigid(translation_m=(2, 0, 0)), reflectance=0.0, transmission=0.6)
-    wall = Body(Box((0.1, 9, 9)), poses=rigid(translation_m=(5.1, 0, 0)), reflectance=0.5)
-    _, led = traced(Scene((ball, wall)), beams_along([[1.0, 0, 0]]))
-    behind = led.subset(led.body == 1)
-    assert behind.gain == pytest.approx([0.6**4 * 0.5 / (math.pi * 25)], rel=1e-9)
-
-
 def test_two_mirrors_face_to_face_make_a_row_of_images():
     mirrors = slab(2.0, reflectance=0.0, specular=0.5), slab(-1.0, yaw_rad=math.pi, reflectance=0.1, specular=0.5)
     looking = direction(np.array([0.0]), np.array([0.05]))

@@ -178,16 +178,13 @@ def test_every_body_stays_below_the_ceiling_and_above_the_floor(scenes):
         assert scene.truth["ball_m"][:, 2].min() > 0.02
 
 
-def test_a_motion_near_the_ceiling_too_fast_or_through_the_arm_is_rejected():
+def test_a_motion_near_the_ceiling_or_too_fast_is_rejected():
     robot = load_robot(None, 0.15)
     waypoints = draw_waypoints(0.1, np.random.default_rng(0))
     with pytest.raises(RejectedError, match="ceiling"):
         Arm(robot, 0.7).follow(waypoints, 10, 1.0, Counter())
     with pytest.raises(RejectedError, match="too fast"):
         Arm(robot, 1.0).follow(waypoints, 10, 500.0, Counter())
-    folded = np.tile([0.0, 1.2, 0.0, -2.05, 0.0, 1.5, 0.0], (3, 1))  # the tool reaches into the pedestal
-    with pytest.raises(RejectedError, match="collide"):
-        Arm(robot, 1.0)._forward(folded, 1.0)
 
 
 def test_scenes_without_jitter_are_refused():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from lidardesign_tasks.importance import (
 )
 from lidardesign_tasks.meshes import MeshesConfig, MeshesTask
 from lidardesign_tasks.pose import rotation_matrix
-from lidardesign_tasks.surroundings import Surroundings
 from pydantic import ValidationError
 from support.tables import each_row
 
@@ -338,11 +336,3 @@ def test_gltf_text_that_names_weights_it_does_not_have_is_refused(tmp_path):
     path.write_text(json.dumps(document))
     with pytest.raises(DataError, match=r"ball\.gltf"):
         load_mesh(path, painted=Painted("_care"))
-
-
-@each_row("kind", [FaceConfig, EmitterConfig, MeshesConfig])
-def test_every_key_of_importance_is_on_the_page(kind):
-    page = (Path(__file__).parents[2] / "docs" / "importance.md").read_text(encoding="utf-8")
-    inherited = set(kind.model_fields) & set(Importance.model_fields) - set(Surroundings.model_fields)
-    assert len(inherited) == 8
-    assert all(f"`{key}`" in page for key in inherited)
