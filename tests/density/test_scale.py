@@ -184,7 +184,8 @@ def test_in_python_it_is_said_once_before_the_first_step(plates):
     said = []
     settings = {"folder": plates, "poses": 1, "truth_points": 100, "jitter_rotation_deg": 0.1, "learning.steps": 4,
                 "learning.batch": 64, "learning.samples": 1000, "density.field_resolution": 8}  # fmt: skip
-    learn("meshes", out=plates.parent / "python", settings=settings, notes=said.append, progress=said.append)
+    out = plates.parent / "python"
+    learn("meshes", out=out, settings=settings, notes=said.append, progress=lambda *now: said.append(now))
     (place,) = [index for index, one in enumerate(said) if isinstance(one, str) and "edge-on" in one]
     assert place < min(index for index, one in enumerate(said) if not isinstance(one, str))
 
