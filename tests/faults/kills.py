@@ -25,8 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.pieces import Pieces
-from support.result_pages import heading, write_page
+from support.long_runs import heading, kept, write_page
 
 from faults.processes import Ended, Fork, forked, fresh, import_all
 from faults.runs import COMMANDS, FINISHED, LEARN, TO_TOLERANCE, Straight, contents, strays, unreadable
@@ -78,12 +77,12 @@ class Tally:
 class Killing:
     """Ends commands in a folder and looks at what is left, beside an undisturbed run."""
 
-    def __init__(self, folder: Path, straight: Straight, tally: Tally, pieces: Pieces) -> None:
-        self.folder, self.straight, self.tally, self.pieces = folder, straight, tally, pieces
+    def __init__(self, folder: Path, straight: Straight, tally: Tally, seed: int) -> None:
+        self.folder, self.straight, self.tally, self.seed = folder, straight, tally, seed
 
     def end(self, way: str, name: str, number: int, run_it: Callable[[Path], Ended], told: str) -> Ended:
         """End one command in a folder of its own, look, give it again, and compare; `told` names the moment."""
-        found = self.pieces.of(f"{way} of {name}, {number}", lambda: self._end(way, name, run_it, told))
+        found = kept(f"kills {self.seed}, {way} of {name}, {number}", lambda: self._end(way, name, run_it, told))
         self.tally.sent[way, name] += 1
         self.tally.early[way, name] += found["code"] not in FINISHED
         self.tally.faults += found["faults"]
@@ -128,7 +127,7 @@ class Killing:
 
     def pair(self, name: str, number: int, delay_s: float) -> None:
         """Two commands at once: each works or is told why not, one works at least, and nothing is spoilt."""
-        found = self.pieces.of(f"{name}, {number}", lambda: self._pair(name, delay_s))
+        found = kept(f"kills {self.seed}, {name}, {number}", lambda: self._pair(name, delay_s))
         self.tally.sent["pair", name] += 1
         self.tally.early["pair", name] += found["both"]
         self.tally.faults += found["faults"]
@@ -224,21 +223,21 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=None, help="write the result as Markdown")
     asked = parser.parse_args()
-    pieces, tally = Pieces(f"kills-{asked.seed}"), Tally()
+    began, tally = time.monotonic(), Tally()
     import_all()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        killing = Killing(folder, Straight(folder / "straight", COMMANDS), tally, pieces)
+        killing = Killing(folder, Straight(folder / "straight", COMMANDS), tally, asked.seed)
         at_steps(killing, asked.steps)
         at_steps(killing, asked.steps, "asked")
         in_pairs(killing, asked.pairs, asked.seed)
         if asked.kills + asked.terms:
             to_tolerance = Straight(folder / "tolerance", {"learn --tolerance": TO_TOLERANCE})
-            at_steps(Killing(folder, to_tolerance, tally, pieces), asked.steps)
+            at_steps(Killing(folder, to_tolerance, tally, asked.seed), asked.steps)
             seconds = killing.straight.measure_fresh(folder)
             at_random(killing, "SIGKILL", asked.kills, asked.seed, seconds)
             at_random(killing, "SIGTERM", asked.terms, asked.seed, seconds)
-    parts = page(tally, asked.seed, pieces.seconds / 60)
+    parts = page(tally, asked.seed, (time.monotonic() - began) / 60)
     print("\n\n".join(parts))
     if asked.out is not None:
         write_page(asked.out, parts)

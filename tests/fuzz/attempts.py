@@ -11,7 +11,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,6 @@ import numpy as np
 from fuzz.mutators import Mutator
 from lidardesign.errors import LidardesignError
 
-EXECUTED = "EXECUTED"
 MOST_SEEDS = 2000
 # Of the inputs so many are damaged good files; the others are files that were damaged before.
 GOOD_SHARE = 0.6
@@ -73,16 +72,12 @@ class Tally:
 
     Arguments:
         read, refused: How many were taken, and how many refused.
-        places: The lines of the program that refused them.
         slowest_s: The longest processor time of one.
-        seconds: The processor time of all.
     """
 
     read: int = 0
     refused: int = 0
-    places: set[str] = field(default_factory=set)
     slowest_s: float = 0.0
-    seconds: float = 0.0
 
 
 def attempt(read: Read, content: bytes, tally: Tally, slow_s: float) -> tuple[str, str | None]:
@@ -99,7 +94,6 @@ def attempt(read: Read, content: bytes, tally: Tally, slow_s: float) -> tuple[st
     except LidardesignError as error:
         place = _place(error)
         tally.refused += 1
-        tally.places.add(place)
         fault = _hidden_fault(error)
     # what is no error of the program is a fault of it, whatever it is
     except BaseException as error:
@@ -107,7 +101,6 @@ def attempt(read: Read, content: bytes, tally: Tally, slow_s: float) -> tuple[st
             raise
         place, fault = _place(error), "".join(traceback.format_exception(error))
     seconds = time.process_time() - before
-    tally.seconds += seconds
     tally.slowest_s = max(tally.slowest_s, seconds)
     if fault is None and seconds > slow_s:
         fault = f"took {seconds:.1f} s of processor time"
