@@ -68,8 +68,10 @@ def kept(name: str, work: Callable[[], Any]) -> Any:
 def ended_after(seconds: float) -> Iterator[None]:
     """End this process where the block takes longer."""
     faulthandler.dump_traceback_later(seconds, exit=True)
-    yield
-    faulthandler.cancel_dump_traceback_later()
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 @pytest.fixture
