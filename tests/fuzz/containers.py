@@ -81,7 +81,7 @@ def mutate_npz(content: bytes, source: random.Random, others: Sequence[bytes]) -
     else:
         name = source.choice(list(members))
         data = members.pop(name)
-        others = (_other_header(data, source), PICKLED_ARRAY, mutate_bytes(data, source, [data]))
+        others = (*(_other_header(data, source) for _ in range(3)), PICKLED_ARRAY, mutate_bytes(data, source, [data]))
         names = ("../../outside.npy", "/absolute.npy", "x.txt", "", "é.npy", ".npy", "a/b.npy", "x" * 300)
         members[source.choice((name, name, name, name, source.choice(names)))] = source.choice(others)
     packed = io.BytesIO()

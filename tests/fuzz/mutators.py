@@ -36,7 +36,8 @@ VALUES = (
 SPECIAL = (0.0, 1.0, -1.0, 0.5, 2.0, 255.0, 1e9, 1e30, -1e30, 1e-40, float("nan"), float("inf"), float("-inf"))
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-TOKEN = re.compile(r"[-+]?(?:\.\d+|\d+(?:\.\d*)?)(?:[eE][-+]?\d+)?|[A-Za-z_][\w.]*|[^\w\s]|[ \t]+")
+NUMBER = re.compile(r"[-+]?(?:\.\d+|\d+(?:\.\d*)?)(?:[eE][-+]?\d+)?")
+TOKEN = re.compile(r"[A-Za-z_][\w.]*|[^\w\s]|[ \t]+")
 
 Mutator = Callable[[bytes, random.Random, Sequence[bytes]], bytes]
 
@@ -46,11 +47,12 @@ def mutate_bytes(content: bytes, source: random.Random, others: Sequence[bytes])
     data = bytearray(content)
     for _ in range(source.choice((1, 1, 1, 2, 3, 8))):
         at, other = source.randrange(len(data) + 1), source.choice(others)
-        end = min(at + source.choice((0, 1, 1, 4, 8, 64, 256, len(data))), len(data))
+        end = min(at + source.choice((0, 1, 1, 1, 1, 4, 8, 64, len(data))), len(data))
         start = source.randrange(len(other) + 1)
         new = (
             b"",
             source.randbytes(end - at or source.choice((1, 4, 32))),
+            bytes(byte ^ 1 << source.randrange(8) for byte in data[at:end]),
             bytes(data[at : min(end, at + 200)]) * source.choice((2, 20)),
             struct.pack(source.choice("<>") + source.choice("BHIQ"), source.choice((0, 1, 127, 128, 255))),
             struct.pack(source.choice("<>") + "q", source.choice((-1, 1 - (1 << 63), 1 << 31, source.getrandbits(40)))),
@@ -72,7 +74,8 @@ def mutate_text(content: bytes, source: random.Random, others: Sequence[bytes]) 
 
 
 def _other_token(text: str, source: random.Random, _: Sequence[bytes]) -> str:
-    found = [match.span() for match in TOKEN.finditer(text)] or [(len(text), len(text))]
+    tokens = source.choice((NUMBER, TOKEN))
+    found = [match.span() for match in tokens.finditer(text)] or [(len(text), len(text))]
     (start, end), (first, last) = source.choice(found), source.choice(found)
     new = source.choice((source.choice(NUMBERS), source.choice(NUMBERS), source.choice(WORDS), text[first:last], ""))
     return text[: source.choice((start, start, end))] + new + text[end:]
