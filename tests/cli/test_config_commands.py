@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import re
-from pathlib import Path
 from types import SimpleNamespace
 
 import jsonschema
@@ -120,12 +119,6 @@ def test_no_word_of_a_task_leaves_its_comment(summary, description, unit):
     assert parse_yaml(text, where="text", empty_sections=True).value == {
         "schema_version": 1, "task_name": "odd", "task": None, "space": None, "density": None, "learning": None
     }  # fmt: skip
-
-
-def test_config_alone_asks_for_a_command(lidardesign):
-    result = lidardesign("config")
-    assert result.code == 2
-    assert "no command" in result.err
 
 
 def accepts(schema, value):
@@ -278,8 +271,3 @@ def test_the_rungs_of_accuracy_are_those_of_the_schema():
     one = {"$ref": "#/$defs/rung", "$defs": schema["$defs"]}
     for row in sweep.as_rows():
         jsonschema.Draft202012Validator(one).validate(row)
-
-
-def test_the_files_of_the_schemas_are_packaged():
-    root = Path(__file__).parents[2] / "lidardesign"
-    assert {path.name for path in root.rglob("*.schema.json")} >= {"design.schema.json", "evaluate.schema.json"}

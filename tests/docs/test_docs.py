@@ -8,11 +8,9 @@ from typing import get_args
 
 import numpy as np
 import pytest
-import typer
 from support.tables import each_row
 
 from lidardesign import registry
-from lidardesign.cli.main import app
 from lidardesign.config import resolve
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.errors import LidardesignError
@@ -104,12 +102,6 @@ def test_every_exit_code_of_the_error_tree_is_listed():
 
     listed = {int(number) for row in re.findall(r"^\| ([\d, ]+) \|", SHELL, re.MULTILINE) for number in row.split(",")}
     assert {0, 70, 130, 141, 143} | set(codes(LidardesignError)) == listed
-
-
-def test_every_command_is_shown():
-    shown = README + (DOCS / "commands.md").read_text(encoding="utf-8")
-    for command in app.registered_commands:
-        assert f"lidardesign {command.name or command.callback.__name__}" in shown
 
 
 def test_the_readme_is_short():
@@ -208,16 +200,3 @@ def test_links_lead_somewhere_and_pictures_are_small(page):
         found = page.parent / target
         assert found.exists(), target
         assert found.suffix != ".png" or found.stat().st_size < LARGEST_PICTURE_BYTES
-
-
-def test_every_option_that_a_console_shows_exists():
-    known = {
-        name
-        for command in typer.main.get_command(app).commands.values()
-        for part in (command, *getattr(command, "commands", {}).values())
-        for parameter in part.params
-        for name in parameter.opts
-    }
-    lines = [line for block in blocks("console") for line in block.splitlines() if line.startswith("$ lidardesign")]
-    shown = {word for line in lines for word in re.findall(r"--[\w-]+", line)}
-    assert shown <= known

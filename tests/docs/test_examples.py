@@ -34,7 +34,7 @@ SETTINGS = {
 
 @pytest.fixture
 def run_example(monkeypatch, capsys):
-    """Runs an example in this process, and the program that it calls, whose starts would take longest; what it prints."""
+    """Runs an example and the program that it calls in this process, as their starts take longest; what it prints."""
     monkeypatch.syspath_prepend(EXAMPLES)
     elsewhere = subprocess.run
 

@@ -13,13 +13,9 @@ from support.tables import each_row
 
 from lidardesign import registry
 from lidardesign.errors import ConfigError
-from lidardesign.run.child import START_SECONDS, ChildError
-from lidardesign.testing import process
 from lidardesign.testing.contract import LAWS
-from lidardesign.testing.law import Finding
 from lidardesign.testing.process import CheckRequest, check_in_process
 
-SCORE = "    def score(self, scene, returns):\n"
 SCENES = "    def scenes(self, config, split, seed):\n"
 
 
@@ -35,14 +31,7 @@ BROKEN = {
     "hang": (in_scenes("import time\n        while True: time.sleep(1)"), "scenes are made", "did not end within"),
     "wrong_version": (GOOD.replace("api_version = 1", "api_version = 7"), "plugin loads", "version 7 of the task"),
     "duplicate": (GOOD, "plugin loads", "is offered by first 1.0 (first_duplicate:Task) and second 1.0"),
-    "nan_metric": (GOOD.replace("50 / len(points)", "float('nan')"), "scores are numbers", "returned np.float64(nan)"),
     "wrong_types": (in_scenes("return ['a scene', 'another']"), "scenes are made", "scenes() returned a str"),
-    "global_seed": (in_scenes("np.random.seed(seed)"), "no global random state", "numpy's random in scenes"),
-    "mutates_scenes": (
-        GOOD.replace(SCORE, SCORE + "        scene.truth['scored'] = True\n"),
-        "scores change nothing",
-        "score changed the scene",
-    ),
 }  # fmt: skip
 # What only a limit on a process or its end can contain.
 CONTAINED = {
@@ -109,31 +98,6 @@ def test_an_unusual_plugin_keeps_every_law_that_applies(findings):
     assert [finding for finding in findings["unusual"] if finding.outcome == "fail"] == []
     kept = {finding.law for finding in findings["unusual"] if finding.outcome == "pass"}
     assert kept >= {"scenes repeat elsewhere", "splits are disjoint"}
-
-
-class Playing:
-    """A process that says given lines, and how long each is waited for."""
-
-    def __init__(self, *lines):
-        self.lines, self.waits = list(lines), []
-
-    def answer(self, seconds, when):
-        self.waits.append(seconds)
-        if not self.lines:
-            raise ChildError("gave no answer", "late")
-        return self.lines.pop(0)
-
-
-def test_every_call_of_a_law_has_its_own_time():
-    finding = Finding("law", "group", "statement", "pass", "").as_dict()
-    child = Playing({"called": "score"}, {"called": ""}, {"called": "score"}, finding)
-    assert process._next_finding(child, 2.0, loading=False) == finding
-    waiting, calling = START_SECONDS + 6.0, 6.0
-    assert child.waits == [waiting, calling, waiting, calling]
-    assert process._next_finding(Playing({"called": "score"}), 2.0, loading=False) == "score did not end within 6 s"
-    assert process._next_finding(Playing({"other": 1}), 2.0, loading=True).startswith(
-        "writes to a stream that is not its own"
-    )
 
 
 def test_none_of_them_is_imported_here_or_spoils_the_others(findings, place, tmp_path, monkeypatch, capsys):
