@@ -16,7 +16,7 @@ from support.command_line import make_run
 import lidardesign as package
 from lidardesign import __version__
 from lidardesign.cli import output as console_module
-from lidardesign.cli.output import command
+from lidardesign.cli.output import command, plain_json
 from lidardesign.cli.tables.designs import show_fit
 from lidardesign.design.catalog.library import Pose, find_part, part_design
 from lidardesign.design.compare import paired_sensors
@@ -199,6 +199,17 @@ def test_an_error_after_the_document_adds_no_second_one(capsys):
     with pytest.raises(console_module.typer.Exit):
         body()
     assert json.loads(capsys.readouterr().out)["value"] == 1
+
+
+def test_numbers_that_json_lacks_become_null():
+    values = {
+        "a": float("nan"),
+        "b": [np.inf, np.float64(1.5)],
+        "c": np.arange(2),
+        "d": Path("x"),
+        "e": (None, True),
+    }
+    assert plain_json(values) == {"a": None, "b": [None, 1.5], "c": [0, 1], "d": "x", "e": [None, True]}
 
 
 def test_a_design_fits_a_terminal_of_80_columns(lidardesign, flat, monkeypatch):

@@ -162,11 +162,3 @@ def test_a_rig_that_hears_only_far_beyond_the_space_is_told(flat):
     far = read_design(rig(flat, "far.csv", 1, start=500.0))
     assert outside_notes(near, space) == []
     assert "listens from 500 m on" in outside_notes(far, space)[0]
-
-
-def test_an_evaluation_says_what_its_task_says_of_the_configuration(capsys, monkeypatch, flat):
-    call = caller(capsys, flat.parent, monkeypatch)
-    name = rig(flat, "other.csv", 1).name
-    kind = type(load_task("flatland"))
-    monkeypatch.setattr(kind, "notes", lambda self, config, space: ["one mesh is all there is"], raising=False)
-    assert "one mesh is all there is" in call("evaluate", name, "--in", flat, "--rays", 9, "--json").json["notes"]

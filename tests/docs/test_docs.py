@@ -18,7 +18,6 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.scene import Scene
-from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import simulate
 from lidardesign.task import Task, conditions_of
 
@@ -168,15 +167,6 @@ def test_the_moving_ball_of_the_guide_is_scored_over_its_frames():
     assert task.score(scene, simulate(scene, everywhere)).value < task.score(
         scene, simulate(scene, seen_at_the_ends)
     ).value
-
-
-def test_the_returns_of_the_guide_tell_about_the_frames_that_they_are_of():
-    task, _, scene = moving_scene_of("PassingTask", 0)
-    ball = scene.bodies[0].poses[:, :3, 3]
-    returns = simulate(scene, rays_at(ball, np.array([0.0, 0.0, 0.3])))
-    found = checked_information(task, scene, returns)
-    assert set(found.item.tolist()) == {number for number, one in enumerate(returns) if (one.body == 0).any()}
-    assert all(returns[item].body[ray] == 0 for ray, item in zip(found.ray, found.item, strict=True))
 
 
 def test_the_drive_of_the_guide_is_scored_over_its_positions():

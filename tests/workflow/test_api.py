@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import doctest
 import shutil
-import subprocess
-import sys
 from html.parser import HTMLParser
 
 import numpy as np
@@ -209,15 +207,3 @@ def test_one_kind_of_progress_says_how_far_everything_has_come(tmp_path):
     assert said[-1] == ("choosing 8 rays", None, None)
     run.evaluate([design], rays=[8], baselines=["none"], progress=lambda *now: said.append(now))
     assert said[-1][1:] == (2, 2)
-
-
-def test_names_are_imported_when_they_are_used():
-    code = (
-        "import sys, lidardesign; assert not {'numpy', 'torch', 'pydantic'} & set(sys.modules); "
-        "lidardesign.open_run; assert not {'torch', 'plotly', 'matplotlib', 'rich', 'typer'} & set(sys.modules), "
-        "{'torch', 'plotly', 'matplotlib', 'rich', 'typer'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-    assert set(lidardesign.__all__) <= set(dir(lidardesign))
-    with pytest.raises(AttributeError):
-        lidardesign.nothing  # noqa: B018 - the attribute is asked for
