@@ -87,6 +87,8 @@ CASES = [
     ("learn flatland --config open", 2, "open"),
     ("learn flatland --set sigma", 2, "KEY=VALUE"),
     ("learn flatland --set density.sigma_m=-1", 2, "--set density.sigma_m=-1"),
+    ("learn flatland --set density.sigma_m=-1 --dry-run", 2, "--set density.sigma_m=-1"),
+    ("learn flatland --out run --dry-run", 2, "not empty"),
     ("learn flatland --set learning.step=3", 2, "did you mean 'steps'"),
     ("learn flatland --set train=0", 2, "--set train=0"),
     ("learn flatland --set space.range_m=[2,1]", 2, "--set space.range_m=[2,1]"),

@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import trimesh
-from lidardesign_tasks.emitter import winding_number
 from lidardesign_tasks.flatland import FlatlandTask
 from support.command_line import files_under, make_run
 from support.mistakes import GARBAGE, GOOD, check_one_clear_message
@@ -15,7 +13,7 @@ from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 from lidardesign.cli.output import EXIT_INTERRUPTED, Output, describe_error
 from lidardesign.errors import PluginError
 from lidardesign.registry import plugin_guard
-from lidardesign.scene import Ambient, Body, Medium, Mesh, Receiver, Scene, Sphere
+from lidardesign.scene import Ambient, Body, Medium, Receiver, Scene, Sphere
 from lidardesign.simulate.light_transport import transport as light_transport_process
 
 LONG = "x" * 300
@@ -189,16 +187,6 @@ def test_a_detector_inside_of_a_head_is_refused(ready, place):
     result = ready("learn", "emitter", "--set", f"detector_m={place}", "--set", "train=2", "--json")
     check_one_clear_message(result, 2, "is inside the train head 0")
     assert "task.detector_m" in result.err
-
-
-def test_meshes_wind_once_round_what_is_inside_of_them():
-    corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
-    cube = trimesh.convex.convex_hull(corners)
-    mesh = Mesh(cube.vertices, cube.faces)
-    inside = [winding_number(mesh, point) for point in np.random.default_rng(0).uniform(0.01, 0.99, (20, 3))]
-    outside = [winding_number(mesh, point) for point in np.random.default_rng(1).uniform(1.01, 3.0, (20, 3))]
-    np.testing.assert_allclose(inside, 1.0, atol=1e-9)
-    np.testing.assert_allclose(outside, 0.0, atol=1e-9)
 
 
 def test_a_library_that_cannot_be_is_named_where_it_comes_from(monkeypatch, tmp_path):

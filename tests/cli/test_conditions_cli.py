@@ -116,17 +116,6 @@ def test_a_track_is_exported_at_a_position(lidardesign, run, tmp_path):
     assert "x_m from 0 to 1" in refused.err
 
 
-def test_a_design_for_one_value_is_exported_anew_from_samples_of_that_value(lidardesign, run, tmp_path):
-    lidardesign("fit", run, "--at", "x_m=0.37", "--layout", "scan", "--rays", 4, "--name", "here")
-    path = run / "designs" / "here.yaml"
-    for at, expected in ((("--at", "x_m=0.9"), 0.9), ((), 0.37)):
-        result = lidardesign("export", path, "--format", "npz", "--rays", 7, *at, "--out", "r.npz")
-        assert result.code == 0, result.err
-        with np.load(tmp_path / "r.npz") as arrays:
-            assert len(arrays["sensor"]) == 7
-            np.testing.assert_array_equal(arrays["origin_x_m"], expected)
-
-
 MISTAKES = [
     ("fit run --at x_m", 2, "NAME=VALUE"),
     ("fit run --at x_m=here", 2, "NAME=VALUE"),

@@ -90,16 +90,6 @@ def test_what_is_chosen_is_set_and_all_else_is_not(lidardesign, tmp_path):
     assert resolve(load_task("flatland"), config_file=path).density.sigma_m == 0.01
 
 
-def test_a_file_is_written_once_and_kept(lidardesign, tmp_path):
-    assert lidardesign("config", "init", "face", "--out", "face.yaml").code == 0
-    before = (tmp_path / "face.yaml").read_text()
-    result = lidardesign("config", "init", "flatland", "--out", "face.yaml")
-    assert result.code == 2
-    assert "already exists" in result.err
-    assert (tmp_path / "face.yaml").read_text() == before == lidardesign("config", "init", "face").out
-    assert lidardesign("config", "init", "face", "--json").json["text"] == before
-
-
 @given(st.text(), st.text(), st.text())
 def test_no_word_of_a_task_leaves_its_comment(summary, description, unit):
     config = type(

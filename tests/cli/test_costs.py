@@ -15,7 +15,6 @@ from lidardesign.cli.tables.scores import show_times
 from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import read_manifest
 
-TITLE = "where the time went"
 LEARN = (
     "learn flatland --preset draft --set learning.steps=20 --set learning.samples=1000 --set learning.batch=64 "
     "--set learning.layers=1 --set learning.hidden=12 --set train=2 --set learning.coverage_proposals=256"
@@ -105,22 +104,6 @@ def test_a_run_that_cannot_be_written_is_still_read(lidardesign, flat, tmp_path)
     assert "the times of export are not kept" in done.err
     assert "writing this run" in done.err
     assert (tmp_path / "rays.csv").is_file()
-
-
-def test_the_time_is_a_line_a_table_with_verbose_and_nothing_with_quiet(lidardesign, flat):
-    usual = lidardesign("fit run --layout grid --sensors 2 --name one")
-    assert re.search("^took .* s$", usual.out, re.MULTILINE)
-    assert TITLE not in usual.out
-    loud = lidardesign("fit run --layout grid --sensors 2 --name one --verbose")
-    assert TITLE in loud.out
-    assert "fitting" in loud.out
-    assert "log-likelihood" in loud.out
-    assert "+-" in loud.out
-    assert lidardesign("fit run --layout grid --sensors 2 --name one --quiet").out == "run/designs/one.yaml\n"
-    # what only looks something up does not tell people how long that took
-    assert TITLE not in lidardesign("show run/designs/one.yaml").out
-    assert TITLE not in lidardesign("tasks list").out
-    assert TITLE not in lidardesign("export --list").out
 
 
 def test_the_table_of_times_indents_what_is_inside_and_leaves_out_what_is_next_to_nothing():

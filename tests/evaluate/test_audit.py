@@ -26,7 +26,7 @@ JITTERY = Detector("jittery", jitter_sigma_s=1e-9)
 @pytest.fixture(autouse=True)
 def without_light_transport(monkeypatch):
     """The same on every machine: late light is rendered by another program, which some do not have."""
-    monkeypatch.setattr(plan_module.process, "missing", lambda: "not here")
+    monkeypatch.setattr(plan_module.transport, "missing", lambda: "not here")
 
 
 class RangeTask(MissTask):

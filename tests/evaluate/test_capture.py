@@ -384,6 +384,13 @@ def test_the_program_scores_designs_and_their_exports_side_by_side(call, tmp_pat
     assert np.linalg.norm(place) == pytest.approx(float(point["range_m"]))
 
 
+def test_the_table_names_its_judges(call):
+    done = call("capture", "untrue.npz", "ball.yaml", "--outlier-mm", "5")
+    assert done.code == 0
+    assert "5 mm from the median range of the 9 nearest pixels" in done.out
+    assert "uniform" in done.out
+
+
 BAD = [
     ("capture clean.npz absent.yaml", 3, "absent.yaml"),
     ("capture ball.yaml ball.yaml", 3, "suffix '.yaml'"),

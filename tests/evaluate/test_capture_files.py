@@ -1,6 +1,7 @@
 """Captures are read from every kind of file alike, and nothing wrong in one gets past the reader."""
 
 import pickle
+import zipfile
 from dataclasses import replace
 
 import h5py
@@ -12,6 +13,7 @@ from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.evaluate.captures import arrays as matlab
+from lidardesign.evaluate.captures.arrays import read_arrays
 from lidardesign.evaluate.captures.capture import load_capture
 from lidardesign.run.inputs import CAPTURE
 
@@ -278,6 +280,13 @@ def test_files_above_the_stated_size_are_refused_before_they_are_read(tmp_path, 
     (tmp_path / "big.npz").write_bytes(bytes(100_001))
     with pytest.raises(DataError, match="the file is too large"):
         load_capture(tmp_path / "big.npz")
+
+
+def test_what_is_no_array_in_an_archive_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "s.npz", "w") as archive:
+        archive.writestr("notes.txt", "hello")
+    with pytest.raises(DataError, match=r"notes\.txt"):
+        read_arrays(tmp_path / "s.npz")
 
 
 def test_a_full_capture_is_read_in_bounded_memory(tmp_path):

@@ -148,15 +148,6 @@ def test_baselines_lie_in_what_the_condition_leaves_free(place):
                 assert (rays.origin_m[:, 0] == PLACES[place]).all()
 
 
-def test_bounding_is_cropped_at_every_place_of_an_aisle():
-    request = aisle_request(SeenTask(PLACES), rays=(10,), equal_bandwidth=False)
-    entries = {entry.name: entry for entry in entries_of(request)}
-    for mine, uniform in zip(entries["bounding"].positions, entries["uniform"].positions, strict=True):
-        assert len(np.unique(mine.gate_m, axis=0)) == 1
-        assert np.ptp(mine.direction[:, 2]) < np.ptp(uniform.direction[:, 2])
-    assert len({rays.direction.tobytes() for rays in entries["bounding"].positions}) == len(PLACES)
-
-
 def test_drawn_baselines_differ_from_scene_to_scene_and_from_place_to_place():
     request = aisle_request(SeenTask(PLACES))
     for entry in entries_of(request):
@@ -185,18 +176,6 @@ def ceiling_sensors():
         )
         for i, (place, look) in enumerate(zip(places, looks, strict=True))
     )
-
-
-def test_all_baselines_of_moving_scenes_have_free_origins_inside_the_space():
-    request = ceiling_request(rays=(50,), baselines=BUILT, train=carried(3, 6, 1))
-    rows = {row.design: row for row in evaluate(request).rows}
-    assert rows["bounding"].value > rows["uniform"].value
-    assert rows["occupancy"].value > 2 * rows["uniform"].value
-    for entry in entries_of(request):
-        if entry.baseline:
-            (rays,) = entry.positions
-            low, high = np.array(CEILING.low[:3]), np.array(CEILING.high[:3])
-            assert ((rays.origin_m >= low) & (rays.origin_m <= high)).all()
 
 
 def test_a_twin_stands_for_no_visibility_with_as_many_rays():

@@ -13,7 +13,10 @@ from support.tables import each_row
 
 from lidardesign import registry
 from lidardesign.errors import ConfigError
+from lidardesign.run.child import START_SECONDS, ChildError
+from lidardesign.testing import process
 from lidardesign.testing.contract import LAWS
+from lidardesign.testing.law import Finding
 from lidardesign.testing.process import CheckRequest, check_in_process
 
 SCENES = "    def scenes(self, config, split, seed):\n"
@@ -98,6 +101,31 @@ def test_an_unusual_plugin_keeps_every_law_that_applies(findings):
     assert [finding for finding in findings["unusual"] if finding.outcome == "fail"] == []
     kept = {finding.law for finding in findings["unusual"] if finding.outcome == "pass"}
     assert kept >= {"scenes repeat elsewhere", "splits are disjoint"}
+
+
+class Playing:
+    """A process that says given lines, and how long each is waited for."""
+
+    def __init__(self, *lines):
+        self.lines, self.waits = list(lines), []
+
+    def answer(self, seconds, when):
+        self.waits.append(seconds)
+        if not self.lines:
+            raise ChildError("gave no answer", "late")
+        return self.lines.pop(0)
+
+
+def test_every_call_of_a_law_has_its_own_time():
+    finding = Finding("law", "group", "statement", "pass", "").as_dict()
+    child = Playing({"called": "score"}, {"called": ""}, {"called": "score"}, finding)
+    assert process._next_finding(child, 2.0, loading=False) == finding
+    waiting, calling = START_SECONDS + 6.0, 6.0
+    assert child.waits == [waiting, calling, waiting, calling]
+    assert process._next_finding(Playing({"called": "score"}), 2.0, loading=False) == "score did not end within 6 s"
+    assert process._next_finding(Playing({"other": 1}), 2.0, loading=True).startswith(
+        "writes to a stream that is not its own"
+    )
 
 
 def test_none_of_them_is_imported_here_or_spoils_the_others(findings, place, tmp_path, monkeypatch, capsys):

@@ -18,6 +18,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document, load_design, save_design
 from lidardesign.design.layouts.rays import certificates_of, gates_of, lay_out
 from lidardesign.design.sensor import tangent_coordinates
+from lidardesign.errors import ConfigError
 from lidardesign.samples import save_samples
 from lidardesign.task import Information
 from lidardesign.workflow import select_rays
@@ -89,6 +90,10 @@ class TestDesignsWithChosenRays:
             laid_out = lay_out(again, len(table))
             for name in ("origin_m", "direction", "gate_m", "sensor", "time_s"):
                 np.testing.assert_array_equal(getattr(laid_out, name), getattr(table, name))
+
+    def test_other_numbers_of_rays_are_refused(self, run):
+        with pytest.raises(ConfigError, match="10 rays, which were not chosen"):
+            lay_out(spec_of(run, "ray"), 10)
 
     def test_the_same_seed_chooses_the_same_rays_and_another_one_others(self, run):
         first, second, other = (chosen(run, rays=9, seed=seed).specification for seed in (0, 0, 1))

@@ -198,16 +198,3 @@ def _on_disc(points):
     distance = [np.linalg.norm(seen - centre, axis=1) - radius for centre, radius in (
         ((0.30, 0.65, 0), 0.09), ((0.68, 0.80, 0), 0.13))]  # fmt: skip
     return np.abs(np.min(distance, axis=0)) < 0.15
-
-
-def test_settings_that_leave_no_weight_are_refused(lidardesign, runs, tmp_path):
-    run = shutil.copytree(runs["flatland"], tmp_path / "run")
-    samples = load_samples(run)
-    # all samples are far from where any curve is
-    points = samples.points.copy()
-    points[:, RANGE] = np.linspace(0.0, 0.1, len(points))
-    save_samples(Samples(points, samples.log_prob, samples.log_target, samples.space), run)
-    result = lidardesign("fit", run, "--weight", "scene=discs", "--weight", "train=1")
-    assert result.code == 3
-    assert "samples count as only" in result.err
-    assert "a setting nearer to the learned one" in result.err
