@@ -182,17 +182,6 @@ def test_the_program_audits_and_exits_with_1_only_where_scores_move(lidardesign,
     assert not document.json["audit"]["passed"]
 
 
-def test_the_program_shows_effects_with_their_reasons(lidardesign, fitted):
-    plain = lidardesign("evaluate", fitted, "--rays", 8, "-v")
-    assert "none needed with the detector ideal" in plain.out
-    noise = ("--detector", "single-photon", "--return-tolerance", 0.002)
-    short = lidardesign("evaluate", fitted, "--rays", 8, *noise)
-    assert "effects with the detector single-photon: " in short.out
-    noisy = lidardesign("evaluate", fitted, "--rays", 8, *noise, "-v")
-    assert "0.12 mm and 0.002 of returns together" in noisy.out
-    assert "bins are 1.2 mm wide" in noisy.out
-
-
 def test_tolerances_are_those_that_are_asked_for():
     planner = Planner(SINGLE, tolerance=Tolerance(0.002, 0.05))
     assert evaluate(make_request(test=sunny(1), planner=planner)).effects[0].tolerance == Tolerance(0.002, 0.05)
