@@ -4,7 +4,7 @@
 # make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
 # make test-pythons  installs and tests the core with every other Python that is found, four minutes each
-# make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak
+# make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak; AMOUNT=N reads fewer
 # make coverage  measures the lines and branches that the tests take, an hour
 # make mutation  changes the core's code in a thousand small ways and counts what its tests notice; to docs/soak
 # make soak   all long runs, a night on two cores: random whole runs, many seeds, kills, then fuzz and mutation; each
@@ -19,6 +19,11 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= PASSIVE
+
+# Long runs do so many things at once
+JOBS ?= 2
+LONG := PYTHONPATH=tests $(BIN)/python -m pytest -p support.long_runs -m long -n $(JOBS) --maxschedchunk 1 \
+	--max-worker-restart 100 -o tmp_path_retention_policy=failed --page docs/soak
 
 .PHONY: demo test docs consumers setup system-programs test-arithmetic test-pythons coverage mutation lint fuzz soak soak-benchmarks soak-runs soak-seeds soak-kills soak-promise clean
 
@@ -100,23 +105,21 @@ lint: $(BIN)/.dev
 	$(BIN)/python -m ruff check --no-cache .
 
 fuzz: $(BIN)/.dev
-	PYTHONPATH=tests $(BIN)/python -m fuzz.campaign --inputs 100000 --out docs/soak
+	$(LONG) tests/fuzz --amount $(or $(AMOUNT),100000)
 
-# JOBS=N does so many runs at once
-JOBS ?= 2
 soak: soak-benchmarks soak-runs soak-seeds soak-kills fuzz mutation
 
 # Every benchmark once, as small as it can be
 soak-benchmarks: $(BIN)/.dev
 	$(BIN)/python -m pytest -m long tests/docs
 
-# 200 whole runs of random configurations: no fault, every constraint kept, the same bytes when done again
+# 300 runs of random configurations, some 200 of them whole: no fault, every constraint kept, the same bytes when done again
 soak-runs: $(BIN)/.dev
-	PYTHONPATH=tests $(BIN)/python -m soak runs --whole 200 --jobs $(JOBS)
+	$(LONG) tests/soak/test_long_runs.py --amount $(or $(AMOUNT),300)
 
 # The face and the arm at draft and standard from 20 seeds each: every one learns well enough
 soak-seeds: $(BIN)/.dev
-	PYTHONPATH=tests $(BIN)/python -m soak seeds --count 20 --jobs $(JOBS)
+	$(LONG) tests/soak/test_long_seeds.py --amount $(or $(AMOUNT),20)
 
 # Learning, fitting and evaluating are killed at random moments: what is left can be read, and going on repeats the bytes
 soak-kills: $(BIN)/.dev
@@ -124,7 +127,7 @@ soak-kills: $(BIN)/.dev
 
 # 2,000 random plans: nothing that is skipped changes more than is tolerated
 soak-promise: $(BIN)/.dev
-	PYTHONPATH=tests $(BIN)/python -m soak.promise --count 2000
+	$(LONG) tests/soak/test_long_promise.py --amount $(or $(AMOUNT),2000)
 
 clean:
 	rm -rf $(VENV) build dist runs *.egg-info

@@ -14,6 +14,8 @@ PACKAGE = ROOT / "lidardesign"
 TASKS = ROOT / "tasks" / "lidardesign_tasks"
 MOST_MODULES = 14
 MOST_PARAMETERS = 12
+# Of the whole program: one person owns it.
+MOST_STATEMENTS, MOST_MODULES_IN_ALL, MOST_COMMAND_PARAMETERS, MOST_CLI_LINES = 28_900, 265, 150, 3_600
 # Functions that take what commands take, each choice by its name.
 API = {"constrain", "evaluate", "evaluate_seeds", "fit", "learn"}
 
@@ -291,3 +293,22 @@ def test_no_test_imports_another_test():
         if isinstance(node, ast.ImportFrom) and (node.module or "").rpartition(".")[2].startswith("test_")
     ]
     assert not imports
+
+
+def statements_of(tree: ast.Module) -> int:
+    """Statements without docstrings."""
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    docstrings = sum(isinstance(node, documented) and ast.get_docstring(node) is not None for node in ast.walk(tree))
+    return sum(isinstance(node, ast.stmt) for node in ast.walk(tree)) - docstrings
+
+
+def test_the_program_stays_within_its_size():
+    functions = [node for tree in package().values() for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    annotations = [ast.unparse(one.annotation) for node in functions for one in node.args.args if one.annotation]
+    assert sum(map(statements_of, package().values())) <= MOST_STATEMENTS
+    assert len(package()) <= MOST_MODULES_IN_ALL
+    assert sum(bool(re.search(r"typer\.(Option|Argument)|options\.", text)) for text in annotations) <= (
+        MOST_COMMAND_PARAMETERS
+    )
+    lines = [len(path.read_text(encoding="utf-8").splitlines()) for path in (PACKAGE / "cli").rglob("*.py")]
+    assert sum(lines) <= MOST_CLI_LINES

@@ -6,7 +6,6 @@ Interrupted and started again it goes on behind the folders that are done.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,21 +23,16 @@ def parts() -> list[list[str]]:
 
 
 def main() -> int:
-    """Run what is not done, and combine; the exit code of tests that fail."""
+    """Run what is not done, and combine; raises where tests fail."""
     sys.path.insert(0, str(ROOT / "tests"))
-    from support.pieces import FOLDER, Pieces
+    from support.long_runs import OURS, kept
 
-    pieces, data = Pieces("coverage"), FOLDER / "coverage"
-    if not pieces.done:
-        shutil.rmtree(data, ignore_errors=True)
+    data = OURS / "coverage"
     data.mkdir(parents=True, exist_ok=True)
+    environment = {**os.environ, "COVERAGE_FILE": str(data / ".coverage")}
     for part in parts():
-        if " ".join(part) not in pieces.done:
-            environment = {**os.environ, "COVERAGE_FILE": str(data / ".coverage")}
-            ended = subprocess.run([*COVERAGE, "run", "-m", "pytest", *part], cwd=ROOT, env=environment, check=False)
-            if ended.returncode:
-                return ended.returncode
-            pieces.keep(" ".join(part), None)
+        words = [*COVERAGE, "run", "-m", "pytest", *part]
+        kept(" ".join(words), lambda words=words: subprocess.run(words, cwd=ROOT, env=environment, check=True).args)
     return subprocess.run([*COVERAGE, "combine", "--keep", str(data)], cwd=ROOT, check=False).returncode
 
 

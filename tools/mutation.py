@@ -1,22 +1,22 @@
 """How many small changes of the core's code its tests notice: `python tools/mutation.py` (see `make mutation`).
 
 Every mutant (`mutants.py`) of a module meets the module's own fast test files in a forked process (`mutant_tests.py`);
-nothing on disk is changed. Interrupted and started again it goes on behind those that are tested. What survives is
+nothing on disk is changed. Interrupted and started again it goes on behind the modules that are done. What survives is
 listed with the reason that `mutation_reasons.yaml` gives.
 """
 
 from __future__ import annotations
 
 import argparse
-import datetime
-import hashlib
+import json
 import os
-import subprocess
 import sys
+import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 from hypothesis import HealthCheck, Phase, settings
@@ -24,6 +24,9 @@ from mutant_tests import Children, try_mutants
 from mutants import Mutant, mutants_of
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tasks")]
+from support.long_runs import heading, kept, table, write_page  # noqa: E402
+
 # The files that test each module. A change outside of functions meets the first one alone, whole.
 TESTS = {
     "lidardesign/numerics.py": ("test_numerics.py",),
@@ -42,7 +45,6 @@ WANTED = 0.85
 class Outcome:
     """What became of one mutant: `killed`, `timeout` (killed too) or `survived`."""
 
-    key: str
     operator: str
     line: int
     before: str
@@ -50,68 +52,46 @@ class Outcome:
     outcome: str
 
 
-class Record:
-    """The outcomes of a module's mutants, one a line of a file in `build/long`.
-
-    Arguments:
-        module: The module.
-        retry: Whether those count that another commit's tests killed in the same source.
-    """
-
-    def __init__(self, module: str, retry: bool) -> None:
-        from support.pieces import Pieces
-
-        self.module = module
-        name = f"mutation.{module.replace('/', '.')}"
-        self.pieces = Pieces(name, still=lambda outcome: retry and outcome["outcome"] != "survived")
-
-    def read(self) -> list[Outcome]:
-        """All outcomes, by line of the module."""
-        found = (Outcome(**outcome) for outcome in self.pieces.done.values())
-        return sorted(found, key=lambda one: (one.line, one.operator))
-
-    def tell(self, mutant: Mutant, outcome: str) -> None:
-        """Write down what became of a mutant."""
-        one = Outcome(key_of(mutant), mutant.operator, mutant.line, mutant.before, mutant.after, outcome)
-        self.pieces.keep(one.key, asdict(one))
-        if outcome == "survived":
-            print(f"{self.module}:{one.line} {one.operator}\n  - {one.before}\n  + {one.after}", flush=True)
+def outcomes(module: str, jobs: int, sample: int | None) -> list[dict[str, Any]]:
+    """What became of a module's mutants, tested in a process that imports for it alone, by line."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "outcomes"
+        child = os.fork()
+        if not child:
+            os._exit(_status_of(lambda: _run_module(module, jobs, sample, path)))
+        if os.waitpid(child, 0)[1]:
+            raise SystemExit(f"the mutants of {module} could not be tested")
+        found = [json.loads(line) for line in path.read_text().splitlines()]
+    return sorted(found, key=lambda one: (one["line"], one["operator"]))
 
 
-def key_of(mutant: Mutant) -> str:
-    """What names the changed source."""
-    return hashlib.sha256(mutant.code.encode()).hexdigest()[:16]
-
-
-def run_module(module: str, jobs: int, retry: bool, sample: int | None) -> int:
-    """Test mutants of a module that were not yet, in this process, which imports for it; pytest's exit code."""
+def _run_module(module: str, jobs: int, sample: int | None, out: Path) -> int:
     path, name = ROOT / module, module.removesuffix(".py").replace("/", ".")
-    files = [str(ROOT / "tests" / name) for name in TESTS[module]]
-    found, record = mutants_of(path.read_text()), Record(module, retry)
-    found = found if sample is None else found[:: max(1, len(found) // sample)]
-    record.pieces.only({key_of(mutant) for mutant in found})
-    known = record.pieces.done
-    waiting = [mutant for mutant in found if key_of(mutant) not in known]
+    mutants = mutants_of(path.read_text())
+    mutants = mutants if sample is None else mutants[:: max(1, len(mutants) // sample)]
     ours = OURS | {"tests", *(folder.name for folder in (ROOT / "tests").iterdir() if folder.is_dir())}
-    return try_mutants(path, name, files, waiting, Children(jobs, record.tell), ours) if waiting else 0
+
+    def tell(mutant: Mutant, outcome: str) -> None:
+        one = Outcome(mutant.operator, mutant.line, mutant.before, mutant.after, outcome)
+        with out.open("a") as file:
+            file.write(json.dumps(asdict(one)) + "\n")
+        if outcome == "survived":
+            print(f"{module}:{one.line} {one.operator}\n  - {one.before}\n  + {one.after}", flush=True)
+
+    files = [str(ROOT / "tests" / file) for file in TESTS[module]]
+    return try_mutants(path, name, files, mutants, Children(jobs, tell), ours)
 
 
-def report(results: dict[str, list[Outcome]], minutes: float, retry: bool) -> str:
-    """The result as a page: a row per module, then the survivors that no reason is written down for."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
-    rows = ["| Module | Mutants | Killed | of these by time | Survived | Killed |", "|---|--:|--:|--:|--:|--:|"]
+def report(results: dict[str, list[Outcome]], command: str) -> list[str]:
+    """The parts of the page: a row per module, then the survivors that no reason is written down for."""
+    rows = []
     for module, found in results.items():
-        alive = sum(one.outcome == "survived" for one in found)
-        late = sum(one.outcome == "timeout" for one in found)
-        share = killed_share(found)
-        rows.append(f"| `{module}` | {len(found)} | {len(found) - alive} | {late} | {alive} | {share:.1%} |")
-    about = (
-        f"{datetime.date.today()}, commit {commit.stdout.strip()}, {minutes:.0f} minutes. Mutants by the operators of "
-        "cosmic-ray, as `tools/mutants.py` chooses them; each meets only its module's own test files"
-        + (", and those that died before in the same source are not tested again:" if retry else ":")
-    )
+        alive, late = (sum(one.outcome == outcome for one in found) for outcome in ("survived", "timeout"))
+        rows.append((f"`{module}`", len(found), len(found) - alive, late, alive, f"{killed_share(found):.1%}"))
     tests = [f"- `{module}`: " + ", ".join(f"`tests/{name}`" for name in TESTS[module]) for module in results]
-    return "\n".join(["# Mutation", "", about, "", *tests, "", *rows, "", *_survivors(results)]) + "\n"
+    about = "Mutants by the operators of cosmic-ray, chosen by `tools/mutants.py`; each meets only its module's tests"
+    columns = ("Module", "Mutants", "Killed", "of these by time", "Survived", "Killed")
+    return [heading("Mutation", command), f"{about}:", "\n".join(tests), table(columns, rows), *_survivors(results)]
 
 
 def killed_share(found: list[Outcome]) -> float:
@@ -126,7 +106,7 @@ def _survivors(results: dict[str, list[Outcome]]) -> Iterator[str]:
     explained = len(alive) - len(unexplained)
     yield f"{explained} of {len(alive)} survivors have their reason in `tools/mutation_reasons.yaml`."
     for module, one in unexplained:
-        yield f"\n`{module}` line {one.line}, {one.operator}:\n"
+        yield f"`{module}` line {one.line}, {one.operator}:"
         yield f"```diff\n- {one.before}\n+ {one.after}\n```"
 
 
@@ -141,26 +121,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("modules", nargs="*", default=list(TESTS), help="modules, as lidardesign/numerics.py; all")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at once; one for each core")
-    parser.add_argument("--retry", action="store_true", help="what another commit killed in the same source counts")
     parser.add_argument("--sample", type=int, help="about so many mutants of each module, evenly spread")
     parser.add_argument("--out", type=Path, help="write the page there")
     options = parser.parse_args()
     os.chdir(ROOT)
-    sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tasks")]
     _own_hypothesis_profile()
+    results = {}
     for module in options.modules:
-        # what one module's process imports must not be there for the next
-        child = os.fork()
-        if not child:
-            os._exit(_status_of(lambda m=module: run_module(m, options.jobs, options.retry, options.sample)))
-        if os.waitpid(child, 0)[1]:
-            return 2
-    records = [Record(module, options.retry) for module in options.modules]
-    results = {record.module: record.read() for record in records}
-    for module, found in results.items():
-        print(f"{module}: {killed_share(found):.1%} killed", flush=True)
+        key = f"mutation of {module}, {options.sample}"
+        found = kept(key, lambda module=module: outcomes(module, options.jobs, options.sample))
+        results[module] = [Outcome(**one) for one in found]
+        print(f"{module}: {killed_share(results[module]):.1%} killed", flush=True)
     if options.out is not None:
-        options.out.write_text(report(results, sum(record.pieces.earlier_s for record in records) / 60, options.retry))
+        write_page(options.out, report(results, "make mutation"))
     return int(min(map(killed_share, results.values())) < WANTED)
 
 

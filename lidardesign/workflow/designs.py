@@ -118,7 +118,7 @@ class Design(DesignSource):
         """Fit it again in its run; what is not given stays as it is.
 
         Arguments:
-            sensors: How many, "best" or "auto".
+            sensors: How many, or "best".
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
             layout: grid, density, scan, distributed, selected or spinning.

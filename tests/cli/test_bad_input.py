@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 from dataclasses import replace
 
 import h5py
@@ -14,7 +13,6 @@ from support.command_line import files_under, make_run
 from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
 from lidardesign.run.files import run_lock
-from lidardesign.run.yaml import dump_yaml, load_yaml
 from lidardesign.samples import load_samples, save_samples
 
 CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
@@ -41,30 +39,17 @@ MESHES = [
 
 TEXTS = {
     "typo.yaml": "density:\n  sigma_m: [0.01\n",
-    "tabs.yaml": "density:\n\tsigma_m: 0.01\n",
     "unknown.yaml": "density:\n  sigma_mm: 0.1\n",
-    "section.yaml": "densty: {sigma_m: 0.1}\n",
     "type.yaml": "density: {sigma_m: wide}\n",
-    "list.yaml": "- 1\n- 2\n",
-    "negative.yaml": "density: {sigma_m: -0.1}\n",
-    "nan.yaml": "density: {sigma_m: .nan}\n",
-    "infinite.yaml": "learning: {rate: .inf}\n",
-    "overflow.yaml": "density: {sigma_m: 1e999}\n",
-    "twice.yaml": "density: {sigma_m: 0.1, sigma_m: 0.2}\n",
-    "code.yaml": "density: !!python/object/apply:os.system ['touch owned']\n",
     "other_task.yaml": "task_name: face\n",
     "upside_down.yaml": "space: {range_m: [1.0, 0.5]}\n",
     "alias.yaml": "task:\n  targets: *hand\n",
-    "sign.yaml": "task:\n  targets: @hand\n",
     "garbage.yaml": "\x00\x01\x02",
     "design.yaml": "schema_version: 1\nsensors: 3\n",
     "gate.yaml": "gate: {width_m: {max: -1}}\n",
-    "gates.yaml": "gates: {width_m: {max: 1}}\n",
     "contradiction.yaml": "gate: {start_m: {min: 0.8}, end_m: {max: 0.5}}\n",
-    "empty.yaml": "",
     "notes.txt": "not a design at all",
     "rows.csv": "a,b,c\n1,2,3\n",
-    "short.csv": "1,2,3\n",
 }
 
 CASES = [
@@ -73,14 +58,11 @@ CASES = [
     ("learn", 2, "TASK"),
     ("learn nothing", 2, "unknown task 'nothing'"),
     ("learn flatland --unknown", 2, "unknown"),
-    ("tasks show nothing", 2, "unknown task"),
     ("tasks remove", 2, "remove"),
     ("config init nothing", 2, "unknown task"),
-    ("config init flatland --preset quick", 2, "draft, standard, fine"),
     ("config init flatland --set colour=red", 2, "colour"),
     ("config schema recipe", 2, "config, constraints, design, evaluate"),
     ("config schema design --task face", 2, "--task"),
-    ("config schema config --task nothing", 2, "unknown task"),
     # meshes
     ("learn meshes", 2, "--set folder=PATH"),
     ("learn meshes --set folder=absent", 3, "absent"),
@@ -88,9 +70,6 @@ CASES = [
     ("learn meshes --set folder=no_mesh", 3, "no_mesh"),
     ("learn meshes --set folder=open --set sign=solid", 3, "a.obj"),
     ("learn meshes --set folder=open --set sign=inside", 2, "--set sign=inside"),
-    ("learn meshes --set folder=open --set scale=0", 2, "--set scale=0"),
-    ("learn meshes --set folder=open --set scale=nan", 2, "--set scale=nan"),
-    ("learn meshes --set folder=open --set scale=1e400", 2, "--set scale=1e400"),
     ("learn meshes --set folder=one_bad_of_two", 3, "b.stl"),
     ("learn meshes --set folder=open --set occluders=garbage_stl", 3, "a.stl"),
     *(
@@ -101,35 +80,22 @@ CASES = [
     # configuration: file, line and column
     ("learn flatland --config absent.yaml", 2, "absent.yaml: cannot be read: No such file"),
     ("learn flatland --config typo.yaml", 2, "typo.yaml:3:1"),
-    ("learn flatland --config tabs.yaml", 2, "tabs.yaml:2:1"),
     ("learn flatland --config unknown.yaml", 2, "unknown.yaml:2:3: unknown key 'density.sigma_mm'"),
-    ("learn flatland --config section.yaml", 2, "did you mean 'density'"),
     ("learn flatland --config type.yaml", 2, "type.yaml:1:20"),
-    ("learn flatland --config list.yaml", 2, "list.yaml"),
-    ("learn flatland --config negative.yaml", 2, "negative.yaml:1:20"),
-    ("learn flatland --config nan.yaml", 2, "nan.yaml:1:20"),
-    ("learn flatland --config infinite.yaml", 2, "infinite.yaml:1:18"),
-    ("learn flatland --config overflow.yaml", 2, "overflow.yaml:1:20"),
-    ("learn flatland --config twice.yaml", 2, "twice.yaml:1:"),
-    ("learn flatland --config code.yaml", 2, "code.yaml:1:"),
     ("learn flatland --config other_task.yaml", 2, "other_task.yaml:1:"),
     ("learn flatland --config upside_down.yaml", 2, "upside_down.yaml:1:"),
-    ("learn flatland --config garbage.yaml", 2, "garbage.yaml"),
     ("learn flatland --config open", 2, "open"),
     ("learn flatland --set sigma", 2, "KEY=VALUE"),
     ("learn flatland --set density.sigma_m=-1", 2, "--set density.sigma_m=-1"),
-    ("learn flatland --set density.sigma_m=nan", 2, "--set density.sigma_m=nan"),
-    ("learn flatland --set learning.steps=1.5", 2, "--set learning.steps=1.5"),
-    ("learn flatland --set learning.steps=many", 2, "--set learning.steps=many"),
+    ("learn flatland --set density.sigma_m=-1 --dry-run", 2, "--set density.sigma_m=-1"),
+    ("learn flatland --out run --dry-run", 2, "not empty"),
     ("learn flatland --set learning.step=3", 2, "did you mean 'steps'"),
     ("learn flatland --set train=0", 2, "--set train=0"),
     ("learn flatland --set space.range_m=[2,1]", 2, "--set space.range_m=[2,1]"),
-    ("learn flatland --set space.range_m=[0,.inf]", 2, "--set space.range_m=[0,.inf]"),
     ("learn flatland --preset quick", 2, "draft, standard, fine"),
     ("learn flatlan", 2, "did you mean 'flatland'"),
     ("learn flatland --device cuda:9", 2, "auto, cpu, cuda"),
     ("learn flatland --seed -1", 2, "seed"),
-    ("learn flatland --seed x", 2, "seed"),
     # morphable models
     ("learn face --set model=absent.h5", 3, "absent.h5"),
     ("learn face --set model=text.h5", 3, "text.h5"),
@@ -137,7 +103,6 @@ CASES = [
     ("learn face --set model=truncated.h5", 3, "truncated.h5"),
     ("learn face --set model=open", 3, "open"),
     # runs
-    ("fit absent", 3, "no such run"),
     ("fit open", 3, "not a run folder"),
     ("fit unfinished", 3, "--resume"),
     ("evaluate unfinished", 3, "no designs yet"),
@@ -158,12 +123,8 @@ CASES = [
     ("learn face --resume --out run", 2, "task"),
     # options
     ("fit run --rays 0", 2, "rays"),
-    ("fit run --rays -5", 2, "rays"),
     ("fit run --sensors 0", 2, "from 1 to 1000, or best"),
-    ("fit run --sensors -2", 2, "from 1 to 1000, or best"),
     ("fit run --sensors 2.5", 2, "from 1 to 1000, or best"),
-    ("fit run --sensors many", 2, "from 1 to 1000, or best"),
-    ("fit run --sensors 1001", 2, "from 1 to 1000, or best"),
     (f"fit run --sensors {'9' * 5000}", 2, "from 1 to 1000, or best"),
     ("fit run --seed 9223372036854775808", 2, "seed"),
     ("fit run --layout spinning --channels 4000000000", 2, "--channels"),
@@ -178,7 +139,6 @@ CASES = [
     ("fit run --parts , --sensors 1", 2, "has an empty part name"),
     ("learn mujoco --set model=robot.xml --set targets=[*hand]", 2, 'in it, such as "*hand"'),
     ("learn mujoco --config alias.yaml", 2, 'in it, such as "*hand"'),
-    ("learn mujoco --config sign.yaml", 2, 'in it, such as "*hand"'),
     ("learn arm --set frames=1000 --set train=10000", 2, "allowed: 200000 frames in all"),
     ("learn mujoco --set frames=1000 --set test=10000", 2, "test: 10000 scenes of 1000 frames"),
     ("fit run --layout spiral", 2, "grid, density, scan"),
@@ -187,33 +147,19 @@ CASES = [
     ("fit run --sensors 5 --rays 3", 4, "3 rays for 5 sensors"),
     ("constrain run --sensors 5 --set budget.rays=3", 4, "budget.rays"),
     ("evaluate run --rays 0", 2, "rays"),
-    ("evaluate run --rays many", 2, "rays"),
     ("evaluate run --fail-above inf", 2, "finite"),
-    ("evaluate run --fail-above nan", 2, "finite"),
     ("evaluate run", 3, "no designs yet"),
     ("evaluate absent", 3, "absent"),
     ("export", 2, "no design"),
     ("export good.yaml", 2, "no format"),
     ("export good.yaml --format jpeg", 2, "csv"),
-    ("export good.yaml --format csv --rays 0", 2, "rays"),
     ("export good.yaml --format csv --out open", 3, "is a folder"),
     ("export good.yaml --format csv --out good.yaml", 2, "overwrite the design"),
     # constraints
-    ("constrain absent.yaml", 3, "absent.yaml"),
     ("constrain run --constraints absent.yaml", 2, "absent.yaml"),
-    ("constrain run --constraints typo.yaml", 2, "typo.yaml:3:1"),
     ("constrain run --constraints gate.yaml", 2, "gate.yaml:1:23"),
-    ("constrain run --constraints gates.yaml", 2, "did you mean 'gate'"),
     ("constrain run --constraints contradiction.yaml", 4, "gate."),
-    ("constrain run --set gate.width_m.max=wide", 2, "--set gate.width_m.max=wide"),
-    ("constrain run --set gate.width_m.most=1", 2, "--set gate.width_m.most=1"),
-    ("constrain run --set gate.width_m.max=-1", 2, "--set gate.width_m.max=-1"),
-    ("constrain run --set gate.width_m.max=nan", 2, "--set gate.width_m.max=nan"),
-    ("constrain run --set gate.width.max=1", 2, "did you mean 'width_m'"),
-    ("constrain run --set rays=1", 2, "did you mean 'budget.rays'"),
     ("constrain run --set mounts_m=[[0,0,1]]", 2, "did you mean 'origin.mounts_m'"),
-    ("constrain run --set field_of_view.horizontal_deg=20", 2, "--set field_of_view.horizontal_deg=20"),
-    ("constrain run --set gate.start_m.min=0.8 --set gate.end_m.max=0.5", 4, "gate.start_m.min"),
     ("constrain run --set sensors.count=3 --sensors 2", 4, "sensors.count"),
     ("constrain run --set gate.start_m.min=7", 4, "gate.start_m.min"),
     ("constrain run --set origin.low_m=[5,0,0] --set origin.high_m=[6,0,0]", 4, "origin"),
@@ -223,14 +169,10 @@ CASES = [
     ("show absent.yaml", 3, "absent.yaml"),
     ("show notes.txt", 2, "notes.txt"),
     ("evaluate design.yaml", 2, "design.yaml:2:10"),
-    ("export absent.yaml --format csv", 3, "absent.yaml"),
     ("export design.yaml --format csv", 2, "design.yaml"),
-    ("export empty.yaml --format csv", 2, "empty.yaml"),
     ("show rows.csv", 3, "rows.csv:1"),
-    ("show short.csv", 3, "short.csv:1"),
     ("show garbage.yaml", 2, "garbage.yaml"),
     ("evaluate good.yaml --in run --baseline best", 2, "uniform"),
-    ("evaluate good.yaml --in run --baseline none --baseline lloyd", 2, "none alone"),
     ("evaluate good.yaml --in run --baseline none --fail-unless-better greedy", 2, "none alone"),
 ]
 
@@ -312,52 +254,6 @@ def test_bad_input_gets_one_message_its_exit_code_and_writes_nothing(
     assert not (mistakes / "runs").exists()
 
 
-# where in a valid design, what stands there instead, words of the message
-DESIGNS = [
-    (("schema_version",), 2, "schema"),
-    (("layout",), "spiral", "layout"),
-    (("rays",), -1, "rays"),
-    (("rays",), "many", "rays"),
-    (("sensors",), [], "sensors"),
-    (("sensors", 0, "name"), "", "name"),
-    (("sensors", 0, "weight"), -1.0, "weight"),
-    (("sensors", 0, "weight"), "heavy", "weight"),
-    (("sensors", 0, "gain"), 2, "gain"),
-    (("sensors", 0, "origin_m", "mean"), [0.0, 0.0], "mean"),
-    (("sensors", 0, "origin_m", "covariance"), [[-1, 0, 0], [0, 1, 0], [0, 0, 1]], "covariance"),
-    (("sensors", 0, "boresight", "elevation_rad"), 2.0, "elevation_rad"),
-    (("sensors", 0, "field_of_view_rad", "horizontal"), -0.1, "horizontal"),
-    (("sensors", 0, "gate_m", "end"), 0.1, "gate_m"),
-    (("sensors", 0, "gate_m"), None, "gate_m"),
-]
-
-
-@pytest.mark.parametrize("command", ["show", "evaluate --in run", "export --format csv"])
-@pytest.mark.parametrize(
-    ("path", "value", "words"), DESIGNS, ids=[f"{'.'.join(map(str, d[0]))}={d[1]}" for d in DESIGNS]
-)
-def test_a_mistake_in_a_design_is_found_with_its_line(mistakes, lidardesign, monkeypatch, path, value, words, command):
-    monkeypatch.chdir(mistakes)
-    document = load_yaml(mistakes / "good.yaml").value
-    node = document
-    for key in path[:-1]:
-        node = node[key]
-    node[path[-1]] = value
-    wrong = mistakes / "wrong.yaml"
-    wrong.write_text(dump_yaml(document))
-    first, *options = command.split()
-    result = lidardesign(first, *options, wrong, "--json")
-    check_one_clear_message(result, 2, words)
-    assert "wrong.yaml:" in result.err
-
-
-def test_a_design_whose_numbers_are_not_finite_is_refused(mistakes, lidardesign, monkeypatch):
-    monkeypatch.chdir(mistakes)
-    for number in (".nan", ".inf", "1e999"):
-        (mistakes / "wrong.yaml").write_text(GOOD.replace("weight: 1.0", f"weight: {number}"))
-        check_one_clear_message(lidardesign("show", "wrong.yaml", "--json"), 2, "wrong.yaml:6:11")
-
-
 COMMANDS = {
     "fit": ("fit", "run", "--layout", "grid", "--sensors", "1"),
     "constrain": ("constrain", "run", "--layout", "grid", "--set", "budget.rays=20"),
@@ -366,21 +262,18 @@ COMMANDS = {
 }
 
 
-@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS, errno.EACCES])
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_disk_that_takes_nothing_leaves_the_old_files(
-    lidardesign, tmp_path, tmp_path_factory, monkeypatch, command, reason
-):
+def test_a_disk_that_takes_nothing_leaves_the_old_files(lidardesign, tmp_path, tmp_path_factory, monkeypatch, command):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path_factory.mktemp("kept")))
     make_run(tmp_path / "run", count=1000)
     (tmp_path / "good.yaml").write_text(GOOD)
     before = files_under(tmp_path)
 
     def refuse(source, target):
-        raise OSError(reason, os.strerror(reason), str(target))
+        raise OSError(errno.ENOSPC, "No space left on device", str(target))
 
     monkeypatch.setattr("lidardesign.run.files.os.replace", refuse)
     result = lidardesign(*COMMANDS[command], "--json")
-    check_one_clear_message(result, 3, os.strerror(reason))
+    check_one_clear_message(result, 3, "No space left on device")
     assert files_under(tmp_path) == before
     assert not (tmp_path / "new").exists()

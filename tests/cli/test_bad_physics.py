@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 import pytest
-import trimesh
-from lidardesign_tasks.emitter import winding_number
 from lidardesign_tasks.flatland import FlatlandTask
 from support.command_line import files_under, make_run
 from support.mistakes import GARBAGE, GOOD, check_one_clear_message
@@ -15,29 +13,12 @@ from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 from lidardesign.cli.output import EXIT_INTERRUPTED, Output, describe_error
 from lidardesign.errors import PluginError
 from lidardesign.registry import plugin_guard
-from lidardesign.scene import Ambient, Body, Medium, Mesh, Receiver, Scene, Sphere
+from lidardesign.scene import Ambient, Body, Medium, Receiver, Scene, Sphere
 from lidardesign.simulate.light_transport import transport as light_transport_process
 
 LONG = "x" * 300
-BILLION_LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
-    f"{name}: &{name} [{','.join(['*' + before] * 9)}]\n" for before, name in zip("abcdefg", "bcdefgh", strict=True)
-)
-
 TEXTS = {
     "empty.yaml": "",
-    "comment.yaml": "# to be filled in\n",
-    "null.yaml": "null\n",
-    "list.yaml": "- 1\n",
-    "laughs.yaml": BILLION_LAUGHS,
-    "code.yaml": "!!python/object/apply:os.system ['touch owned']\n",
-    "unit.yaml": "bin_m: 1\n",
-    "no_unit.yaml": "bin: 100\n",
-    "nan.yaml": "bin_ps: .nan\n",
-    "negative.yaml": "jitter_fwhm_ps: -1\n",
-    "huge.yaml": "bin_ps: 1e300\n",
-    "text.yaml": "bin_ps: '100'\n",
-    "photons.yaml": "name: ideal\nwavelength_nm: 900\n",
-    "line.yaml": "footprint_rays: 7\n",
     "short.yaml": "bin_ps: 100\nbins: 3\n",
     "pulse.yaml": "bin_ps: 100\nbins: 3\nhistogram_start: pulse\n",
     "shape.yaml": "origin:\n  exclude: [[0, 0, 0], [1, 1, 1]]\n",
@@ -63,26 +44,12 @@ CASES = [
             "garbage": "is not UTF-8 text",
             "run": "it is a folder",
             "empty.yaml": "does not describe a detector",
-            "comment.yaml": "does not describe a detector",
-            "null.yaml": "does not describe a detector",
-            "list.yaml": "list.yaml:1:1",
-            "laughs.yaml": "expands to too many values",
-            "code.yaml": "code.yaml:1:1",
-            "unit.yaml": "unit.yaml:1:1: unknown key 'bin_m': 'm' is not a unit of 'bin'",
-            "no_unit.yaml": "'bin' needs a unit",
-            "nan.yaml": "nan.yaml:1:9",
-            "negative.yaml": "negative.yaml:1:17",
-            "huge.yaml": "huge.yaml:1:9",
-            "text.yaml": "text.yaml:1:9",
-            "photons.yaml": "counts photons, but does not give energy_fj",
-            "line.yaml": "line.yaml:1:17: footprint_rays: 7 rays in a beam of divergence 0",
             "short.yaml": "is longer than the histogram",
             "pulse.yaml": "outside the histogram, which starts with the pulse",
         }.items()
     ),
     ("evaluate run --effects ambint", 2, "did you mean 'ambient'"),
     ("evaluate run --effects dew", 2, "unknown effect 'dew'"),
-    ("evaluate run --effects Jitter", 2, "did you mean 'jitter'"),
     ("evaluate run --effects ALL", 2, "did you mean 'all'"),
     ("evaluate run --effects audit,all", 2, "'audit' cannot be combined with effects"),
     ("evaluate run --effects jitter,none", 2, "'none' cannot be combined with effects"),
@@ -94,31 +61,22 @@ CASES = [
     ),
     ("evaluate good.yaml far.yaml --in run --rays 8", 2, "sensors[0].gate_m.end is 1e+300"),
     ("evaluate bare --effects audit", 3, "no designs yet"),
-    ("evaluate bare --effects audit,all", 2, "--effects"),
     *(
         (f"learn flatland --set {key}={value}", 2, f"--set {key}={value}")
         for key, value in [
-            ("illuminance_lux", "-1"),
             ("illuminance_lux", "1e9"),
             ("light", "moon"),
             ("visibility_m", "0"),
             ("visibility_m", "1e-300"),
-            ("visibility_m", ".inf"),
-            ("reflectance", "-0.1"),
             ("reflectance", "1.1"),
             ("gloss", ".nan"),
-            ("gloss", "2"),
         ]
     ),
     ("learn face --set speed_m_s=1e9", 2, "--set speed_m_s=1e9"),
-    ("learn face --set speed_m_s=-1", 2, "--set speed_m_s=-1"),
-    ("learn emitter --set field_of_view_deg=[0,50]", 2, "allowed: greater than 0"),
     ("learn emitter --set field_of_view_deg=[60,180]", 2, "allowed: less than 180"),
     ("learn emitter --set emitter_box_m=-0.1", 2, "half sizes are 0 m or more"),
-    ("learn emitter --set emitter_box_m=[0.1,-0.1,0.1]", 2, "half sizes are 0 m or more"),
     ("learn emitter --set detector_m=[1,2]", 2, "allowed: a list of 3 values"),
     ("learn emitter --set detector_m=[nan,0,0]", 2, "a finite number"),
-    ("learn emitter --set model=absent.h5", 3, "absent.h5"),
     ("constrain run --constraints shape.yaml", 2, "allowed: keys and values"),
     ("constrain run --constraints turned.yaml", 2, "low_m is above high_m along x"),
     ("constrain run --constraints key.yaml", 2, "did you mean 'low_m'"),
@@ -127,9 +85,6 @@ CASES = [
     ("export wide.yaml --format galvo", 2, "beyond the mirrors' reach"),
     ("export far.yaml --format galvo", 2, "a number from 0 to 1e+09"),
     ("export open.yaml --format galvo", 2, "give --rays N"),
-    ("export good.yaml --format galvo --out run", 3, "is a folder"),
-    ("capture absent.npz good.yaml", 3, "absent.npz"),
-    ("capture garbage good.yaml", 3, ".npz, .mat"),
     ("capture broken.npz good.yaml", 3, "cut short"),
     ("capture far.npz good.yaml", 3, "origin_m"),
     ("capture scan.npz none.yaml", 2, "none.yaml:3:7: rays is 0"),
@@ -232,16 +187,6 @@ def test_a_detector_inside_of_a_head_is_refused(ready, place):
     result = ready("learn", "emitter", "--set", f"detector_m={place}", "--set", "train=2", "--json")
     check_one_clear_message(result, 2, "is inside the train head 0")
     assert "task.detector_m" in result.err
-
-
-def test_meshes_wind_once_round_what_is_inside_of_them():
-    corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
-    cube = trimesh.convex.convex_hull(corners)
-    mesh = Mesh(cube.vertices, cube.faces)
-    inside = [winding_number(mesh, point) for point in np.random.default_rng(0).uniform(0.01, 0.99, (20, 3))]
-    outside = [winding_number(mesh, point) for point in np.random.default_rng(1).uniform(1.01, 3.0, (20, 3))]
-    np.testing.assert_allclose(inside, 1.0, atol=1e-9)
-    np.testing.assert_allclose(outside, 0.0, atol=1e-9)
 
 
 def test_a_library_that_cannot_be_is_named_where_it_comes_from(monkeypatch, tmp_path):

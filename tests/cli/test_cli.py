@@ -5,8 +5,6 @@ from __future__ import annotations
 import html
 import io
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,25 +29,11 @@ from lidardesign.samples import Samples, load_samples, save_samples
 from lidardesign.workflow.designs import Design
 
 PART = "vl53l8cx:4x4"
-COMMANDS = ["learn", "fit", "constrain", "evaluate", "export", "show", "tasks list", "tasks show"]
-
-
-@pytest.fixture(scope="module")
-def finished_run(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("runs") / "flat land ü")
 
 
 @pytest.fixture
 def flat(tmp_path):
     return make_run(tmp_path / "run")
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_explains_itself_and_has_the_common_options(lidardesign, name):
-    result = lidardesign(*name.split(), "--help")
-    assert result.code == 0
-    for option in ("--json", "--quiet"):
-        assert option in result.out
 
 
 def test_the_version_is_printed(lidardesign):
@@ -79,20 +63,13 @@ def test_a_task_shows_what_is_designed_what_is_given_and_how_it_is_fitted(lidard
     assert "a condition (--at)" in kinds["x_m"]
     assert "fixed" in kinds["azimuth_rad"]
     assert "designed" in kinds["elevation_rad"]
+    assert "follows from the configuration" in lidardesign("tasks", "show", "meshes").out
 
 
 def test_the_chain_works_from_a_run_to_exported_rays(lidardesign, flat, tmp_path):
     fitted = lidardesign("fit", flat, "--layout", "grid", "--sensors", 2, "--json").json
-    assert {
-        "design",
-        "sensors",
-        "log_likelihood",
-        "admissible_mass",
-        "ess",
-        "satisfied",
-        "constraints",
-        "seconds",
-    } <= {*fitted}
+    keys = {"design", "sensors", "log_likelihood", "admissible_mass", "ess", "satisfied", "constraints", "seconds"}
+    assert keys <= {*fitted}
     assert Path(fitted["design"]) == flat / "designs" / "fit.yaml"
     assert len(fitted["sensors"]) == 2
     arguments = ("--set", "gate.width_m.max=0.3", "--set", "budget.rays=40", "--name", "tight")
@@ -149,17 +126,6 @@ def test_evaluate_fails_unless_designs_are_better_than_a_rival(lidardesign, flat
         assert words in wrong.err
 
 
-def test_further_baselines_are_built_where_they_are_asked_for(lidardesign, flat):
-    lidardesign("fit", flat, "--layout", "grid", "--sensors", 2)
-    asked = ("--baseline", "occupancy", "--baseline", "no-visibility")
-    result = lidardesign("evaluate", flat, "--rays", 12, *asked, "--report", "page.html", "--json").json
-    names = ["fit", "uniform", "random", "bounding", "silhouette", "greedy", "occupancy", "no-visibility"]
-    assert [row["design"] for row in result["rows"]] == names
-    assert all(row["rays"] == 12 for row in result["rows"])
-    assert {row["design"] for row in result["equal_bandwidth"]} == {*names[1:]}
-    assert Path("page.html").is_file()
-
-
 def test_no_visibility_needs_a_design_whose_run_is_there(lidardesign, flat):
     lidardesign("fit", flat, "--layout", "grid", "--sensors", 2)
     away = Path("away.yaml")
@@ -189,11 +155,6 @@ def test_a_run_that_is_being_written_is_left_alone(lidardesign, flat, monkeypatc
     assert "is writing this run" in result.err
 
 
-def test_names_with_spaces_and_letters_of_all_kinds_work(lidardesign, finished_run):
-    assert lidardesign("fit", finished_run, "--layout", "grid", "--sensors", 1, "--name", "größe-1").code == 0
-    assert (finished_run / "designs" / "größe-1.yaml").is_file()
-
-
 def test_an_unexpected_error_is_one_line_with_a_hint(capsys, monkeypatch):
     for debug in ("", "1"):
         monkeypatch.setenv("LIDARDESIGN_DEBUG", debug)
@@ -219,17 +180,6 @@ def test_a_damaged_cache_of_compiled_code_is_named_with_what_to_do(tmp_path, cap
     assert "*.nbi" in error["hint"]
 
 
-def test_what_libraries_print_does_not_spoil_the_document(capsys):
-    with command(json=True, quiet=False) as console:
-        print("a library says hello")
-        console.result({"value": 1}, lambda rich: None)
-    captured = capsys.readouterr()
-    document = json.loads(captured.out)
-    assert set(document) == {"schema_version", "value", "timings", "peak_memory_bytes"}
-    assert document["value"] == 1
-    assert "hello" in captured.err
-
-
 def test_an_error_after_the_document_adds_no_second_one(capsys):
     def body():
         with command(json=True, quiet=False) as console:
@@ -250,16 +200,6 @@ def test_numbers_that_json_lacks_become_null():
         "e": (None, True),
     }
     assert plain_json(values) == {"a": None, "b": [None, 1.5], "c": [0, 1], "d": "x", "e": [None, True]}
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device /dev/full")
-def test_a_full_disk_behind_stdout_is_one_message(tmp_path):
-    with open("/dev/full", "w") as full:
-        code = "from lidardesign.cli.main import run; run(['tasks', 'list'])"
-        result = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, check=False)
-    assert result.returncode == 3
-    assert result.stderr.splitlines()[0] == b"system error: No space left on device"
-    assert len(result.stderr.splitlines()) == 2
 
 
 def test_a_design_fits_a_terminal_of_80_columns(lidardesign, flat, monkeypatch):
@@ -291,34 +231,10 @@ def test_wherever_a_sensor_looks_its_roll_part_and_frame_are_said(lidardesign, t
     assert paired_sensors(upright, design)[0].as_dict()["difference"]["roll_deg"] == pytest.approx(90)
 
 
-def test_a_task_lists_the_keys_of_every_section_in_words(lidardesign):
-    document = lidardesign("tasks", "show", "meshes", "--json").json
-    takes = {entry["key"]: entry["type"] for entry in document["config"]}
-    assert takes["folder"] == "path or null"
-    assert takes["origin_m"] == "3 numbers or null"
-    assert takes["up"] == "x or y or z"
-    assert {"sigma_m"} <= {entry["key"] for entry in document["density"]}
-    assert {"steps"} <= {entry["key"] for entry in document["learning"]}
-    text = lidardesign("tasks", "show", "meshes").out
-    assert "folder" in text
-    assert "sigma_m" in text
-
-
 def test_every_pinned_place_gets_a_sensor(lidardesign, flat):
     each = "each=[{}, {}, {}, {}, {gate: {width_m: {max: 0.3}}}]"
     made = lidardesign("constrain", flat, "--layout", "grid", "--set", each, "--json").json
     assert len(made["sensors"]) == 5
-
-
-def test_a_scan_exported_at_another_count_has_its_own_sensors(lidardesign, flat, tmp_path):
-    assert lidardesign("fit", flat, "--layout", "scan", "--rays", 12, "--name", "beams").code == 0
-    design = flat / "designs" / "beams.yaml"
-    lidardesign("export", design, "--format", "sensors-csv", "--rays", 20, "--out", "sensors.csv")
-    assert len((tmp_path / "sensors.csv").read_text().splitlines()) == 21
-    lidardesign("export", design, "--format", "npz", "--rays", 20, "--out", "rays.npz")
-    with np.load(tmp_path / "rays.npz") as arrays:
-        assert len(arrays["sensor_names"]) == 20
-        assert arrays["sensor"].max() == 19
 
 
 def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesign, flat, tmp_path):

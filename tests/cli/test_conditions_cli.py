@@ -116,29 +116,13 @@ def test_a_track_is_exported_at_a_position(lidardesign, run, tmp_path):
     assert "x_m from 0 to 1" in refused.err
 
 
-def test_a_design_for_one_value_is_exported_anew_from_samples_of_that_value(lidardesign, run, tmp_path):
-    lidardesign("fit", run, "--at", "x_m=0.37", "--layout", "scan", "--rays", 4, "--name", "here")
-    path = run / "designs" / "here.yaml"
-    for at, expected in ((("--at", "x_m=0.9"), 0.9), ((), 0.37)):
-        result = lidardesign("export", path, "--format", "npz", "--rays", 7, *at, "--out", "r.npz")
-        assert result.code == 0, result.err
-        with np.load(tmp_path / "r.npz") as arrays:
-            assert len(arrays["sensor"]) == 7
-            np.testing.assert_array_equal(arrays["origin_x_m"], expected)
-
-
 MISTAKES = [
     ("fit run --at x_m", 2, "NAME=VALUE"),
-    ("fit run --at x_m=", 2, "NAME=VALUE"),
-    ("fit run --at =3", 2, "NAME=VALUE"),
     ("fit run --at x_m=here", 2, "NAME=VALUE"),
     ("fit run --at x_m=nan", 2, "finite"),
-    ("fit run --at x_m=inf", 2, "finite"),
-    ("fit run --at x_m=1_0", 2, "finite number"),
     ("fit run --at x_m=0.1 --at x_m=0.2", 2, "twice"),
     ("fit run --at x_m=1.01", 2, "0 to 1"),
     ("fit run --at y_m=0", 2, "x_m"),
-    ("fit run --at speed=0", 2, "x_m"),
     ("fit run --layout grid", 2, "--layout scan, or --at x_m=VALUE"),
     ("fit run --layout density --rays 4", 2, "--at x_m=VALUE"),
     ("fit run --layout distributed --rays 4", 2, "--at x_m=VALUE"),
@@ -155,21 +139,28 @@ MISTAKES = [
 ]
 
 
+@pytest.fixture(scope="module")
+def refusing(tmp_path_factory):
+    """A folder with runs of several conditions."""
+    folder = tmp_path_factory.mktemp("refusing")
+    make_run(folder / "plain", count=1000)
+    for name, condition in (("run", "[x_m]"), ("two", "[x_m,azimuth_rad]"), ("turning", "[azimuth_rad]")):
+        make_conditioned_run(folder / name, 4000, condition)
+    return folder
+
+
 @pytest.mark.parametrize(("arguments", "code", "words"), MISTAKES, ids=[entry[0] for entry in MISTAKES])
-def test_a_mistake_gets_one_message_its_exit_code_and_writes_nothing(lidardesign, tmp_path, arguments, code, words):
-    kinds = {"run": "[x_m]", "two": "[x_m,azimuth_rad]", "turning": "[azimuth_rad]"}
-    name = arguments.split()[1]
-    if name == "plain":
-        make_run(tmp_path / name, count=1000)
-    else:
-        make_conditioned_run(tmp_path / name, 4000, kinds[name])
-    before = files_under(tmp_path)
+def test_a_mistake_gets_one_message_its_exit_code_and_writes_nothing(
+    lidardesign, refusing, monkeypatch, arguments, code, words
+):
+    monkeypatch.chdir(refusing)
+    before = files_under(refusing)
     result = lidardesign(*arguments.split())
     assert result.code == code, result.err
     assert words in result.err
     assert result.out == ""
     assert result.err.count("error") == 1
-    assert files_under(tmp_path) == before
+    assert files_under(refusing) == before
 
 
 def test_several_conditions_are_given_at_once(lidardesign, tmp_path):
@@ -239,26 +230,3 @@ def test_a_scan_for_one_value_is_fitted_anew_once_for_all_places(lidardesign, ru
     for other, x in zip(others, (0.37, 1.0), strict=True):
         np.testing.assert_array_equal(other.direction, first.direction)
         np.testing.assert_array_equal(other.origin_m[:, 0], x)
-
-
-def test_a_distributed_design_by_hand_is_evaluated_with_the_gates_of_its_layout(tmp_path):
-    from lidardesign.workflow.run_samples import Layouts
-
-    (tmp_path / "hand.yaml").write_text(OPEN.format(layout="distributed"))
-    design = load_design(tmp_path / "hand.yaml")
-    expected = lay_out(design, 20)
-    found = Layouts({})(design, 20, None)
-    np.testing.assert_array_equal(found.gate_m, expected.gate_m)
-    np.testing.assert_array_equal(found.origin_m, expected.origin_m)
-
-
-def test_an_export_draws_its_layout_anew(lidardesign, run, tmp_path):
-    from lidardesign.samples import load_samples
-
-    made = ("--at", "x_m=0.37", "--layout", "density", "--rays", 8, "--sensors", 1)
-    assert lidardesign("fit", run, *made).code == 0
-    path = run / "designs" / "fit.yaml"
-    assert lidardesign("export", path, "--format", "npz", "--rays", 30, "--out", "r.npz").code == 0
-    expected = lay_out(load_design(path), 30, load_samples(run), retarget=log_target)
-    with np.load(tmp_path / "r.npz") as arrays:
-        np.testing.assert_allclose(np.cos(arrays["azimuth_rad"]), expected.direction[:, 0], atol=1e-12)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import re
-from pathlib import Path
 from types import SimpleNamespace
 
 import jsonschema
@@ -91,16 +90,6 @@ def test_what_is_chosen_is_set_and_all_else_is_not(lidardesign, tmp_path):
     assert resolve(load_task("flatland"), config_file=path).density.sigma_m == 0.01
 
 
-def test_a_file_is_written_once_and_kept(lidardesign, tmp_path):
-    assert lidardesign("config", "init", "face", "--out", "face.yaml").code == 0
-    before = (tmp_path / "face.yaml").read_text()
-    result = lidardesign("config", "init", "flatland", "--out", "face.yaml")
-    assert result.code == 2
-    assert "already exists" in result.err
-    assert (tmp_path / "face.yaml").read_text() == before == lidardesign("config", "init", "face").out
-    assert lidardesign("config", "init", "face", "--json").json["text"] == before
-
-
 @given(st.text(), st.text(), st.text())
 def test_no_word_of_a_task_leaves_its_comment(summary, description, unit):
     config = type(
@@ -120,12 +109,6 @@ def test_no_word_of_a_task_leaves_its_comment(summary, description, unit):
     assert parse_yaml(text, where="text", empty_sections=True).value == {
         "schema_version": 1, "task_name": "odd", "task": None, "space": None, "density": None, "learning": None
     }  # fmt: skip
-
-
-def test_config_alone_asks_for_a_command(lidardesign):
-    result = lidardesign("config")
-    assert result.code == 2
-    assert "no command" in result.err
 
 
 def accepts(schema, value):
@@ -278,8 +261,3 @@ def test_the_rungs_of_accuracy_are_those_of_the_schema():
     one = {"$ref": "#/$defs/rung", "$defs": schema["$defs"]}
     for row in sweep.as_rows():
         jsonschema.Draft202012Validator(one).validate(row)
-
-
-def test_the_files_of_the_schemas_are_packaged():
-    root = Path(__file__).parents[2] / "lidardesign"
-    assert {path.name for path in root.rglob("*.schema.json")} >= {"design.schema.json", "evaluate.schema.json"}

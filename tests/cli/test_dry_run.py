@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
-from support.command_line import caller, files_under, make_run
+from support.command_line import files_under
 from support.tables import each_row
 
 from lidardesign.density.training.training import Trainer
@@ -30,34 +30,6 @@ def test_learning_writes_what_was_said_and_before_that_nothing(lidardesign, tmp_
         assert any(name.startswith(said) for said in plan["writes"]) or name.endswith(".lock"), name
     for name in plan["writes"]:
         assert (tmp_path / name).exists(), name
-
-
-REFUSED = [
-    ("learn nothing", 2),
-    ("learn flatland --out run", 2),
-    ("learn flatland --out notes.txt/run", 3),
-    ("learn flatland --set density.sigma_m=-1", 2),
-    ("learn flatland --tolerance 2", 2),
-    ("learn flatland --resume --out absent", 3),
-]
-
-
-@pytest.fixture(scope="module")
-def refusing(tmp_path_factory):
-    """A folder with a run and a file."""
-    folder = tmp_path_factory.mktemp("refusing")
-    make_run(folder / "run", count=1000)
-    (folder / "notes.txt").write_text("keep me")
-    return folder
-
-
-@each_row(("arguments", "code"), REFUSED, ids=[one[0] for one in REFUSED])
-def test_what_the_command_would_refuse_is_refused(capsys, monkeypatch, refusing, arguments, code):
-    call, before = caller(capsys, refusing, monkeypatch), files_under(refusing)
-    result = call(*arguments.split(), "--dry-run", "--json")
-    assert result.code == code, result.out + result.err
-    assert result.json["exit_code"] == code
-    assert files_under(refusing) == before
 
 
 SLOW_S = 0.02

@@ -51,16 +51,6 @@ def test_a_dry_run_says_once_for_all_parts_that_they_look_like_millimetres(call)
     assert "millimetres" not in scaled.err + scaled.out
 
 
-def test_the_error_about_sigma_names_the_likely_cause_after_a_note_before_learning(call):
-    result = call("learn", "meshes", "--set", "folder=parts", *QUICK, "--out", "run")
-    assert result.code == 2
-    before, error = result.err.split("config error")
-    assert "3 of 3 meshes" in before
-    assert "below the grid step" in error
-    assert "scale=0.001" in error
-    assert "density.field_resolution" in error
-
-
 def test_the_error_about_sigma_leaves_units_alone_where_scenes_are_small():
     found = {}
     for step in (0.9, 3.6):
@@ -157,7 +147,7 @@ def test_a_rig_in_millimetres_is_told_wherever_it_meets_a_run(capsys, monkeypatc
     name = rig(flat, f"rig{factor}.csv", factor).name
     commands = (
         ("show", name, "--in", flat),
-        ("evaluate", name, "--in", flat, "--rays", 9),
+        ("evaluate", name, "--in", flat, "--rays", 9, "--set", "test=1", "--baseline", "none"),
     )
     for arguments in commands:
         result = call(*arguments)
@@ -172,11 +162,3 @@ def test_a_rig_that_hears_only_far_beyond_the_space_is_told(flat):
     far = read_design(rig(flat, "far.csv", 1, start=500.0))
     assert outside_notes(near, space) == []
     assert "listens from 500 m on" in outside_notes(far, space)[0]
-
-
-def test_an_evaluation_says_what_its_task_says_of_the_configuration(capsys, monkeypatch, flat):
-    call = caller(capsys, flat.parent, monkeypatch)
-    name = rig(flat, "other.csv", 1).name
-    kind = type(load_task("flatland"))
-    monkeypatch.setattr(kind, "notes", lambda self, config, space: ["one mesh is all there is"], raising=False)
-    assert "one mesh is all there is" in call("evaluate", name, "--in", flat, "--rays", 9, "--json").json["notes"]

@@ -49,11 +49,6 @@ def test_sentences_wrap_instead():
     assert console.file.getvalue().count("jitter") == 1
 
 
-def test_wide_terminals_have_one_line_per_row():
-    assert "-0.013 (-0.021 to -0.004)" in printed(120)
-    assert "-0.013 (-0.021 to -0.004)" in printed(56)
-
-
 @each_row(
     ("value", "digits", "shown"),
     [(0.0, 2, "0"), (1300.0, 2, "1,300"), (99.9, 2, "100"), (14.71, 3, "14.7"), (0.0036, 2, "0.0036"),

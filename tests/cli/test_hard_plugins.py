@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 from lidardesign_tasks.flatland import FlatlandTask
-from support.command_line import make_run
 from support.conditioned_runs import make_conditioned_run
 
+from lidardesign import open_run
 from lidardesign.errors import PluginError
 from lidardesign.space import DesignSpace
-from lidardesign.task import Score, scenes_of
+from lidardesign.task import scenes_of
 
 
 def broken():
@@ -31,29 +31,21 @@ CONDITIONS = {
 }
 
 
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    opened = open_run(make_conditioned_run(tmp_path_factory.mktemp("runs") / "run", count=3000))
+    opened.fit(layout="scan", rays=3, name="fit").save()
+    return opened.folder
+
+
 @pytest.mark.parametrize("given", CONDITIONS)
-def test_conditions_that_are_none_are_the_tasks_fault_and_no_traceback(lidardesign, tmp_path, monkeypatch, given):
+def test_conditions_that_are_none_are_the_tasks_fault_and_no_traceback(lidardesign, run, monkeypatch, given):
     answer, code, words = CONDITIONS[given]
-    run = make_conditioned_run(tmp_path / "run", count=3000)
-    assert lidardesign("fit", run, "--layout", "scan", "--rays", 3).code == 0
     monkeypatch.setattr(FlatlandTask, "conditions", lambda self, config: answer(), raising=False)
     result = lidardesign("evaluate", run, "--rays", 3, "--json")
     assert result.code == code, result.err
     assert words in result.err
     assert "internal error" not in result.err
-
-
-DETAILS = {"nothing": None, "a list": [1.0], "unnamed": {3: 1.0}, "text": {"seen": "some"}}
-
-
-@pytest.mark.parametrize("given", DETAILS)
-def test_details_of_a_score_that_are_no_numbers_by_name_are_the_tasks_fault(lidardesign, tmp_path, monkeypatch, given):
-    run = make_run(tmp_path / "run", count=1000)
-    assert lidardesign("fit", run, "--layout", "grid", "--sensors", 1).code == 0
-    monkeypatch.setattr(FlatlandTask, "score", lambda *_: Score(1.0, details=DETAILS[given]))
-    result = lidardesign("evaluate", run, "--rays", 4, "--json")
-    assert result.code == 6, result.err
-    assert "score returned the detail" in result.err
 
 
 def test_scenes_that_are_none_are_the_tasks_fault():

@@ -131,8 +131,6 @@ def program_ended(*arguments, folder, **streams):
 
 
 FAILING = {
-    "a full CSV file": ("--csv", "/dev/full"),
-    "a full page": ("--report", "/dev/full"),
     "a full page beside a CSV file": ("--csv", "scores.csv", "--report", "/dev/full"),
     "a full CSV file beside a page": ("--csv", "/dev/full", "--report", "scores.html"),
 }
@@ -151,19 +149,6 @@ def test_scores_are_shown_and_other_files_written_where_one_file_cannot(call, wo
         assert "bounding" in (work / name).read_text()
         (work / name).unlink()
     assert "bounding" in call(*EVALUATE, *FAILING[case]).out
-
-
-@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS, errno.EIO])
-def test_scores_are_shown_whatever_the_system_says_when_they_are_written(call, work, monkeypatch, reason):
-    def refuse(source, target):
-        raise OSError(reason, os.strerror(reason), str(target))
-
-    monkeypatch.setattr("lidardesign.run.files.os.replace", refuse)
-    result = call(*EVALUATE, "--csv", "lost.csv", "--json")
-    assert result.code == 3
-    assert len(result.json["rows"]) > 5
-    assert os.strerror(reason) in result.err
-    assert not (work / "lost.csv").exists()
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError, RuntimeError])

@@ -37,11 +37,6 @@ def test_no_option_and_no_argument_may_be_empty(command, option):
             assert option in (None, caught.value.where)
 
 
-@each_row("line", ["learn", "constrain run --set", "evaluate run --csv", "export", "catalog show"])
-def test_an_empty_value_is_one_clear_message(lidardesign, line):
-    check_one_clear_message(lidardesign(*line.split(), "", "--json"), 2, "is empty")
-
-
 WRITTEN = ("1_0", "nan", "inf", "-inf", "0x10", "1e400", "1:30", "yes", "true", "１０", "٣", "1,5", "null", "1e", "--1")
 NUMBERS = [
     ("fit", "--rays"),
@@ -93,8 +88,11 @@ def test_numbers_are_decimal_digits_as_in_files(lidardesign, command, option):
     assert not Path("runs").exists()
 
 
-HEADER = "sensor,origin_x_m,origin_y_m,origin_z_m,azimuth_rad,elevation_rad,gate_start_m,gate_end_m"
-RAY = {"sensor": "0", "azimuth_rad": "3.14", "gate_start_m": "0.2", "gate_end_m": "0.4"}
+HEADER = (
+    "sensor,origin_x_m,origin_y_m,origin_z_m,direction_x,direction_y,direction_z,azimuth_rad,elevation_rad,"
+    "gate_start_m,gate_end_m,time_s"
+)
+RAY = {"sensor": "0", "direction_x": "1", "gate_start_m": "0.2", "gate_end_m": "0.4"}
 RAYS = [
     ({"sensor": "-1"}, "sensor is '-1'"),
     ({"sensor": "1e18"}, "sensor is '1e18'"),
@@ -105,7 +103,11 @@ RAYS = [
     ({"azimuth_rad": "3.1_4"}, "a finite number"),
     ({"azimuth_rad": "３.14"}, "a finite number"),
     ({"azimuth_rad": ""}, "a finite number"),
-    ({"gate_end_m": "inf"}, "a finite number"),
+    *(
+        ({name: text}, "a finite number")
+        for name, text in (("gate_end_m", "inf"), ("time_s", "nan"), ("direction_x", "nan"))
+    ),
+    ({"origin_x_m": "1e300"}, "1e+300"),
 ]
 
 

@@ -656,7 +656,7 @@ def test_a_rig_scores_as_the_design_that_fires_its_rays(call, run, tmp_path):
     path = flat_rig(tmp_path, end=False)
     save_design(load_design(path, reach_m=1.2), tmp_path / "same.yaml")
     for asked, count in (((), 16), (("--rays", 8), 8)):
-        result = call("evaluate", run, path, "same.yaml", *asked, "--json")
+        result = call("evaluate", path, "same.yaml", "--in", run, *asked, "--json")
         assert result.code == 0, result.err
         values = {row["design"]: row["value"] for row in result.json["rows"]}
         assert values["fans"] == values["same"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import math
 import runpy
 import subprocess
 import sys
@@ -96,104 +95,6 @@ def test_a_command_is_measured_from_outside(common):
     assert result.document() == {"a": 1}
     assert result.peak_mib > 32
     assert result.wall > 0
-
-
-def test_a_command_that_fails_ends_the_benchmark_with_its_message(common):
-    result = common.run_process([sys.executable, "-c", "import sys; sys.exit('what went wrong')"])
-    with pytest.raises(SystemExit, match="what went wrong"):
-        result.document()
-
-
-def test_a_claim_is_said_to_hold_or_where_it_does_not(common):
-    assert common.verdict("lower", {"a": True, "b": True}) == "holds: lower (2 of 2)"
-    assert common.verdict("lower", {"a": True, "b": False}) == "does not hold: lower (1 of 2; not for b)"
-
-
-def test_a_run_is_taken_as_it_is(common, tmp_path):
-    options = common.parser(None)
-    common.run_options(options)
-    assert common.learned("arm", tmp_path, options.parse_args(["--run", "here"]), {}) == Path("here")
-    with pytest.raises(SystemExit, match="as it is"):
-        common.learned("arm", tmp_path, options.parse_args(["--run", "here", "--preset", "draft"]), {})
-    with pytest.raises(SystemExit, match="as it is"):
-        common.learned("arm", tmp_path, options.parse_args(["--run", "here"]), {"robot": "other.xml"})
-
-
-def test_a_benchmark_that_is_refused_says_why_without_a_traceback(common):
-    from lidardesign.errors import ConfigError
-
-    def refused():
-        raise ConfigError("5 m", where="--at", allowed="0 to 4 m")
-
-    with pytest.raises(SystemExit, match="--at: 5 m"):
-        common.without_traceback(refused)
-
-
-def test_the_rays_that_a_distance_takes_are_exact_on_a_power_law_and_bounded_beyond_the_curve(script):
-    rays = (100, 200, 400, 1600)
-    distances = [3 * count**-0.7 for count in rays]
-    needed = script("occlusion").rays_needed
-    for wanted in (130.0, 200.0, 399.0, 1000.0):
-        found = needed(rays, distances, 3 * wanted**-0.7)
-        assert found.rays == pytest.approx(wanted)
-        assert not found.bound
-    assert needed((100, 200), (0.4, 0.2), 0.5).text() == "<= 100"
-    assert needed((100, 200), (0.4, 0.2), 0.1).text() == "> 200"
-    # of a curve that rises again, where it first comes down
-    assert needed((100, 200, 400, 800), (0.4, 0.2, 0.3, 0.1), 0.2).rays == pytest.approx(200)
-
-
-def test_bounds_only_count_towards_a_factor_that_they_support(script):
-    occlusion = script("occlusion")
-    factors = [occlusion.Needed(3.0, "<="), occlusion.Needed(3.0, ">"), occlusion.Needed(1.9)]
-    assert occlusion.layout_line("density", (100, 200, 300), factors).endswith("at least 2 times at 200")
-
-
-def test_a_constant_and_a_power_are_found_in_what_grows(script):
-    sizes = (10, 100, 1000, 10_000)
-    found = script("growth").fitted(sizes, [5 + 0.1 * size**0.9 for size in sizes])
-    assert found == pytest.approx((5, 0.1, 0.9), rel=1e-6)
-
-
-def rows_of(**values):
-    """Rows of an evaluation from name = (value, bandwidth), at 10 rays."""
-    return {
-        "rows": [
-            {"design": name.replace("_", "-"), "rays": 10, "value": value, "bandwidth_mbps": spent}
-            for name, (value, spent) in values.items()
-        ]
-    }
-
-
-@each_row(("spent", "value", "holds"), [(1.0, 0.1, True), (1.01, 0.1, False), (0.5, 0.5, False)])
-def test_the_arm_must_be_better_at_half_the_bandwidth(script, spent, value, holds):
-    others = {"uniform": (0.5, 2.0), "random": (0.6, 2.0), "bounding": (0.4, 2.0)}
-    others |= {"occupancy": (0.4, 2.0), "no_visibility": (0.4, 2.0)}
-    first = script("arm").verdicts(rows_of(mine=(value, spent), **others))[0]
-    assert first.startswith("holds") == holds
-
-
-@each_row(("mine", "theirs", "holds"), [(9.0, 10.0, True), (10.0, 10.0, False), (2.0, 2.0, True), (2.1, 2.0, False)])
-def test_the_warehouse_must_beat_bounding_where_that_misses_much(script, mine, theirs, holds):
-    others = {"uniform": (50.0, 8.0), "random": (50.0, 8.0), "bounding": (theirs, 2.0)}
-    sparse, bounded = script("warehouse").verdicts(rows_of(mine=(mine, 1.0), **others))
-    assert sparse.startswith("holds")
-    assert bounded.startswith("holds") == holds
-
-
-def test_a_warehouse_without_an_eighth_of_the_bandwidth_falls_short(script):
-    others = {"uniform": (50.0, 7.9), "random": (50.0, 8.0), "bounding": (10.0, 2.0)}
-    sparse = script("warehouse").verdicts(rows_of(mine=(9.0, 1.0), **others))[0]
-    assert sparse.startswith("does not hold")
-    assert "uniform" in sparse
-
-
-def test_positions_between_are_held_against_the_worst_of_the_papers(script):
-    paper = [[0.0, 0.5, 2.0, 0.8, 20.0], [1.2, 0.5, 3.0, 0.7, 10.0]]
-    said = script("warehouse").position_verdict
-    assert said([*paper, [0.37, 0.5, 0.1, 0.8, 20.0]]).startswith("holds")
-    assert said([*paper, [0.37, 0.5, 2.0, 0.81, 20.0]]).startswith("does not hold")
-    assert said([*paper, [0.37, 0.5, 2.0, math.nan, 20.0]]).startswith("does not hold")
 
 
 def test_the_reference_of_ray_casting_meets_a_box_where_planes_do(script):
@@ -325,26 +226,6 @@ def test_a_benchmark_runs_at_its_smallest(run_here, tmp_path, monkeypatch, name,
     monkeypatch.chdir(tmp_path)
     assert "| ---" in run_here(name, "--rounds", "1", "--json", "found.json", *words)
     assert all(json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["tables"].values())
-
-
-def test_every_density_has_its_own_loss_and_one_that_is_refused_an_infinite_one(script, monkeypatch, tmp_path):
-    verdicts, common = script("verdicts"), script("common")
-    numbers = iter(range(1, 1000))
-
-    def answer(command):
-        kind, run = command[1], str(command[command.index("--out") + 1] if "--out" in command else command[2])
-        loss = {"certificates": [{"held_back_value": float(next(numbers))}]}
-        learned = {"steps": 10, "misplaced": 0.1, "kl_nats": 0.2, "ess": 0.3, "verdict": "good"}
-        code = 3 if kind == "fit" and "-10-0" in run else 0
-        return common.ProcessResult(code, json.dumps(learned if kind == "learn" else loss), "", 1.0, 1.0, 1.0)
-
-    monkeypatch.setattr(verdicts, "run_process", answer)
-    rows = verdicts.rows_of(tmp_path, "flatland", ((0.0, 10), (0.0, 30), (0.25, 30)), 2)
-    increases = [row[-1] for row in rows]
-    assert increases[0] == "+0.0%"
-    assert increases[-1] == "+inf%"
-    assert len(set(increases)) == len(rows) == 6
-    assert verdicts.rows_of(tmp_path, "flatland", ((0.0, 10), (0.0, 30), (0.25, 30)), 2) == rows  # what was kept
 
 
 @pytest.mark.long

@@ -8,11 +8,9 @@ from typing import get_args
 
 import numpy as np
 import pytest
-import typer
 from support.tables import each_row
 
 from lidardesign import registry
-from lidardesign.cli.main import app
 from lidardesign.config import resolve
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.errors import LidardesignError
@@ -20,7 +18,6 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.scene import Scene
-from lidardesign.selection.information import checked_information
 from lidardesign.simulate.simulate import simulate
 from lidardesign.task import Task, conditions_of
 
@@ -106,12 +103,6 @@ def test_every_exit_code_of_the_error_tree_is_listed():
     assert {0, 70, 130, 141, 143} | set(codes(LidardesignError)) == listed
 
 
-def test_every_command_is_shown():
-    shown = README + (DOCS / "commands.md").read_text(encoding="utf-8")
-    for command in app.registered_commands:
-        assert f"lidardesign {command.name or command.callback.__name__}" in shown
-
-
 def test_the_readme_is_short():
     assert len(README.splitlines()) <= MOST_LINES
 
@@ -178,15 +169,6 @@ def test_the_moving_ball_of_the_guide_is_scored_over_its_frames():
     ).value
 
 
-def test_the_returns_of_the_guide_tell_about_the_frames_that_they_are_of():
-    task, _, scene = moving_scene_of("PassingTask", 0)
-    ball = scene.bodies[0].poses[:, :3, 3]
-    returns = simulate(scene, rays_at(ball, np.array([0.0, 0.0, 0.3])))
-    found = checked_information(task, scene, returns)
-    assert set(found.item.tolist()) == {number for number, one in enumerate(returns) if (one.body == 0).any()}
-    assert all(returns[item].body[ray] == 0 for ray, item in zip(found.ray, found.item, strict=True))
-
-
 def test_the_drive_of_the_guide_is_scored_over_its_positions():
     task, config, scene = moving_scene_of("DriveTask", 1)
     space = resolve(task).space
@@ -208,16 +190,3 @@ def test_links_lead_somewhere_and_pictures_are_small(page):
         found = page.parent / target
         assert found.exists(), target
         assert found.suffix != ".png" or found.stat().st_size < LARGEST_PICTURE_BYTES
-
-
-def test_every_option_that_a_console_shows_exists():
-    known = {
-        name
-        for command in typer.main.get_command(app).commands.values()
-        for part in (command, *getattr(command, "commands", {}).values())
-        for parameter in part.params
-        for name in parameter.opts
-    }
-    lines = [line for block in blocks("console") for line in block.splitlines() if line.startswith("$ lidardesign")]
-    shown = {word for line in lines for word in re.findall(r"--[\w-]+", line)}
-    assert shown <= known

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from support.small_runs import shifting_environment
+from support.docs_session import in_process
+from support.small_runs import shifted
 
 from lidardesign.export.galvo import is_galvo_file
 
@@ -30,21 +32,34 @@ SETTINGS = {
 }  # fmt: skip
 
 
-def run_example(name: str, folder: Path, *further: str) -> str:
-    """What an example prints that ends well."""
-    words = [word for setting in SETTINGS[name] for word in ("--set", setting)]
-    done = subprocess.run(
-        [sys.executable, EXAMPLES / f"{name}.py", "--out", folder, *words, *further],
-        capture_output=True, text=True, check=False, cwd=folder.parent,
-        env=shifting_environment(),
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr + done.stdout
-    assert "Done in" in done.stdout
-    return done.stdout
+@pytest.fixture
+def run_example(monkeypatch, capsys):
+    """Runs an example and the program that it calls in this process, as their starts take longest; what it prints."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    elsewhere = subprocess.run
+
+    def here(words, **options):
+        if Path(words[0]).name != "lidardesign":
+            return elsewhere(words, **options)
+        ran = in_process([*words[1:], *(("--seed", shifted()) if words[1] == "learn" else ())])
+        assert ran.code == 0, ran.err + ran.out
+        return subprocess.CompletedProcess(words, ran.code, ran.out)
+
+    def run(name, folder, *further):
+        words = [word for setting in SETTINGS[name] for word in ("--set", setting)]
+        monkeypatch.setattr(subprocess, "run", here)
+        monkeypatch.setattr(sys, "argv", [name, "--out", str(folder), *words, *further])
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+        printed = capsys.readouterr().out
+        assert "Done in" in printed
+        return printed
+
+    yield run
+    sys.modules.pop("demo", None)
 
 
 @pytest.mark.slow
-def test_the_arm_is_designed_with_free_mounted_and_railed_sensors(tmp_path):
+def test_the_arm_is_designed_with_free_mounted_and_railed_sensors(run_example, tmp_path):
     run_example("arm", tmp_path / "arm")
     written = {path.stem for path in (tmp_path / "arm" / "run" / "designs").iterdir()}
     assert written == {"free", "mounted", "rails"}
@@ -52,7 +67,7 @@ def test_the_arm_is_designed_with_free_mounted_and_railed_sensors(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_warehouse_is_designed_for_every_position(tmp_path):
+def test_the_warehouse_is_designed_for_every_position(run_example, tmp_path):
     run_example("warehouse", tmp_path / "aisle")
     for x_m in ("0.37", "3.91"):
         with open(tmp_path / "aisle" / f"rays_{x_m}.csv", encoding="utf-8") as file:
@@ -62,7 +77,7 @@ def test_the_warehouse_is_designed_for_every_position(tmp_path):
 
 
 @pytest.mark.slow
-def test_emitters_are_designed_beside_a_laser_at_the_detector(tmp_path):
+def test_emitters_are_designed_beside_a_laser_at_the_detector(run_example, tmp_path):
     out = run_example("emitter", tmp_path / "phone")
     for name in ("laser", "flood", "floods", "bistatic"):
         assert (tmp_path / "phone" / "run" / "designs" / f"{name}.yaml").exists()
@@ -70,7 +85,7 @@ def test_emitters_are_designed_beside_a_laser_at_the_detector(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_simulated_laboratory_captures_a_head_and_gates_remove_outliers(tmp_path):
+def test_a_simulated_laboratory_captures_a_head_and_gates_remove_outliers(run_example, tmp_path):
     # sensors of a short training may look past the mirrors' reach of 20 degrees, where their space goes further
     run_example("capture", tmp_path / "lab", "--side", "48", "--set", "half_angle_deg=18")
     assert is_galvo_file(tmp_path / "lab" / "sensors-10.galvo.csv")

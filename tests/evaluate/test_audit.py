@@ -26,7 +26,7 @@ JITTERY = Detector("jittery", jitter_sigma_s=1e-9)
 @pytest.fixture(autouse=True)
 def without_light_transport(monkeypatch):
     """The same on every machine: late light is rendered by another program, which some do not have."""
-    monkeypatch.setattr(plan_module.process, "missing", lambda: "not here")
+    monkeypatch.setattr(plan_module.transport, "missing", lambda: "not here")
 
 
 class RangeTask(MissTask):
@@ -180,17 +180,6 @@ def test_the_program_audits_and_exits_with_1_only_where_scores_move(lidardesign,
     document = lidardesign("evaluate", fitted, *rough, "--range-tolerance-mm", 1e4, "--json")
     assert document.code == 1
     assert not document.json["audit"]["passed"]
-
-
-def test_the_program_shows_effects_with_their_reasons(lidardesign, fitted):
-    plain = lidardesign("evaluate", fitted, "--rays", 8, "-v")
-    assert "none needed with the detector ideal" in plain.out
-    noise = ("--detector", "single-photon", "--return-tolerance", 0.002)
-    short = lidardesign("evaluate", fitted, "--rays", 8, *noise)
-    assert "effects with the detector single-photon: " in short.out
-    noisy = lidardesign("evaluate", fitted, "--rays", 8, *noise, "-v")
-    assert "0.12 mm and 0.002 of returns together" in noisy.out
-    assert "bins are 1.2 mm wide" in noisy.out
 
 
 def test_tolerances_are_those_that_are_asked_for():

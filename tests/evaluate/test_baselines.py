@@ -8,10 +8,7 @@ from support.rivals import Rivals, balls
 from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.candidates import opened_gate
-from lidardesign.evaluate.baselines.even import even_placement
 from lidardesign.evaluate.baselines.simple import check_baseline
 from lidardesign.evaluate.baselines.views import unrolled
 from lidardesign.scene import Body, Box, Scene, rigid
@@ -163,31 +160,10 @@ def test_the_seed_moves_only_the_random_baseline():
         assert np.array_equal(first.direction, second.direction) == (name not in ("random", "occupancy"))
 
 
-def test_an_unknown_baseline_names_the_known_ones():
-    with pytest.raises(ConfigError, match="uniform, random, bounding"):
-        build_baseline("bouncing", FIXED, [], 3, seed=0)
-
-
 @each_row("name", ["catalog:vl53l5cx", "uniform:3", "uniform:", ""])
 def test_a_name_that_is_no_baselines_is_refused(name):
     with pytest.raises(ConfigError, match="unknown baseline"):
         check_baseline(name)
-
-
-@pytest.mark.parametrize("axes", [1, 2, 3, 5])
-def test_low_discrepancy_points_fill_every_slab_evenly(axes):
-    points = low_discrepancy(1000, axes)
-    assert points.shape == (1000, axes)
-    for column in points.T:
-        counts = np.histogram(column, 20, (0, 1))[0]
-        # of 20 independent counts the largest would stray by about 14
-        assert np.abs(counts - 50).max() <= 6
-
-
-def test_even_placement_of_two_lengths_has_square_cells():
-    points = even_placement(np.zeros(5), np.array([2.0, 1.0, 0, 0, 0]), 50)
-    assert len(np.unique(points[:, 0])) == 10
-    assert len(np.unique(points[:, 1])) == 5
 
 
 def test_unrolled_azimuths_lie_on_the_smallest_arc():
@@ -195,9 +171,3 @@ def test_unrolled_azimuths_lie_on_the_smallest_arc():
     arc = unrolled(azimuth)
     assert np.ptp(arc) == pytest.approx(2 * math.pi - 6.0 + 0.3)
     np.testing.assert_allclose(np.cos(arc), np.cos(azimuth), atol=1e-12)
-
-
-def test_gates_hear_their_own_ends():
-    assert opened_gate(1.0, 2.0)[1] > 2.0
-    start, end = opened_gate(3.0, 3.0)
-    assert start < 3.0 < end

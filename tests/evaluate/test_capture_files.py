@@ -1,9 +1,6 @@
 """Captures are read from every kind of file alike, and nothing wrong in one gets past the reader."""
 
-import contextlib
-import io
 import pickle
-import struct
 import zipfile
 from dataclasses import replace
 
@@ -211,57 +208,6 @@ def test_matlab_structures_are_refused(tmp_path, kind):
         load_capture(tmp_path / "s.mat")
 
 
-NUMBERS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
-SHAPES = ((1, 1), (1, 3), (4, 1), (2, 3), (3, 2, 4), (0, 3), (0, 0))
-
-
-@each_row("packed", [True, False])
-def test_every_type_and_shape_of_matlab_5_comes_through(tmp_path, packed):
-    generator = np.random.default_rng(0)
-    arrays = {
-        f"a{number}_{kind.replace('?', 'logical')}": (100 * generator.random(shape)).astype(kind)
-        for kind in NUMBERS
-        for number, shape in enumerate(SHAPES)
-    }
-    savemat(tmp_path / "s.mat", arrays, do_compression=packed)
-    found = read_arrays(tmp_path / "s.mat")
-    assert list(found) == list(arrays)
-    for name, array in arrays.items():
-        # SciPy writes booleans as bytes with a flag, as MATLAB does
-        assert found[name].dtype == array.dtype
-        np.testing.assert_array_equal(found[name], array)
-
-
-def test_matrices_of_matlab_4_come_through(tmp_path):
-    path = tmp_path / "s.mat"
-    arrays = {name: np.arange(12).reshape(3, 4).astype(name) for name in ("f8", "f4", "i4", "i2", "u1")}
-    savemat(path, arrays, format="4")
-    found = read_arrays(path)
-    assert list(found) == list(arrays)
-    for name, array in arrays.items():
-        np.testing.assert_array_equal(found[name], array)
-    for other in ({"a": "text"}, {"a": np.array([[1j]])}):
-        savemat(path, other, format="4")
-        with pytest.raises(DataError, match=r"'a' is a MATLAB (char|complex)"):
-            read_arrays(path)
-
-
-def test_numbers_that_matlab_stored_in_less_space_and_in_the_other_byte_order_come_through(tmp_path):
-    """Doubles that are whole and small are stored as bytes; files of some computers begin with the high byte."""
-    for order, mark in (("<", b"IM"), (">", b"MI")):
-        flags = struct.pack(order + "IIII", 6, 8, 6, 0)
-        shape = struct.pack(order + "IIii", 5, 8, 1, 3)
-        name = struct.pack(order + "I", 1 << 16 | 1) + b"a\x00\x00\x00"
-        values = struct.pack(order + "I", 3 << 16 | 2) + bytes([7, 8, 9, 0])
-        body = flags + shape + name + values
-        header = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack(order + "H", 0x0100) + mark
-        content = header + struct.pack(order + "II", 14, len(body)) + body
-        (tmp_path / "s.mat").write_bytes(content)
-        found = read_arrays(tmp_path / "s.mat")["a"]
-        assert found.dtype == np.float64
-        np.testing.assert_array_equal(found, [[7.0, 8.0, 9.0]])
-
-
 def test_a_reader_that_crashes_or_does_not_end_is_a_damaged_file(tmp_path, monkeypatch):
     path = tmp_path / "s.mat"
     save_matlab_5(path, make_capture(3))
@@ -305,22 +251,6 @@ def test_a_file_that_was_cut_short_is_refused(tmp_path, kind, share):
         load_capture(path)
 
 
-@pytest.mark.parametrize("kind", FORMATS)
-def test_flipped_bytes_end_in_a_clear_error_or_in_a_checked_capture(tmp_path, kind):
-    path = path_of(tmp_path, kind)
-    FORMATS[kind](path, make_capture(3))
-    content = path.read_bytes()
-    generator = np.random.default_rng(1)
-    # each file of MATLAB 5 takes a process
-    for _ in range(12 if kind == "mat 5" else 60):
-        damaged = bytearray(content)
-        for place in generator.integers(0, len(content), 3):
-            damaged[place] = int(generator.integers(0, 256))
-        path.write_bytes(bytes(damaged))
-        with contextlib.suppress(DataError):
-            assert np.isfinite(load_capture(path).direction).all()
-
-
 @pytest.mark.parametrize("suffix", [".npz", ".mat"])
 def test_garbage_a_folder_and_nothing_are_refused(tmp_path, suffix):
     path = tmp_path / f"s{suffix}"
@@ -352,22 +282,11 @@ def test_files_above_the_stated_size_are_refused_before_they_are_read(tmp_path, 
         load_capture(tmp_path / "big.npz")
 
 
-def npz_with(header, data, path):
-    content = io.BytesIO()
-    np.lib.format.write_array_header_1_0(content, header)
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("counts.npy", content.getvalue() + data)
-
-
-def test_a_header_that_promises_more_than_there_is_is_refused(tmp_path):
-    path = tmp_path / "s.npz"
-    npz_with({"shape": (10**6, 10**6), "fortran_order": False, "descr": "<f8"}, bytes(80), path)
-    with pytest.raises(DataError, match="80 bytes of data"):
-        read_arrays(path)
-    with zipfile.ZipFile(path, "w") as archive:
+def test_what_is_no_array_in_an_archive_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "s.npz", "w") as archive:
         archive.writestr("notes.txt", "hello")
     with pytest.raises(DataError, match=r"notes\.txt"):
-        read_arrays(path)
+        read_arrays(tmp_path / "s.npz")
 
 
 def test_a_full_capture_is_read_in_bounded_memory(tmp_path):

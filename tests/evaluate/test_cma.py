@@ -291,11 +291,6 @@ def test_a_time_that_is_none_or_that_nothing_takes_is_refused(seconds, names):
         ScoreOptions(cma_seconds=seconds, baselines=names)
 
 
-def test_a_time_is_taken_where_it_is_asked_for_or_left_out():
-    assert ScoreOptions(cma_seconds=5.0, baselines=["cma"]).cma_seconds == 5.0
-    assert ScoreOptions().cma_seconds is None
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

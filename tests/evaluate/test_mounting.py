@@ -130,11 +130,6 @@ def test_every_row_stands_beside_itself_mounted_exactly():
     assert not mounting_table(exact)
 
 
-def test_perfect_mounting_costs_nothing():
-    evaluation = evaluate(make_request(mount_error=NONE))
-    assert [cost.difference for cost in evaluation.mounting.costs] == pytest.approx([0.0] * len(evaluation.rows))
-
-
 def test_over_seeds_rows_and_costs_are_means():
     requests = [
         make_request([design("own", azimuth=0.02 * seed)], seed=seed, mount_error=ERROR, test=scenes(2))

@@ -261,8 +261,9 @@ def test_details_are_means_over_the_scenes_that_give_them():
     row = evaluate(make_request(task=Detailed())).rows[0]
     assert row.details == {"hit": 2.5, "even": 2.0}
     assert row.as_dict()["details"] == row.details
-    with pytest.raises(PluginError, match="detail 'hit'"):
-        evaluate(make_request(task=BrokenTask(Score(1.0, details={"hit": "many"}))))
+    for details in ({"hit": "many"}, {3: 1.0}, [1.0], None):
+        with pytest.raises(PluginError, match="score returned the detail"):
+            evaluate(make_request(task=BrokenTask(Score(1.0, details=details))))
 
 
 def test_errors_about_data_keep_their_kind():

@@ -2,8 +2,6 @@
 
 import csv
 import io
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -63,15 +61,6 @@ def test_the_table_holds_every_row_with_units_in_its_header(tmp_path):
     assert float(lines[0][2]) == evaluation.rows[0].value
     assert lines[3][0] == "'=cmd()"
     assert lines[-1][header.index("matched_to")] == "with, comma"
-
-
-def test_nothing_that_draws_is_imported_before_it_is_asked_for():
-    code = (
-        "import sys, lidardesign.evaluate.report.report, lidardesign.evaluate.score\n"
-        "print([m for m in ('matplotlib', 'plotly', 'torch', 'scipy.stats') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 @each_row("span", [4.1, 20.0, 29.0, 31.0, 1e5])

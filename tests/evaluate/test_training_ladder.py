@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.small_runs import shifted
-from support.tables import each_row
 
 from lidardesign.config import load_run_config, resolve, save_run_config
 from lidardesign.density.learn import learn
@@ -24,7 +23,7 @@ from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Accuracy
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
-from lidardesign.run.manifest import record, start_manifest
+from lidardesign.run.manifest import start_manifest
 from lidardesign.task import random_generator, scenes_of
 from lidardesign.workflow import evaluate as scoring
 
@@ -112,15 +111,6 @@ def test_seconds_of_steps_between_rows_of_the_progress_are_interpolated(runs, sw
     assert last == seconds[64]
 
 
-@each_row("text", ["{", "[]", '{"step": 1}', '{"step": null, "seconds": 1}'])
-def test_progress_that_is_none_is_told(runs, tmp_path, text):
-    shutil.copytree(runs, tmp_path / "run")
-    (tmp_path / "run" / "progress.jsonl").write_text(text)
-    record(tmp_path / "run", ["progress.jsonl"])
-    with pytest.raises(DataError, match=r"progress.jsonl: does not hold the progress"):
-        seconds_at(tmp_path / "run")
-
-
 @pytest.fixture
 def fitted(runs, lidardesign, tmp_path):
     """A copy of a run, with a design, in the current folder."""
@@ -157,23 +147,6 @@ def test_sweeps_are_those_of_the_scenes_that_were_learned_whatever_designs_are_j
 def flatland(lidardesign, out, *options):
     small = [word for setting in SMALL for word in ("--set", setting)]
     return lidardesign("learn", "flatland", "--preset", "draft", "--seed", shifted(), "--out", out, *small, *options)
-
-
-@each_row(
-    ("options", "message"),
-    [
-        ("--tolerance 0", "from 0.0001 to 0.9999"),
-        ("--tolerance nan", "a finite number"),
-        ("--time-budget -3", "from 1 to 31622400"),
-        ("--time-budget inf", "a finite number"),
-        ("--time-budget 1e300", "from 1 to 31622400"),
-    ],
-)
-def test_goals_that_make_no_sense_are_config_errors(lidardesign, options, message):
-    done = flatland(lidardesign, "run", *options.split())
-    assert done.code == 2
-    assert message in done.err
-    assert not Path("run").exists()
 
 
 def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_run(lidardesign, tmp_path):

@@ -171,13 +171,16 @@ def test_every_frame_of_carla_has_the_grids_rays_once(tmp_path, rate_hz, case):
     (columns, rows), azimuth, elevation = CARLA_GRIDS[case]
     local = even(columns, rows, azimuth, elevation)
     count = len(local)
-    looking = sensor("one", (0, 0, 0), 2.5, -0.4, 0.3)
-    rays = Rays(
-        np.zeros((count, 3)), local @ looking.frame, np.tile([0.0, 9.0], (count, 1)), np.zeros(count), np.zeros(count)
-    )
+    looking = sensor("one", (0.3, -0.4, 1.2), 2.5, -0.4, 0.3)
+    places, gates = np.tile(looking.origin_m, (count, 1)), np.tile([0.0, 9.0], (count, 1))
+    rays = Rays(places, local @ looking.frame, gates, np.zeros(count), np.zeros(count))
     EXPORTERS["carla"].write(DesignSpec("one", (looking,)), rays, tmp_path / "out.json", rate_hz)
     whole = json.loads((tmp_path / "out.json").read_text())
     [written] = whole["sensors"]
+    assert (written["name"], written["type"]) == ("one", "sensor.lidar.ray_cast")
+    assert all(isinstance(value, str) for value in written["attributes"].values())
+    assert [written["transform"]["location"][axis] for axis in "xyz"] == pytest.approx([0.3, 0.4, 1.2])
+    assert float(written["attributes"]["range"]) == 9.0
     frames = carla_frames(written, whole["fixed_delta_seconds"], 100)
     fired = unreal_rays(written["transform"]["rotation"], frames[0])
     assert len(fired) == count
@@ -362,12 +365,3 @@ def test_cloudcompare_knows_every_property_of_the_points(points):
         *("X", "Y", "Z", "NX", "NY", "NZ", "RED", "GREEN", "BLUE"), *("scalar",) * 4
     ]  # fmt: skip
     assert set(cloudcompare("edge", properties(points / "beams.ply")["edge"]).values()) == {None}
-
-
-def test_blender_finds_points_edges_and_faces_by_their_names(points):
-    for file in ("rays.ply", "beams.ply", "frusta.ply"):
-        elements = properties(points / file)
-        assert {"x", "y", "z", "red", "green", "blue"} <= set(elements["vertex"])
-    assert {"nx", "ny", "nz"} <= set(properties(points / "rays.ply")["vertex"])
-    assert properties(points / "beams.ply")["edge"] == ["vertex1", "vertex2"]
-    assert properties(points / "frusta.ply")["face"] == ["vertex_indices"]

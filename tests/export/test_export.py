@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from support.tables import each_row
@@ -12,7 +9,6 @@ from support.tables import each_row
 from lidardesign.design.files import load_design
 from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.rigs.ray_lists import ray_columns
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.export.galvo import read_galvo
@@ -57,15 +53,6 @@ def test_a_ray_list_comes_back_to_the_last_bit(tmp_path, name, read, count):
     assert any("constraints" in note for note in notes)
 
 
-def test_the_angles_of_a_ray_list_give_its_directions():
-    rays = lay_out(design(), 100)
-    columns = ray_columns(rays)
-    azimuth, elevation = columns["azimuth_rad"], columns["elevation_rad"]
-    flat = np.cos(elevation)
-    again = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], 1)
-    np.testing.assert_allclose(again, rays.direction, atol=1e-14)
-
-
 def test_the_sensor_table_is_a_design_again(tmp_path):
     path = tmp_path / "two.csv"
     notes = EXPORTERS["sensors-csv"].write(design(), lay_out(design()), path)
@@ -106,13 +93,6 @@ def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(tmp_path
     assert contents(path) == ({".": b"mine"} if exporter.folder else {})
 
 
-def test_listing_the_formats_imports_none_of_them():
-    code = "import sys\nfrom lidardesign.export.registry import EXPORTERS\n"
-    code += "print([exporter.module in sys.modules for exporter in EXPORTERS.values()])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "True" not in done.stdout
-
-
 ROUNDING = 1e-15
 
 
@@ -144,9 +124,3 @@ def test_a_roll_that_a_table_cannot_hold_is_told_and_stays_in_its_spreads(tmp_pa
     assert any("roll is lost" in note for note in notes) == (roll != 0)
     for one in load_design(path).sensors:
         assert one.spread_horizontal_rad == pytest.approx(spread_rad, abs=ROUNDING)
-
-
-@each_row("angle", [1e-12, 1e-6, 0.3, np.pi])
-def test_angles_are_exact_from_the_smallest_to_the_largest(angle):
-    first, second = np.array([[1.0, 0, 0]]), np.array([[np.cos(angle), np.sin(angle), 0]])
-    assert angles_between(first, second)[0] == pytest.approx(angle, rel=1e-7)

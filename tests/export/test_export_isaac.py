@@ -1,11 +1,9 @@
-"""Isaac Sim's sensors as USD, and CARLA's attributes: fields, types, lengths, and where rays go."""
+"""Isaac Sim's sensors as USD: fields, types, lengths, and where rays go."""
 
-import json
 
 import numpy as np
 import pytest
-from support.rigs import farthest_nearest, rig, spinning
-from support.tables import each_row
+from support.rigs import rig
 
 from lidardesign.errors import ConfigError
 from lidardesign.export.registry import EXPORTERS
@@ -32,15 +30,6 @@ TOKENS = {
     "scanType": "SOLID_STATE", "rayType": "IDEALIZED", "elementsCoordsType": "CARTESIAN",
     "outputFrameOfReference": "SENSOR",
 }  # fmt: skip
-# What CARLA documents of sensor.lidar.ray_cast, with the types of its attributes.
-CARLA = {
-    "channels": int, "range": float, "points_per_second": int, "rotation_frequency": float, "upper_fov": float,
-    "lower_fov": float, "horizontal_fov": float, "atmosphere_attenuation_rate": float, "dropoff_general_rate": float,
-    "dropoff_intensity_limit": float, "dropoff_zero_intensity": float, "sensor_tick": float, "noise_stddev": float,
-    "role_name": str,
-}  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory):
     usd = pytest.importorskip("pxr.Usd", reason="needs usd-core: the extra `consumers`")
@@ -117,55 +106,3 @@ def test_frames_are_whole_numbers_per_second(tmp_path):
     assert list(tmp_path.iterdir()) == []
     notes = EXPORTERS["isaac-usd"].write(DESIGN, RAYS, tmp_path / "out", 12.6)
     assert any("12.6 Hz is 13 Hz" in note for note in notes)
-
-
-def swept(sensor, step_s):
-    """Unit vectors in our frame that CARLA fires in one frame: sweeps to the right, channels from above."""
-    attributes = {name: CARLA[name](value) for name, value in sensor["attributes"].items()}
-    channels, field = attributes["channels"], attributes["horizontal_fov"]
-    points = round(attributes["points_per_second"] * step_s / channels)
-    per_frame = attributes["rotation_frequency"] * field * step_s
-    fall = (attributes["upper_fov"] - attributes["lower_fov"]) / (channels - 1) if channels > 1 else 0.0
-    turn = {key: np.radians(value) for key, value in sensor["transform"]["rotation"].items()}
-    found = []
-    for channel in range(channels):
-        for point in range(points):
-            right = np.radians((per_frame / points * point) % field - field / 2)
-            up = np.radians(attributes["upper_fov"] - channel * fall)
-            x, y, z = np.cos(up) * np.cos(right), np.cos(up) * np.sin(right), np.sin(up)
-            # about x: the right side goes down
-            y, z = (
-                y * np.cos(turn["roll"]) + z * np.sin(turn["roll"]),
-                z * np.cos(turn["roll"]) - y * np.sin(turn["roll"]),
-            )
-            # about y: the front goes up
-            x, z = (
-                x * np.cos(turn["pitch"]) - z * np.sin(turn["pitch"]),
-                z * np.cos(turn["pitch"]) + x * np.sin(turn["pitch"]),
-            )
-            # about z: the front goes to the right
-            x, y = x * np.cos(turn["yaw"]) - y * np.sin(turn["yaw"]), y * np.cos(turn["yaw"]) + x * np.sin(turn["yaw"])
-            found.append((x, -y, z))
-    return np.array(found)
-
-
-@each_row(("design", "rays"), [(DESIGN, RAYS), spinning()])
-@each_row("rate_hz", [10.0, 12.5])
-def test_carla_sweeps_the_rays_that_are_on_even_grids(tmp_path, design, rays, rate_hz):
-    path = tmp_path / "rig.carla.json"
-    EXPORTERS["carla"].write(design, rays, path, rate_hz)
-    document = json.loads(path.read_text())
-    assert document["fixed_delta_seconds"] * rate_hz == pytest.approx(1)
-    assert [one["name"] for one in document["sensors"]] == [one.name for one in design.sensors]
-    for index, one in enumerate(document["sensors"]):
-        assert one["type"] == "sensor.lidar.ray_cast"
-        assert all(isinstance(value, str) for value in one["attributes"].values())
-        mine = rays.subset(rays.sensor == index)
-        place = [one["transform"]["location"][axis] for axis in "xyz"]
-        np.testing.assert_allclose(np.array(place) * (1, -1, 1), mine.origin_m.mean(axis=0), atol=1e-12)
-        assert float(one["attributes"]["range"]) == mine.gate_m[:, 1].max()
-        if index != 1:
-            fired = swept(one, document["fixed_delta_seconds"])
-            assert len(fired) == len(mine)
-            assert farthest_nearest(mine.direction, fired) < 1e-7
-            assert farthest_nearest(fired, mine.direction) < 1e-7

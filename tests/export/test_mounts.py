@@ -10,7 +10,7 @@ from support.tables import each_row
 
 from lidardesign.design.layouts.grid import grid_tangent
 from lidardesign.design.sensor import DesignSpec, tangent_directions
-from lidardesign.export.mounts import EvenGrid, grid_losses, mounts, nearest_grid, quaternion
+from lidardesign.export.mounts import grid_losses, mounts, nearest_grid, quaternion
 from lidardesign.export.names import (
     distinct,
     document,
@@ -104,11 +104,6 @@ def test_a_mounts_rotation_is_its_sensors_frame(seed):
     steps = [rotation_of_quaternion(*one) for one in about]
     np.testing.assert_allclose(steps[2] @ steps[1] @ steps[0], one.frame.T, atol=1e-15)
     np.testing.assert_allclose([mount.azimuth_rad, mount.elevation_rad], 0.0, atol=1e-15)
-
-
-def test_a_grid_of_one_ray_is_that_ray():
-    grid = nearest_grid(np.array([0.3]), np.array([-0.1]))
-    assert grid == EvenGrid(1, 1, (0.3, 0.3), (-0.1, -0.1))
 
 
 @settings(max_examples=100, deadline=None)

@@ -25,8 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.pieces import Pieces
-from support.result_pages import heading, write_page
+from support.long_runs import heading, kept, write_page
 
 from faults.processes import Ended, Fork, forked, fresh, import_all
 from faults.runs import COMMANDS, FINISHED, LEARN, TO_TOLERANCE, Straight, contents, strays, unreadable
@@ -68,26 +67,35 @@ for the seconds in them. Of two commands at once one worked at least, and the ot
 
 @dataclass
 class Tally:
-    """What was done, by way and command, how often it met the command at work, and what was not as it must be."""
+    """What was done, by way, how often it met the command at work, and what was not as it must be.
 
-    sent: Counter[tuple[str, str]] = field(default_factory=Counter)
-    early: Counter[tuple[str, str]] = field(default_factory=Counter)
+    Arguments:
+        seed: Of random moments.
+    """
+
+    seed: int
+    sent: Counter[str] = field(default_factory=Counter)
+    early: Counter[str] = field(default_factory=Counter)
     faults: list[str] = field(default_factory=list)
+
+    def of(self, way: str, key: str, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Count what came of one disturbance: as it was kept, or of doing it now."""
+        found = kept(f"kills {self.seed}, {way} of {key}", work)
+        self.sent[way] += 1
+        self.early[way] += found["early"]
+        self.faults += found["faults"]
+        return found
 
 
 class Killing:
     """Ends commands in a folder and looks at what is left, beside an undisturbed run."""
 
-    def __init__(self, folder: Path, straight: Straight, tally: Tally, pieces: Pieces) -> None:
-        self.folder, self.straight, self.tally, self.pieces = folder, straight, tally, pieces
+    def __init__(self, folder: Path, straight: Straight, tally: Tally) -> None:
+        self.folder, self.straight, self.tally = folder, straight, tally
 
-    def end(self, way: str, name: str, number: int, run_it: Callable[[Path], Ended], told: str) -> Ended:
+    def end(self, way: str, name: str, number: int, run_it: Callable[[Path], Ended], told: str) -> dict[str, Any]:
         """End one command in a folder of its own, look, give it again, and compare; `told` names the moment."""
-        found = self.pieces.of(f"{way} of {name}, {number}", lambda: self._end(way, name, run_it, told))
-        self.tally.sent[way, name] += 1
-        self.tally.early[way, name] += found["code"] not in FINISHED
-        self.tally.faults += found["faults"]
-        return Ended(found["code"], found["seconds"], "")
+        return self.tally.of(way, f"{name}, {number}", lambda: self._end(way, name, run_it, told))
 
     def _end(self, way: str, name: str, run_it: Callable[[Path], Ended], told: str) -> dict[str, Any]:
         place = self.folder / "killed"
@@ -97,7 +105,7 @@ class Killing:
         print(f"{way} of {name}, {told}: {'; '.join(faults) or 'recovered'}", file=sys.stderr, flush=True)
         shutil.rmtree(place)
         faults = [f"{WAYS[way]}, {name}, {told}: {fault}" for fault in faults]
-        return {"code": ended.code, "seconds": ended.seconds, "faults": faults}
+        return {"early": ended.code not in FINISHED, "seconds": ended.seconds, "faults": faults}
 
     def _left(self, way: str, ended: Ended, place: Path) -> Iterator[str]:
         """What is wrong with the folder as it was left."""
@@ -128,10 +136,7 @@ class Killing:
 
     def pair(self, name: str, number: int, delay_s: float) -> None:
         """Two commands at once: each works or is told why not, one works at least, and nothing is spoilt."""
-        found = self.pieces.of(f"{name}, {number}", lambda: self._pair(name, delay_s))
-        self.tally.sent["pair", name] += 1
-        self.tally.early["pair", name] += found["both"]
-        self.tally.faults += found["faults"]
+        self.tally.of("pair", f"{name}, {number}", lambda: self._pair(name, delay_s))
 
     def _pair(self, name: str, delay_s: float) -> dict[str, Any]:
         before, first, second = PAIRS[name]
@@ -149,7 +154,7 @@ class Killing:
         print(f"{name}, {delay_s:.3f} s apart: {'; '.join(faults) or 'in order'}", file=sys.stderr, flush=True)
         shutil.rmtree(place)
         told = [f"{name}, {delay_s:.3f} s apart: {fault}" for fault in faults]
-        return {"both": all(end.code == 0 for end in ends), "faults": told}
+        return {"early": all(end.code == 0 for end in ends), "faults": told}
 
 
 def _badly_refused(ends: list[Ended]) -> Iterator[str]:
@@ -166,15 +171,15 @@ def at_random(killing: Killing, way: str, count: int, seed: int, seconds: dict[s
     sent = signal.SIGTERM if way == "SIGTERM" else signal.SIGKILL
     names = [name for name, share in SHARES.items() for _ in range(share)]
     for number, name in enumerate(itertools.islice(itertools.cycle(names), MOST_TRIES * count)):
-        if sum(met for (one, _), met in killing.tally.early.items() if one == way) >= count:
+        if killing.tally.early[way] >= count:
             return
         # of a sequence of its own: what is done already draws nothing
         share = np.random.default_rng([seed, int(sent), number]).uniform(LIBRARIES_LOADED, 1.0)
         after_s = float(share * seconds[name])
         ends = functools.partial(fresh, killing.straight.commands[name], after_s=after_s, sent=sent)
         ended = killing.end(way, name, number, ends, f"after {after_s:.3f} s")
-        if ended.code in FINISHED:  # the computer has less to do than before
-            seconds[name] = ended.seconds
+        if not ended["early"]:  # the computer has less to do than before
+            seconds[name] = ended["seconds"]
 
 
 def at_steps(killing: Killing, most: int, way: str = "step") -> None:
@@ -199,15 +204,12 @@ def spread(last: int, count: int) -> list[int]:
     return sorted({round(number) for number in np.linspace(0, last + 1, min(count, last) + 2)[1:-1]})
 
 
-def page(tally: Tally, seed: int, minutes: float) -> list[str]:
+def page(tally: Tally, minutes: float) -> list[str]:
     """The parts of the result's page."""
-    killed, met, both, worked = (
-        sum(count for (way, _), count in counted.items() if (way == "pair") == pairs)
-        for pairs in (False, True)
-        for counted in (tally.sent, tally.early)
-    )
+    both, worked = tally.sent["pair"], tally.early["pair"]
+    killed, met = tally.sent.total() - both, tally.early.total() - worked
     return [
-        heading("Kills", f"python -m faults.kills --seed {seed}"),
+        heading("Kills", f"python -m faults.kills --seed {tally.seed}"),
         f"- {minutes:.0f} minutes\n- killed or terminated: {killed}, of them while the command was at work: {met}\n"
         f"- two at once: {both}, of them both worked: {worked}\n- not recovered: {len(tally.faults)}",
         "\n".join(tally.faults) or RECOVERED,
@@ -224,25 +226,25 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=None, help="write the result as Markdown")
     asked = parser.parse_args()
-    pieces, tally = Pieces(f"kills-{asked.seed}"), Tally()
+    began, tally = time.monotonic(), Tally(asked.seed)
     import_all()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        killing = Killing(folder, Straight(folder / "straight", COMMANDS), tally, pieces)
+        killing = Killing(folder, Straight(folder / "straight", COMMANDS), tally)
         at_steps(killing, asked.steps)
         at_steps(killing, asked.steps, "asked")
         in_pairs(killing, asked.pairs, asked.seed)
         if asked.kills + asked.terms:
             to_tolerance = Straight(folder / "tolerance", {"learn --tolerance": TO_TOLERANCE})
-            at_steps(Killing(folder, to_tolerance, tally, pieces), asked.steps)
+            at_steps(Killing(folder, to_tolerance, tally), asked.steps)
             seconds = killing.straight.measure_fresh(folder)
             at_random(killing, "SIGKILL", asked.kills, asked.seed, seconds)
             at_random(killing, "SIGTERM", asked.terms, asked.seed, seconds)
-    parts = page(tally, asked.seed, pieces.seconds / 60)
+    parts = page(tally, (time.monotonic() - began) / 60)
     print("\n\n".join(parts))
     if asked.out is not None:
         write_page(asked.out, parts)
-    sys.exit(1 if killing.tally.faults else 0)
+    sys.exit(1 if tally.faults else 0)
 
 
 if __name__ == "__main__":

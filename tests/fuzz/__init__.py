@@ -1,1 +1,1 @@
-"""Damaged files for every reader: `python -m fuzz.campaign`."""
+"""Damaged files for every reader: `make fuzz`."""

@@ -10,16 +10,15 @@ import random
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from fuzz.mutators import Mutator
+from fuzz.mutators import Mutator, mutate_bytes
 from lidardesign.errors import LidardesignError
 
-EXECUTED = "EXECUTED"
 MOST_SEEDS = 2000
 # Of the inputs so many are damaged good files; the others are files that were damaged before.
 GOOD_SHARE = 0.6
@@ -73,16 +72,12 @@ class Tally:
 
     Arguments:
         read, refused: How many were taken, and how many refused.
-        places: The lines of the program that refused them.
         slowest_s: The longest processor time of one.
-        seconds: The processor time of all.
     """
 
     read: int = 0
     refused: int = 0
-    places: set[str] = field(default_factory=set)
     slowest_s: float = 0.0
-    seconds: float = 0.0
 
 
 def attempt(read: Read, content: bytes, tally: Tally, slow_s: float) -> tuple[str, str | None]:
@@ -99,7 +94,6 @@ def attempt(read: Read, content: bytes, tally: Tally, slow_s: float) -> tuple[st
     except LidardesignError as error:
         place = _place(error)
         tally.refused += 1
-        tally.places.add(place)
         fault = _hidden_fault(error)
     # what is no error of the program is a fault of it, whatever it is
     except BaseException as error:
@@ -107,7 +101,6 @@ def attempt(read: Read, content: bytes, tally: Tally, slow_s: float) -> tuple[st
             raise
         place, fault = _place(error), "".join(traceback.format_exception(error))
     seconds = time.process_time() - before
-    tally.seconds += seconds
     tally.slowest_s = max(tally.slowest_s, seconds)
     if fault is None and seconds > slow_s:
         fault = f"took {seconds:.1f} s of processor time"
@@ -167,19 +160,18 @@ class Fuzzer:
     """
 
     def __init__(self, target: Target, folder: Path, seed: int) -> None:
-        self.target, self.folder = target, folder
+        self.target = target
         self.source = random.Random(f"{target.name} {seed}")
         self.seeds = target.seeds(_made(folder / "seeds"))
         self._good, self._places = list(self.seeds), set()
         self.tally = Tally()
-        with inside(_made(folder / "work")) as work:
-            self.read = target.opened(work)
-            self.present = _names(work)
+        self.work = _made(folder / "work")
+        with contextlib.chdir(self.work):
+            self.read = target.opened(self.work)
+        self.present = _names(self.work)
 
     def next(self) -> bytes:
         """The next damaged content; damage that a mutator cannot do to a damaged file is done to its bytes."""
-        from fuzz.mutators import mutate_bytes
-
         content = self.source.choice(self._good if self.source.random() < GOOD_SHARE else self.seeds)
         try:
             return self.target.mutate(content, self.source, self._good)
@@ -189,21 +181,21 @@ class Fuzzer:
 
     def run(self, content: bytes) -> str | None:
         """Read a content, in a folder of its own; what fault it found."""
-        with inside(self.folder / "work") as work:
+        with contextlib.chdir(self.work):
             place, fault = attempt(self.read, content, self.tally, self.target.slow_s)
-            fault = fault or self._left_behind(work)
+        fault = fault or self._left_behind()
         new = place not in self._places or (place == "read" and self.source.random() < KEPT_SHARE)
         if new and len(self.seeds) < MOST_SEEDS:
             self._places.add(place)
             self.seeds.append(content)
         return fault
 
-    def _left_behind(self, work: Path) -> str | None:
+    def _left_behind(self) -> str | None:
         """Files that only reading has made: whatever they are, reading must make none."""
-        made = _names(work) - self.present - {name for name in _names(work) if name.startswith("input")}
+        made = {name for name in _names(self.work) - self.present if not name.startswith("input")}
         for name in made:
             with contextlib.suppress(OSError):
-                (work / name).unlink()
+                (self.work / name).unlink()
         return f"reading made {', '.join(sorted(made))}" if made else None
 
 
@@ -214,14 +206,3 @@ def _made(folder: Path) -> Path:
 
 def _names(folder: Path) -> set[str]:
     return {entry.name for entry in os.scandir(folder)}
-
-
-@contextlib.contextmanager
-def inside(folder: Path) -> Iterator[Path]:
-    """Work in a folder, and come back."""
-    before = Path.cwd()
-    os.chdir(folder)
-    try:
-        yield folder
-    finally:
-        os.chdir(before)

@@ -14,11 +14,10 @@ import h5py
 import numpy as np
 from scipy.io import loadmat, savemat
 
-from fuzz.mutators import LARGEST_INPUT, mutate_bytes, mutate_tree
+from fuzz.mutators import LARGEST_INPUT, SPECIAL, mutate_bytes, mutate_tree
 
 KINDS = ("<f8", "<f4", "<f2", ">f8", "<i8", "<i4", "|i1", "|u1", "<u2", "<u8", "|b1", "<c16", "<U3", "|S4", "<M8[s]")
 NUMERIC_KINDS = ("<f8", "<f4", "<i8", "<i4", "|i1", "|u1", "<u2", "<u8")
-SPECIAL = (0.0, 1.0, -1.0, 0.5, 2.0, 255.0, 1e9, 1e30, -1e30, 1e300, np.nan, np.inf, -np.inf, 1e-300)
 SHAPES = ((), (0,), (1,), (3,), (2, 3), (1, 1), (0, 3), (3, 0), (4, 4, 4), (1, 3, 1, 1), (12,), (36, 3))
 
 
@@ -29,29 +28,29 @@ class Executed:
         return (open, ("EXECUTED", "w"))
 
 
-PICKLED = pickle.dumps(Executed())
+# an array of objects: a pickle, as numpy writes it when it may
+_HEADER = b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n"
+PICKLED_ARRAY = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(_HEADER)) + _HEADER + pickle.dumps(Executed())
 
 
 def mutate_array(array: np.ndarray, source: random.Random, kinds: Sequence[str] = KINDS) -> np.ndarray:
     """An array with other values, another shape or another type."""
-    array = np.array(array)
-    kind = source.random()
-    if kind < 0.45 and array.size:
-        flat = array.reshape(-1).copy()
-        count = source.choice((1, 1, 2, flat.size))
-        values = np.array([source.choice(SPECIAL) for _ in range(min(count, 50))])
-        with np.errstate(all="ignore"):
-            flat[[source.randrange(flat.size) for _ in values]] = values.astype(flat.dtype)
-        return flat.reshape(array.shape)
-    if kind < 0.6:
-        with np.errstate(all="ignore"):
-            return array.astype(source.choice(kinds))
-    if kind < 0.8:
-        with np.errstate(all="ignore"):
-            return np.full(source.choice(SHAPES), source.choice(SPECIAL)).astype(source.choice(kinds))
-    if kind < 0.9:
-        return array[: source.randrange(len(array) + 1)] if array.ndim else array.reshape(1)
-    return source.choice((array.reshape(-1), array[None], np.moveaxis(array, 0, -1) if array.ndim > 1 else array))
+    array, special = np.array(array), source.choice(SPECIAL)
+    with np.errstate(all="ignore"):
+        if array.size and source.random() < 0.45:
+            for _ in range(source.choice((1, 1, 2, 50))):
+                array.flat[source.randrange(array.size)] = np.array(source.choice(SPECIAL)).astype(array.dtype)
+            return array
+        return source.choice(
+            (
+                array.astype(source.choice(kinds)),
+                np.full(source.choice(SHAPES), special).astype(source.choice(kinds)),
+                array[: source.randrange(len(array) + 1)] if array.ndim else array.reshape(1),
+                array.reshape(-1),
+                array[None],
+                array.T,
+            )
+        )
 
 
 def mutate_arrays(
@@ -61,15 +60,12 @@ def mutate_arrays(
     arrays = dict(arrays)
     for _ in range(source.choice((1, 1, 2, 3))):
         name = source.choice(list(arrays) or ["x"])
-        kind = source.random()
-        if kind < 0.7:
-            arrays[name] = mutate_array(arrays.get(name, np.zeros(3)), source, kinds)
-        elif kind < 0.8:
-            arrays.pop(name, None)
-        elif kind < 0.9:
-            arrays[source.choice(("x", name + "_ns", "a" * 60))] = arrays.pop(name, np.zeros(3))
+        array = arrays.get(name, np.zeros(3))
+        if source.random() < 0.2:
+            del arrays[name]
         else:
-            arrays[name] = arrays[source.choice(list(arrays))] if arrays else np.zeros(1)
+            new = source.choice((name, name, name, "x", name + "_ns", "a" * 60, *arrays))
+            arrays[new] = mutate_array(array, source, kinds) if new == name else array
     return arrays
 
 
@@ -84,8 +80,10 @@ def mutate_npz(content: bytes, source: random.Random, others: Sequence[bytes]) -
         members = {f"{name}.npy": _npy(array) for name, array in mutate_arrays(arrays, source).items()}
     else:
         name = source.choice(list(members))
-        change = source.choice((_other_header, _other_header, _pickled, _damaged, _renamed))
-        change(members, name, source)
+        data = members.pop(name)
+        others = (*(_other_header(data, source) for _ in range(3)), PICKLED_ARRAY, mutate_bytes(data, source, [data]))
+        names = ("../../outside.npy", "/absolute.npy", "x.txt", "", "é.npy", ".npy", "a/b.npy", "x" * 300)
+        members[source.choice((name, name, name, name, source.choice(names)))] = source.choice(others)
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", source.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
         for name, data in members.items():
@@ -99,37 +97,17 @@ def _npy(array: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def _other_header(members: dict[str, bytes], name: str, source: random.Random) -> None:
+def _other_header(data: bytes, source: random.Random) -> bytes:
     """A header whose shape, type or order was changed, of the right length."""
-    data = members[name]
     length = struct.unpack("<H", data[8:10])[0]
     header = data[10 : 10 + length].decode("latin-1")
     shapes = ("()", "(10,)", "(1000000000000,)", "(0,)", "(-1,)", "(4294967296, 4294967296)", "(2, 3)", "[3]", "'x'")
     kinds = ("'|O'", "'<f8'", "'<c16'", "[('a', '<f8')]", "'<U1000000'", "'|V0'", "'<f99'", "__import__('os')", "5")
-    at = source.random()
-    if at < 0.4:
-        header = header[: header.find("'shape': ") + 9] + source.choice(shapes) + ", }"
-    elif at < 0.8:
-        header = header.replace(header[header.find("'descr': ") + 9 : header.find(", 'fortran")], source.choice(kinds))
-    else:
-        header = source.choice(("", "{}", "{" * 300, "nonsense", header.replace("False", "True"), header + header))
-    header += "\n"
-    members[name] = data[:8] + struct.pack("<H", len(header) % 65536) + header.encode("latin-1") + data[10 + length :]
-
-
-def _pickled(members: dict[str, bytes], name: str, _: random.Random) -> None:
-    """An array of objects: a pickle, as numpy writes it when it may."""
-    header = "{'descr': '|O', 'fortran_order': False, 'shape': (1,), }\n"
-    members[name] = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + PICKLED
-
-
-def _damaged(members: dict[str, bytes], name: str, source: random.Random) -> None:
-    members[name] = mutate_bytes(members[name], source, list(members.values()))
-
-
-def _renamed(members: dict[str, bytes], name: str, source: random.Random) -> None:
-    names = ("../../outside.npy", "/absolute.npy", "x.txt", "", "é.npy", ".npy", "a/b.npy", "x" * 300)
-    members[source.choice(names)] = members.pop(name)
+    others = ("", "{}", "{" * 300, "nonsense", header.replace("False", "True"), header + header)
+    shaped = header[: header.find("'shape': ") + 9] + source.choice(shapes) + ", }"
+    typed = header.replace(header[header.find("'descr': ") + 9 : header.find(", 'fortran")], source.choice(kinds))
+    header = source.choice((shaped, shaped, typed, typed, source.choice(others))) + "\n"
+    return data[:8] + struct.pack("<H", len(header) % 65536) + header.encode("latin-1") + data[10 + length :]
 
 
 def mutate_matlab(content: bytes, source: random.Random, others: Sequence[bytes]) -> bytes:
@@ -167,27 +145,23 @@ def _change_item(file: h5py.File, name: str, source: random.Random) -> None:
     if name not in file:
         return
     item, kind = file[name], source.random()
-    if kind < 0.5 and isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf":
-        array = mutate_array(item[()], source, (*NUMERIC_KINDS, "|b1", "|S4", ">f8", "<c16"))
-        attributes = dict(item.attrs)
-        del file[name]
-        made = file.create_dataset(name, data=array)
-        made.attrs.update(attributes)
-    elif kind < 0.65:
-        del file[name]
-        links = (h5py.ExternalLink("/etc/passwd", "/x"), h5py.SoftLink("/" + name), h5py.SoftLink("/nowhere"))
-        file[name] = source.choice(links)
-    elif kind < 0.75:
-        del file[name]
-        file[name] = source.choice((np.bytes_("text"), "text", np.zeros(3), h5py.Empty("f8")))
-    elif kind < 0.85:
-        name = source.choice(("unit", "MATLAB_class", "x"))
-        item.attrs[name] = source.choice(("mm", "lightyear", 5, b"\xff", "cell"))
-    elif kind < 0.95:
-        del file[name]
-        file.create_dataset(name, shape=(1 << 40,), dtype="f8", chunks=(1 << 10,))
+    if kind < 0.15:
+        values = ("mm", "lightyear", 5, b"\xff", "cell")
+        item.attrs[source.choice(("unit", "MATLAB_class", "x"))] = source.choice(values)
+        return
+    attributes, huge = dict(item.attrs), {"shape": (1 << 40,), "dtype": "f8", "chunks": (1 << 10,)}
+    links = (h5py.ExternalLink("/etc/passwd", "/x"), h5py.SoftLink("/" + name), h5py.SoftLink("/nowhere"))
+    others = (*links, np.bytes_("text"), "text", np.zeros(3), h5py.Empty("f8"))
+    is_array = isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf"
+    array = mutate_array(item[()], source, (*NUMERIC_KINDS, "|b1", "|S4", ">f8", "<c16")) if is_array else None
+    del file[name]
+    if is_array and kind < 0.65:
+        file.create_dataset(name, data=array).attrs.update(attributes)
+    elif kind < 0.9:
+        file[name] = source.choice(others)
+    elif kind < 0.97:
+        file.create_dataset(name, **huge)
     else:
-        del file[name]
         file.create_group(name)
 
 

@@ -1,8 +1,11 @@
-"""A short run of the fuzzer, what long runs once found, and that the fuzzer itself finds what it looks for."""
+"""A short run of the fuzzer, what long runs once found, and that the fuzzer finds what it looks for."""
 
 from __future__ import annotations
 
-import json
+import os
+import re
+import subprocess
+import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,16 +14,15 @@ import numpy as np
 import pytest
 from support.tables import each_row
 
-from fuzz import campaign
-from fuzz.attempts import Fuzzer, Tally, Target, attempt, not_finite
-from fuzz.campaign import Job, run_job, together
+from fuzz.attempts import Fuzzer, Tally, Target, attempt
 from fuzz.commands import COMMANDS
 from fuzz.fuzz_targets import NAMES, TARGETS, target_of
 from fuzz.mutators import mutate_bytes
 from lidardesign.errors import ConfigError, DataError
 
 INPUTS = 12
-FOUND = Path(__file__).parent / "found"
+TESTS = Path(__file__).parents[1]
+FOUND = TESTS / "fuzz" / "found"
 
 
 @pytest.fixture(autouse=True)
@@ -68,15 +70,6 @@ def test_whole_commands_end_with_a_message_and_nothing_half_written(tmp_path, na
         assert fault is None, f"{content[:300]!r}: {fault}"
 
 
-def test_damage_repeats_for_a_seed_and_differs_between_seeds(tmp_path):
-    def inputs(seed, place):
-        fuzzer = Fuzzer(target_of("mesh, OBJ"), tmp_path / place, seed)
-        return [fuzzer.next() for _ in range(20)]
-
-    assert inputs(1, "a") == inputs(1, "b")
-    assert inputs(1, "c") != inputs(2, "d")
-
-
 # --- what the fuzzer must find
 
 
@@ -94,10 +87,6 @@ def out_of_memory(_):
 
 def warned(_):
     warnings.warn("overflow", RuntimeWarning, stacklevel=1)
-
-
-def refused(_):
-    raise ConfigError("is no file", where="input")
 
 
 FAULTS = {
@@ -118,14 +107,6 @@ def test_a_fault_is_found(kind):
     assert words in fault
 
 
-def test_a_refusal_and_a_result_are_no_faults():
-    tally = Tally()
-    assert attempt(refused, b"", tally, 10.0)[1] is None
-    assert attempt(lambda _: ({"a": [1.0, "x"]}, None), b"", tally, 10.0)[1] is None
-    assert (tally.refused, tally.read) == (1, 1)
-    assert not_finite(({"a": [1.0, float("inf")]},)) == "result[0]['a'][1] is inf"
-
-
 def test_a_file_that_reading_leaves_behind_is_found(tmp_path):
     def opened(folder):
         return lambda _: (folder / "EXECUTED").write_text("by a tag")
@@ -134,44 +115,42 @@ def test_a_file_that_reading_leaves_behind_is_found(tmp_path):
     assert fuzzer.run(b"x") == "reading made EXECUTED"
 
 
-CRASHING = """
-import json, os, sys, time
+PLANTED = """
+import ctypes, os, time, pytest
 from pathlib import Path
-name, seed, first, inputs, folder = sys.argv[1:]
-first, inputs, folder = int(first), int(inputs), Path(folder)
-tally = dict(read=3, refused=1, broken=0, places=["a"], slowest_s=0.1, seconds=0.2, memory_mib=5.0)
-(folder / "faults").mkdir()
-(folder / "tally.json").write_text(json.dumps({"beat": 4, **tally}))
-(folder / "current").write_bytes(b"5\\nthe culprit")
-if first == 0:
-    WHAT
+from support.long_runs import ended_after
+NAME, TITLE = "planted", "Planted faults"
+
+@pytest.mark.parametrize("what", ["good", "fault", "crash", "hang"])
+def test_planted(piece, what):
+    def work():
+        Path("begun-" + what).touch()
+        with ended_after(1.0):
+            {"crash": os.abort, "hang": lambda: ctypes.PyDLL(None).sleep(60)}.get(what, int)()
+        return {"faults": ["found"] if what == "fault" else []}
+    piece(work)
+
+def parts(pieces):
+    return [str(len(pieces)) + " pieces"]
 """
 
 
-@each_row(
-    ("what", "words"),
-    [
-        ("os.abort()", "ended with -6"),
-        ("time.sleep(60)", "it hangs"),
-        ("while True: pass", "it hangs"),
-        ("raise ValueError('x')", "ValueError: x"),
-    ],
-)
-def test_an_input_that_ends_or_stops_its_process_is_kept_and_the_batch_goes_on(tmp_path, monkeypatch, what, words):
-    worker = tmp_path / "worker.py"
-    worker.write_text(CRASHING.replace("WHAT", what))
-    monkeypatch.setattr(campaign, "WORKER", worker)
-    monkeypatch.setattr(campaign, "HANG_S", 1.0 if "sleep" in what else 60.0)
-    monkeypatch.setattr(campaign, "HANG_PROCESSOR_S", 0.5)
-    job = Job("any", 9, 0)
-    found = run_job(job, tmp_path / "kept")
-    assert [words in reason for reason in found.faults.values()] == [True]
-    assert [Path(path).read_bytes() for path in found.faults] == [b"the culprit"]
-    assert (found.inputs, found.read, found.refused) == (4 + 1 + 4, 6, 2)
-    assert together([(job, found)])["any"].memory_mib == 5.0
-
-
-def test_the_worker_reads_a_batch_and_counts_it(tmp_path):
-    found = run_job(Job("progress (JSON lines)", 25, 3), tmp_path / "kept")
-    assert not found.faults, json.dumps(found.faults)
-    assert (found.inputs, found.read + found.refused) == (25, 25)
+def test_a_long_run_goes_on_behind_crashes_and_hangs_and_tells_them(tmp_path):
+    (tmp_path / "test_planted.py").write_text(PLANTED)
+    paths = os.pathsep.join(map(str, (tmp_path, TESTS, TESTS.parent)))
+    options = f"-p support.long_runs -p no:cacheprovider -c {os.devnull} -n 1 --page . --rootdir . test_planted.py"
+    for again in (False, True):
+        ended = subprocess.run(
+            [sys.executable, "-m", "pytest", *options.split()],
+            cwd=tmp_path, env={**os.environ, "PYTHONPATH": paths, "LONG_RUNS": str(tmp_path / "long")},
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        (page,) = tmp_path.glob("planted-*.md")
+        said = page.read_text()
+        assert ended.returncode == 1, ended.stdout + ended.stderr
+        assert "2 pieces" in said
+        told = re.findall(r"test_planted\[(\w+)\]`: (.*found|[^-]*crashed)", said)
+        assert {what for what, _ in told} == {"fault", "crash", "hang"}
+        # what was done is not done again
+        assert (tmp_path / "begun-good").exists() != again
+        (tmp_path / "begun-good").unlink(missing_ok=True)

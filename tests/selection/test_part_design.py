@@ -105,7 +105,7 @@ class TestDesignsOfParts:
         ({"parts": ["vl53l8xc"], "sensors": 1}, "no part 'vl53l8xc'"),
         ({"parts": ["vl53l8cx"]}, "number of parts is missing"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "grid"}, "parts in the layout grid"),
-        ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "ray"}, "with --gates"),
+        ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "ray"}, "with gates"),
         ({"parts": [str(Path(__file__).parent)], "sensors": 1}, "holds no file"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "constraints": {"each": [{"gate": {"width_m": {"max": 1}}}]}}, "each"),
         (
@@ -127,7 +127,7 @@ def test_bounds_that_no_part_keeps_are_named(run):
 @pytest.mark.parametrize(
     ("options", "conflicts"),
     [
-        ({"sensors": 2, "rays": 1}, ["--rays", "--sensors"]),
+        ({"sensors": 2, "rays": 1}, ["rays", "sensors"]),
         ({"constraints": {"parts": {"count": 2}, "budget": {"rays": 1}}}, ["budget.rays", "parts.count"]),
         ({"constraints": {"parts": {"count": 1}, "sensors": {"count": 2}}}, ["sensors.count", "parts.count"]),
         ({"constraints": {"parts": {"count": 1}, "sensors": {"min": 2}}}, ["sensors.min", "parts.count"]),

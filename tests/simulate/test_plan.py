@@ -130,7 +130,7 @@ def test_choices_are_taken_as_they_are():
 
 
 def test_what_cannot_be_simulated_here_is_named_and_asking_for_it_is_refused(monkeypatch):
-    monkeypatch.setattr(plan_module.process, "missing", lambda: "not installed")
+    monkeypatch.setattr(plan_module.transport, "missing", lambda: "not installed")
     floor = Body(Box((3, 3, 0.05)), "floor", poses=rigid(translation_m=(0, 0, -0.3)))
     scene = Scene((*room().bodies, floor))
     decision = decisions(Planner(CONSUMER).plan(scene, [grid()]))["multipath"]

@@ -1,4 +1,4 @@
-"""The planner's promise in random scenes: `python -m soak.promise --count 2000`, with tests/ on PYTHONPATH.
+"""The planner's promise in random scenes.
 
 What a plan skips changes ranges by no more than its tolerance, rms over returns, and no more than its share of returns:
 ray by ray, with the same random numbers, against all effects but multipath, which needs another program.
@@ -6,9 +6,7 @@ ray by ray, with the same random numbers, against all effects but multipath, whi
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -206,24 +204,3 @@ def kept_promise(case: Case) -> Kept:
     # ranges of meshes are exact to float32
     most_m2 = (case.tolerance.range_m + 1e-6) ** 2
     return Kept(case, tuple(sorted(skipped)), math.sqrt(mean), share, mean - error > most_m2 or share > allowed)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Make random plans and print those that break their promise; 1 where there are any."""
-    parser = argparse.ArgumentParser(prog="python -m soak.promise", description=__doc__)
-    parser.add_argument("--count", type=int, default=2000, help="plans (default %(default)s)")
-    parser.add_argument("--first", type=int, default=0, help="the first seed (default %(default)s)")
-    given = parser.parse_args(arguments)
-    broken = skipping = 0
-    for seed in range(given.first, given.first + given.count):
-        kept = kept_promise(random_case(seed))
-        skipping += bool(kept.skipped)
-        if kept.broken:
-            broken += 1
-            print(f"seed {seed}: {kept}", flush=True)
-    print(f"{given.count} plans, {skipping} of which skip something; {broken} broke their promise")
-    return int(broken > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

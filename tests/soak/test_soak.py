@@ -5,13 +5,9 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
-from support.pieces import Pieces
-from support.result_pages import table
 from support.tables import each_row
 
 from lidardesign.config import resolve
@@ -22,14 +18,11 @@ from lidardesign.errors import InfeasibleError
 from lidardesign.registry import load_task
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.space import DesignSpace
-from soak import batches
 from soak.keeping import broken_bounds
 from soak.limits import Bounds, contradictions, drawn, kept_already
 from soak.plans import DIMENSIONS, MOST_SENSORS, SIGMA_SHARES, SIZES_M, random_plan
-from soak.runs_page import runs_page
 from soak.scaled_flatland import NAME, ScaledFlatlandTask, offer
-from soak.seeds import Learned, seeds_page
-from soak.whole_runs import BLIND, ROUGH, WHOLE, Record, whole_run
+from soak.whole_runs import WHOLE, whole_run
 
 PLANS = [random_plan(seed) for seed in range(300)]
 # Runs that are whole after a second of learning. 26: its range is fixed, which was a fault when the soak was first run.
@@ -183,62 +176,3 @@ def test_random_runs_are_whole_and_repeat_to_the_byte(offered, tmp_path, seed):
     assert record.outcome == WHOLE
     assert record.bounds > 0
     assert record.differences(whole_run(plan, tmp_path / "again")) == []
-
-
-def record_of(seed, **changes):
-    return dataclasses.replace(Record(seed, 1.0, 0.1, 3, 2, "grid"), **changes)
-
-
-def test_outcomes_tell_refusals_from_whole_runs_and_faults():
-    assert record_of(0).outcome == BLIND
-    assert record_of(0, ess=0.1, steps=[("learn", "", 0, 1.0), ("fit", "", 3, 1.0)]).outcome == ROUGH
-    assert record_of(0, ess=0.1, steps=[("learn", "", 0, 1.0), ("fit", "", 0, 1.0)]).outcome == WHOLE
-    assert record_of(0, ess=0.1, faults=["it ended"]).outcome == "fault"
-    one, other = (record_of(0, digests=found) for found in ({"a": "1", "b": "1"}, {"a": "2", "c": "1"}))
-    assert one.differences(other) == ["a", "b", "c"]
-
-
-@each_row(("code", "words"), [("import os; os._exit(3)", "ended with 3"), ("import time; time.sleep(60)", "hung")])
-def test_a_run_that_takes_its_process_down_or_hangs_is_a_fault_and_the_others_go_on(tmp_path, monkeypatch, code, words):
-    def started(seed, folder, _):
-        if seed != 8:
-            batches.keep(record_of(seed, ess=0.5), folder)
-        with (folder / f"record-{seed}.log").open("wb") as log:
-            return subprocess.Popen([sys.executable, "-c", code if seed == 8 else "pass"], stdout=log, stderr=log)
-
-    monkeypatch.setattr(batches, "LONGEST_RUN_S", 0.5 if words == "hung" else 600.0)
-    monkeypatch.setattr(batches, "_started", started)
-    asked = {"first": 7, "jobs": 1, "repeat_every": 0, "tell": lambda _: None}
-    records = batches.soak(2, tmp_path, Pieces("runs", tmp_path, lambda: "one"), **asked)
-    assert [(record["seed"], record["outcome"]) for record in records] == [(7, WHOLE), (8, "fault"), (9, WHOLE)]
-    assert words in records[1]["faults"][0]
-    monkeypatch.setattr(batches, "_started", None)  # nothing is left to be started
-    assert batches.soak(2, tmp_path, Pieces("runs", tmp_path, lambda: "one"), **asked) == records
-
-
-def test_what_an_ended_soak_did_is_read_and_its_page_names_the_runs_that_are_missing(tmp_path):
-    pieces = Pieces("runs", tmp_path, lambda: "one")
-    for seed in (30, 20, 21, 22, 24):
-        record = record_of(seed, ess=0.5)
-        pieces.keep(str(seed), {**dataclasses.asdict(record), "outcome": record.outcome})
-    records = batches.soak(0, tmp_path, pieces, first=0, jobs=1, repeat_every=0, tell=lambda _: None)
-    runs_page(tmp_path / "runs.md", records, "soak runs")
-    assert "seeds 23, 25, 26, 27, 28, 29." in (tmp_path / "runs.md").read_text()
-
-
-def test_pages_say_how_many_runs_were_whole_and_which_were_not(tmp_path):
-    whole = record_of(1, ess=0.5, bounds=9, repeated=True, steps=[("constrain", "drawn", 4, 0.1)])
-    fault = record_of(2, ess=0.5, faults=["fit.yaml breaks gate.end_m.max"])
-    records = [{**dataclasses.asdict(record), "outcome": record.outcome} for record in (whole, fault)]
-    runs_page(tmp_path / "runs.md", records, "soak runs")
-    text = (tmp_path / "runs.md").read_text()
-    assert "1 runs did all of learn, fit, constrain and evaluate" in text
-    assert "- seed 2: fit.yaml breaks gate.end_m.max" in text
-    assert table(("bounds", "asked"), [("drawn", 1)]).splitlines()[1] == "| --- | --- |"
-    document = {"ess": 0.5, "kl_nats": 0.1, "log_z": 0.0, "coverage": 0.9, "misplaced": 0.1, "seconds": 3.0}
-    learned = [Learned("face", "draft", seed, 0, {**document, "ess": ess}) for seed, ess in enumerate((0.5, 0.2))]
-    learned.append(Learned("face", "draft", 2, 5, {"error": {"message": "diverged"}}))
-    seeds_page(tmp_path / "seeds.md", learned, "seeds")
-    text = (tmp_path / "seeds.md").read_text()
-    assert "1 of 3 end with an ESS above 0.3 and a KL below 0.5 nats" in text.replace("\n", " ")
-    assert "seed 1: ESS 0.200; seed 2: exit 5: diverged" in text.replace("\n", " ")

@@ -62,7 +62,6 @@ class Record:
     bounds: int = 0  # that the second reader checked on written files
     faults: list[str] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)  # of what a second run has to repeat: documents and files
-    repeated: bool | None = None  # None where there was no second run
     seconds: float = 0.0  # of the processor
 
     @classmethod

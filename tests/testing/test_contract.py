@@ -19,7 +19,6 @@ from lidardesign.task import mount_of
 from lidardesign.testing import BrokenLawError, check_task, contract_of
 from lidardesign.testing.contract import LAWS
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
-from lidardesign.testing.law import restore_random_states
 
 METRIC = 'Metric("radius error", "mm", "lower", worst=100.0, tolerance=0.5)'
 DEFAULTS = 'Defaults(density={"sigma_m": 0.05})'
@@ -266,15 +265,6 @@ def test_a_fingerprint_is_of_the_content_alone():
     loop.append(loop)
     with pytest.raises(ValueError, match="hold themselves"):
         fingerprint(loop)
-
-
-def test_global_random_states_are_put_back():
-    drawn, state = [], np.random.get_state()[1].copy()  # noqa: NPY002
-    for _ in range(2):
-        with restore_random_states(drawn, "a test"):
-            np.random.seed(3)  # noqa: NPY002
-    assert (np.random.get_state()[1] == state).all()  # noqa: NPY002
-    assert drawn == ["numpy's random in a test"]
 
 
 def test_sensors_are_on_a_body_with_a_name_or_in_the_world():

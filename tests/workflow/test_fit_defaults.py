@@ -54,7 +54,6 @@ class TestWhatIsLeftOpen:
             ({"layout": "grid"}, "grid", BEST),
             ({"layout": "scan"}, "scan", None),
             ({"sensors": 2}, "selected", 2),
-            ({"sensors": "auto"}, "selected", "auto"),
             ({"sensors": 2, "layout": "density"}, "density", 2),
         ],
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import replace
 
@@ -18,7 +17,6 @@ from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.score import evaluate
-from lidardesign.export.registry import EXPORTERS
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import Samples, save_samples
@@ -201,27 +199,3 @@ def test_a_design_for_one_position_drives_along_the_aisle_as_it_is(lidardesign, 
     here, there = (lay_out(design, at={"x_m": x}) for x in (0.37, 3.0))
     np.testing.assert_array_equal(here.direction, there.direction)
     np.testing.assert_array_equal(here.gate_m, there.gate_m)
-
-
-@pytest.mark.parametrize("at", [(), ("--at", "x_m=0.37")], ids=["track", "here"])
-def test_every_format_is_written_at_a_position_and_tables_have_its_rays_there(lidardesign, aisle, tmp_path, at):
-    assert lidardesign("fit", aisle, "--layout", "scan", "--rays", 4, *at).code == 0
-    path = aisle / "designs" / "fit.yaml"
-    for name in EXPORTERS:
-        # a table of sensors is read again by its ending
-        out = tmp_path / f"out.{name}.csv"
-        result = lidardesign("export", path, "--format", name, "--at", "x_m=2.5", "--out", out.name, "--json")
-        if name == "galvo" and result.code:
-            # four rays across a whole shelf may be too far apart for two mirrors
-            assert result.code == 2
-            assert "degrees" in result.err
-            continue
-        assert result.code == 0, result.err
-    with np.load(tmp_path / "out.npz.csv") as arrays:
-        tables = [arrays["origin_x_m"]]
-    rows = list(csv.DictReader((tmp_path / "out.csv.csv").read_text().splitlines()))
-    tables.append(np.array([float(row["origin_x_m"]) for row in rows]))
-    sensors = load_design(tmp_path / "out.sensors-csv.csv").sensors
-    tables.append(np.array([sensor.origin_m[0] for sensor in sensors]))
-    for origins in tables:
-        np.testing.assert_array_equal(origins, np.full(4, 2.5))

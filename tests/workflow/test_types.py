@@ -75,5 +75,7 @@ def test_every_name_of_the_package_is_known_and_every_mistake_is_found(checked):
 def test_the_names_that_type_checkers_see_are_those_that_are_imported():
     for name in lidardesign.__all__:
         assert getattr(lidardesign, name) is not None
+    with pytest.raises(AttributeError):
+        lidardesign.nothing  # noqa: B018 - the attribute is asked for
     listed = {name for names in lidardesign._HOMES.values() for name in names.split()}
     assert listed == set(lidardesign.__all__) - {"__version__"}

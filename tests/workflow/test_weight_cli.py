@@ -110,16 +110,6 @@ def test_evaluate_lays_a_weighted_design_out_by_the_same_weighted_samples(lidard
     assert not np.allclose(plain.direction, by_hand(weighted, flat, 20).direction)
 
 
-def test_export_lays_a_weighted_design_out_by_the_same_weighted_samples(lidardesign, flat, weighted, tmp_path):
-    out = tmp_path / "rays.npz"
-    result = lidardesign("export", weighted, "--format", "npz", "--rays", 20, "--out", out)
-    assert result.code == 0, result.err
-    rays = by_hand(weighted, flat, 20)
-    with np.load(out) as written:
-        np.testing.assert_array_equal(written["gate_start_m"], rays.gate_m[:, 0])
-        np.testing.assert_allclose(written["direction_z"], rays.direction[:, 2], atol=1e-12)
-
-
 def test_constrain_keeps_how_a_design_was_weighted(lidardesign, flat, weighted):
     found = succeeded(lidardesign, "constrain", weighted, "--gates", "ray", "--set", "gate.width_m.max=0.6")
     assert found["satisfied"]
@@ -128,9 +118,7 @@ def test_constrain_keeps_how_a_design_was_weighted(lidardesign, flat, weighted):
 
 
 OTHER_VERSIONS = {
-    "factors": {"factors": {"points_m": [[0.3, 0.8, 0.0]], "log_factors": [1.2]}},
     "a spread": {"set": [SETTING], "range_spread_m": 0.04},
-    "a text": {"set": SETTING},
     "a list": [SETTING],
 }
 
@@ -174,11 +162,10 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("command", ["fit", "constrain"])
 @pytest.mark.parametrize("name", WRONG)
-def test_weights_that_cannot_be_are_refused_by_the_options_name(lidardesign, runs, name, command):
+def test_weights_that_cannot_be_are_refused_by_the_options_name(lidardesign, runs, name):
     task, text, words = WRONG[name]
-    result = lidardesign(command, runs[task], "--weight", text)
+    result = lidardesign("fit", runs[task], "--weight", text)
     assert result.code == 2
     assert f"--weight {text}" in result.err
     assert words in result.err
@@ -211,16 +198,3 @@ def _on_disc(points):
     distance = [np.linalg.norm(seen - centre, axis=1) - radius for centre, radius in (
         ((0.30, 0.65, 0), 0.09), ((0.68, 0.80, 0), 0.13))]  # fmt: skip
     return np.abs(np.min(distance, axis=0)) < 0.15
-
-
-def test_settings_that_leave_no_weight_are_refused(lidardesign, runs, tmp_path):
-    run = shutil.copytree(runs["flatland"], tmp_path / "run")
-    samples = load_samples(run)
-    # all samples are far from where any curve is
-    points = samples.points.copy()
-    points[:, RANGE] = np.linspace(0.0, 0.1, len(points))
-    save_samples(Samples(points, samples.log_prob, samples.log_target, samples.space), run)
-    result = lidardesign("fit", run, "--weight", "scene=discs", "--weight", "train=1")
-    assert result.code == 3
-    assert "samples count as only" in result.err
-    assert "a setting nearer to the learned one" in result.err
