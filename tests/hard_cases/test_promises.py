@@ -239,7 +239,7 @@ print("ready", flush=True)
 for step in range(1, 100_000):
     save_arrays(Path(sys.argv[1]), "checkpoint.safetensors", {"weights": np.full(20_000, float(step))}, {"step": step})
 """
-KILLS = 6
+KILLS = 3
 
 
 @hard_case(
