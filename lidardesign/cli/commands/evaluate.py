@@ -259,9 +259,7 @@ def evaluate(
 
 def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
     with output.progress("evaluating") as progress:
-        return request.score(
-            lambda scene, done, total: progress.show(done, total), search_display(request, progress)
-        )
+        return request.score(lambda scene, done, total: progress.show(done, total), search_display(request, progress))
 
 
 def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDisplay) -> Show:

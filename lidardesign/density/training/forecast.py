@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import torch
 from lidardesign.config import RunConfig
 from lidardesign.density.learn import TrainingData, choose_device, make_trainer, on_one_thread
 from lidardesign.density.training.sampling import draw_samples
-from lidardesign.density.training.training import Trainer
+from lidardesign.density.training.training import Trainer, least_balancing_steps
 from lidardesign.run.clock import peak_memory_bytes, phase
 
 TIMED_STEPS = 6
@@ -33,12 +34,15 @@ def forecast(
     pathwise_s = _seconds(lambda: _try_step(trainer, 0)) if pathwise else 0.0
     balancing_s = _seconds(lambda: _try_step(trainer, pathwise))
     sampling_s = _seconds(lambda: draw_samples(trainer.learned(), TIMED_POINTS)) * learning.samples / TIMED_POINTS
-    steps_s = pathwise * pathwise_s + (learning.steps - pathwise) * balancing_s
+    balanced = learning.steps - pathwise
+    if time_budget_s is not None:
+        in_time = (time_budget_s - pathwise * pathwise_s) / balancing_s
+        balanced = min(balanced, max(math.ceil(in_time), least_balancing_steps(pathwise)))
     return {
-        "steps": learning.steps,
+        "steps": pathwise + balanced,
         "pathwise_s": pathwise_s,
         "balancing_s": balancing_s,
-        "seconds": (steps_s if time_budget_s is None else min(steps_s, time_budget_s)) + sampling_s,
+        "seconds": pathwise * pathwise_s + balanced * balancing_s + sampling_s,
         "peak_memory_bytes": peak_memory_bytes(),
         "gpu_memory_bytes": torch.cuda.max_memory_allocated(place) if place.type == "cuda" else None,
     }

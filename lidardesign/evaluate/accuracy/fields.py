@@ -249,5 +249,3 @@ def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: Dens
         if body.is_target
     ]
     return BodyField(place_bodies(entries, len(columns), build))
-
-

@@ -299,9 +299,7 @@ class CmaCandidate:
         seconds = time.perf_counter() - began
         return sensors.rays(best), SearchRecord(count, sensors.count, len(best), seconds, candidates, scenes, *values)
 
-    def _values(
-        self, sensors: MovableSensors, vectors: Sequence[np.ndarray], stop: Callable[[], bool]
-    ) -> np.ndarray:
+    def _values(self, sensors: MovableSensors, vectors: Sequence[np.ndarray], stop: Callable[[], bool]) -> np.ndarray:
         """Scores of vectors, lower is better, shape (L,)."""
         lists = [sensors.rays(vector) for vector in vectors]
         excess = np.array([sensors.excess(positions) for positions in lists])
