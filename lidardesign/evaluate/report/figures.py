@@ -28,21 +28,6 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
-SYMBOLS = {
-    "o": "circle",
-    "s": "square",
-    "^": "triangle-up",
-    "D": "diamond",
-    "v": "triangle-down",
-    "P": "cross",
-    "x": "x-thin-open",
-    "+": "cross-thin-open",
-    "*": "asterisk-open",
-    "1": "y-down-open",
-    "d": "diamond-tall-open",
-}
-DASH_NAMES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
-
 
 FAR_SHARE = 0.5  # of the worst design's score: rivals that are always worse by more are hidden at first
 
@@ -124,10 +109,10 @@ def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
         "line": {
             "color": curve.colour,
             "width": 1.5 if curve.baseline else 2.5,
-            "dash": DASH_NAMES[curve.dash],
+            "dash": curve.dash,
         },
         "marker": {
-            "symbol": SYMBOLS[curve.marker],
+            "symbol": curve.marker,
             "size": 8,
             "color": curve.colour,
             "line": {"color": curve.colour, "width": 1.5},
@@ -164,7 +149,7 @@ def marginal_figure(marginal: Marginal, looks: Mapping[str, Series]) -> dict[str
     lines = [
         {
             **_steps(marginal.edges, heights),
-            "line": {"color": looks[name].colour, "width": 2, "dash": DASH_NAMES[looks[name].dash]},
+            "line": {"color": looks[name].colour, "width": 2, "dash": looks[name].dash},
             "name": html.escape(name),
             "hovertemplate": "%{y:.3g}<extra>%{fullData.name}</extra>",
         }

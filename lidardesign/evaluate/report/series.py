@@ -25,9 +25,10 @@ OUTCOME_WORDS = {
 # Okabe and Ito 2008, without yellow (too faint on white) and with black kept for text.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 GREYS = ("#555555", "#808080", "#222222", "#999999", "#6b6b6b")
-MARKERS = ("o", "s", "^", "D", "v", "P")
-BASELINE_MARKERS = ("x", "+", "*", "1", "d")
-DASHES = ("solid", "dashed", "dashdot", "dotted")
+# By plotly's names, as dashes are.
+MARKERS = ("circle", "square", "triangle-up", "diamond", "triangle-down", "cross")
+BASELINE_MARKERS = ("x-thin-open", "cross-thin-open", "asterisk-open", "y-down-open", "diamond-tall-open")
+DASHES = ("solid", "dash", "dashdot", "dot")
 # Labels of a logarithmic axis: at these times every power of ten, the few where the values span more than the factor.
 FEW_MANTISSAS, MANY_MANTISSAS, WIDE_FACTOR = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0), 30.0
 TICK_MARGIN = 1.2
