@@ -15,6 +15,8 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.files import write_atomic
 from lidardesign.run.outputs import check_outputs
 
+PAGE_SUFFIXES = (".html", ".htm")
+
 
 @contextlib.contextmanager
 def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
@@ -34,9 +36,6 @@ def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
                 "is not a folder, and this is a folder of files", where=str(path), hint="give a folder's name"
             )
         write_atomic(path, staged.read_bytes())
-
-
-PAGE_SUFFIXES = (".html", ".htm")
 
 
 def claim_outputs(output: Output, *, csv: Path | None = None, report: Path | None = None) -> None:

@@ -263,7 +263,7 @@ def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
 
 
 def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDisplay) -> Show:
-    """What shows the best score of each search, in a line of its own."""
+    """Shows the best score of each search, in a line of its own."""
 
     def show(label: str, share: float, best: float) -> None:
         found = f"best {best:.4g} {request.run.metric.unit}"

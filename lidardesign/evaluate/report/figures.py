@@ -1,9 +1,7 @@
-"""The figures of the report and of notebooks, as plain plotly documents.
+"""The curves of scores and the learned density as plain plotly documents, for the report and for notebooks.
 
 plotly reads a little HTML in names, so every name is escaped here. Legends are in the page itself, where they can be
 switched from the keyboard too.
-
-They are the curves of scores, and the learned density: marginals beside those of designs, and the field it observes.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""Small pieces of the report's markup: sections, figures, folds, and swatches that tell lines apart without colour.
+"""The report's frame (head, style, scripts, a policy that forbids every connection) and small pieces of its markup.
 
 Everything that comes from outside is escaped here or where it is put in.
-
-The frame of the report's page: head, style, scripts, and a policy that forbids every connection.
 """
 
 from __future__ import annotations

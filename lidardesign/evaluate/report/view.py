@@ -1,10 +1,9 @@
 """The report's section with the 3D view: its switches, sliders and buttons, and the data that it is drawn from.
 
-What the report's 3D view is drawn from, as one JSON document: numbers as base64 of little-endian arrays.
-
-Bodies at rest are merged, moving ones keep their own frame and a pose per frame; sensors are a few numbers each, and
-the page draws their fields of view and gates; a ray is where it starts, where it looks, how far it goes and what
-becomes of it. The page's script (`assets/scene.js`) puts together what is switched on.
+The data are one JSON document, numbers as base64 of little-endian arrays. Bodies at rest are merged, moving ones keep
+their own frame and a pose per frame; sensors are a few numbers each, and the page draws their fields of view and gates;
+a ray is where it starts, where it looks, how far it goes and what becomes of it. The page's script
+(`assets/scene.js`) puts together what is switched on.
 """
 
 from __future__ import annotations
