@@ -308,9 +308,8 @@ class Trainer(LearnedFlow):
         }
         append_line(self.run / PROGRESS, json.dumps(row))
         if progress:
-            steps, left = self.settings.steps, seconds / self.step * (self.settings.steps - self.step)
-            if self.is_over is not None:
-                steps = left = None
+            steps = self.settings.steps if self.is_over is None else None
+            left = None if steps is None else seconds / self.step * (steps - self.step)
             progress(LearnProgress(self.step, steps, loss, ess, seconds, left))
 
     def _advance(self) -> tuple[float, float]:
