@@ -80,7 +80,7 @@ def __dir__() -> list[str]:
 
 
 def _is_cache(folder: str) -> bool:
-    """Whether numba can keep compiled code in a user's cache folder, which may still have to be made."""
+    """True for a user's cache folder, made or not, in which numba can keep compiled code."""
     place = os.path.abspath(os.path.join(folder, "numba"))
     while not os.path.lexists(place):
         place = os.path.dirname(place)

@@ -193,8 +193,10 @@ def _invoke(arguments: list[str]) -> int:
     except typer.Abort:
         return report_error(KeyboardInterrupt(), output)
     except SystemExit as error:
-        # neither typer nor rich exits by itself here but for a closed pipe
-        raise BrokenPipeError from error
+        # typer ends like this once completion is shown or installed, rich where nobody reads any more
+        if error.code:
+            raise BrokenPipeError from error
+        return 0
     except BrokenPipeError:
         raise
     except Exception as error:

@@ -238,7 +238,7 @@ class StrictCommand(TyperCommand):
 
 
 def _texts(given: Any) -> list[str]:
-    """What a command line gives for a parameter: nothing, one text, or several."""
+    """The texts of a command line for a parameter: none, one, or several."""
     return [text for text in (given if isinstance(given, list | tuple) else [given]) if isinstance(text, str)]
 
 

@@ -1,4 +1,4 @@
-"""What commands print and how they end: one JSON document or text for people, messages, exit codes."""
+"""Output of commands: one JSON document or text for people, messages, exit codes."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def plain_json(value: Any) -> Any:
 
 @dataclass
 class Output:
-    """Where a command's output goes.
+    """The output of a command.
 
     Arguments:
         json: Print one JSON document on stdout and nothing else there.
@@ -96,7 +96,7 @@ class Output:
             print_message(text)
 
     def says(self, note: str) -> bool:
-        """Whether people are told a note."""
+        """True where people are told a note."""
         return not self.quiet and (self.verbose or not isinstance(note, BackgroundNote))
 
     def remark(self, text: str) -> None:
@@ -174,7 +174,7 @@ class Output:
             print_message(f"what could not be written is kept in {place}")
 
     def progress(self, label: str) -> ProgressDisplay:
-        """How far work has come: a bar on a terminal, elsewhere a line now and then; nothing with --quiet."""
+        """A bar of progress on a terminal, elsewhere a line now and then; nothing with --quiet."""
         on_terminal = not self.quiet and sys.stderr.isatty()
         return ProgressDisplay(label, self.note, self.rich(stderr=True) if on_terminal else None)
 

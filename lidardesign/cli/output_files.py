@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from shlex import quote
 
-from lidardesign.cli.output import Output
+from lidardesign.cli.output import STDOUT, Output
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.files import write_atomic
 from lidardesign.run.outputs import check_outputs
+
+PAGE_SUFFIXES = (".html", ".htm")
 
 
 @contextlib.contextmanager
@@ -34,15 +38,7 @@ def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
         write_atomic(path, staged.read_bytes())
 
 
-PAGE_SUFFIXES = (".html", ".htm")
-
-
-def claim_outputs(
-    output: Output,
-    *,
-    csv: Path | None = None,
-    report: Path | None = None,
-) -> None:
+def claim_outputs(output: Output, *, csv: Path | None = None, report: Path | None = None) -> None:
     """Claim what a command will write: a page for the report, and places that can be written.
 
     Raises:
@@ -59,11 +55,16 @@ def claim_outputs(
             allowed=", ".join(PAGE_SUFFIXES),
             hint=f"--report {quote(str(report.with_suffix('.html')))}; a browser prints it as PDF",
         )
-    note_new_folders([path for path in (csv, report) if path is not None], output)
+    announce([path for path in (csv, report) if path is not None], output)
 
 
-def note_new_folders(paths: Iterable[Path], output: Output) -> None:
-    """Say which folders are made for files, so that a misspelt one is seen; each once, by its topmost new part."""
+def announce(paths: Sequence[Path], output: Output) -> None:
+    """Say which folders are made for files, so that a misspelt one is seen; each once, by its topmost new part.
+
+    Where one of the files is standard output, people read everything else on standard error.
+    """
+    if not output.json and any(map(_is_stdout, paths)):
+        output.stream = sys.stderr
     new: dict[Path, Path] = {}
     for path in paths:
         missing = [parent for parent in path.parents if not parent.exists()]
@@ -71,3 +72,10 @@ def note_new_folders(paths: Iterable[Path], output: Output) -> None:
             new.setdefault(missing[-1], path)
     for folder, path in new.items():
         output.note(f"note: the folder {folder} does not exist yet; it is created for {path}")
+
+
+def _is_stdout(path: Path) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(STDOUT))
+    except OSError:
+        return False

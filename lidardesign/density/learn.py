@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -22,13 +24,20 @@ from lidardesign.density.target.visibility import common_receiver
 from lidardesign.density.training.checkpoint import clear_snapshots, save_flow
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import IndependentProbes, draw_probes, measure
-from lidardesign.density.training.training import PROGRESS, STOPPING_POINTS, LearnProgress, Trainer
+from lidardesign.density.training.sampling import draw_samples
+from lidardesign.density.training.training import (
+    PROGRESS,
+    STOPPING_POINTS,
+    LearnProgress,
+    Trainer,
+    least_balancing_steps,
+)
 from lidardesign.density.verdict import Verdict
 from lidardesign.errors import BackgroundNote, ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.geometry.frames import in_view
 from lidardesign.registry import plugin_guard
-from lidardesign.run.clock import phase, running
+from lidardesign.run.clock import peak_memory_bytes, phase, running
 from lidardesign.run.manifest import note, record
 from lidardesign.samples import save_samples
 from lidardesign.scene import Scene
@@ -266,3 +275,50 @@ def make_flow(config: RunConfig, generator: torch.Generator) -> DesignFlow:
         periodic=[config.space.free[n] == AZIMUTH and config.space.full_azimuth for n in coordinates.learned],
         generator=generator,
     )
+
+
+# Steps and samples that a forecast times.
+TIMED_STEPS = 6
+TIMED_POINTS = 2048
+
+
+@phase("planning")
+@on_one_thread()
+def forecast(
+    data: TrainingData, config: RunConfig, run: Path, device: str, time_budget_s: float | None
+) -> dict[str, Any]:
+    """Time of single steps, the most that all take with the samples after them [s], and the memory held [bytes].
+
+    Nothing is written. A balancing step on a learned density may take longer than on the untrained one that is timed.
+    """
+    place, learning = choose_device(device), config.learning
+    trainer, pathwise = make_trainer(data, config, run, place), learning.pathwise_steps
+    pathwise_s = _seconds(lambda: _try_step(trainer, 0)) if pathwise else 0.0
+    balancing_s = _seconds(lambda: _try_step(trainer, pathwise))
+    sampling_s = _seconds(lambda: draw_samples(trainer.learned(), TIMED_POINTS)) * learning.samples / TIMED_POINTS
+    balanced = learning.steps - pathwise
+    if time_budget_s is not None:
+        in_time = math.ceil((time_budget_s - pathwise * pathwise_s) / balancing_s)
+        balanced = min(balanced, max(in_time, least_balancing_steps(pathwise)))
+    return {
+        "steps": pathwise + balanced,
+        "pathwise_s": pathwise_s,
+        "balancing_s": balancing_s,
+        "seconds": pathwise * pathwise_s + balanced * balancing_s + sampling_s,
+        "peak_memory_bytes": peak_memory_bytes(),
+        "gpu_memory_bytes": torch.cuda.max_memory_allocated(place) if place.type == "cuda" else None,
+    }
+
+
+def _try_step(trainer: Trainer, step: int) -> None:
+    trainer.step = step
+    trainer.find_gradient()
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    """Mean time of a call [s], without the first one, which may have to compile."""
+    call()
+    started = time.perf_counter()
+    for _ in range(TIMED_STEPS):
+        call()
+    return (time.perf_counter() - started) / TIMED_STEPS

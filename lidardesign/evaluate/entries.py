@@ -63,7 +63,7 @@ class Entry:
         return len(self.positions[0])
 
     def mbps(self, bandwidth: Bandwidth) -> float:
-        """What its rays cost to read out, averaged over condition values [Mbit/s]."""
+        """The bandwidth of its rays, averaged over condition values [Mbit/s]."""
         return mean_mbps(self.positions, bandwidth)
 
     def drawn(self, scene: int) -> RaysPerCondition:
@@ -132,7 +132,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
 
 
 def has_gates_per_ray(design: DesignSpec) -> bool:
-    """Whether a design's rays have gates of their own, be it that each is a sensor."""
+    """True for a design whose rays have gates of their own, be it that each is a sensor."""
     return gates_of(design) == "ray" or layout_of(design).one_sensor_per_ray
 
 

@@ -1,6 +1,4 @@
-"""The checked score of lists of rays in a scene.
-
-One pass over scenes: many sets of rays, scored in each scene under the effects that it calls for.
+"""Scores of many sets of rays in every scene, each scene under the effects that it calls for.
 
 A scene is the unit of work: all its rays are planned and traced together, and what comes of it depends on nothing
 else. So scenes can be scored one after the other here, or by workers (`lidardesign.evaluate.workers`), to the same

@@ -233,7 +233,7 @@ def _check_cluster(client: Any, task: Task) -> None:
 
 
 def _answered(connect: Callable[[], Any]) -> Any:
-    """What a connection comes to; the client itself waits for ever where something else than a scheduler listens.
+    """The result of a connection; the client itself waits for ever where something else than a scheduler listens.
 
     Raises:
         TimeoutError: Nothing came of it.

@@ -80,7 +80,7 @@ class Child:
 
     @property
     def alive(self) -> bool:
-        """Whether it runs, and is this process's own."""
+        """True while it runs, in the process that started it."""
         return self.owner == os.getpid() and self._process.poll() is None
 
     @property
@@ -132,7 +132,7 @@ class Child:
         return found
 
     def _died_of(self, deadline: float, when: str) -> str | None:
-        """How it ended; None where it only closed its stream and hangs until the deadline and a little longer."""
+        """Its end in words; None where it only closed its stream and hangs until the deadline and a little longer."""
         try:
             code = self._process.wait(max(deadline - time.monotonic(), 0.0) + GRACE_SECONDS)
         except subprocess.TimeoutExpired:

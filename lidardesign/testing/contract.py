@@ -1,6 +1,6 @@
 """The whole contract of a task plugin, law by law, each tried once.
 
-Laws of what a task does to the process that runs it: random state and time.
+The laws of random state and time stand here, those of what a task gives in the modules beside.
 """
 
 from __future__ import annotations

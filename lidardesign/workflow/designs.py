@@ -118,7 +118,7 @@ class Design(DesignSource):
         """Fit it again in its run; what is not given stays as it is.
 
         Arguments:
-            sensors: How many, or "best".
+            sensors: How many, or "best": as many as score best on training scenes.
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
             layout: grid, density, scan, distributed, selected or spinning.
@@ -232,7 +232,7 @@ class Design(DesignSource):
         return design_figure(self.specification, None if count is None else self.rays(count))
 
     def as_dict(self) -> dict[str, Any]:
-        """What `lidardesign fit --json` prints of it: sensors, and what the fit found."""
+        """The document of `lidardesign fit --json`: sensors, and what the fit found."""
         place = self.name if self.path is None else str(self.path)
         certificates = certificates_of(self.specification)
         further = {CERTIFICATES: certificates} if certificates else {}
@@ -372,7 +372,7 @@ def judging_run(designs: Sequence[Design], judge: RunFolder | None, notes: Notes
 
 
 def _settings(run: RunFolder) -> tuple[Any, ...]:
-    """What runs share whose designs are scored in the same scenes."""
+    """Equal for runs whose designs can be scored in the same scenes."""
     return run.config.task_name, scoring_settings(run.task, run.config.task), run.config.space
 
 

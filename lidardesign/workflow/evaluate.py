@@ -48,7 +48,7 @@ COMMAND = "evaluate"
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreOptions:
-    """What a user may choose for an evaluation.
+    """A user's choices for an evaluation.
 
     Arguments:
         rays: Numbers of rays per frame; the task's by default, and those of fixed patterns.
@@ -119,11 +119,11 @@ class ScoreOptions:
             )
 
     def misplacement(self) -> MountError | None:
-        """How carelessly sensors are mounted in further rows."""
+        """Standard deviations of misplaced sensors in further rows; None without these."""
         return None if self.mount_error is None else MountError.parse(self.mount_error)
 
     def planner(self) -> tuple[Planner, bool]:
-        """How effects are chosen, and whether the choice is audited.
+        """The choice of effects, and True where it is audited.
 
         Raises:
             ConfigError: An unknown effect or detector.
@@ -265,7 +265,7 @@ class ScoreRequest:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """What designs and baselines score on held-out scenes, and how they differ, scene by scene.
+    """Scores of designs and baselines on held-out scenes, and their differences, scene by scene.
 
     `run.evaluate([...])` gives scores.
 
@@ -303,7 +303,7 @@ class Scores:
         return self.evaluation.paired
 
     def as_dict(self) -> dict[str, Any]:
-        """What `lidardesign evaluate --json` prints of them."""
+        """The document of `lidardesign evaluate --json`."""
         return {**self.evaluation.as_dict(), "set": list(settings_texts(self.request.options.settings))}
 
     def check(self) -> None:
@@ -316,7 +316,7 @@ class Scores:
         names_arguments(check_scores)(self)
 
     def last_scores(self) -> dict[str, Any]:
-        """What the run's manifest keeps of them: the scores of the designs that lie in the run."""
+        """The entry of the run's manifest: the scores of the designs that lie in the run."""
         folder = (self.run.folder / DESIGN_FOLDER).resolve()
         files = {one.name: one.path for one in self.request.designs if one.path and one.path.resolve().parent == folder}
         return {SCORES: last_scores_of(self.evaluation, files, settings_texts(self.request.options.settings))}

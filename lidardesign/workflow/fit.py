@@ -110,7 +110,6 @@ class FitRequest:
         channels: Rings of each sensor that spins.
         names: What sensors are called, where there are as many; none numbers them.
         command: For the design's provenance.
-        files: Files that were read for it.
     """
 
     run: RunFolder

@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress, LearnResult
 
 LOCK = ".lock"
-# A run has begun once it has its configuration, which is written last; snapshots are of no use without a checkpoint.
-# How the folders beside a run that is replaced are called: of the new run, and of the old one for an instant.
+# Endings of the folders beside a run that is replaced: of the new run, and of the old one for an instant.
 NEW, OLD = ".new", ".old"
+# A run has begun once it has its configuration, which is written last; snapshots are of no use without a checkpoint.
 STARTED_FILES = {CONFIGURATION, MANIFEST, "progress.jsonl", "snapshots"}
 CHECKPOINTS = "checkpoint*"
 LEARNED_FILES = (
@@ -56,7 +56,7 @@ MOST_STEPS = 100_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class LearnOptions:
-    """What a user may choose for learning.
+    """A user's choices for learning.
 
     Arguments:
         out: The run folder to make; runs/TASK by default.
@@ -104,7 +104,7 @@ class LearnOptions:
 
 @dataclass(frozen=True, eq=False)
 class LearnRequest:
-    """What is learned where.
+    """A task to learn, with its settings and its folder.
 
     Arguments:
         task: The task.
@@ -175,17 +175,17 @@ class LearnRequest:
 
     @property
     def has_checkpoint(self) -> bool:
-        """Whether there is one to go on from."""
+        """True where a run is resumed that has a checkpoint."""
         return self.begun and any(self.place.glob(CHECKPOINTS))
 
     @phase("scenes")
     def task_notes(self) -> list[str]:
-        """What the task has to say of its configuration, before anything takes time."""
+        """The task's own notes on its configuration, before anything takes time."""
         with plugin_guard(self.task.name):
             return notes_of(self.task, self.settings.task, self.settings.space)
 
     def scale_notes(self) -> list[str]:
-        """What is wrong with the lengths of the training scenes, which are made for it, of the space and of sigma.
+        """Notes on lengths that do not fit together: of training scenes, which are made for it, the space and sigma.
 
         Raises:
             DataError: There are no training scenes.
@@ -205,8 +205,7 @@ class LearnRequest:
             ConfigError, DataError: Unusable settings or scenes, or a folder that cannot be written.
         """
         with phase("libraries"):
-            from lidardesign.density.learn import prepare_training_data
-            from lidardesign.density.training.forecast import forecast
+            from lidardesign.density.learn import forecast, prepare_training_data
 
         settings, writes = self.settings, [f"{self.folder}/{name}" for name in LEARNED_FILES]
         for path in writes:
@@ -279,7 +278,7 @@ class LearnRequest:
         return replace(result, notes=(*result.notes, BackgroundNote(f"{result.steps} steps in {budget_s:g} s")))
 
     def resume_hint(self) -> str:
-        """What an interruption leaves, and how to go on from there."""
+        """The last checkpoint and the command that goes on from there, after an interruption."""
         checkpoints = sorted(path.name for path in self.place.glob(CHECKPOINTS))
         if checkpoints:
             rest = f"the last checkpoint is {self.place / checkpoints[-1]}"
@@ -308,7 +307,7 @@ class LearnRequest:
 
 
 def result_document(result: LearnResult) -> dict[str, Any]:
-    """What `lidardesign learn --json` prints of a result."""
+    """The document of `lidardesign learn --json`."""
     figures = ("task", "seconds", "steps", "ess", "kl_nats", "log_z", "coverage", "misplaced")
     return {
         "run": str(result.run),
@@ -373,7 +372,7 @@ def check_can_start(run: Path) -> None:
 
 
 def _holds_run(folder: Path) -> bool:
-    """Whether there is a run to replace; a folder without anything in it is none.
+    """True where a folder has a run to replace; a folder without anything in it has none.
 
     Raises:
         ConfigError: It holds something else, somebody is writing it, or what replaced a run before is left.
@@ -423,7 +422,7 @@ def put_in_place(folder: Path) -> None:
 
 
 def _was_killed_before_it_began(run: Path) -> bool:
-    """Whether a folder holds nothing but what a start that was killed leaves; an empty one does."""
+    """True for a folder that is empty, or holds only what a start that was killed leaves."""
     names = {entry.name for entry in run.iterdir()}
     return CONFIGURATION not in names and all(
         name in STARTED_FILES or name == LOCK or is_temporary(name) for name in names

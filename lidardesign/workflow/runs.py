@@ -36,7 +36,7 @@ FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
 
 @dataclass(frozen=True)
 class LearnedQuality:
-    """How good a learned density is.
+    """The quality of a learned density.
 
     Arguments:
         ess: Effective share of the samples, 0 to 1.
@@ -97,7 +97,7 @@ class Run(RunFolder):
 
     @property
     def quality(self) -> LearnedQuality:
-        """How good the learned density is.
+        """The quality of the learned density.
 
         Raises:
             DataError: Learning did not end, or the manifest is damaged.
@@ -186,7 +186,7 @@ class Run(RunFolder):
         return [Design(read_design(path), self, path) for path in self.design_paths()]
 
     def summary(self) -> dict[str, Any]:
-        """What the run has: how good its density is, designs with what they scored last, and what can be done next.
+        """The quality of the density, the designs with their last scores, and commands that go on from here.
 
         Raises:
             DataError: The manifest is damaged.
@@ -372,8 +372,8 @@ def learn(
         device: auto, cpu or cuda.
         resume: Continue an interrupted run.
         overwrite: Replace a run that is in the folder, once the new one is learned.
-        tolerance: Learn until at most this share of the density's mass is in the wrong place.
-        time_budget_s: Learn as long as all of it ends within this time [s].
+        tolerance: The setting learning.misplaced, which has to be reached: the share of mass in the wrong place.
+        time_budget_s: Steps are taken until this time has passed; measuring comes after [s].
         progress: Called about every tenth step with "learning", the steps done, and all steps, where that is known.
         notes: Called with every note; they are logged by default.
 

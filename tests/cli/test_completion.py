@@ -50,6 +50,12 @@ def test_what_fails_while_a_shell_asks_says_nothing():
     assert (failed.returncode, failed.stdout, failed.stderr) == (1, "", "")
 
 
+def test_the_script_of_a_shell_is_shown():
+    command = [sys.executable, "-m", "lidardesign", "--show-completion", "bash"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "_LIDARDESIGN_COMPLETE" in done.stdout
+
+
 @each_row("name", completion.detectors())
 def test_every_detector_that_is_offered_is_one(name):
     load_detector(name)

@@ -52,4 +52,5 @@ def test_learning_foresees_its_time_from_real_steps(lidardesign, monkeypatch, fu
     assert found["pathwise_s"] > SLOW_S or pathwise == 0
     all_s = pathwise * found["pathwise_s"] + (found["steps"] - pathwise) * found["balancing_s"]
     assert found["seconds"] == pytest.approx(min(all_s, 60.0), abs=1.0)
+    assert found["steps"] < 60.0 / SLOW_S
     assert found["peak_memory_bytes"] > 0

@@ -207,3 +207,11 @@ def test_one_kind_of_progress_says_how_far_everything_has_come(tmp_path):
     assert said[-1] == ("choosing 8 rays", None, None)
     run.evaluate([design], rays=[8], baselines=["none"], progress=lambda *now: said.append(now))
     assert said[-1][1:] == (2, 2)
+
+
+def test_steps_are_not_counted_down_where_time_decides(tmp_path):
+    said = []
+    lidardesign.learn(
+        "flatland", out=tmp_path / "run", settings=SMALL, time_budget_s=1.0, progress=lambda *now: said.append(now)
+    )
+    assert all(now[1] > 0 and now[2] is None for now in said)

@@ -114,12 +114,13 @@ def capture(
             evaluation = evaluate_capture(captured, named, settings)
         for note in evaluation.notes:
             output.remark(note)
-        written: list[Path] = []
+        written: dict[str, Path] = {}
 
         def show_result() -> None:
-            document = {"capture": str(file), **evaluation.as_dict(), "files": [str(path) for path in written]}
-            files = dict(zip(("csv",), written, strict=False))
-            output.result(document, lambda rich: _show(document, evaluation, rich, verbose=output.verbose), files=files)
+            document = {"capture": str(file), **evaluation.as_dict(), "files": [str(path) for path in written.values()]}
+            output.result(
+                document, lambda rich: _show(document, evaluation, rich, verbose=output.verbose), files=written
+            )
 
         with ExitStack() as rest:  # the scores are shown whatever becomes of the file
             rest.callback(show_result)
@@ -128,7 +129,7 @@ def capture(
             if csv is not None:
                 with phase("writing"):
                     write_csv(evaluation, csv)
-                written.append(csv)
+                written["csv"] = csv
 
 
 def _rays_and_run(path: Path, count: int | None, at: dict[str, float], output: Output) -> tuple[Rays, Path | None]:

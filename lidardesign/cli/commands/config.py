@@ -11,7 +11,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.completion import tasks, words
 from lidardesign.cli.output import Output, command
-from lidardesign.cli.output_files import note_new_folders
+from lidardesign.cli.output_files import announce
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_writable
@@ -96,7 +96,7 @@ def _write(text: str, document: dict[str, Any], out: Path | None, output: Output
     from lidardesign.run.files import write_atomic
 
     if out is not None:
-        note_new_folders([out], output)
+        announce([out], output)
         with phase("writing"):
             write_atomic(out, text)
     if output.json:

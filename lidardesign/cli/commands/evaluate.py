@@ -259,13 +259,11 @@ def evaluate(
 
 def _score(request: ScoreRequest | SeedsRequest, output: Output) -> Scores:
     with output.progress("evaluating") as progress:
-        return request.score(
-            lambda scene, done, total: progress.show(done, total), search_display(request, progress)
-        )
+        return request.score(lambda scene, done, total: progress.show(done, total), search_display(request, progress))
 
 
 def search_display(request: ScoreRequest | SeedsRequest, progress: ProgressDisplay) -> Show:
-    """What shows the best score of each search, in a line of its own."""
+    """Shows the best score of each search, in a line of its own."""
 
     def show(label: str, share: float, best: float) -> None:
         found = f"best {best:.4g} {request.run.metric.unit}"

@@ -11,7 +11,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.completion import formats
 from lidardesign.cli.output import Output, command, keep_times
-from lidardesign.cli.output_files import note_new_folders, written_file
+from lidardesign.cli.output_files import announce, written_file
 from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
@@ -87,7 +87,7 @@ def export(
         source = DesignSource(read_design(design, output.remark), path=design)
         target = export_target(design, out, exporter)
         request = ExportRequest(source, exporter, target, rays, place, rate_hz, robot=robot)
-        note_new_folders([target], output)
+        announce([target], output)
         check_outputs({"--out": target}, [robot] if robot else [], ("--out",) if exporter.folder else ())
         notes: list[str] = []
         with written_file(target, exporter.suffix) as file:

@@ -19,6 +19,15 @@ if TYPE_CHECKING:
     from lidardesign.design.compare import BandwidthUse
     from lidardesign.design.sensor import DesignSpec
 
+DESIGN_COLUMNS, VALUE_COLUMNS = ("design", "layout", "sensors", "rays"), ("value", "95 % interval", "difference")
+IDEAL = "ideal"
+# What rounding leaves of no difference is none.
+DECIMALS = 6
+SENSOR_COLUMNS = (
+    "first", "second", "place [m]", "looks [deg]", "roll [deg]", "field of view [deg]", "gate start [m]",
+    "gate end [m]", "weight", "rays",
+)  # fmt: skip
+
 
 def show(
     design: Annotated[
@@ -159,16 +168,6 @@ def _show_readout(readout: BandwidthUse, rich: RichConsole) -> None:
     rays = "each ray in a frame" if readout.rays is None else f"{readout.rays} rays per frame"
     bins = f"({number(model.bin_ps)} ps bins of {number(model.bits_per_bin)} bits, {number(model.rate_hz)} frames/s)"
     rich.print(f"bandwidth: {span} Mbit/s for {rays}\n{bins}", soft_wrap=True)
-
-
-DESIGN_COLUMNS, VALUE_COLUMNS = ("design", "layout", "sensors", "rays"), ("value", "95 % interval", "difference")
-IDEAL = "ideal"
-# What rounding leaves of no difference is none.
-DECIMALS = 6
-SENSOR_COLUMNS = (
-    "first", "second", "place [m]", "looks [deg]", "roll [deg]", "field of view [deg]", "gate start [m]",
-    "gate end [m]", "weight", "rays",
-)  # fmt: skip
 
 
 def _show_differences(files: Sequence[Path], designs: Sequence[DesignSpec], output: Output) -> None:

@@ -1,4 +1,4 @@
-"""`lidardesign tasks`: which tasks there are, what they take, whether they keep the contract; packages of new ones."""
+"""`lidardesign tasks`: installed tasks, their keys, checks of the contract, and packages of new ones."""
 
 from __future__ import annotations
 

@@ -142,14 +142,14 @@ class LearnProgress:
     """Where learning stands, for progress bars and progress.jsonl.
 
     Arguments:
-        step, steps: Done, and the most that are taken; 0 where time decides.
+        step, steps: Done, and the most that are taken; None where time decides.
         loss: Mean of (1 + eta) log p - log p* over the batch [nats].
         ess: Effective share of the batch at the present sigma.
         seconds: Spent so far; seconds_left: with all steps, None where time decides.
     """
 
     step: int
-    steps: int
+    steps: int | None
     loss: float
     ess: float
     seconds: float
@@ -308,9 +308,8 @@ class Trainer(LearnedFlow):
         }
         append_line(self.run / PROGRESS, json.dumps(row))
         if progress:
-            steps, left = self.settings.steps, seconds / self.step * (self.settings.steps - self.step)
-            if self.is_over is not None:
-                steps, left = 0, None
+            steps = self.settings.steps if self.is_over is None else None
+            left = None if steps is None else seconds / self.step * (steps - self.step)
             progress(LearnProgress(self.step, steps, loss, ess, seconds, left))
 
     def _advance(self) -> tuple[float, float]:

@@ -1,11 +1,6 @@
 """Accuracy and cost of distance fields of meshes by their grid points along the longest side.
 
-Bodies that are primitives are exact at any cost and need no field.
-
-Settings of a target from its quick sweep: the coarsest distance fields that misplace little enough of its mass.
-
-What is visible is found exactly (by ray casting, or not at all where nothing is in the way), and primitives have exact
-distances: fields of meshes are what a target's accuracy costs time and memory for.
+Bodies that are primitives have exact distances at any cost and need no field.
 """
 
 from __future__ import annotations
@@ -249,5 +244,3 @@ def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: Dens
         if body.is_target
     ]
     return BodyField(place_bodies(entries, len(columns), build))
-
-

@@ -1,4 +1,4 @@
-"""What the sweeps of a density are measured on: its scenes, and weighted points that know nothing of the flow."""
+"""The scenes of a density that sweeps are measured on, and weighted points that know nothing of the flow."""
 
 from __future__ import annotations
 

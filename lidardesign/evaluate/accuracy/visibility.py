@@ -1,8 +1,6 @@
 """Accuracy and cost of visibility: none, quadrature or ray casting against opaque geometry.
 
-Visibility by opaque geometry: T = 1 up to the margin in front of the first hit, 0 behind it.
-
-The closed form that ways to compute visibility are compared with; it has no gradient.
+Opaque geometry is the closed form, without a gradient: T = 1 up to the margin in front of the first hit, 0 behind it.
 """
 
 from __future__ import annotations

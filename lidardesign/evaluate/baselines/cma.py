@@ -54,7 +54,7 @@ Show = Callable[[str, float, float], None]
 
 @dataclass(frozen=True)
 class CmaSettings:
-    """How long the baseline `cma` searches at each number of rays, whichever is over first.
+    """Limits of the search of the baseline `cma` at each number of rays; the first that is reached ends it.
 
     Arguments:
         seconds: Wall time [s].
@@ -140,7 +140,7 @@ class MovableSensors:
         self.vector_bounds = [(side / self._unit)[self._free] for side in (self._low, self._high)]
 
     def _changes(self, every: Rays, spread: np.ndarray) -> np.ndarray:
-        """How far each number may fall and rise, shape (2, G, 10); 0 where it is not free."""
+        """Largest fall and rise of each number, shape (2, G, 10); 0 where it is not free."""
         axes, bounds, sides = self._axes, self._bounds, np.zeros((2, self.count, 10))
         first, last = np.full((self.count, 3), np.inf), np.full((self.count, 3), -np.inf)
         np.minimum.at(first, every.sensor, every.origin_m)
@@ -251,7 +251,7 @@ class CmaCandidate:
         return self.positions(spaces, max(of_limit))
 
     def record_of(self, positions: RaysPerCondition) -> SearchRecord:
-        """How these rays were found."""
+        """The search that found these rays."""
         return next(record for known, record in self._known.values() if known is positions)
 
     @phase("cma")
@@ -299,9 +299,7 @@ class CmaCandidate:
         seconds = time.perf_counter() - began
         return sensors.rays(best), SearchRecord(count, sensors.count, len(best), seconds, candidates, scenes, *values)
 
-    def _values(
-        self, sensors: MovableSensors, vectors: Sequence[np.ndarray], stop: Callable[[], bool]
-    ) -> np.ndarray:
+    def _values(self, sensors: MovableSensors, vectors: Sequence[np.ndarray], stop: Callable[[], bool]) -> np.ndarray:
         """Scores of vectors, lower is better, shape (L,)."""
         lists = [sensors.rays(vector) for vector in vectors]
         excess = np.array([sensors.excess(positions) for positions in lists])

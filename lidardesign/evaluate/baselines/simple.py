@@ -1,4 +1,4 @@
-"""The simple rivals of every design.
+"""The baselines that stand beside every design, by name.
 
 Each is built for exactly N rays, alone from the design space and from the training scenes. A baseline is one or
 more candidate layouts; where there are several, the best on training scenes is taken at each number of rays.
@@ -12,16 +12,11 @@ more candidate layouts; where there are several, the best on training scenes is 
   `lidardesign.evaluate.baselines.silhouette`.
 - `greedy`: rays chosen on training scenes without a density, see `lidardesign.evaluate.baselines.greedy`.
 - `occupancy`: see `lidardesign.evaluate.baselines.occupancy`.
-- `no-visibility`: the design fitted anew without its occlusion term, see below.
+- `no-visibility`: a design fitted anew to the density without its occlusion term; the number of sensors, the layout,
+  the constraints, the level and the seed stay. It is not weighted, even where the design is.
 - `cma`: see `lidardesign.evaluate.baselines.cma`.
 
 Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
-
-The baseline `no-visibility`: the same design fitted to the density without its occlusion term.
-
-The number of sensors, the layout, the constraints, the level and the seed are those of a fitted design; only the
-samples differ. What its rays are worth beside that design is what knowing about occlusion is worth, and where that
-design was weighted, what that is worth as well: the twin is not.
 """
 
 from __future__ import annotations
@@ -60,6 +55,7 @@ from lidardesign.task import random_generator
 
 Judge = Callable[[Sequence[RaysPerCondition]], Sequence[float]]
 NO_VISIBILITY = "no-visibility"
+CLOSE_ENOUGH = 0.98  # of the bandwidth: every further step may be another fit
 
 
 class Option(NamedTuple):
@@ -246,11 +242,8 @@ def check_baseline(name: str, *, where: str = "baselines") -> None:
         raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=", ".join(BASELINES))
 
 
-CLOSE_ENOUGH = 0.98  # of the bandwidth: every further step may be another fit
-
-
 class LayOut(Protocol):
-    """How a design becomes a ray list of a given length at a condition value."""
+    """Lays out so many rays of a design at a condition value."""
 
     def __call__(
         self, design: DesignSpec, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None

@@ -1,4 +1,4 @@
-"""What rays return and score in training scenes: where, how often, the gates that hold it, and the task's metric."""
+"""Training scenes as baselines see them: their returns, the gates that hold these, and the task's metric."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ class TrainingObjective:
 
     @property
     def sign(self) -> float:
-        """What turns the metric so that lower is better."""
+        """1 where lower is better, else -1."""
         return 1.0 if self.metric.better == "lower" else -1.0
 
     def values(self, lists: Sequence[RaysPerCondition], stop: Callable[[], bool] = lambda: False) -> np.ndarray:

@@ -1,9 +1,8 @@
 """The arrays of a `.npz` or MATLAB `.mat` file, read without running anything that is in it.
 
 Names, types and sizes are looked at before any data is read: objects, cells and structures are refused, and so is more
-data than a stated size, packed or not.
-
-MATLAB files of versions 4 to 7, read by SciPy in a process of its own, which damaged ones may crash.
+data than a stated size, packed or not. SciPy reads MATLAB files of versions 4 to 7 in a process of its own, which
+damaged ones may crash.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ import numpy as np
 
 from lidardesign.design.layouts.rays import certificates_of
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.evaluate.report.figures import AXIS, DASH_NAMES, LAYOUT, SYMBOLS
+from lidardesign.evaluate.report.figures import AXIS, LAYOUT
 from lidardesign.evaluate.report.markup import figure, folded, paragraphs, swatch
 from lidardesign.evaluate.report.series import Series
 from lidardesign.evaluate.report.tables import four_digits, table
@@ -146,8 +146,8 @@ def _lines(drawn: Mapping[str, Points], looks: Mapping[str, Series], titles: tup
             "y": [point[1] for point in points],
             "mode": "lines+markers",
             "name": html.escape(name),
-            "line": {"color": looks[name].colour, "dash": DASH_NAMES[looks[name].dash], "width": 2},
-            "marker": {"symbol": SYMBOLS[looks[name].marker], "size": 8, "color": looks[name].colour},
+            "line": {"color": looks[name].colour, "dash": looks[name].dash, "width": 2},
+            "marker": {"symbol": looks[name].marker, "size": 8, "color": looks[name].colour},
             "hovertemplate": "%{x:.4g}: %{y:.4g}<extra>%{fullData.name}</extra>",
         }
         for name, points in drawn.items()

@@ -1,12 +1,9 @@
 """The learned density as it can be looked at: over each dimension alone, and in space.
 
 A density over six dimensions has no picture. Its marginals have: how much of it lies at each azimuth, elevation,
-range and origin, beside the same of designs. And every design point observes one point in space: how much of the
-density observes each place is a field that can be laid over the scene, seen along an axis.
-
-Design points that a design's sensors stand for, spread evenly through their normal distributions: no randomness.
-
-What a scene covers when it is looked at along an axis: cells of a grid, for pictures.
+range and origin, beside the same of designs, whose sensors stand for points spread evenly through their normal
+distributions. And every design point observes one point in space: how much of the density observes each place is a
+field that can be laid over the scene, seen along an axis.
 """
 
 from __future__ import annotations

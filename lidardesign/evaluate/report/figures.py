@@ -1,9 +1,7 @@
-"""The figures of the report and of notebooks, as plain plotly documents.
+"""The curves of scores and the learned density as plain plotly documents, for the report and for notebooks.
 
 plotly reads a little HTML in names, so every name is escaped here. Legends are in the page itself, where they can be
 switched from the keyboard too.
-
-They are the curves of scores, and the learned density: marginals beside those of designs, and the field it observes.
 """
 
 from __future__ import annotations
@@ -28,21 +26,6 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
-SYMBOLS = {
-    "o": "circle",
-    "s": "square",
-    "^": "triangle-up",
-    "D": "diamond",
-    "v": "triangle-down",
-    "P": "cross",
-    "x": "x-thin-open",
-    "+": "cross-thin-open",
-    "*": "asterisk-open",
-    "1": "y-down-open",
-    "d": "diamond-tall-open",
-}
-DASH_NAMES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
-
 
 FAR_SHARE = 0.5  # of the worst design's score: rivals that are always worse by more are hidden at first
 
@@ -134,10 +117,10 @@ def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
         "line": {
             "color": curve.colour,
             "width": 1.5 if curve.baseline else 2.5,
-            "dash": DASH_NAMES[curve.dash],
+            "dash": curve.dash,
         },
         "marker": {
-            "symbol": SYMBOLS[curve.marker],
+            "symbol": curve.marker,
             "size": 8,
             "color": curve.colour,
             "line": {"color": curve.colour, "width": 1.5},
@@ -174,7 +157,7 @@ def marginal_figure(marginal: Marginal, looks: Mapping[str, Series]) -> dict[str
     lines = [
         {
             **_steps(marginal.edges, heights),
-            "line": {"color": looks[name].colour, "width": 2, "dash": DASH_NAMES[looks[name].dash]},
+            "line": {"color": looks[name].colour, "width": 2, "dash": looks[name].dash},
             "name": html.escape(name),
             "hovertemplate": "%{y:.3g}<extra>%{fullData.name}</extra>",
         }

@@ -1,8 +1,6 @@
-"""Small pieces of the report's markup: sections, figures, folds, and swatches that tell lines apart without colour.
+"""The report's frame (head, style, scripts, a policy that forbids every connection) and small pieces of its markup.
 
 Everything that comes from outside is escaped here or where it is put in.
-
-The frame of the report's page: head, style, scripts, and a policy that forbids every connection.
 """
 
 from __future__ import annotations
@@ -14,33 +12,24 @@ from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any
 
-STROKES = {
-    "solid": "",
-    "dash": "6 3",
-    "dashed": "6 3",
-    "dashdot": "7 3 2 3",
-    "dot": "2 3",
-    "dotted": "2 3",
-    "longdash": "11 4",
-}
+STROKES = {"solid": "", "dash": "6 3", "dashdot": "7 3 2 3", "dot": "2 3", "longdash": "11 4"}
 # Marks of curves and of rays' ends, as closed shapes (filled) and strokes, about (0, 0) in a box of 8.
 SHAPES = {
-    "o": "M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0Z",
-    "s": "M-4 -4H4V4H-4Z",
-    "^": "M0 -4.5L4.5 3.5H-4.5Z",
-    "v": "M0 4.5L4.5 -3.5H-4.5Z",
-    "D": "M0 -5L5 0L0 5L-5 0Z",
-    "P": "M-1.5 -4.5H1.5V-1.5H4.5V1.5H1.5V4.5H-1.5V1.5H-4.5V-1.5H-1.5Z",
+    "circle": "M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0Z",
+    "square": "M-4 -4H4V4H-4Z",
+    "triangle-up": "M0 -4.5L4.5 3.5H-4.5Z",
+    "triangle-down": "M0 4.5L4.5 -3.5H-4.5Z",
+    "diamond": "M0 -5L5 0L0 5L-5 0Z",
+    "cross": "M-1.5 -4.5H1.5V-1.5H4.5V1.5H1.5V4.5H-1.5V1.5H-4.5V-1.5H-1.5Z",
 }
 LINES = {
-    "x": "M-4 -4L4 4M-4 4L4 -4",
-    "+": "M-4.5 0H4.5M0 -4.5V4.5",
-    "*": "M-4 -4L4 4M-4 4L4 -4M-4.5 0H4.5",
-    "1": "M0 0V4.5M0 0L4 -3M0 0L-4 -3",
-    "d": "M0 -5L3.5 0L0 5L-3.5 0Z",
-    "plus": "M-4.5 0H4.5M0 -4.5V4.5",
-    "diamond": "M0 -5L5 0L0 5L-5 0Z",
-    "square": "M-4 -4H4V4H-4Z",
+    "x-thin-open": "M-4 -4L4 4M-4 4L4 -4",
+    "cross-thin-open": "M-4.5 0H4.5M0 -4.5V4.5",
+    "asterisk-open": "M-4 -4L4 4M-4 4L4 -4M-4.5 0H4.5",
+    "y-down-open": "M0 0V4.5M0 0L4 -3M0 0L-4 -3",
+    "diamond-tall-open": "M0 -5L3.5 0L0 5L-3.5 0Z",
+    "diamond-open": "M0 -5L5 0L0 5L-5 0Z",
+    "square-open": "M-4 -4H4V4H-4Z",
 }
 
 

@@ -1,4 +1,4 @@
-"""What accuracy costs: error against seconds, one panel per sweep, on logarithmic axes, and tables.
+"""Error against seconds of every sweep: a panel each, on logarithmic axes, and tables.
 
 A line joins the settings that no other one beats in both; those that are beaten are pale. The tolerance is a dashed
 line, the run's own setting has a ring, the one to choose has another colour. A reference, whose error is nothing,
@@ -76,7 +76,7 @@ class Panel:
 
     @property
     def shows_tolerance(self) -> bool:
-        """Whether the tolerance has a place on the axis."""
+        """True where the tolerance has a place on the axis."""
         return self.errors[0] <= self.sweep.tolerance <= self.errors[1]
 
     @property
@@ -114,7 +114,7 @@ def _spanned(low: float, high: float) -> tuple[float, float]:
 
 
 def has_fine_ticks(ends: tuple[float, float]) -> bool:
-    """Whether an axis between these ends needs ticks between the powers of ten."""
+    """True for an axis between ends that needs ticks between the powers of ten."""
     low, high = ends
     powers = math.floor(math.log10(high)) - math.ceil(math.log10(low)) + 1
     return high < FINE_TICKS_SPAN * low or powers < 2
@@ -145,7 +145,7 @@ def _mark(measurement: Measurement, least_seconds: float, errors: tuple[float, f
 
 
 def label_places(panel: Panel) -> list[tuple[float, float, str]]:
-    """Where each mark's setting is written: pixels to the right and upwards, and the side of the text that is aligned.
+    """Places of the marks' settings: pixels to the right and upwards, and the side of the text that is aligned.
 
     To the right of its mark, to the left in the right third of the panel; moved up where texts would meet.
     """

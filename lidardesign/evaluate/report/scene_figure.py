@@ -62,7 +62,7 @@ class DrawnDesign:
 
     @property
     def ends_m(self) -> np.ndarray:
-        """Where the drawn rays end at every position and frame, shape (P, T, N, 3) [m]."""
+        """Ends of the drawn rays at every position and frame, shape (P, T, N, 3) [m]."""
         origin = np.stack([rays.origin_m for rays in self.rays])
         direction = np.stack([rays.direction for rays in self.rays])
         return origin[:, None] + self.length_m[..., None] * direction[:, None]
@@ -182,7 +182,7 @@ def evaluated_scene(evaluation: Evaluation, request: EvaluationRequest) -> Scene
 
 
 def constraint_slack_of(design: DesignSpec, space: DesignSpace) -> list[ConstraintSlack]:
-    """How tight each constraint of a design is, by the independent checker; the bounds of its space last."""
+    """The slack of each constraint of a design, by the independent checker; the bounds of its space last."""
     checks = check_design(design_document(design), design.constraints, space)
     slacks = constraint_slack(checks, [sensor.name for sensor in design.sensors])
     return sorted(slacks, key=lambda one: one.name.startswith(SPACE_MARK))

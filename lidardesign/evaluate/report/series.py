@@ -25,13 +25,14 @@ OUTCOME_WORDS = {
 # Okabe and Ito 2008, without yellow (too faint on white) and with black kept for text.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 GREYS = ("#555555", "#808080", "#222222", "#999999", "#6b6b6b")
-MARKERS = ("o", "s", "^", "D", "v", "P")
-BASELINE_MARKERS = ("x", "+", "*", "1", "d")
-DASHES = ("solid", "dashed", "dashdot", "dotted")
+# By plotly's names, as dashes are.
+MARKERS = ("circle", "square", "triangle-up", "diamond", "triangle-down", "cross")
+BASELINE_MARKERS = ("x-thin-open", "cross-thin-open", "asterisk-open", "y-down-open", "diamond-tall-open")
+DASHES = ("solid", "dash", "dashdot", "dot")
 # Labels of a logarithmic axis: at these times every power of ten, the few where the values span more than the factor.
 FEW_MANTISSAS, MANY_MANTISSAS, WIDE_FACTOR = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0), 30.0
 TICK_MARGIN = 1.2
-MANY_DECADES = 4.0  # a range of values wider than this factor is easier to read on a logarithmic axis
+LOGARITHMIC_FACTOR = 4.0  # a range of values wider than this factor is easier to read on a logarithmic axis
 
 
 @dataclass(frozen=True)
@@ -68,14 +69,14 @@ def series(evaluation: Evaluation) -> list[Series]:
 
 
 def position(row: Row, against: Against) -> float:
-    """Where a row stands on the horizontal axis: rays per frame or position, or Mbit/s."""
+    """The place of a row on the horizontal axis: rays per frame or position, or Mbit/s."""
     return float(row.rays) if against == "rays" else row.bandwidth_mbps
 
 
 def logarithmic(values: Sequence[float]) -> bool:
-    """Whether values span so much that a logarithmic axis shows them better."""
+    """True for values that span so much that a logarithmic axis shows them better."""
     positive = [value for value in values if value > 0]
-    return len(positive) == len(values) > 1 and max(positive) > MANY_DECADES * min(positive)
+    return len(positive) == len(values) > 1 and max(positive) > LOGARITHMIC_FACTOR * min(positive)
 
 
 def log_ticks(values: Sequence[float]) -> list[float]:

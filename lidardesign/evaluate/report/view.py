@@ -1,10 +1,9 @@
 """The report's section with the 3D view: its switches, sliders and buttons, and the data that it is drawn from.
 
-What the report's 3D view is drawn from, as one JSON document: numbers as base64 of little-endian arrays.
-
-Bodies at rest are merged, moving ones keep their own frame and a pose per frame; sensors are a few numbers each, and
-the page draws their fields of view and gates; a ray is where it starts, where it looks, how far it goes and what
-becomes of it. The page's script (`assets/scene.js`) puts together what is switched on.
+The data are one JSON document, numbers as base64 of little-endian arrays. Bodies at rest are merged, moving ones keep
+their own frame and a pose per frame; sensors are a few numbers each, and the page draws their fields of view and gates;
+a ray is where it starts, where it looks, how far it goes and what becomes of it. The page's script
+(`assets/scene.js`) puts together what is switched on.
 """
 
 from __future__ import annotations
@@ -47,15 +46,13 @@ MANY_RAYS, FAINT = 300, 0.22
 OUTCOMES = tuple(
     (code, OUTCOME_WORDS[code], colour, dash, symbol)
     for code, colour, dash, symbol in (
-        (Outcome.RETURN, "#009E73", "solid", "plus"),
-        (Outcome.OCCLUDED, "#D55E00", "dash", "x"),
-        (Outcome.AFTER_GATE, "#0072B2", "dot", "diamond"),
+        (Outcome.RETURN, "#009E73", "solid", "cross-thin-open"),
+        (Outcome.OCCLUDED, "#D55E00", "dash", "x-thin-open"),
+        (Outcome.AFTER_GATE, "#0072B2", "dot", "diamond-open"),
         (Outcome.MISS, "#6b7280", "longdash", None),
-        (Outcome.NOT_DETECTED, "#CC79A7", "dashdot", "square"),
+        (Outcome.NOT_DETECTED, "#CC79A7", "dashdot", "square-open"),
     )
 )
-# Dashes of the view by those of curves.
-DASHES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
 
 
 def view_document(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndarray | None = None) -> dict[str, Any]:
@@ -181,7 +178,7 @@ def _design(one: DrawnDesign, look: Series) -> dict[str, Any]:
     return {
         "name": html.escape(one.design.name),
         "colour": look.colour,
-        "dash": DASHES[look.dash],
+        "dash": look.dash,
         "sensors": len(one.design.sensors) if few else 0,
         "cones": encoded(np.array(cones), "<f4"),
         "rays": len(one.rays[0]),
@@ -246,7 +243,7 @@ def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndar
     layers += [switch("fields of view", layer="fields"), switch("gates", layer="gates")]
     layers += [switch("where rays start", layer="starts")]
     if density_m is not None:
-        dots = swatch("#7b2d8b", "dotted")
+        dots = swatch("#7b2d8b", "dot")
         layers.append(switch("what the learned density observes", picture=dots, checked=False, layer="density"))
     groups = (_group("Rays", switches), _group("Shown", "".join(layers)), _designs(shown, looks))
     controls = _sliders(shown) + "".join(groups)
@@ -303,7 +300,7 @@ def _sliders(shown: SceneFigure) -> str:
 def _designs(shown: SceneFigure, looks: Sequence[Series]) -> str:
     parts = ""
     for number, (one, look) in enumerate(zip(shown.designs, looks, strict=True)):
-        picture = swatch(look.colour, DASHES[look.dash])
+        picture = swatch(look.colour, look.dash)
         parts += switch(one.design.name, picture=picture, checked=number == 0, design=str(number))
         parts += _sensors(one, number)
     return _group("Designs", parts) if parts else ""
