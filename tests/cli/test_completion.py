@@ -58,4 +58,4 @@ def test_the_script_of_a_shell_is_shown():
 
 @each_row("name", completion.detectors())
 def test_every_detector_that_is_offered_is_one(name):
-    load_detector(name)
+    assert load_detector(name).name
