@@ -31,9 +31,9 @@ def add_head(figures: Figures, scene: Any, run: Any, designs: Sequence[Path], op
     """Capture a head without a gate, and along every design with one; score all of them."""
     import capture as laboratory
 
-    from lidardesign.design.files import load_design
-    from lidardesign.design.layouts.rays import lay_out
-    from lidardesign.export.galvo import read_galvo, write_galvo
+    from lidardesign.formats.galvo import read_galvo, write_galvo
+    from lidardesign.layouts.rays import lay_out
+    from lidardesign.sensors.design_file import load_design
 
     detector = laboratory.load_detector(options.detector)
     laboratory.write_mesh(scene, folder / "head.ply")
@@ -55,9 +55,9 @@ def add_rows(
     figures: Figures, scan: Path, designs: Sequence[Any], estimator: str, folder: Path, gate: str | None = None
 ) -> None:
     """Outliers [%] and Chamfer [mm] of designs in a capture."""
-    from lidardesign.evaluate.captures.capture import load_capture
-    from lidardesign.evaluate.captures.scan import Estimation, default_within_rad
-    from lidardesign.evaluate.captures.score import CaptureSettings, evaluate_capture
+    from lidardesign.scoring.captures.capture import load_capture
+    from lidardesign.scoring.captures.scan import Estimation, default_within_rad
+    from lidardesign.scoring.captures.score import CaptureSettings, evaluate_capture
 
     capture = load_capture(scan)
     settings = CaptureSettings(
@@ -73,7 +73,7 @@ def figure_rows(figures: Figures, seed: int) -> list[list[object]]:
     """Means over heads with 95 % intervals, and the difference to uniform rays head by head."""
     import numpy as np
 
-    from lidardesign.evaluate.statistics import mean_interval, paired_difference
+    from lidardesign.scoring.scenes.statistics import mean_interval, paired_difference
 
     rows = []
     for (estimator, name, gate), values in sorted(figures.items(), key=_place):
@@ -99,9 +99,9 @@ def tour_rows(designs: Sequence[Path], rounds: int) -> list[list[object]]:
     """Travel of the mirrors and the median time of finding their order."""
     import statistics
 
-    from lidardesign.design.files import load_design
-    from lidardesign.design.layouts.rays import lay_out
-    from lidardesign.export.galvo import plan, travel
+    from lidardesign.formats.galvo import plan, travel
+    from lidardesign.layouts.rays import lay_out
+    from lidardesign.sensors.design_file import load_design
 
     rows = []
     for path in designs:

@@ -19,7 +19,7 @@ def even_rays(count: int, gate_m: tuple[float, float]) -> Any:
     """An even grid of rays at a face from 0.40 m."""
     import numpy as np
 
-    from lidardesign.geometry.rays import Rays
+    from lidardesign.scenes.rays import Rays
     from lidardesign.space import direction
 
     side = int(np.ceil(np.sqrt(count)))
@@ -36,7 +36,7 @@ def planning(scenes: list[Any], rays: Any, rounds: int) -> tuple[list[list[objec
     from lidardesign_tasks.face import FaceTask
 
     from lidardesign.simulate.plan import Planner
-    from lidardesign.simulate.simulate import build_casters, simulate
+    from lidardesign.simulate.returns import build_casters, simulate
 
     planner, task = Planner(), FaceTask()
 
@@ -56,7 +56,7 @@ def planning(scenes: list[Any], rays: Any, rounds: int) -> tuple[list[list[objec
 
 def troubled(scene: Any) -> Any:
     """A scene that calls for every effect: sunlight, fog, gloss, and a head that moves."""
-    from lidardesign.scene import Ambient, Medium
+    from lidardesign.scenes.scene import Ambient, Medium
 
     bodies = tuple(
         replace(body, reflectance=0.4, specular=0.1, transmission=0.05, velocity_m_s=(0.3, 0.0, 0.0))
@@ -67,15 +67,15 @@ def troubled(scene: Any) -> Any:
 
 def effects_here() -> list[str]:
     """All effects that can be simulated without a light-transport simulator."""
-    from lidardesign.simulate.detector.detector import EFFECTS
+    from lidardesign.simulate.detector.physics import EFFECTS
 
     return [name for name in EFFECTS if name not in ("multipath", "shadowing")]
 
 
 def by_effect(scenes: list[Any], rays: Any, detector: Any, rounds: int) -> list[list[object]]:
     """Time per scene of each effect alone and of all."""
-    from lidardesign.simulate.detector.detector import Physics
-    from lidardesign.simulate.simulate import build_casters, simulate
+    from lidardesign.simulate.detector.physics import Physics
+    from lidardesign.simulate.returns import build_casters, simulate
 
     names = effects_here()
     casters = {id(scene): build_casters(scene) for scene in scenes}
@@ -100,8 +100,8 @@ def by_effect(scenes: list[Any], rays: Any, detector: Any, rounds: int) -> list[
 
 def many(scene: Any, count: int, detector: Any, gates: dict[str, tuple[float, float]]) -> list[list[object]]:
     """Seconds for many rays with all effects on."""
-    from lidardesign.simulate.detector.detector import Physics
-    from lidardesign.simulate.simulate import build_casters, simulate
+    from lidardesign.simulate.detector.physics import Physics
+    from lidardesign.simulate.returns import build_casters, simulate
 
     casters, rows = build_casters(scene), []
     for name, gate_m in gates.items():

@@ -18,13 +18,13 @@ from common import median_ratio, parser, report
 from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
-from lidardesign.design.mixture.bounds import Bounds, Floors
-from lidardesign.design.mixture.em import fit_mixture, seed_mixture
-from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.mixture.m_step import maximise
-from lidardesign.design.mixture.mixture import expect, log_density
-from lidardesign.design.sensor import interval_factor
+from lidardesign.mixture.bounds import Bounds, Floors
+from lidardesign.mixture.components import expect, log_density
+from lidardesign.mixture.em import fit_mixture, seed_mixture
+from lidardesign.mixture.features import Axes, Features
+from lidardesign.mixture.m_step import maximise
 from lidardesign.samples import load_samples
+from lidardesign.sensors.sensor import interval_factor
 from lidardesign.space import DesignSpace
 
 SENSORS = 10

@@ -26,8 +26,8 @@ from common import face_scenes, installed, interleaved, median_ratio, model_opti
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import TableField, build_field
 from lidardesign.density.fields.grids import BAND_CELLS, Grid, distance_grid
-from lidardesign.density.target.target import PADDING_SIGMAS
-from lidardesign.scene import Mesh
+from lidardesign.density.objective.target import PADDING_SIGMAS
+from lidardesign.scenes.scene import Mesh
 
 INSIDE = 0.5  # winding numbers above this are inside
 

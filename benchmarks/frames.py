@@ -27,11 +27,11 @@ from common import Timing, interleaved, median_ratio, parser, report, robot_sett
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import build_field, scene_columns
-from lidardesign.density.target.proposals import independent_points
-from lidardesign.density.target.surfaces import SceneTable
-from lidardesign.density.target.target import PADDING_SIGMAS, Target, build_target
-from lidardesign.density.target.visibility import NoVisibility, RayBatch, Raycast, RayGradient
-from lidardesign.scene import Body, Scene
+from lidardesign.density.objective.proposals import independent_points
+from lidardesign.density.objective.surfaces import SceneTable
+from lidardesign.density.objective.target import PADDING_SIGMAS, Target, build_target
+from lidardesign.density.objective.visibility import NoVisibility, RayBatch, Raycast, RayGradient
+from lidardesign.scenes.scene import Body, Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
 
 NOTHING_LEFT_OUT_NATS = 1e6

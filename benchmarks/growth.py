@@ -151,10 +151,10 @@ def simulation(options: Any) -> Growth:
     from effects import even_rays
     from lidardesign_tasks.face import FaceTask
 
-    from lidardesign.simulate.detector.detector import Physics
     from lidardesign.simulate.detector.files import load_detector
+    from lidardesign.simulate.detector.physics import Physics
     from lidardesign.simulate.plan import Planner
-    from lidardesign.simulate.simulate import build_casters, simulate
+    from lidardesign.simulate.returns import build_casters, simulate
 
     scene, task, detector = face_scenes(options.model, 1)[0], FaceTask(), load_detector(options.detector)
     casters, rows = build_casters(scene), []
@@ -178,12 +178,12 @@ def simulation(options: Any) -> Growth:
 
 def mixtures(options: Any) -> Growth:
     """EM on samples of a mixture of as many components, by the number of sensors."""
-    from lidardesign.design.mixture.bounds import Bounds, Floors
-    from lidardesign.design.mixture.em import fit_mixture, seed_mixture
-    from lidardesign.design.mixture.features import Axes, Features
-    from lidardesign.design.mixture.m_step import maximise
-    from lidardesign.design.mixture.mixture import expect
-    from lidardesign.design.sensor import interval_factor
+    from lidardesign.mixture.bounds import Bounds, Floors
+    from lidardesign.mixture.components import expect
+    from lidardesign.mixture.em import fit_mixture, seed_mixture
+    from lidardesign.mixture.features import Axes, Features
+    from lidardesign.mixture.m_step import maximise
+    from lidardesign.sensors.sensor import interval_factor
     from lidardesign.space import DesignSpace
 
     space, rows = DesignSpace(LOW, HIGH), []
@@ -220,8 +220,8 @@ def dimensions(options: Any) -> Growth:
     import torch
 
     from lidardesign.config import DensitySettings, LearningSettings
-    from lidardesign.density.flow.objective import Coordinates
-    from lidardesign.density.target.target import build_target
+    from lidardesign.density.flow.coordinates import Coordinates
+    from lidardesign.density.objective.target import build_target
     from lidardesign.space import DesignSpace
 
     scenes, settings, rows = face_scenes(options.model, options.heads), LearningSettings(), []
@@ -259,7 +259,7 @@ def flow_of(coordinates: Any, settings: Any) -> Any:
     """The flow that learning would make."""
     import torch
 
-    from lidardesign.density.flow.flow import DesignFlow
+    from lidardesign.density.flow.network import DesignFlow
 
     sizes = {"layers": settings.layers, "hidden": settings.hidden, "bins": settings.bins}
     generator = torch.Generator().manual_seed(0)

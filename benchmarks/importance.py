@@ -75,9 +75,9 @@ class Bench:
         """The run's samples with the weights of some settings."""
         import numpy as np
 
+        from lidardesign.fitting.run_samples import RunTarget, Weighting, weighted_samples
         from lidardesign.space import RANGE
         from lidardesign.task import random_generator
-        from lidardesign.workflow.run_samples import RunTarget, Weighting, weighted_samples
 
         texts = tuple(f"{key}={value}" for key, value in settings.items())
         weighting = Weighting(texts)
@@ -91,8 +91,8 @@ class Bench:
         """Designs of one kind at a number of rays."""
         import numpy as np
 
-        from lidardesign.design.fit import fit
-        from lidardesign.design.layouts.rays import lay_out
+        from lidardesign.layouts.rays import lay_out
+        from lidardesign.mixture.fit import fit
 
         found, rays = [], None
         for seed in range(self.fits):
@@ -106,7 +106,7 @@ class Bench:
         import numpy as np
         from lidardesign_tasks.surface import reconstruct
 
-        from lidardesign.simulate.simulate import simulate
+        from lidardesign.simulate.returns import simulate
 
         returns = simulate(scene, rays, casters=casters)
         truth, estimate = scene.truth["surface"], reconstruct(returns)
@@ -123,7 +123,7 @@ def in_region(scene: Any, points: Any) -> Any:
     """Which points (N, 3) of a scene lie in the region of its head, shape (N,)."""
     import numpy as np
 
-    from lidardesign.scene import inverse_rigid
+    from lidardesign.scenes.scene import inverse_rigid
 
     to_head = inverse_rigid(scene.bodies[0].pose())
     local = points @ to_head[:3, :3].T + to_head[:3, 3]
@@ -132,7 +132,7 @@ def in_region(scene: Any, points: Any) -> Any:
 
 def percent(values: Any, plain: Any) -> tuple[str, str]:
     """How much lower or higher values are than others of the same heads, and its 95 % interval, in percent."""
-    from lidardesign.evaluate.statistics import paired_difference
+    from lidardesign.scoring.scenes.statistics import paired_difference
 
     found = [100 * value / plain.mean() for value in paired_difference(values, plain, 0)]
     return f"{found[0]:+.1f}", f"{found[1]:+.1f} to {found[2]:+.1f}"
@@ -215,7 +215,7 @@ def main() -> None:
     made.add_argument("--picture", type=Path, metavar="FILE", help="also draw where rays go")
     options = made.parse_args()
     from lidardesign import open_run
-    from lidardesign.simulate.simulate import build_casters
+    from lidardesign.simulate.returns import build_casters
 
     settings = face_settings(options.model) if options.run is None else {}
     scans: dict[tuple[str, int], Measured] = {}

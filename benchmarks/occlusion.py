@@ -68,12 +68,12 @@ def rays_needed(rays: Sequence[int], distance_m: Sequence[float], reached_m: flo
 def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], seed: int) -> tuple[Curve, Curve]:
     """Of a design fitted with a seed, and of its twin."""
     from lidardesign import open_run
-    from lidardesign.design.constraints.document import Constraints
-    from lidardesign.design.fit import fit
-    from lidardesign.evaluate.request import EvaluationRequest
-    from lidardesign.evaluate.score import evaluate
+    from lidardesign.constraints.document import Constraints
+    from lidardesign.fitting.run_samples import TWIN_NAME, Layouts, RunTarget, twin_without_visibility
+    from lidardesign.mixture.fit import fit
     from lidardesign.samples import load_samples
-    from lidardesign.workflow.run_samples import TWIN_NAME, Layouts, RunTarget, twin_without_visibility
+    from lidardesign.scoring.evaluation.request import EvaluationRequest
+    from lidardesign.scoring.evaluation.score import evaluate
 
     run = open_run(run_folder)
     config, samples = run.config, load_samples(run.folder)

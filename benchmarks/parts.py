@@ -28,15 +28,15 @@ STAGES = ("poses", "shared rays", "returns", "choice")
 
 def chosen(options: Any, kinds: int) -> dict[str, Any]:
     """One choice, with the processor time of its stages [s]."""
-    from lidardesign.design.catalog.library import named_parts
-    from lidardesign.design.constraints.document import Constraints
+    from lidardesign.constraints.document import Constraints
+    from lidardesign.fitting.part_bundle import PartBundle, part_table, parts_inform
+    from lidardesign.fitting.part_design import proposed
+    from lidardesign.fitting.part_sets import SetLimits, choose_set
+    from lidardesign.fitting.select_rays import selection_scenes
+    from lidardesign.parts.catalogue import named_parts
+    from lidardesign.rays.information import checked_information
+    from lidardesign.run_folder import RunFolder
     from lidardesign.samples import load_samples
-    from lidardesign.selection.information import checked_information
-    from lidardesign.selection.part_design import proposed
-    from lidardesign.selection.parts import PartBundle, part_table, parts_inform
-    from lidardesign.selection.sets import SetLimits, choose_set
-    from lidardesign.workflow.run_folder import RunFolder
-    from lidardesign.workflow.select_rays import selection_scenes
 
     run, samples = RunFolder.open(options.run), load_samples(options.run)
     marks = [time.process_time()]
@@ -60,7 +60,7 @@ def small_problems() -> list[list[object]]:
     sys.path.insert(0, str(ROOT / "tests"))
     from support.coverages import relaxed_by_highs, small
 
-    from lidardesign.selection.sets import SetLimits, choose_set
+    from lidardesign.fitting.part_sets import SetLimits, choose_set
 
     rows: list[list[object]] = []
     for candidates in (20, 40):

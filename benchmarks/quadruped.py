@@ -69,7 +69,7 @@ def recording(model: object, generator: np.random.Generator) -> tuple[np.ndarray
 
 def write_recordings(path: Path, folder: Path) -> None:
     """Joint positions of the robot and places of the ball, a file each."""
-    from lidardesign.mujoco_model import load_model
+    from lidardesign.scenes.mujoco_models import load_model
 
     model, _ = load_model(path)
     terrain = model.geom("terrain")  # flat, below the floor
@@ -82,9 +82,9 @@ def write_recordings(path: Path, folder: Path) -> None:
 
 def write_by_hand(run: Path) -> None:
     """Designs of four parts of a kind that look out and down, and the constraints of the choice as `parts.yaml`."""
-    from lidardesign.design.catalog.library import find_part, looking_at, part_design
-    from lidardesign.design.files import save_design
+    from lidardesign.parts.catalogue import find_part, looking_at, part_design
     from lidardesign.run.yaml import dump_yaml
+    from lidardesign.sensors.design_file import save_design
 
     mounts = {"mounts_m": [list(mount) for mount in MOUNTS_M]}
     bought = {"origin": mounts, "parts": {"names": list(OFFERED), "count": len(OUT_M)}}

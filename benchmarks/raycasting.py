@@ -19,8 +19,8 @@ import common  # noqa: F401 (before numpy: it limits the thread pools)
 import numpy as np
 from common import face_scenes, installed, interleaved, median_ratio, model_option, parser, report
 
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Body, Mesh, Scene
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Body, Mesh, Scene
 
 # A way of casting: (N, 3) origins and unit directions to ranges (N,), infinite for a miss.
 Cast = Callable[[np.ndarray, np.ndarray], np.ndarray]

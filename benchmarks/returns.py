@@ -50,8 +50,8 @@ def cases() -> dict[str, tuple[str, str, Mapping[str, Any]]]:
 def with_returns(run: Any, folder: Path) -> tuple[Any, dict[str, float]]:
     """A copy of a run whose samples are points of the training scenes, and what they are worth and took [s]."""
     from lidardesign import open_run
-    from lidardesign.density.target.prepare import prepare_target, training_scenes
-    from lidardesign.density.target.proposals import independent_points
+    from lidardesign.density.objective.prepare import prepare_target, training_scenes
+    from lidardesign.density.objective.proposals import independent_points
     from lidardesign.run.manifest import read_manifest
     from lidardesign.samples import Samples, load_samples, save_samples
     from lidardesign.task import random_generator
@@ -114,7 +114,7 @@ def measured(title: str, seed: int, sensors: int, folder: Path) -> dict[str, Any
 
 def bandwidth_mbps(run: Any, design: Any, rays: int) -> float:
     """Bandwidth of a design's rays, where rays have conditions the largest one [Mbit/s]."""
-    from lidardesign.design.bandwidth import Bandwidth
+    from lidardesign.sensors.bandwidth import Bandwidth
 
     conditions = run.conditions()
     return max(Bandwidth().mbps(design.rays(rays, at=at or None)) for at in conditions)

@@ -116,9 +116,9 @@ def misread_m(run: Path, model_file: Path, exported: Path, case: Case, options: 
     import mujoco
 
     from lidardesign import load_design
-    from lidardesign.geometry.raycast import SceneCaster
-    from lidardesign.mujoco_model import bodies_from_mujoco, load_model
-    from lidardesign.scene import Scene, rigid
+    from lidardesign.scenes.casting import SceneCaster
+    from lidardesign.scenes.mujoco_models import bodies_from_mujoco, load_model
+    from lidardesign.scenes.scene import Scene, rigid
 
     design = load_design(run / "designs" / "two.yaml")
     rays, mount = design.rays(64), design.specification.mount

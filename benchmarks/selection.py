@@ -32,7 +32,7 @@ def even_candidates(scenes: list[Any], count: int) -> Any:
     """So many rays, even over where some scenes return."""
     from effects import even_rays
 
-    from lidardesign.simulate.simulate import simulate
+    from lidardesign.simulate.returns import simulate
 
     share = np.mean([simulate(scene, even_rays(2500, (0.05, 1.05)))[0].returned for scene in scenes])
     rays = even_rays(int(np.ceil(1.1 * count / share)), (0.05, 1.05))
@@ -54,11 +54,11 @@ def chosen(options: Any, candidates: int, scenes: int) -> tuple[Any, Any, Any, n
     """Rays, their table, the choice and its gates, with the processor time that each stage took [s]."""
     from lidardesign_tasks.face import FaceTask
 
-    from lidardesign.design.bandwidth import Bandwidth
-    from lidardesign.selection.candidates import gate_choices, inform
-    from lidardesign.selection.certificate import certify
-    from lidardesign.selection.choice import RayCounts, choose
-    from lidardesign.selection.coverage import gather
+    from lidardesign.rays.certificate import certify
+    from lidardesign.rays.choice import RayCounts, choose
+    from lidardesign.rays.coverage import gather
+    from lidardesign.rays.gates import gate_choices, inform
+    from lidardesign.sensors.bandwidth import Bandwidth
 
     task, rays = FaceTask(), even_candidates(face_scenes(options.model, 5), candidates)
     bandwidth = Bandwidth()
@@ -104,8 +104,8 @@ def small_problems(options: Any) -> list[list[object]]:
     sys.path.insert(0, str(ROOT / "tests"))
     from support.coverages import relaxed_by_highs, small
 
-    from lidardesign.selection.certificate import certify
-    from lidardesign.selection.choice import RayCounts, choose
+    from lidardesign.rays.certificate import certify
+    from lidardesign.rays.choice import RayCounts, choose
 
     rows: list[list[object]] = []
     for price in (0.0, 0.002):
@@ -127,10 +127,10 @@ def proxy_beside_score(options: Any) -> tuple[list[list[object]], float]:
     from lidardesign_tasks.face import FaceTask
     from scipy.stats import spearmanr
 
-    from lidardesign.selection.candidates import inform
-    from lidardesign.selection.choice import RayCounts, choose
-    from lidardesign.selection.coverage import gather
-    from lidardesign.simulate.simulate import simulate
+    from lidardesign.rays.choice import RayCounts, choose
+    from lidardesign.rays.coverage import gather
+    from lidardesign.rays.gates import inform
+    from lidardesign.simulate.returns import simulate
 
     task, generator = FaceTask(), np.random.default_rng(0)
     rays, coverage, _, gates_m, _ = chosen(options, options.proxy[0], options.proxy[1])

@@ -33,8 +33,8 @@ class Tally:
 
 def request_of(run: Any, designs: list[Any], options: Any) -> Any:
     """What to evaluate, with the detector and what the scenes call for."""
-    from lidardesign.evaluate.request import EvaluationRequest
     from lidardesign.samples import load_samples
+    from lidardesign.scoring.evaluation.request import EvaluationRequest
     from lidardesign.simulate.detector.files import load_detector
     from lidardesign.simulate.plan import Planner
 
@@ -57,7 +57,7 @@ def request_of(run: Any, designs: list[Any], options: Any) -> Any:
 
 def add_scene(request: Any, entries: list[Any], tallies: list[Tally], scene: Any) -> frozenset[str]:
     """Simulate and score every entry in one scene; what the scene called for."""
-    from lidardesign.simulate.simulate import build_casters, simulate_many
+    from lidardesign.simulate.returns import build_casters, simulate_many
 
     casters = build_casters(scene)
     lists = [entry.positions[0] for entry in entries]
@@ -82,7 +82,7 @@ def add_scene(request: Any, entries: list[Any], tallies: list[Tally], scene: Any
 
 def physics_of(request: Any, effects: frozenset[str]) -> Any:
     """Some effects with the evaluation's own random numbers."""
-    from lidardesign.simulate.detector.detector import Physics
+    from lidardesign.simulate.detector.physics import Physics
 
     return Physics(request.planner.detector, effects, request.seed)
 
@@ -120,7 +120,7 @@ def paired_rows(entries: list[Any], tallies: list[Tally], seed: int) -> list[lis
     """Every design against every baseline at equal rays, scene by scene."""
     import numpy as np
 
-    from lidardesign.evaluate.statistics import paired_difference
+    from lidardesign.scoring.scenes.statistics import paired_difference
 
     rows = []
     for entry, tally in zip(entries, tallies, strict=True):
@@ -155,7 +155,7 @@ def main() -> None:
 def measure(run_folder: Path, options: Any) -> None:
     """Fit, simulate and print."""
     from lidardesign import open_run
-    from lidardesign.evaluate.entries import entries_of
+    from lidardesign.scoring.evaluation.entries import entries_of
 
     run = open_run(run_folder)
     designs = [fitted(run_folder, f"sunlight-{n}", sensors=n, layout="grid").specification for n in options.sensors]

@@ -24,8 +24,8 @@ from common import face_scenes, interleaved, median_ratio, model_option, parser,
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import TableField
-from lidardesign.density.target.proposals import propose
-from lidardesign.density.target.target import Target, build_target
+from lidardesign.density.objective.proposals import propose
+from lidardesign.density.objective.target import Target, build_target
 from lidardesign.space import DesignSpace, observed_point
 
 EXPONENT_LIMIT = 60.0

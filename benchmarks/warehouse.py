@@ -79,11 +79,11 @@ def verdicts(found: dict[str, Any]) -> list[str]:
 def miss_rates(run_folder: Path, designs: list[Any], x_m: float, rays: int) -> dict[str, float]:
     """Mean miss rate [%] on the held-out shelves seen from one position, by design and baseline."""
     from lidardesign import open_run
-    from lidardesign.evaluate.request import EvaluationRequest
-    from lidardesign.evaluate.score import evaluate
+    from lidardesign.fitting.run_samples import Layouts
     from lidardesign.samples import load_samples
+    from lidardesign.scoring.evaluation.request import EvaluationRequest
+    from lidardesign.scoring.evaluation.score import evaluate
     from lidardesign.task import scenes_of
-    from lidardesign.workflow.run_samples import Layouts
 
     run = open_run(run_folder)
     config = run.config
@@ -118,10 +118,10 @@ def divergence_nats(run_folder: Path, x_m: float, log_likelihood: float) -> floa
     import numpy as np
 
     from lidardesign import open_run
-    from lidardesign.design.mixture.support import MOVED_SAMPLES, at_condition
+    from lidardesign.fitting.run_samples import RunTarget
+    from lidardesign.mixture.support import MOVED_SAMPLES, at_condition
     from lidardesign.samples import load_samples
     from lidardesign.task import random_generator
-    from lidardesign.workflow.run_samples import RunTarget
 
     run = open_run(run_folder)
     generator = random_generator(run.config.seed, "condition")  # the fit's own samples

@@ -25,16 +25,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lidardesign import open_run
-from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS, degree_frame, scan_directions
-from lidardesign.evaluate.captures.capture import Capture, load_capture
-from lidardesign.export.galvo import read_galvo
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays
+from lidardesign.formats.galvo import read_galvo
+from lidardesign.formats.galvo_angles import SPEED_OF_LIGHT_M_PER_PS, degree_frame, scan_directions
 from lidardesign.run.files import write_atomic
-from lidardesign.scene import Mesh, Scene
-from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector, Physics
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Mesh, Scene
+from lidardesign.scoring.captures.capture import Capture, load_capture
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.simulate import photon_histograms
+from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Detector, Physics
+from lidardesign.simulate.returns import photon_histograms
 from lidardesign.space import RANGE, DesignSpace
 
 SUNLIGHT = ("illuminance_lux=100000", "light=sun")

@@ -27,10 +27,10 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 import lidardesign
 from lidardesign.config import RunConfig
-from lidardesign.density.target.target import Target, build_target
-from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.density.objective.target import Target, build_target
 from lidardesign.samples import Samples, load_samples
-from lidardesign.scene import Capsule, Scene
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Capsule, Scene
 from lidardesign.space import AZIMUTH, RANGE, DesignSpace, X, aim
 
 INK, QUIET, SURFACE, OCCLUDER = "#1f2933", "#9aa5b1", "#3e4c59", "#b0b8c1"

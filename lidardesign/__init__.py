@@ -17,9 +17,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lidardesign.design.constraints.document import Constraints
-    from lidardesign.geometry.rays import Rays, Returns
-    from lidardesign.scene import (
+    from lidardesign.api.design import Design
+    from lidardesign.api.run import Run, learn, load_design, open_run
+    from lidardesign.api.scores import Scores
+    from lidardesign.api.seeds import evaluate_seeds
+    from lidardesign.constraints.document import Constraints
+    from lidardesign.scenes.rays import Rays, Returns
+    from lidardesign.scenes.scene import (
         Ambient,
         Body,
         Box,
@@ -36,10 +40,6 @@ if TYPE_CHECKING:
     )
     from lidardesign.space import DesignSpace
     from lidardesign.task import Defaults, Information, Metric, Score, Split, Task, TaskConfig, random_generator
-    from lidardesign.workflow.designs import Design
-    from lidardesign.workflow.evaluate import Scores
-    from lidardesign.workflow.runs import Run, learn, load_design, open_run
-    from lidardesign.workflow.seeds import evaluate_seeds
 
 __version__ = "0.1.0"
 __all__ = [
@@ -50,15 +50,15 @@ __all__ = [
 ]  # fmt: skip
 # Where names are imported from when they are first used; type checkers read the imports above.
 _HOMES = {
-    "lidardesign.design.constraints.document": "Constraints",
-    "lidardesign.geometry.rays": "Rays Returns",
-    "lidardesign.scene": "Ambient Body Box Capsule Cylinder Ellipsoid Medium Mesh Plane Receiver Scene Sphere rigid",
+    "lidardesign.constraints.document": "Constraints",
+    "lidardesign.scenes.rays": "Rays Returns",
+    "lidardesign.scenes.scene": "Ambient Body Box Capsule Cylinder Ellipsoid Medium Mesh Plane Receiver Scene Sphere rigid",
     "lidardesign.space": "DesignSpace",
     "lidardesign.task": "Defaults Information Metric Score Split Task TaskConfig random_generator",
-    "lidardesign.workflow.designs": "Design",
-    "lidardesign.workflow.evaluate": "Scores",
-    "lidardesign.workflow.runs": "Run learn load_design open_run",
-    "lidardesign.workflow.seeds": "evaluate_seeds",
+    "lidardesign.api.design": "Design",
+    "lidardesign.api.scores": "Scores",
+    "lidardesign.api.run": "Run learn load_design open_run",
+    "lidardesign.api.seeds": "evaluate_seeds",
 }
 
 

@@ -17,9 +17,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from lidardesign.errors import ConfigError, DataError, PluginError
-from lidardesign.geometry.rays import Returns
 from lidardesign.run.files import sha256_file
-from lidardesign.scene import Scene
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Scene
 from lidardesign.space import DIMENSIONS, FARTHEST_M, DesignSpace
 
 API_VERSION = 1
@@ -261,7 +261,7 @@ def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpa
             raise PluginError(
                 f"scenes() returned a {type(scene).__name__}",
                 where=f"task {task.name}",
-                allowed="lidardesign.scene.Scene",
+                allowed="lidardesign.scenes.scene.Scene",
             )
     return scenes
 

@@ -46,10 +46,10 @@ def pytest_collection_modifyitems(items):
 def choices_look_at_few_scenes():
     """Rays and sensors are chosen as users choose them, but on fewer scenes: those take half a minute."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lidardesign.selection.information.FEW_SCENES", 5)
-        patch.setattr("lidardesign.selection.information.MOST_SCENES", 10)
-        patch.setattr("lidardesign.evaluate.entries.USUAL_SCENES", 10)
-        patch.setattr("lidardesign.workflow.fit.COUNTS", (1, 2))
+        patch.setattr("lidardesign.rays.information.FEW_SCENES", 5)
+        patch.setattr("lidardesign.rays.information.MOST_SCENES", 10)
+        patch.setattr("lidardesign.scoring.evaluation.entries.USUAL_SCENES", 10)
+        patch.setattr("lidardesign.fitting.request.COUNTS", (1, 2))
         yield
 
 

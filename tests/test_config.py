@@ -17,9 +17,9 @@ from lidardesign.config import (
     save_run_config,
     with_task_settings,
 )
-from lidardesign.design.catalog.statements import PartFile
-from lidardesign.design.constraints.document import Constraints
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.parts.statements import PartFile
 from lidardesign.registry import list_tasks, load_task
 from lidardesign.run.manifest import start_manifest, write_recorded
 from lidardesign.run.overrides import parse_override

@@ -21,9 +21,9 @@ API = {"constrain", "evaluate", "evaluate_seeds", "fit", "learn"}
 
 # From the ground up: a room imports its own modules and those of rooms before it.
 ROOMS = (
-    "errors", "numerics", "estimates", "run", "space", "scene", "geometry", "meshio", "mujoco_model", "samples",
-    "task", "registry", "config", "density", "design", "simulate", "selection", "evaluate", "export", "testing",
-    "workflow", "cli", "__main__",
+    "errors", "numerics", "estimates", "run", "space", "scenes", "samples", "task", "registry", "config", "run_folder",
+    "density", "sensors", "parts", "constraints", "mixture", "layouts", "simulate", "rays", "scoring", "fitting",
+    "formats", "report", "contract", "api", "cli", "__main__",
 )  # fmt: skip
 
 # Where a library may be imported, by the beginnings of module names; nowhere else.
@@ -31,17 +31,17 @@ HOMES = {
     "torch": ("density.",),
     "safetensors": ("density.",),
     "zuko": ("density.",),
-    "embreex": ("geometry.triangles",),
-    "cma": ("evaluate.baselines.cma",),
-    "mujoco": ("mujoco_model.", "design.rigs.mjcf."),
+    "embreex": ("scenes.triangles",),
+    "cma": ("scoring.baselines.cma",),
+    "mujoco": ("scenes.mujoco_models.", "formats.mjcf."),
     "mink": (),
     "typer": ("cli.",),
     "click": ("cli.",),
     "rich": ("cli.",),
-    "plotly": ("evaluate.report.",),
+    "plotly": ("report.",),
     "matplotlib": (),
-    "distributed": ("evaluate.workers.",),
-    "dask": ("evaluate.workers.",),
+    "distributed": ("scoring.evaluation.workers.",),
+    "dask": ("scoring.evaluation.workers.",),
     # it can abort its process: only the one of its own imports it
     "mitsuba": ("simulate.light_transport.worker",),
     "mitransient": ("simulate.light_transport.worker",),
@@ -50,7 +50,9 @@ HOMES = {
 SLOW_AT_TOP = {
     "torch", "cma", "numba", "trimesh", "matplotlib", "plotly", "igl", "h5py", "scipy", "zuko", "embreex",
 }  # fmt: skip
-FAST_ROOMS = ("run", "design", "cli", "registry", "task", "workflow", "config", "samples")
+FAST_ROOMS = (
+    "run", "run_folder", "sensors", "parts", "constraints", "mixture", "fitting", "formats", "cli", "registry", "task", "api", "config", "samples",
+)  # fmt: skip
 
 # Words that say nothing of what a module, class or function holds.
 EMPTY_WORDS = {

@@ -10,7 +10,7 @@ from support.meshes import BOX_FACES, BOX_VERTICES, write_box
 from support.tables import each_row
 
 from lidardesign.errors import DataError
-from lidardesign.meshio import (
+from lidardesign.scenes.mesh_files import (
     SUFFIXES,
     check_mesh,
     edge_defects,

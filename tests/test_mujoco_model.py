@@ -11,10 +11,10 @@ from support.tables import each_row
 
 from lidardesign.density.fields.distance import build_field
 from lidardesign.errors import DataError
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.surface import sample_body
-from lidardesign.mujoco_model import PNG_BEGINNING, bodies_from_mujoco, load_model, visible_geoms
-from lidardesign.scene import Cylinder, Mesh, Plane, Scene, Sphere
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.mujoco_models import PNG_BEGINNING, bodies_from_mujoco, load_model, visible_geoms
+from lidardesign.scenes.scene import Cylinder, Mesh, Plane, Scene, Sphere
+from lidardesign.scenes.surface import sample_body
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((-1, -1, -1, -3, -1, 0.1), (1, 1, 1, 3, 1, 3))

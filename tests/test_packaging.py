@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from lidardesign.testing.scaffold import new_task
+from lidardesign.contract.scaffold import new_task
 
 ROOT = Path(__file__).parents[1]
 # All that a checkout has.
@@ -110,7 +110,7 @@ def test_the_wheel_holds_every_module_and_data_file_and_no_tests(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     expected = {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob("*.py")}
     expected |= {path.relative_to(ROOT / "tasks").as_posix() for path in (ROOT / "tasks").rglob("*.py")}
-    expected |= {"lidardesign/py.typed", "lidardesign/design/design.schema.json"}
+    expected |= {"lidardesign/py.typed", "lidardesign/sensors/design.schema.json"}
     expected |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob("*.yaml")}
     expected |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob("template/*.txt")}
     data = ROOT / "tasks" / "lidardesign_tasks" / "data"

@@ -12,8 +12,20 @@ from support import references
 from support.tables import each_row
 
 from lidardesign.errors import DataError
-from lidardesign.geometry.surface import sample_body, sample_triangles, surface_area_m2
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, inverse_rigid, rigid
+from lidardesign.scenes.scene import (
+    Body,
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    Mesh,
+    Plane,
+    Scene,
+    Sphere,
+    inverse_rigid,
+    rigid,
+)
+from lidardesign.scenes.surface import sample_body, sample_triangles, surface_area_m2
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, 0, -1, 0), (0, 0, 0, 1, 1, 3))

@@ -30,9 +30,9 @@ from support.long_runs import heading, kept, table, write_page  # noqa: E402
 # The files that test each module. A change outside of functions meets the first one alone, whole.
 TESTS = {
     "lidardesign/numerics.py": ("test_numerics.py",),
-    "lidardesign/design/mixture/mixture.py": ("design/test_mixture.py",),
-    "lidardesign/design/constraints/document.py": ("design/test_constraints.py", "design/test_check.py"),
-    "lidardesign/design/layouts/rays.py": (
+    "lidardesign/mixture/components.py": ("design/test_mixture.py",),
+    "lidardesign/constraints/document.py": ("design/test_constraints.py", "design/test_check.py"),
+    "lidardesign/layouts/rays.py": (
         "design/test_rays.py", "design/test_catalog.py", "design/test_track.py", "workflow/test_select_rays.py",
     ),
 }  # fmt: skip

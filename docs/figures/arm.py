@@ -20,13 +20,13 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from lidardesign import open_run
-from lidardesign.design.files import load_design
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays, Returns
+from lidardesign.layouts.rays import lay_out
 from lidardesign.samples import load_samples
-from lidardesign.scene import Body, Plane, Scene
-from lidardesign.simulate.simulate import simulate
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Rays, Returns
+from lidardesign.scenes.scene import Body, Plane, Scene
+from lidardesign.sensors.design_file import load_design
+from lidardesign.simulate.returns import simulate
 
 RAYS, SENSORS = 400, 4
 FRAME = 26

@@ -19,12 +19,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lidardesign.design.catalog.library import load_library
-from lidardesign.design.catalog.part import Part
-from lidardesign.design.files import load_design
-from lidardesign.design.layouts.rays import own_count
-from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
+from lidardesign.layouts.rays import own_count
+from lidardesign.parts.catalogue import load_library
+from lidardesign.parts.part import Part
+from lidardesign.sensors.design_file import load_design
+from lidardesign.sensors.sensor import DesignSpec
 from lidardesign.space import angles
 
 COLOURS = {

@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Scene
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Scene
 
 INK, QUIET, PAPER = "#1f2933", "#7b8794", "#ffffff"
 COLOUR_STEP = 5  # of 255: divides it, so that white stays white

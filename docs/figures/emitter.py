@@ -24,13 +24,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from lidardesign import open_run
-from lidardesign.design.files import load_design
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import IDEAL, Physics
-from lidardesign.simulate.simulate import simulate
+from lidardesign.layouts.rays import lay_out
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Scene
+from lidardesign.sensors.design_file import load_design
+from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.simulate.detector.physics import IDEAL, Physics
+from lidardesign.simulate.returns import simulate
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from emitter import EMITTERS

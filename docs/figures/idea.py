@@ -28,16 +28,16 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator, Null
 from scipy.ndimage import gaussian_filter
 
 from lidardesign.config import RunConfig, load_run_config
-from lidardesign.design.files import load_design
-from lidardesign.design.layouts.grid import field_on_sphere
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
-from lidardesign.evaluate.report.density_views import DensityView, density_view
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays, Returns
+from lidardesign.layouts.grid import field_on_sphere
+from lidardesign.layouts.rays import lay_out
+from lidardesign.report.density_views import DensityView, density_view
 from lidardesign.samples import Samples, load_samples
-from lidardesign.scene import Scene
-from lidardesign.simulate.simulate import simulate
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Outcome, Rays, Returns
+from lidardesign.scenes.scene import Scene
+from lidardesign.sensors.design_file import load_design
+from lidardesign.sensors.sensor import DesignSpec, Sensor, tangent_directions
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import AZIMUTH, ELEVATION, angles, direction
 
 SIZE_INCHES, DOTS_PER_INCH = (14.0, 11.2), 100

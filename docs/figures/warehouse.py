@@ -25,13 +25,13 @@ from matplotlib.patches import Rectangle
 from scipy.ndimage import gaussian_filter
 
 from lidardesign import open_run
-from lidardesign.design.files import load_design
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec
-from lidardesign.geometry.rays import Outcome
+from lidardesign.layouts.rays import lay_out
 from lidardesign.samples import Samples, load_samples
-from lidardesign.scene import Scene
-from lidardesign.simulate.simulate import simulate
+from lidardesign.scenes.rays import Outcome
+from lidardesign.scenes.scene import Scene
+from lidardesign.sensors.design_file import load_design
+from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import AZIMUTH, ELEVATION, X
 
 RAYS = 12

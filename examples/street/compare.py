@@ -15,7 +15,7 @@ from pathlib import Path
 import lidardesign as ld
 import numpy as np
 from lidardesign import Rays
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.returns import simulate
 
 from lidardesign_street.scenes import OWN, scene_of, user_of
 from lidardesign_street.task import FARTHEST_M, NEAREST_M, StreetTask

@@ -14,18 +14,18 @@ import numpy as np
 import torch
 
 from lidardesign.config import RunConfig
-from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates, on_device, stays_on
-from lidardesign.density.target.prepare import prepare_target, training_scenes
-from lidardesign.density.target.proposals import independent_points
-from lidardesign.density.target.scale import scale_notes
-from lidardesign.density.target.target import Target
-from lidardesign.density.target.visibility import common_receiver
+from lidardesign.density.flow.coordinates import Coordinates, on_device, stays_on
+from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.objective.prepare import prepare_target, training_scenes
+from lidardesign.density.objective.proposals import independent_points
+from lidardesign.density.objective.scale import scale_notes
+from lidardesign.density.objective.target import Target
+from lidardesign.density.objective.visibility import common_receiver
 from lidardesign.density.training.checkpoint import clear_snapshots, save_flow
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import IndependentProbes, draw_probes, measure
 from lidardesign.density.training.sampling import draw_samples
-from lidardesign.density.training.training import (
+from lidardesign.density.training.trainer import (
     PROGRESS,
     STOPPING_POINTS,
     LearnProgress,
@@ -35,12 +35,12 @@ from lidardesign.density.training.training import (
 from lidardesign.density.verdict import Verdict
 from lidardesign.errors import BackgroundNote, ConfigError, DataError
 from lidardesign.estimates import Estimate
-from lidardesign.geometry.frames import in_view
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import peak_memory_bytes, phase, running
 from lidardesign.run.manifest import note, record
 from lidardesign.samples import save_samples
-from lidardesign.scene import Scene
+from lidardesign.scenes.receivers import in_view
+from lidardesign.scenes.scene import Scene
 from lidardesign.space import AZIMUTH, observed_point
 from lidardesign.task import Task, notes_of, random_generator
 

@@ -21,17 +21,17 @@ import numpy as np
 import torch
 
 from lidardesign.config import LearningSettings, RunConfig
-from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.flow.coordinates import Coordinates
+from lidardesign.density.flow.network import DesignFlow
 from lidardesign.density.learn import FLOW, make_flow, training_scenes
-from lidardesign.density.target.prepare import prepare_target
-from lidardesign.density.target.target import Target
-from lidardesign.density.target.visibility import Optics
+from lidardesign.density.objective.prepare import prepare_target
+from lidardesign.density.objective.target import Target
+from lidardesign.density.objective.visibility import Optics
 from lidardesign.density.training.checkpoint import load_arrays, stored_snapshots
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.density.training.quality import IndependentProbes, measure
 from lidardesign.density.training.sampling import LearnedFlow, Thinning, condition_groups, draw_samples, log_density_of
-from lidardesign.density.training.training import PROGRESS, SIGMA_START_RATIO
+from lidardesign.density.training.trainer import PROGRESS, SIGMA_START_RATIO
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.numerics import TINY

@@ -21,13 +21,13 @@ from typing import Literal
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.frames import path_windows
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.run.validation import suggest
-from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import (
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.receivers import path_windows
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.physics import (
     COUNTED,
     EFFECTS,
     IDEAL,
@@ -53,7 +53,7 @@ from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.effects.steps import with_steps
 from lidardesign.simulate.light_transport import transport
-from lidardesign.simulate.simulate import build_casters
+from lidardesign.simulate.returns import build_casters
 from lidardesign.task import Metric
 
 # Per further sub-ray of a beam [s].

@@ -3,7 +3,7 @@
 World frame and heads are those of the task `face`. The detector stands at one place and hears every ray; what is
 designed are the emitters around it: their places, directions and ranges. Light goes from an emitter to the face and
 from there to the detector, so only what both of them see counts, and the range along a ray follows from the whole
-path of its light (`lidardesign.geometry.frames`). A flood emitter is a sensor whose rays are the dots of its pattern.
+path of its light (`lidardesign.scenes.receivers`). A flood emitter is a sensor whose rays are the dots of its pattern.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Returns
-from lidardesign.scene import Mesh, Receiver, Scene, inverse_rigid
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Mesh, Receiver, Scene, inverse_rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Information, Interval, Metres, Metric, Score, Split, Vector
 from lidardesign_tasks.face import FaceTask, HeadConfig, head_scenes

@@ -18,9 +18,9 @@ import numpy as np
 from pydantic import Field
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Returns
-from lidardesign.meshio import check_mesh, usable_faces
-from lidardesign.scene import Body, Mesh, Receiver, Scene, Sign
+from lidardesign.scenes.mesh_files import check_mesh, usable_faces
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Body, Mesh, Receiver, Scene, Sign
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Information, Interval, Metres, Metric, Score, Split, Vector, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model

@@ -15,11 +15,11 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from lidardesign.evaluate.metrics import chamfer_m
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Returns
-from lidardesign.scene import Body, Capsule, Scene, Sphere, rigid
-from lidardesign.selection.information import surface_information
+from lidardesign.rays.information import surface_information
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Body, Capsule, Scene, Sphere, rigid
+from lidardesign.scoring.scenes.metrics import chamfer_m
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
 from lidardesign_tasks.surroundings import Surroundings

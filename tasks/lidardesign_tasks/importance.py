@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.surface import sample_triangles
+from lidardesign.scenes.surface import sample_triangles
 from lidardesign.space import DesignSpace
 from lidardesign.task import Vector, random_generator
 from lidardesign_tasks.surroundings import Surroundings

@@ -21,9 +21,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.geometry.rays import Returns
-from lidardesign.meshio import COLOURS, SUFFIXES, Painted, list_mesh_files, load_mesh
-from lidardesign.scene import Body, Mesh, Scene, Sign
+from lidardesign.scenes.mesh_files import COLOURS, SUFFIXES, Painted, list_mesh_files, load_mesh
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Body, Mesh, Scene, Sign
 from lidardesign.space import FARTHEST_M, DesignSpace
 from lidardesign.task import Defaults, FolderConfig, Information, Metres, Metric, Score, Split, Vector, random_generator
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins

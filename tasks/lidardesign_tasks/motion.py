@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.scene import Mesh
+from lidardesign.scenes.scene import Mesh
 from lidardesign_tasks.poses_csv import BodyPath, read_poses, span_s
 
 EVERY = "*"

@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.geometry.rays import Outcome, Returns
-from lidardesign.mujoco_model import import_mujoco, mujoco_warnings
-from lidardesign.scene import Body, Box, Mesh, rigid
+from lidardesign.scenes.mujoco_models import import_mujoco, mujoco_warnings
+from lidardesign.scenes.rays import Outcome, Returns
+from lidardesign.scenes.scene import Body, Box, Mesh, rigid
 
 Kind = Literal["bin", "table"]
 # Everything that is simulated is scaled to objects of this size, dropped at this density, in steps of this length.

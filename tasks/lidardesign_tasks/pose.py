@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.scene import rigid
+from lidardesign.scenes.scene import rigid
 
 LARGEST_DEVIATIONS = 2.5  # jitter is normal, cut at this many standard deviations so that no scene is absurd
 

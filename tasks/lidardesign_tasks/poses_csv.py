@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.geometry.frames import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.run.arrays import csv_rows
 from lidardesign.run.inputs import TABLE
 from lidardesign.run.yaml import plain_number
-from lidardesign.scene import rigid
+from lidardesign.scenes.receivers import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.scenes.scene import rigid
 from lidardesign.space import FARTHEST_M
 from lidardesign_tasks.pose import rotation_matrix
 

@@ -10,10 +10,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lidardesign.evaluate.metrics import SurfaceCloud, delaunay_surface, ray_spacing, surface_cloud, visible_surface
-from lidardesign.geometry.rays import Returns
-from lidardesign.scene import Mesh, Scene
-from lidardesign.selection.information import scattered_area_m2, surface_information
+from lidardesign.rays.information import scattered_area_m2, surface_information
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Mesh, Scene
+from lidardesign.scoring.scenes.metrics import (
+    SurfaceCloud,
+    delaunay_surface,
+    ray_spacing,
+    surface_cloud,
+    visible_surface,
+)
 from lidardesign.space import DesignSpace
 from lidardesign.task import Information, Metric, Score, random_generator
 

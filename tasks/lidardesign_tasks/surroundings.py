@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lidardesign.scene import Ambient, Medium, Scene
+from lidardesign.scenes.scene import Ambient, Medium, Scene
 from lidardesign.space import FARTHEST_M
 from lidardesign.task import TaskConfig
 

@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Returns
-from lidardesign.scene import Scene
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Scene
 from lidardesign.space import DIMENSIONS, DesignSpace, X
 from lidardesign.task import Defaults, Information, Interval, Metric, Score, Split, conditions_of, random_generator
 from lidardesign_tasks.surroundings import Surroundings

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from lidardesign.scene import Body, Box, Role, rigid
+from lidardesign.scenes.scene import Body, Box, Role, rigid
 from lidardesign.task import Interval
 
 LEVELS = 4

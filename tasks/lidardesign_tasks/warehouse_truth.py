@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Returns
-from lidardesign.scene import Scene
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 from lidardesign.task import Information, Metric, Score
 

@@ -10,10 +10,10 @@ from lidardesign_tasks.flatland import FlatlandTask
 from support.command_line import files_under, make_run
 from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
-from lidardesign.cli.output import EXIT_INTERRUPTED, Output, describe_error
+from lidardesign.cli.terminal.output import EXIT_INTERRUPTED, Output, describe_error
 from lidardesign.errors import PluginError
 from lidardesign.registry import plugin_guard
-from lidardesign.scene import Ambient, Body, Medium, Receiver, Scene, Sphere
+from lidardesign.scenes.scene import Ambient, Body, Medium, Receiver, Scene, Sphere
 from lidardesign.simulate.light_transport import transport as light_transport_process
 
 LONG = "x" * 300

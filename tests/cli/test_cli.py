@@ -15,18 +15,18 @@ from support.command_line import make_run
 
 import lidardesign as package
 from lidardesign import __version__
-from lidardesign.cli import output as console_module
-from lidardesign.cli.output import command, plain_json
+from lidardesign.api.design import Design
 from lidardesign.cli.tables.designs import show_fit
-from lidardesign.design.catalog.library import Pose, find_part, part_design
-from lidardesign.design.compare import paired_sensors
-from lidardesign.design.files import save_design
+from lidardesign.cli.terminal import output as console_module
+from lidardesign.cli.terminal.output import command, plain_json
 from lidardesign.errors import InfeasibleError
-from lidardesign.evaluate.report.tables import sensors_table
+from lidardesign.parts.catalogue import Pose, find_part, part_design
+from lidardesign.report.tables import sensors_table
 from lidardesign.run.files import run_lock
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples, load_samples, save_samples
-from lidardesign.workflow.designs import Design
+from lidardesign.sensors.compare import paired_sensors
+from lidardesign.sensors.design_file import save_design
 
 PART = "vl53l8cx:4x4"
 
@@ -140,7 +140,7 @@ def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, m
     def refuse(design, request):
         raise InfeasibleError("broken", conflicts=["gate.width_m.max"])
 
-    monkeypatch.setattr("lidardesign.workflow.fit_design.check_written", refuse)
+    monkeypatch.setattr("lidardesign.fitting.fit.check_written", refuse)
     result = lidardesign("constrain", flat, "--layout", "grid", "--set", "gate.width_m.max=0.3", "--json")
     assert result.code == 4
     assert result.json["error"]["conflicts"] == ["gate.width_m.max"]
@@ -148,7 +148,7 @@ def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, m
 
 
 def test_a_run_that_is_being_written_is_left_alone(lidardesign, flat, monkeypatch):
-    monkeypatch.setattr("lidardesign.workflow.designs.WAIT_S", 0.1)
+    monkeypatch.setattr("lidardesign.api.design.WAIT_S", 0.1)
     with run_lock(flat):
         result = lidardesign("fit", flat)
     assert result.code == 2
@@ -257,8 +257,8 @@ def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesi
 @pytest.mark.parametrize("decided", ["raycast", "off", None])
 def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on(flat, monkeypatch, decided):
     from lidardesign import open_run
+    from lidardesign.fitting.run_samples import RunTarget
     from lidardesign.run.manifest import note
-    from lidardesign.workflow.run_samples import RunTarget
 
     asked = []
 
@@ -271,7 +271,7 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
         asked.append((len(scenes), visibility))
         return Flat(), []
 
-    monkeypatch.setattr("lidardesign.density.target.prepare.prepare_target", prepare)
+    monkeypatch.setattr("lidardesign.density.objective.prepare.prepare_target", prepare)
     if decided is not None:
         note(flat, visibility=decided)
     target = RunTarget(open_run(flat))

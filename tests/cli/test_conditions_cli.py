@@ -9,14 +9,14 @@ import pytest
 from support.command_line import caller, files_under, make_run
 from support.conditioned_runs import log_target, make_conditioned_run
 
-from lidardesign.design.files import load_design
-from lidardesign.design.layouts.rays import lay_out
+from lidardesign.layouts.rays import lay_out
+from lidardesign.sensors.design_file import load_design
 
 
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process; the target density is the planted one."""
-    monkeypatch.setattr("lidardesign.workflow.run_samples.RunTarget.__call__", lambda self, points: log_target(points))
+    monkeypatch.setattr("lidardesign.fitting.run_samples.RunTarget.__call__", lambda self, points: log_target(points))
     return caller(capsys, tmp_path, monkeypatch)
 
 
@@ -198,8 +198,8 @@ def test_a_design_by_hand_without_a_number_of_rays_is_exported_at_the_one_that_i
 
 
 def test_a_design_is_exported_with_the_rays_that_it_is_evaluated_with(lidardesign, run, tmp_path):
+    from lidardesign.fitting.run_samples import Layouts
     from lidardesign.samples import load_samples
-    from lidardesign.workflow.run_samples import Layouts
 
     for layout, gates in (("grid", "ray"), ("density", "ray"), ("distributed", "sensor"), ("distributed", "ray")):
         name = f"{layout}-{gates}"
@@ -217,7 +217,7 @@ def test_a_design_is_exported_with_the_rays_that_it_is_evaluated_with(lidardesig
 
 
 def test_a_scan_for_one_value_is_fitted_anew_once_for_all_places(lidardesign, run, monkeypatch):
-    from lidardesign.design import fit as fit_module
+    from lidardesign.mixture import fit as fit_module
     from lidardesign.samples import load_samples
 
     assert lidardesign("fit", run, "--at", "x_m=0.37", "--layout", "scan", "--rays", 4, "--name", "here").code == 0

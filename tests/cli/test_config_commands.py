@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from support.command_line import make_run
 from support.tables import each_row
 
+from lidardesign.api.config_reference import config_template, config_text, default_document, schema_of
 from lidardesign.config import PRESETS, DensitySettings, LearningSettings, resolve
-from lidardesign.design.constraints.document import Constraints
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError
 from lidardesign.registry import list_tasks, load_task
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.task import Metric, TaskConfig
-from lidardesign.workflow.config_reference import config_template, config_text, default_document, schema_of
 
 TASKS = [item.name for item in list_tasks() if item.error is None and item.distribution.startswith("lidardesign ")]
 # They need a folder or a model, so that no configuration follows from the defaults alone.
@@ -250,7 +250,7 @@ def test_what_evaluate_prints_is_valid_and_complete(evaluation):
 
 
 def test_the_rungs_of_accuracy_are_those_of_the_schema():
-    from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
+    from lidardesign.scoring.accuracy.settings import Measurement, Sweep
 
     measurements = [
         Measurement("4", 0.1, 0.01, 2.0, values={"gap_mm": 1.0}),

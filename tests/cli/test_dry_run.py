@@ -8,7 +8,7 @@ import pytest
 from support.command_line import files_under
 from support.tables import each_row
 
-from lidardesign.density.training.training import Trainer
+from lidardesign.density.training.trainer import Trainer
 
 TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverage_proposals=256", "hidden=4")
 SETTINGS = [word for value in ("train=1", *(f"learning.{one}" for one in TINY)) for word in ("--set", value)]

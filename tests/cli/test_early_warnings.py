@@ -12,13 +12,13 @@ from support.command_line import caller, make_run
 from support.tables import each_row
 
 from lidardesign.config import load_run_config
-from lidardesign.density.target.prepare import resolution_notes
-from lidardesign.design.compare import outside_notes
+from lidardesign.density.objective.prepare import resolution_notes
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import load_task
+from lidardesign.run_folder import read_design
+from lidardesign.sensors.compare import outside_notes
 from lidardesign.space import DesignSpace
 from lidardesign.task import notes_of
-from lidardesign.workflow.run_folder import read_design
 
 SPACE = DesignSpace(low=(1.0, 0, 0, 2.8, -0.4, 0.5), high=(1.0, 0, 0, 3.5, 0.4, 1.5))
 QUICK = [word for key in ("poses=1", "truth_points=100", "density.field_resolution=8", "density.visibility=off")

@@ -15,20 +15,20 @@ from support.captures import make_capture
 from support.command_line import make_run
 from support.tables import each_row
 
-from lidardesign.cli.output import Output, describe_error
+from lidardesign.cli.terminal.output import Output, describe_error
+from lidardesign.constraints.document import MOST_FITTED, Constraints
 from lidardesign.density.fields.grids import _digest, _load
 from lidardesign.density.learned import seconds_at
-from lidardesign.density.training.training import _step_of
-from lidardesign.design.bandwidth import split_budget
-from lidardesign.design.constraints.document import MOST_FITTED, Constraints
-from lidardesign.design.files import load_design
-from lidardesign.design.fit import fit
-from lidardesign.design.sensor import MOST_RAYS, interval_factor
+from lidardesign.density.training.trainer import _step_of
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.evaluate.captures.capture import load_capture
-from lidardesign.meshio import check_mesh, load_mesh
+from lidardesign.mixture.fit import fit
 from lidardesign.run.manifest import record
 from lidardesign.samples import Samples, load_samples
+from lidardesign.scenes.mesh_files import check_mesh, load_mesh
+from lidardesign.scoring.captures.capture import load_capture
+from lidardesign.sensors.bandwidth import split_budget
+from lidardesign.sensors.design_file import load_design
+from lidardesign.sensors.sensor import MOST_RAYS, interval_factor
 from lidardesign.space import FARTHEST_M, DesignSpace
 
 SPACE = DesignSpace((0.0, 0, 0, 2, 0, 0), (1.0, 0, 0, 4, 0, 1))

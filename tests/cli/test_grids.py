@@ -9,7 +9,7 @@ from rich.console import Console
 from support.tables import each_row
 
 from lidardesign.cli.tables.grids import duration, print_table
-from lidardesign.evaluate.report.tables import plain_number
+from lidardesign.report.tables import plain_number
 
 HEADINGS = ("design", "rays", "difference (95 % interval)", "seconds")
 LINES = (["free", "196", "-0.013 (-0.021 to -0.004)", "1.4, 2.6"], ["(own)", "36", "0.002 (-0.010 to 0.012)", "3, 3"])

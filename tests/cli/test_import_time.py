@@ -75,7 +75,7 @@ def test_compiled_loops_are_imported_where_neither_package_nor_home_can_be_writt
     environment = {**os.environ, "HOME": os.devnull, "TMPDIR": str(tmp_path / "temporary files")}
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
         environment.pop(name, None)
-    code = "import os, lidardesign.geometry.closest as m; print(m.__file__, os.environ['XDG_CACHE_HOME'], sep='\\n')"
+    code = "import os, lidardesign.scenes.distances as m; print(m.__file__, os.environ['XDG_CACHE_HOME'], sep='\\n')"
     ended = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )

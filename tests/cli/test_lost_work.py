@@ -47,10 +47,10 @@ def idle(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("the work has begun")
 
-    monkeypatch.setattr("lidardesign.workflow.evaluate.ScoreRequest.score", refuse)
-    monkeypatch.setattr("lidardesign.workflow.export.ExportRequest.write", refuse)
-    monkeypatch.setattr("lidardesign.evaluate.captures.capture.load_capture", refuse)
-    monkeypatch.setattr("lidardesign.workflow.designs.Design.fitted", refuse)
+    monkeypatch.setattr("lidardesign.api.scores.ScoreRequest.score", refuse)
+    monkeypatch.setattr("lidardesign.api.export.ExportRequest.write", refuse)
+    monkeypatch.setattr("lidardesign.scoring.captures.capture.load_capture", refuse)
+    monkeypatch.setattr("lidardesign.api.design.Design.fitted", refuse)
 
 
 UNWRITABLE = [
@@ -156,7 +156,7 @@ def test_scores_are_shown_where_a_page_is_interrupted(call, monkeypatch, error):
     def refuse(*_, **__):
         raise error
 
-    monkeypatch.setattr("lidardesign.workflow.evaluate.Scores.report", refuse)
+    monkeypatch.setattr("lidardesign.api.scores.Scores.report", refuse)
     result = call(*EVALUATE, "--report", "page.html")
     assert result.code == (130 if error is KeyboardInterrupt else 70)
     assert "bounding" in result.out
@@ -164,7 +164,7 @@ def test_scores_are_shown_where_a_page_is_interrupted(call, monkeypatch, error):
 
 @pytest.mark.parametrize("gone", ["run", "."])
 def test_scores_are_shown_where_the_run_or_the_working_folder_goes_meanwhile(call, work, tmp_path, monkeypatch, gone):
-    import lidardesign.workflow.evaluate as workflow
+    import lidardesign.api.scores as workflow
 
     shutil.copytree(work, tmp_path / "moved", ignore=shutil.ignore_patterns("socket"))
     monkeypatch.chdir(tmp_path / "moved")

@@ -9,12 +9,12 @@ import pytest
 from support.command_line import caller
 from support.tables import each_row
 
-from lidardesign.cli import progress
-from lidardesign.cli.output import Output
-from lidardesign.cli.progress import ProgressDisplay
 from lidardesign.cli.tables.scores import sentence
+from lidardesign.cli.terminal import progress
+from lidardesign.cli.terminal.output import Output
+from lidardesign.cli.terminal.progress import ProgressDisplay
 from lidardesign.errors import BackgroundNote
-from lidardesign.evaluate.results import Paired
+from lidardesign.scoring.evaluation.results import Paired
 
 
 @pytest.fixture

@@ -118,7 +118,7 @@ def test_the_old_run_stays_as_it_is_while_the_new_one_is_not_finished(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"lidardesign.density.training.training.Trainer.{method}", interrupt)
+        patch.setattr(f"lidardesign.density.training.trainer.Trainer.{method}", interrupt)
         result = learned(lidardesign, "--seed", 1, "--overwrite")
     assert result.code == 130
     now = files_under(tmp_path)

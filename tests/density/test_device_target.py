@@ -12,8 +12,7 @@ import trimesh
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import (
+from lidardesign.density.flow.coordinates import (
     Coordinates,
     DeviceTarget,
     log_target,
@@ -21,10 +20,11 @@ from lidardesign.density.flow.objective import (
     on_device,
     stays_on,
 )
-from lidardesign.density.target.target import build_target
+from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.objective.target import build_target
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.errors import NumericalError
-from lidardesign.scene import Body, Mesh, Scene, rigid
+from lidardesign.scenes.scene import Body, Mesh, Scene, rigid
 from lidardesign.space import DesignSpace
 
 CPU = torch.device("cpu")

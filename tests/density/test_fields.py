@@ -15,8 +15,8 @@ from support.tables import each_row
 from lidardesign.density.fields import grids
 from lidardesign.density.fields.distance import BodyField, UnionField, build_field
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.closest import TriangleTree
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.distances import TriangleTree
+from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Plane, Scene, Sphere, rigid
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 

@@ -12,13 +12,13 @@ from support import references
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.bodies import Pairs, collect_bodies, occluding_bodies
 from lidardesign.density.fields.distance import BodyField
-from lidardesign.density.target.proposals import independent_points
-from lidardesign.density.target.surfaces import MovingFrames
-from lidardesign.density.target.target import build_target
-from lidardesign.density.target.visibility import BodyRaycast, RayBatch
+from lidardesign.density.objective.proposals import independent_points
+from lidardesign.density.objective.surfaces import MovingFrames
+from lidardesign.density.objective.target import build_target
+from lidardesign.density.objective.visibility import BodyRaycast, RayBatch
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, direction, observed_point
 
 CEILING = DesignSpace((-0.6, -0.6, 1.0, 0.0, -math.pi / 2, 0.1), (0.6, 0.6, 1.0, 2 * math.pi, -math.pi / 4, 1.5))
@@ -143,7 +143,7 @@ def test_bodies_are_found_by_their_boxes_as_by_looking_at_all():
     bodies = collect_bodies(scenes, lambda body: not isinstance(body.shape, Plane), resolution=24, padding_m=0.1)
     points = np.random.default_rng(5).uniform(-0.6, 0.8, (400, 3))
     everything = BodyField(bodies).distances(points)
-    from lidardesign.density.target.surfaces import near_pairs
+    from lidardesign.density.objective.surfaces import near_pairs
 
     pairs = near_pairs(bodies, points, np.zeros(bodies.columns), 0.05, 1e9)
     np.testing.assert_array_equal(pairs.columns, np.tile(np.arange(bodies.columns), len(points)))

@@ -22,13 +22,13 @@ from lidardesign.density.fields.importance import (
     log_weight_grid,
 )
 from lidardesign.density.learn import learn
-from lidardesign.density.target.prepare import prepare_target
-from lidardesign.density.target.proposals import independent_points
-from lidardesign.density.target.target import build_target
+from lidardesign.density.objective.prepare import prepare_target
+from lidardesign.density.objective.proposals import independent_points
+from lidardesign.density.objective.target import build_target
 from lidardesign.errors import DataError
 from lidardesign.numerics import logsumexp
 from lidardesign.samples import load_samples
-from lidardesign.scene import LARGEST_WEIGHT, Body, Box, Capsule, Mesh, Receiver, Scene, Sphere, rigid
+from lidardesign.scenes.scene import LARGEST_WEIGHT, Body, Box, Capsule, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, observed_point
 from lidardesign.task import Defaults, Metric, TaskConfig, scoring_settings
 

@@ -27,7 +27,7 @@ from lidardesign.density.training.checkpoint import (
     stored_snapshots,
 )
 from lidardesign.density.training.sampling import log_density_of
-from lidardesign.density.training.training import AVERAGING, BETAS, Adam
+from lidardesign.density.training.trainer import AVERAGING, BETAS, Adam
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.manifest import verify

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from support import references
 
-from lidardesign.density.target.proposals import occluded_share, propose
-from lidardesign.scene import Body, Box, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.density.objective.proposals import occluded_share, propose
+from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
 SPREAD_M = 0.05

@@ -9,11 +9,11 @@ import pytest
 from support import references
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.target.prepare import refine_quadrature
-from lidardesign.density.target.target import build_target
-from lidardesign.density.target.visibility import BistaticVisibility, NoVisibility
+from lidardesign.density.objective.prepare import refine_quadrature
+from lidardesign.density.objective.target import build_target
+from lidardesign.density.objective.visibility import BistaticVisibility, NoVisibility
 from lidardesign.errors import ConfigError
-from lidardesign.scene import Body, Box, Receiver, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Body, Box, Receiver, Scene, Sphere, rigid
 from lidardesign.space import RANGE, DesignSpace, aim, observed_point
 
 SPACE = DesignSpace((-0.3, -0.3, -0.3, -0.7, -0.7, 0.2), (0.3, 0.3, 0.3, 0.7, 0.7, 4.0))

@@ -15,10 +15,10 @@ from support.learning import config_of
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings, resolve
-from lidardesign.density.target.prepare import training_scenes
-from lidardesign.density.target.scale import scale_notes
+from lidardesign.density.objective.prepare import training_scenes
+from lidardesign.density.objective.scale import scale_notes
 from lidardesign.registry import load_task
-from lidardesign.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
 from lidardesign.space import RANGE, DesignSpace
 
 # Sensors within 0.1 m of the origin look to +x.

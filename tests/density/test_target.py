@@ -10,8 +10,8 @@ from support import references
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.target.target import build_target, nearby_order
-from lidardesign.scene import Body, Capsule, Plane, Scene, Sphere, rigid
+from lidardesign.density.objective.target import build_target, nearby_order
+from lidardesign.scenes.scene import Body, Capsule, Plane, Scene, Sphere, rigid
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 
 FACING = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # turns a plane's +z to face the sensor along -x

@@ -9,9 +9,9 @@ import pytest
 from support.visibility import OPTICS, SPACE, along_axis, both_ways, config_of, plate, transmittance_on, wall
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.target.prepare import prepare_target
-from lidardesign.density.target.target import build_target
-from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
+from lidardesign.density.objective.prepare import prepare_target
+from lidardesign.density.objective.target import build_target
+from lidardesign.scenes.scene import Body, Mesh, Scene, Sphere, rigid
 from lidardesign.space import RANGE
 
 pytestmark = pytest.mark.usefixtures("own_cache")

@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.tables import each_row
 
-from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import SPEED_OF_LIGHT_M_S
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S
+from lidardesign.sensors.bandwidth import Bandwidth
 
 
 def rays_with_gates(gates):

@@ -14,7 +14,12 @@ from hypothesis import strategies as st
 from support.command_line import make_run
 from support.tables import each_row
 
-from lidardesign.design.catalog.library import (
+from lidardesign.errors import ConfigError
+from lidardesign.fitting.part_shapes import PartShape, gate_inside, shapes_of
+from lidardesign.layouts.grid import grid_rows
+from lidardesign.layouts.rays import LAYOUTS, lay_out
+from lidardesign.mixture.features import Axes
+from lidardesign.parts.catalogue import (
     FOLDER,
     Pose,
     boresight_of,
@@ -27,17 +32,12 @@ from lidardesign.design.catalog.library import (
     parts_for,
     side_by_side,
 )
-from lidardesign.design.catalog.part import Part, conditions_of, disagreements, even_subset, to_angles, to_directions
-from lidardesign.design.catalog.shapes import PartShape, gate_inside, shapes_of
-from lidardesign.design.catalog.statements import FIELDS, PartFile, Statement
-from lidardesign.design.files import design_document, design_from_document, load_design, save_design
-from lidardesign.design.layouts.grid import grid_rows
-from lidardesign.design.layouts.rays import LAYOUTS, lay_out
-from lidardesign.design.mixture.features import Axes
-from lidardesign.design.sensor import boresight_frame
-from lidardesign.errors import ConfigError
+from lidardesign.parts.part import Part, conditions_of, disagreements, even_subset, to_angles, to_directions
+from lidardesign.parts.statements import FIELDS, PartFile, Statement
 from lidardesign.run.validation import check_model
 from lidardesign.run.yaml import parse_yaml
+from lidardesign.sensors.design_file import design_document, design_from_document, load_design, save_design
+from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import DesignSpace, direction
 
 LIBRARY = load_library()

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from support.tables import each_row
 
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.files import design_document
-from lidardesign.design.fit import fit
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.mixture.fit import fit
 from lidardesign.samples import Samples
+from lidardesign.sensors.design_file import design_document
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((-1.0, -1.0, 0.0, 0.0, -1.5, 0.1), (1.0, 1.0, 2.0, 2 * math.pi, 1.5, 4.0))

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from support.command_line import make_run
 
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.compare import angle_between, paired_sensors, readout_of
-from lidardesign.design.files import load_design
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec, Sensor
+from lidardesign.layouts.rays import lay_out
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.compare import angle_between, paired_sensors, readout_of
+from lidardesign.sensors.design_file import load_design
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 from lidardesign.space import direction
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from support.tables import each_row
 
-from lidardesign.design.mixture.support import at_condition, conditioned, fixed_conditions
 from lidardesign.errors import ConfigError, DataError, NumericalError
+from lidardesign.mixture.support import at_condition, conditioned, fixed_conditions
 from lidardesign.samples import Samples
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 

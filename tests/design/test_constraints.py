@@ -9,10 +9,10 @@ from pydantic import ValidationError
 from support.constraints import CONTRADICTIONS, FACE
 from support.tables import each_row
 
-from lidardesign.design.constraints.document import Constraints, DistanceRange, Gate, rules_of
-from lidardesign.design.constraints.feasibility import check_feasible
-from lidardesign.design.sensor import MOST_RAYS
+from lidardesign.constraints.document import Constraints, DistanceRange, Gate, rules_of
+from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import DesignSpace
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec, Sensor
+from lidardesign.layouts.rays import lay_out
 from lidardesign.samples import Samples
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 from lidardesign.space import DesignSpace, angles
 
 SPACE = DesignSpace((0, 0, 0, 0, -math.pi / 2, 0), (0, 0, 0, 2 * math.pi, math.pi / 2, 10))

@@ -11,13 +11,13 @@ from scipy.special import chdtri
 from support.rings import RING
 from support.tables import each_row
 
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts import distributed as lines
-from lidardesign.design.layouts.distributed import in_region, normal_ball
-from lidardesign.design.layouts.grid import low_discrepancy
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.mixture.ensemble import coupling_of
-from lidardesign.design.sensor import Sensor, tangent_directions
+from lidardesign.layouts import distributed as lines
+from lidardesign.layouts.distributed import in_region, normal_ball
+from lidardesign.layouts.grid import low_discrepancy
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.ensemble import coupling_of
+from lidardesign.mixture.fit import fit
+from lidardesign.sensors.sensor import Sensor, tangent_directions
 from lidardesign.space import angles, observed_point
 
 SLOPES = np.array([[0.4, -0.2, 0.1], [0.3, 0.5, -0.3]])

@@ -15,13 +15,13 @@ from support.aisles import AISLE
 from support.command_line import caller, make_run
 from support.tables import each_row
 
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.files import design_document, load_design, save_design
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import lay_out
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.fit import fit
 from lidardesign.samples import Samples
+from lidardesign.sensors.design_file import design_document, load_design, save_design
 from lidardesign.space import DesignSpace, aim, observed_point
 
 ROOM = DesignSpace((-1, -1, 0, 0.0, -math.pi / 2, 0.05), (1, 1, 2, 2 * math.pi, math.pi / 2, 6.0))

@@ -13,18 +13,18 @@ from hypothesis import strategies as st
 from support.strategies import finite, length, sensors, width
 from support.tables import each_row
 
-from lidardesign.design.files import (
+from lidardesign.errors import ConfigError, DataError, NumericalError
+from lidardesign.layouts.rays import gates_of, lay_out
+from lidardesign.run.yaml import dump_yaml, parse_yaml
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.design_file import (
     SCHEMA_FILE,
     design_document,
     design_from_document,
     load_design,
     save_design,
 )
-from lidardesign.design.layouts.rays import gates_of, lay_out
-from lidardesign.design.sensor import DesignSpec, interval_factor
-from lidardesign.errors import ConfigError, DataError, NumericalError
-from lidardesign.geometry.rays import Rays
-from lidardesign.run.yaml import dump_yaml, parse_yaml
+from lidardesign.sensors.sensor import DesignSpec, interval_factor
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hand_written_design.yaml"
 DOCS = Path(__file__).parents[2] / "docs" / "design-file.md"

@@ -10,9 +10,9 @@ import pytest
 from support.fits import FACE, FIXED, MOVING, blob, log_target
 from support.tables import each_row
 
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.fit import fit
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError
+from lidardesign.mixture.fit import fit
 
 
 def constrained(**values):

@@ -8,7 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.tables import each_row
 
-from lidardesign.design.galvo import (
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.formats.galvo import is_galvo_file, read_galvo, short_tour, travel, write_galvo
+from lidardesign.formats.galvo_angles import (
     degree_frame,
     gate_m,
     gate_ps,
@@ -16,11 +18,9 @@ from lidardesign.design.galvo import (
     scan_angles_deg,
     scan_directions,
 )
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.errors import ConfigError, DataError
-from lidardesign.export.galvo import is_galvo_file, read_galvo, short_tour, travel, write_galvo
-from lidardesign.geometry.rays import Rays
+from lidardesign.layouts.rays import lay_out
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 
 C_M_PER_PS = 299_792_458e-12
 HERE = (0.4, 0.0, 0.0)

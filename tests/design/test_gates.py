@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidardesign.design.layouts.gates import admissible_gates, central_intervals
-from lidardesign.design.mixture.bounds import Bounds
+from lidardesign.layouts.gates import admissible_gates, central_intervals
+from lidardesign.mixture.bounds import Bounds
 
 LEVEL_FACTOR = 1.96
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support.tables import each_row
 
-from lidardesign.design.files import design_from_document
-from lidardesign.design.layouts.rays import lay_out
 from lidardesign.errors import ConfigError
+from lidardesign.layouts.rays import lay_out
+from lidardesign.sensors.design_file import design_from_document
 
 COUPLING = {
     "direction_rad_per_m": [[0.0, 0.1, 0.0], [0.1, 0.0, 0.0]],

@@ -7,10 +7,10 @@ import pytest
 from support.conditioned_runs import make_conditioned_run
 from support.tables import each_row
 
-from lidardesign.design.files import design_from_document
-from lidardesign.design.layouts.gates import central_intervals
 from lidardesign.errors import ConfigError
+from lidardesign.layouts.gates import central_intervals
 from lidardesign.run.yaml import dump_yaml, load_yaml
+from lidardesign.sensors.design_file import design_from_document
 
 
 def written(**changes):

@@ -12,23 +12,23 @@ import pytest
 from support.command_line import make_run
 from support.tables import each_row
 
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rig_constraints import rig_constraints
-from lidardesign.design.files import load_design, save_design
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.rigs.rig import aim_of
-from lidardesign.design.sensor import (
+from lidardesign.constraints.document import Constraints
+from lidardesign.constraints.rig_constraints import rig_constraints
+from lidardesign.errors import DataError, LidardesignError
+from lidardesign.formats.registry import EXPORTERS
+from lidardesign.formats.rig import aim_of
+from lidardesign.layouts.rays import lay_out
+from lidardesign.run.xml import _Builder
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.receivers import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.sensors.design_file import load_design, save_design
+from lidardesign.sensors.sensor import (
     DesignSpec,
     Sensor,
     boresight_frame,
     interval_factor,
     tangent_coordinates,
 )
-from lidardesign.errors import DataError, LidardesignError
-from lidardesign.export.registry import EXPORTERS
-from lidardesign.geometry.frames import rotation_of_quaternion, rotation_of_rpy
-from lidardesign.geometry.rays import Rays
-from lidardesign.run.xml import _Builder
 from lidardesign.space import DesignSpace, angles, direction
 
 NASTY = ('front "left"', "a,b\u00e9</script>", "{x} [bold]")
@@ -508,7 +508,7 @@ def test_poses_of_nested_models_are_worked_out_once(tmp_path):
 
 
 def test_more_lidars_than_a_design_has_are_refused_at_the_first_too_many(tmp_path, monkeypatch):
-    monkeypatch.setattr("lidardesign.design.rigs.sdf.MOST_SENSORS", 3)
+    monkeypatch.setattr("lidardesign.formats.sdf.MOST_SENSORS", 3)
     with pytest.raises(DataError, match="more rays or sensors than a design") as refused:
         load_sdf(tmp_path, '<model name="m"><link name="l">' + "\n".join([lidar(rows=None)] * 5) + "</link></model>")
     assert refused.value.where == f"{tmp_path / 'robot.sdf'}:6"

@@ -11,13 +11,13 @@ from support.command_line import make_run
 from support.designs import drawn_from, three_sensors
 from support.rings import RING
 
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.files import load_design
-from lidardesign.design.fit import fit, rays_at
-from lidardesign.design.layouts.gates import seen_from
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec, interval_factor
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import InfeasibleError
+from lidardesign.layouts.gates import seen_from
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.fit import fit, rays_at
+from lidardesign.sensors.design_file import load_design
+from lidardesign.sensors.sensor import DesignSpec, interval_factor
 from lidardesign.space import observed_point
 
 LEVELS = (0.8, 0.95, 0.99)

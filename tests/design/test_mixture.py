@@ -11,10 +11,8 @@ from hypothesis import strategies as st
 from support.mixtures import POINT, WHOLE, Z, drawn, features_of, random_mixture
 from support.tables import each_row
 
-from lidardesign.design.mixture.bounds import Bounds, Floors
-from lidardesign.design.mixture.em import fit_mixture, mixture_of_labels, run_em, seed_mixture
-from lidardesign.design.mixture.m_step import fit_field, fit_gate, maximise
-from lidardesign.design.mixture.mixture import (
+from lidardesign.mixture.bounds import Bounds, Floors
+from lidardesign.mixture.components import (
     Mixture,
     angle_ratio,
     expect,
@@ -25,8 +23,10 @@ from lidardesign.design.mixture.mixture import (
     mean_directions,
     responsibilities,
 )
-from lidardesign.design.sensor import boresight_frame, tangent_coordinates, tangent_directions
+from lidardesign.mixture.em import fit_mixture, mixture_of_labels, run_em, seed_mixture
+from lidardesign.mixture.m_step import fit_field, fit_gate, maximise
 from lidardesign.numerics import logsumexp, wrap_angle
+from lidardesign.sensors.sensor import boresight_frame, tangent_coordinates, tangent_directions
 from lidardesign.space import DesignSpace, angles
 
 
@@ -378,7 +378,7 @@ def case_of(name, count=70):
 @each_row("block", [7, 2048])
 @each_row("name", SPACES)
 def test_density_and_shares_are_those_of_the_free_dimensions_alone_in_blocks_of_any_length(name, block, monkeypatch):
-    monkeypatch.setattr("lidardesign.design.mixture.mixture.BLOCK", block)
+    monkeypatch.setattr("lidardesign.mixture.components.BLOCK", block)
     mixture, features = case_of(name)
     terms = naive_terms(mixture, features)
     whole = logsumexp(terms, axis=1)
@@ -389,7 +389,7 @@ def test_density_and_shares_are_those_of_the_free_dimensions_alone_in_blocks_of_
 @each_row("block", [1, 7, 70, 1000])
 @each_row("name", SPACES)
 def test_statistics_are_sums_over_the_shares_in_blocks_of_any_length(name, block, monkeypatch):
-    monkeypatch.setattr("lidardesign.design.mixture.mixture.BLOCK", block)
+    monkeypatch.setattr("lidardesign.mixture.components.BLOCK", block)
     mixture, features = case_of(name)
     terms = naive_terms(mixture, features)
     shares = np.exp(terms - logsumexp(terms, axis=1)[:, None]) * features.weights[:, None]

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.tables import each_row
 
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.origins import most_mounted, mounts_suffice
-from lidardesign.design.files import design_document
-from lidardesign.design.fit import fit
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.constraints.origins import most_mounted, mounts_suffice
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.mixture.fit import fit
 from lidardesign.samples import Samples
+from lidardesign.sensors.design_file import design_document
 from lidardesign.space import DesignSpace, aim, observed_point
 
 ROOM = DesignSpace((-2, -2, 0, 0.0, -math.pi / 2, 0.05), (2, 2, 2, 2 * math.pi, math.pi / 2, 6.0))

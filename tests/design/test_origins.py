@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.tables import each_row
 
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, nearest_in_boxes, origin_box
-from lidardesign.design.mixture.bounds import Bounds, Floors, bounds_of
-from lidardesign.design.mixture.em import run_em, seed_mixture
-from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.mixture.m_step import fit_gate
-from lidardesign.design.mixture.origin_step import (
+from lidardesign.constraints.document import Constraints
+from lidardesign.constraints.origins import box_around, free_boxes, inside_excluded, nearest_in_boxes, origin_box
+from lidardesign.mixture.bounds import Bounds, Floors, bounds_of
+from lidardesign.mixture.em import run_em, seed_mixture
+from lidardesign.mixture.features import Axes, Features
+from lidardesign.mixture.m_step import fit_gate
+from lidardesign.mixture.origin_step import (
     OriginLimits,
     best_origins,
     improve_in_boxes,

@@ -11,17 +11,17 @@ from support import references
 from support.designs import from_the_ceiling
 from support.tables import each_row
 
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.files import design_document
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.mixture.bounds import Bounds
-from lidardesign.design.mixture.em import mixture_of_labels, run_em
-from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.sensor import boresight_frame, interval_factor, tangent_directions
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.bounds import Bounds
+from lidardesign.mixture.em import mixture_of_labels, run_em
+from lidardesign.mixture.features import Axes, Features
+from lidardesign.mixture.fit import fit
 from lidardesign.numerics import clipped_eigenvalues
 from lidardesign.samples import Samples
+from lidardesign.sensors.design_file import design_document
+from lidardesign.sensors.sensor import boresight_frame, interval_factor, tangent_directions
 from lidardesign.space import DesignSpace, aim, angles, direction
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

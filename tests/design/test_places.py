@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from support.command_line import caller, make_run
 
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.feasibility import check_feasible
-from lidardesign.design.constraints.origins import SAME_PLACE_M, snap_to_space
-from lidardesign.design.constraints.rig_constraints import rig_constraints
-from lidardesign.design.files import design_document, load_design
-from lidardesign.design.sensor import DesignSpec, Sensor
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.constraints.feasibility import check_feasible
+from lidardesign.constraints.origins import SAME_PLACE_M, snap_to_space
+from lidardesign.constraints.rig_constraints import rig_constraints
 from lidardesign.errors import InfeasibleError
+from lidardesign.sensors.design_file import design_document, load_design
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 from lidardesign.space import DesignSpace
 
 PLACE_M = 0.4510446472167969

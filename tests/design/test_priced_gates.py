@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.tables import each_row
 
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.layouts.gates import RayRanges, _Prices, central_intervals, gates_within
-from lidardesign.design.mixture.bounds import Bounds
-from lidardesign.design.sensor import interval_factor
+from lidardesign.layouts.gates import RayRanges, _Prices, central_intervals, gates_within
+from lidardesign.mixture.bounds import Bounds
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import interval_factor
 
 Z = interval_factor(0.95)
 MODEL = Bandwidth()  # bins of 1.5 cm

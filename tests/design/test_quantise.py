@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.tables import each_row
 
-from lidardesign.design.layouts.quantise import Nearest, lloyd
 from lidardesign.errors import ConfigError
+from lidardesign.mixture.quantise import Nearest, lloyd
 
 
 def cost(features, weights, centres):

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from support.command_line import make_run
 
-from lidardesign.design.files import save_design
-from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.request import fired_numbers, left_out, numbers_alone, numbers_fired, usual_numbers
-from lidardesign.geometry.rays import Rays
+from lidardesign.scenes.rays import Rays
+from lidardesign.scoring.evaluation.request import fired_numbers, left_out, numbers_alone, numbers_fired, usual_numbers
+from lidardesign.sensors.design_file import save_design
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 
 FAR_M = 0.9
 

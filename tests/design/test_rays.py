@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from support.designs import SPACE, drawn_from, sensor, three_sensors
 from support.tables import each_row
 
-from lidardesign.design.bandwidth import split_budget
-from lidardesign.design.fit import rays_at, refitted
-from lidardesign.design.layouts.gates import log_density, members, seen_from
-from lidardesign.design.layouts.grid import grid_rows, grid_tangent
-from lidardesign.design.layouts.rays import LAYOUTS, gates_of, lay_out, own_count
-from lidardesign.design.sensor import MOST_RAYS, DesignSpec, Track, interval_factor, tangent_coordinates
 from lidardesign.errors import ConfigError
+from lidardesign.layouts.gates import log_density, members, seen_from
+from lidardesign.layouts.grid import grid_rows, grid_tangent
+from lidardesign.layouts.rays import LAYOUTS, gates_of, lay_out, own_count
+from lidardesign.mixture.fit import rays_at, refitted
 from lidardesign.samples import Samples
+from lidardesign.sensors.bandwidth import split_budget
+from lidardesign.sensors.sensor import MOST_RAYS, DesignSpec, Track, interval_factor, tangent_coordinates
 from lidardesign.space import DesignSpace, angles, direction
 
 TURN = 0.7

@@ -18,24 +18,24 @@ from support.mixtures import drawn as drawn_from_mixture
 from support.rivals import Rivals
 from support.tables import each_row
 
-from lidardesign.density.flow.objective import Coordinates
+from lidardesign.constraints.document import Constraints
+from lidardesign.density.flow.coordinates import Coordinates
 from lidardesign.density.learned import FlatTarget
-from lidardesign.density.target.visibility import Optics
+from lidardesign.density.objective.visibility import Optics
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.sampling import draw_samples, log_density_of, log_prob_of_unit
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.grid import low_discrepancy
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.mixture.bounds import sensor_groups
-from lidardesign.design.mixture.mixture import log_density
-from lidardesign.design.mixture.support import pin_samples, restrict_samples
-from lidardesign.design.sensor import DesignSpec, tangent_coordinates, tangent_directions
-from lidardesign.evaluate.baselines.occupancy import OccupancyGrid
-from lidardesign.geometry.surface import sample_body
+from lidardesign.layouts.grid import low_discrepancy
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.bounds import sensor_groups
+from lidardesign.mixture.components import log_density
+from lidardesign.mixture.fit import fit
+from lidardesign.mixture.support import pin_samples, restrict_samples
 from lidardesign.numerics import systematic_draw
 from lidardesign.samples import Samples
-from lidardesign.scene import Body, Box, Capsule, Mesh, Scene, Sphere
+from lidardesign.scenes.scene import Body, Box, Capsule, Mesh, Scene, Sphere
+from lidardesign.scenes.surface import sample_body
+from lidardesign.scoring.baselines.occupancy import OccupancyGrid
+from lidardesign.sensors.sensor import DesignSpec, tangent_coordinates, tangent_directions
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
 
 DRAWS = 20_000

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from support.strategies import sensors
 from support.tables import each_row
 
-from lidardesign.design.files import load_design
-from lidardesign.design.rigs.ray_lists import SENSOR_COLUMNS, begins_as_sensor_csv, read_sensor_csv, write_sensor_csv
-from lidardesign.design.sensor import DesignSpec, Sensor, tangent_coordinates
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.formats.ray_lists import SENSOR_COLUMNS, begins_as_sensor_csv, read_sensor_csv, write_sensor_csv
+from lidardesign.sensors.design_file import load_design
+from lidardesign.sensors.sensor import DesignSpec, Sensor, tangent_coordinates
 from lidardesign.space import direction
 
 ROW = "3,0,0,3.14,0.1,1.2,0.04,0.01,0,0.09,0.02,0.05,0.2,0.1,0.3,1"

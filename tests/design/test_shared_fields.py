@@ -11,15 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.tables import each_row
 
-from lidardesign.design.bandwidth import Bandwidth, split_budget
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.files import design_document
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.density import bandwidth_limit, shared_rays
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor, tangent_coordinates
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.layouts.density import bandwidth_limit, shared_rays
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.fit import fit
 from lidardesign.samples import Samples
+from lidardesign.sensors.bandwidth import Bandwidth, split_budget
+from lidardesign.sensors.design_file import design_document
+from lidardesign.sensors.sensor import DesignSpec, Sensor, interval_factor, tangent_coordinates
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, -1.2, -0.9, 0.2), (0, 0, 0, 1.2, 0.9, 3.0))

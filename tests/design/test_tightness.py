@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from support.tables import each_row
 
-from lidardesign.design.constraints.check import ConstraintCheck
-from lidardesign.design.constraints.slack import constraint_slack, room_of
+from lidardesign.constraints.check import ConstraintCheck
+from lidardesign.constraints.slack import constraint_slack, room_of
 
 
 def check(name, bound, value, satisfied=True):

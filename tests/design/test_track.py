@@ -15,19 +15,19 @@ from hypothesis import strategies as st
 from support.aisles import AISLE, SAMPLES, shelves
 from support.tables import each_row
 
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
-from lidardesign.design.fit import fit, rays_at
-from lidardesign.design.layouts.quantise import lloyd
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.layouts.track import interpolated, placed, track_of, travels
-from lidardesign.design.sensor import DesignSpec, Sensor, Track
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, InfeasibleError
-from lidardesign.geometry.rays import Rays
+from lidardesign.layouts.rays import lay_out
+from lidardesign.layouts.track import interpolated, placed, track_of, travels
+from lidardesign.mixture.fit import fit, rays_at
+from lidardesign.mixture.quantise import lloyd
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.design_file import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
+from lidardesign.sensors.sensor import DesignSpec, Sensor, Track
 from lidardesign.space import DesignSpace, angles
 
 SCHEMA = json.loads(SCHEMA_FILE.read_text())
@@ -500,7 +500,7 @@ def test_the_checked_bandwidth_is_that_of_the_dearest_position(widths):
 
 
 def test_the_error_of_a_tracks_likelihood_is_its_spread_over_other_samples(monkeypatch):
-    monkeypatch.setattr("lidardesign.design.layouts.scan.KNOT_SPACING_M", 2.25)
+    monkeypatch.setattr("lidardesign.layouts.scan.KNOT_SPACING_M", 2.25)
     repeats = 24
     tracks = [fit(shelves(1500, seed), layout="scan", rays=2) for seed in range(repeats)]
     assert {len(one.design.track.knots) for one in tracks} == {3}

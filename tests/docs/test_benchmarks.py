@@ -18,7 +18,7 @@ from support.meshes import BOX_FACES, BOX_VERTICES
 from support.small_runs import shifting_environment
 from support.tables import each_row
 
-from lidardesign.scene import Mesh
+from lidardesign.scenes.scene import Mesh
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = sorted(path for path in (ROOT / "benchmarks").glob("*.py") if path.stem != "common")

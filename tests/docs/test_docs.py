@@ -12,13 +12,13 @@ from support.tables import each_row
 
 from lidardesign import registry
 from lidardesign.config import resolve
-from lidardesign.design.constraints.document import Constraints
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import LidardesignError
-from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
 from lidardesign.run.yaml import parse_yaml
-from lidardesign.scene import Scene
-from lidardesign.simulate.simulate import simulate
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.returns import simulate
 from lidardesign.task import Task, conditions_of
 
 ROOT = Path(__file__).parents[2]
@@ -164,9 +164,10 @@ def test_the_moving_ball_of_the_guide_is_scored_over_its_frames():
     seen_at_the_ends = rays_at(ball.poses[[0, -1], :3, 3], origin)
     assert 0.0 < task.score(scene, simulate(scene, seen_at_the_ends)).value < 100.0
     everywhere = rays_at(ball.poses[:, :3, 3], origin)
-    assert task.score(scene, simulate(scene, everywhere)).value < task.score(
-        scene, simulate(scene, seen_at_the_ends)
-    ).value
+    assert (
+        task.score(scene, simulate(scene, everywhere)).value
+        < task.score(scene, simulate(scene, seen_at_the_ends)).value
+    )
 
 
 def test_the_drive_of_the_guide_is_scored_over_its_positions():

@@ -12,7 +12,7 @@ import pytest
 from support.docs_session import in_process
 from support.small_runs import shifted
 
-from lidardesign.export.galvo import is_galvo_file
+from lidardesign.formats.galvo import is_galvo_file
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 QUICK = ("learning.samples=10000", "learning.coverage_proposals=1024")

@@ -11,13 +11,13 @@ from support.command_line import make_run
 from support.planning import SINGLE
 from support.scoring import MissTask, design, make_request, scenes
 
-from lidardesign.evaluate.effects import effect_notes, effect_summaries
-from lidardesign.evaluate.report.tables import audit_section, effects_section
-from lidardesign.evaluate.results import Audit, AuditRow
-from lidardesign.evaluate.score import evaluate
-from lidardesign.scene import Ambient, Scene
+from lidardesign.report.tables import audit_section, effects_section
+from lidardesign.scenes.scene import Ambient, Scene
+from lidardesign.scoring.evaluation.effects import effect_notes, effect_summaries
+from lidardesign.scoring.evaluation.results import Audit, AuditRow
+from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.simulate import plan as plan_module
-from lidardesign.simulate.detector.detector import EFFECTS, IDEAL, Detector
+from lidardesign.simulate.detector.physics import EFFECTS, IDEAL, Detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 
 JITTERY = Detector("jittery", jitter_sigma_s=1e-9)

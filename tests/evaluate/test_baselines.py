@@ -7,12 +7,12 @@ import pytest
 from support.rivals import Rivals, balls
 from support.tables import each_row
 
-from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.simple import check_baseline
-from lidardesign.evaluate.baselines.views import unrolled
-from lidardesign.scene import Body, Box, Scene, rigid
-from lidardesign.simulate.simulate import simulate
+from lidardesign.scenes.scene import Body, Box, Scene, rigid
+from lidardesign.scoring.baselines.simple import check_baseline
+from lidardesign.scoring.baselines.views import unrolled
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace, angles
 
 FIXED = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))

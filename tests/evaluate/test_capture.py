@@ -10,14 +10,14 @@ from support.captures import BALL_AT, BALL_M, BIN_PS, C_M_PER_PS, START_PS, ball
 from support.command_line import caller
 from support.tables import each_row
 
-from lidardesign.design.files import save_design
-from lidardesign.design.galvo import degree_frame, scan_directions
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.evaluate.captures import scan as capture_ranges
-from lidardesign.evaluate.captures.capture import Capture, load_capture
-from lidardesign.evaluate.captures.scan import (
+from lidardesign.formats.galvo import read_galvo, write_galvo
+from lidardesign.formats.galvo_angles import degree_frame, scan_directions
+from lidardesign.layouts.rays import lay_out
+from lidardesign.scenes.rays import Rays
+from lidardesign.scoring.captures import scan as capture_ranges
+from lidardesign.scoring.captures.capture import Capture, load_capture
+from lidardesign.scoring.captures.scan import (
     Captured,
     Estimation,
     default_within_rad,
@@ -27,9 +27,9 @@ from lidardesign.evaluate.captures.scan import (
     uniform_rays,
     whole_window,
 )
-from lidardesign.evaluate.captures.score import CaptureSettings, evaluate_capture
-from lidardesign.export.galvo import read_galvo, write_galvo
-from lidardesign.geometry.rays import Rays
+from lidardesign.scoring.captures.score import CaptureSettings, evaluate_capture
+from lidardesign.sensors.design_file import save_design
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 
 BIN_M = BIN_PS * C_M_PER_PS / 2
 ESTIMATIONS = [Estimation("peak"), Estimation("matched")]

@@ -15,9 +15,9 @@ import pytest
 from support.workers import make_request, results
 
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate import workers
-from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.workers import scorer_of
+from lidardesign.scoring.evaluation import workers
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.evaluation.workers import scorer_of
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

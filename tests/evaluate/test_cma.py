@@ -14,24 +14,24 @@ from support.rivals import balls
 from support.scoring import HitTask, MissTask
 from support.tables import each_row
 
+from lidardesign.api.scores import ScoreOptions
 from lidardesign.cli.commands.evaluate import search_display
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.catalog.library import Pose, find_part, part_design
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec, Sensor, Track
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines import cma
-from lidardesign.evaluate.baselines.candidates import mean_mbps, rays_at
-from lidardesign.evaluate.baselines.cma import CmaCandidate, CmaSettings, MovableSensors
-from lidardesign.evaluate.baselines.views import TrainingObjective
-from lidardesign.evaluate.entries import entries_of
-from lidardesign.evaluate.request import EvaluationRequest
-from lidardesign.evaluate.score import evaluate
+from lidardesign.layouts.rays import lay_out
 from lidardesign.numerics import wrap_angle
+from lidardesign.parts.catalogue import Pose, find_part, part_design
+from lidardesign.scoring.baselines import cma
+from lidardesign.scoring.baselines.candidates import mean_mbps, rays_at
+from lidardesign.scoring.baselines.cma import CmaCandidate, CmaSettings, MovableSensors
+from lidardesign.scoring.baselines.views import TrainingObjective
+from lidardesign.scoring.evaluation.entries import entries_of
+from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import DesignSpec, Sensor, Track
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace, angles
 from lidardesign.task import TaskConfig
-from lidardesign.workflow.evaluate import ScoreOptions
 
 FIXED = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
 FREE = DesignSpace((-0.2, -0.2, -0.2, -0.6, -0.5, 0.05), (0.2, 0.2, 0.2, 0.6, 0.5, 4.0))

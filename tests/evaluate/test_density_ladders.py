@@ -17,8 +17,8 @@ from support.tables import each_row
 
 from lidardesign.config import DensitySettings, LearningSettings, resolve, save_run_config
 from lidardesign.density.fields.distance import build_field
-from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.flow.coordinates import Coordinates
+from lidardesign.density.flow.network import DesignFlow
 from lidardesign.density.learn import learn
 from lidardesign.density.learned import (
     LearningSteps,
@@ -27,19 +27,19 @@ from lidardesign.density.learned import (
     noise_share,
     noise_shares,
 )
-from lidardesign.density.target.target import build_target
+from lidardesign.density.objective.target import build_target
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.errors import NumericalError
-from lidardesign.evaluate.accuracy import fields, visibility
-from lidardesign.evaluate.accuracy import training as learning_steps
-from lidardesign.evaluate.accuracy.fields import ExactField, fresh_table
-from lidardesign.evaluate.accuracy.probes import AccuracyRequest, draw_probes, few_columns, with_frames
-from lidardesign.evaluate.accuracy.visibility import LOG_OPAQUE, opaque_target
-from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
-from lidardesign.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
+from lidardesign.scoring.accuracy import fields, visibility
+from lidardesign.scoring.accuracy import training as learning_steps
+from lidardesign.scoring.accuracy.fields import ExactField, fresh_table
+from lidardesign.scoring.accuracy.probes import AccuracyRequest, draw_probes, few_columns, with_frames
+from lidardesign.scoring.accuracy.visibility import LOG_OPAQUE, opaque_target
+from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.space import DesignSpace
 from lidardesign.task import scenes_of
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, Track
-from lidardesign.evaluate.report.density_views import (
+from lidardesign.report.density_views import (
     PERCENT,
     density_view,
     marginals,
@@ -18,7 +17,8 @@ from lidardesign.evaluate.report.density_views import (
     turn_start,
 )
 from lidardesign.samples import Samples
-from lidardesign.scene import Body, Box, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Body, Box, Plane, Scene, Sphere, rigid
+from lidardesign.sensors.sensor import Coupling, DesignSpec, Sensor, Track
 from lidardesign.space import AZIMUTH, RANGE, DesignSpace, observed_point
 
 BALL = Scene((Body(Sphere(0.5), "ball", "target", rigid(translation_m=(3.0, 0.0, 0.0))),), "ball")

@@ -8,13 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.scoring import MissTask, make_request
 
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Coupling, DesignSpec, Sensor
-from lidardesign.evaluate.entries import entries_of
-from lidardesign.evaluate.score import evaluate
 from lidardesign.samples import Samples
-from lidardesign.scene import Body, Box, Capsule, Scene, Sphere, rigid
-from lidardesign.simulate.simulate import simulate
+from lidardesign.scenes.scene import Body, Box, Capsule, Scene, Sphere, rigid
+from lidardesign.scoring.evaluation.entries import entries_of
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import Coupling, DesignSpec, Sensor
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace, angles
 from lidardesign.task import Metric, Score
 

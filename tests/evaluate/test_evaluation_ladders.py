@@ -8,10 +8,10 @@ import pytest
 from support.references import STANDARD_ERRORS
 from support.scoring import design, make_request, scenes
 
-from lidardesign.evaluate.accuracy import evaluation as sweeps
-from lidardesign.evaluate.accuracy.probes import AccuracyRequest
-from lidardesign.evaluate.results import Evaluation, Row
-from lidardesign.evaluate.score import evaluate
+from lidardesign.scoring.accuracy import evaluation as sweeps
+from lidardesign.scoring.accuracy.probes import AccuracyRequest
+from lidardesign.scoring.evaluation.results import Evaluation, Row
+from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from support.rivals import Rivals, balls
 from support.tables import each_row
 
-from lidardesign.evaluate.baselines.bounding import bounding
-from lidardesign.evaluate.baselines.candidates import LayoutSite
-from lidardesign.evaluate.baselines.even import Patch, Zone, central_field, even_placement
-from lidardesign.evaluate.baselines.views import TrainingViews
-from lidardesign.scene import Body, Box, Scene, rigid
+from lidardesign.scenes.scene import Body, Box, Scene, rigid
+from lidardesign.scoring.baselines.bounding import bounding
+from lidardesign.scoring.baselines.candidates import LayoutSite
+from lidardesign.scoring.baselines.even import Patch, Zone, central_field, even_placement
+from lidardesign.scoring.baselines.views import TrainingViews
 from lidardesign.space import DesignSpace, angles, direction
 
 SPHERE = DesignSpace((0, 0, 0, 0, -math.pi / 2, 0.05), (0, 0, 0, 2 * math.pi, math.pi / 2, 4.0))

@@ -13,15 +13,15 @@ from support.rivals import Rivals, balls
 from support.scoring import MissTask, design, make_request, rows_by_key
 from support.tables import each_row
 
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.evaluate.baselines import greedy as greedy_module
-from lidardesign.evaluate.baselines.candidates import mean_mbps, whole_range
-from lidardesign.evaluate.baselines.greedy import Fired, GreedyCandidate, GreedySource, greedy_rays
-from lidardesign.evaluate.baselines.views import TrainingViews
-from lidardesign.evaluate.entries import entries_of
-from lidardesign.evaluate.score import evaluate
-from lidardesign.selection import information
-from lidardesign.simulate.simulate import simulate
+from lidardesign.rays import information
+from lidardesign.scoring.baselines import greedy as greedy_module
+from lidardesign.scoring.baselines.candidates import mean_mbps, whole_range
+from lidardesign.scoring.baselines.greedy import Fired, GreedyCandidate, GreedySource, greedy_rays
+from lidardesign.scoring.baselines.views import TrainingViews
+from lidardesign.scoring.evaluation.entries import entries_of
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace, angles
 
 RADIUS_M = 0.4

@@ -11,7 +11,9 @@ from support.tables import each_row
 from support.triangles import naive_triangle_distance_m
 
 from lidardesign.errors import DataError
-from lidardesign.evaluate.metrics import (
+from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
+from lidardesign.scenes.surface import sample_triangles
+from lidardesign.scoring.scenes.metrics import (
     chamfer_m,
     delaunay_surface,
     nearest_m,
@@ -19,8 +21,6 @@ from lidardesign.evaluate.metrics import (
     surface_cloud,
     visible_surface,
 )
-from lidardesign.geometry.surface import sample_triangles
-from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, angles
 
 STANDARD_ERRORS = 4  # the tolerance of every sampled mean below

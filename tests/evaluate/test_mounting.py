@@ -14,12 +14,12 @@ from support.scoring import design, make_request, rows_by_key, scenes
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.mounting import MountError
-from lidardesign.evaluate.report.tables import mounting_table
-from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.seeds import over_seeds
-from lidardesign.evaluate.statistics import paired_difference
-from lidardesign.geometry.rays import Rays
+from lidardesign.report.tables import mounting_table
+from lidardesign.scenes.rays import Rays
+from lidardesign.scoring.evaluation.mounting import MountError
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.evaluation.seeds import over_seeds
+from lidardesign.scoring.scenes.statistics import paired_difference
 
 DEGREE = math.pi / 180
 ERROR = MountError(0.005, 0.5 * DEGREE)

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidardesign.evaluate.baselines.candidates import LayoutSite
-from lidardesign.evaluate.baselines.occupancy import AimedPoints, occupancy, occupancy_grid
-from lidardesign.evaluate.baselines.views import RAY_AXES
-from lidardesign.scene import Body, Box, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Body, Box, Scene, Sphere, rigid
+from lidardesign.scoring.baselines.candidates import LayoutSite
+from lidardesign.scoring.baselines.occupancy import AimedPoints, occupancy, occupancy_grid
+from lidardesign.scoring.baselines.views import RAY_AXES
 from lidardesign.space import DesignSpace, direction, observed_point
 
 CEILING = DesignSpace((-1, -1, 1, 0, -math.pi / 2, 0.1), (1, 1, 1, 2 * math.pi, -0.2, 2.5))

@@ -6,8 +6,7 @@ import math
 import plotly.graph_objects as go
 from support.tables import each_row
 
-from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
-from lidardesign.evaluate.report.pareto import (
+from lidardesign.report.pareto import (
     ABOVE_PX,
     BELOW_PX,
     LINE_PX,
@@ -17,6 +16,7 @@ from lidardesign.evaluate.report.pareto import (
     panels,
     pareto_figures,
 )
+from lidardesign.scoring.accuracy.settings import Measurement, Sweep
 
 NASTY = "</script><img src=x onerror=alert(1)>$x^2"
 

@@ -23,9 +23,7 @@ from support.report_pages import (
 )
 from support.tables import each_row
 
-from lidardesign.design.sensor import DesignSpec
-from lidardesign.evaluate.entries import StrongestRival
-from lidardesign.evaluate.report.drawing import (
+from lidardesign.report.drawing import (
     FEWEST_STEPS,
     MOST_FACES,
     STEPS,
@@ -37,18 +35,18 @@ from lidardesign.evaluate.report.drawing import (
     round_steps,
     thinned,
 )
-from lidardesign.evaluate.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure
-from lidardesign.evaluate.report.markup import asset
-from lidardesign.evaluate.report.report import report_html
-from lidardesign.evaluate.report.scene_figure import MOST_RAY_STEPS, MOST_STEPS, SceneFigure
-from lidardesign.evaluate.report.series import series
-from lidardesign.evaluate.report.tables import (
+from lidardesign.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure
+from lidardesign.report.markup import asset
+from lidardesign.report.page import report_html
+from lidardesign.report.scene_figure import MOST_RAY_STEPS, MOST_STEPS, SceneFigure
+from lidardesign.report.series import series
+from lidardesign.report.tables import (
     CommandTimes,
     constraints_table,
     rows_table,
     times_tables,
 )
-from lidardesign.evaluate.report.view import (
+from lidardesign.report.view import (
     MOST_BODIES,
     MOST_SENSORS,
     OUTCOMES,
@@ -57,9 +55,11 @@ from lidardesign.evaluate.report.view import (
     view_document,
     view_notes,
 )
-from lidardesign.evaluate.results import Evaluation, leading_detail, verdict
-from lidardesign.geometry.rays import Outcome
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.rays import Outcome
+from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scoring.evaluation.entries import StrongestRival
+from lidardesign.scoring.evaluation.results import Evaluation, leading_detail, verdict
+from lidardesign.sensors.sensor import DesignSpec
 from lidardesign.task import Metric
 
 

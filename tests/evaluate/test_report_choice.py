@@ -11,10 +11,10 @@ import pytest
 from support.report_pages import NASTY, make_row, make_sensor
 from support.tables import each_row
 
-from lidardesign.design.sensor import CERTIFICATES, DesignSpec
-from lidardesign.evaluate.report.choice import choice_section, correlation_sentence
-from lidardesign.evaluate.report.series import series
-from lidardesign.evaluate.results import Evaluation
+from lidardesign.report.choice import choice_section, correlation_sentence
+from lidardesign.report.series import series
+from lidardesign.scoring.evaluation.results import Evaluation
+from lidardesign.sensors.sensor import CERTIFICATES, DesignSpec
 from lidardesign.task import Metric
 
 METRICS = {better: Metric("score", "mm", better, worst=200.0, tolerance=0.1) for better in ("lower", "higher")}

@@ -7,10 +7,10 @@ import pytest
 from support.report_pages import NASTY, make_evaluation, make_row, make_sensor
 from support.tables import each_row
 
-from lidardesign.design.sensor import CERTIFICATES, DesignSpec
-from lidardesign.evaluate.entries import StrongestRival
-from lidardesign.evaluate.report.result import headline, result_section
-from lidardesign.evaluate.results import Evaluation, Paired
+from lidardesign.report.result import headline, result_section
+from lidardesign.scoring.evaluation.entries import StrongestRival
+from lidardesign.scoring.evaluation.results import Evaluation, Paired
+from lidardesign.sensors.sensor import CERTIFICATES, DesignSpec
 from lidardesign.task import Metric
 
 RIVAL = StrongestRival("greedy", 25, 20, {"greedy": 5.5, "uniform": 20.0})

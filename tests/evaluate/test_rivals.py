@@ -10,18 +10,18 @@ from support.evaluations import make_row
 from support.scoring import HitTask, MissTask, design, make_request, scenes
 from support.tables import each_row
 
-from lidardesign.evaluate.baselines.greedy import GreedySource
-from lidardesign.evaluate.entries import (
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scoring.baselines.greedy import GreedySource
+from lidardesign.scoring.evaluation.entries import (
     FEWEST_RIVAL_SCENES,
     LARGEST_RIVAL_SHARE,
     MOST_RIVAL_SCENES,
     entries_of,
     mean_rival,
 )
-from lidardesign.evaluate.results import middle_rays
-from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.seeds import over_seeds
-from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.scoring.evaluation.results import middle_rays
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.evaluation.seeds import over_seeds
 
 HELD_BACK = scenes(31, 40, side=0.3)
 

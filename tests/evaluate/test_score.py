@@ -10,16 +10,16 @@ from support.scoring import RAYS, HitTask, MissTask, design, make_request, rows_
 from support.tables import each_row
 
 from lidardesign.cli.tables.scores import show_evaluation
-from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError, DataError, PluginError
-from lidardesign.evaluate.baselines import candidates
-from lidardesign.evaluate.entries import FEWEST_RIVAL_SCENES
-from lidardesign.evaluate.report.figures import scores_figure
-from lidardesign.evaluate.report.tables import paired_tables
-from lidardesign.evaluate.results import csv_text, verdict
-from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.statistics import mean_interval, paired_difference
-from lidardesign.evaluate.thresholds import worse_than_threshold
+from lidardesign.report.figures import scores_figure
+from lidardesign.report.tables import paired_tables
+from lidardesign.scoring.baselines import candidates
+from lidardesign.scoring.evaluation.entries import FEWEST_RIVAL_SCENES
+from lidardesign.scoring.evaluation.results import csv_text, verdict
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.evaluation.thresholds import worse_than_threshold
+from lidardesign.scoring.scenes.statistics import mean_interval, paired_difference
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score
 

@@ -8,8 +8,8 @@ from scipy.stats import t, ttest_1samp
 from support.scoring import design, make_request, rows_by_key
 
 from lidardesign.errors import NumericalError
-from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.seeds import over_seeds, two_way_interval
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.evaluation.seeds import over_seeds, two_way_interval
 
 TRIALS = 1500
 # Four standard errors of a share of 95 % over so many trials.
@@ -22,9 +22,9 @@ def naive_variance(table):
     rows, columns = table.mean(axis=1), table.mean(axis=0)
     of_seeds = sum(groups * (row - mean) ** 2 for row in rows) / (seeds - 1)
     of_groups = sum(seeds * (column - mean) ** 2 for column in columns) / (groups - 1)
-    errors = sum(
-        (table[s, g] - rows[s] - columns[g] + mean) ** 2 for s in range(seeds) for g in range(groups)
-    ) / ((seeds - 1) * (groups - 1))
+    errors = sum((table[s, g] - rows[s] - columns[g] + mean) ** 2 for s in range(seeds) for g in range(groups)) / (
+        (seeds - 1) * (groups - 1)
+    )
     return (of_seeds + of_groups - errors) / (seeds * groups), (of_seeds, of_groups, errors)
 
 

@@ -8,10 +8,10 @@ import pytest
 from support.evaluations import make_evaluation
 from support.tables import each_row
 
-from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.evaluate.report.scene_figure import constraint_slack_of
-from lidardesign.evaluate.report.series import COLOURS, axis_titles, log_ticks, logarithmic, series
-from lidardesign.evaluate.results import csv_text, write_csv
+from lidardesign.report.scene_figure import constraint_slack_of
+from lidardesign.report.series import COLOURS, axis_titles, log_ticks, logarithmic, series
+from lidardesign.scoring.evaluation.results import csv_text, write_csv
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, -0.3, -0.3, 1.0), (0, 0, 0, 0.3, 0.3, 5.0))

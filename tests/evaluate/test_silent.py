@@ -8,10 +8,10 @@ import numpy as np
 from support.scoring import design, make_request, scenes
 from support.tables import each_row
 
-from lidardesign.evaluate.scene_scores import silent_notes
-from lidardesign.evaluate.score import evaluate
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import rigid
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import rigid
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.scenes.scene_scores import silent_notes
 
 
 def silent(evaluation):

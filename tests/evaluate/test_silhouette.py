@@ -8,12 +8,12 @@ from scipy.spatial import cKDTree
 from support.rivals import Rivals, balls
 from support.tables import each_row
 
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.evaluate.baselines.bounding import bounding
-from lidardesign.evaluate.baselines.candidates import LayoutSite
-from lidardesign.evaluate.baselines.silhouette import lloyd, silhouette, survey
-from lidardesign.evaluate.baselines.views import TrainingViews
-from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scoring.baselines.bounding import bounding
+from lidardesign.scoring.baselines.candidates import LayoutSite
+from lidardesign.scoring.baselines.silhouette import lloyd, silhouette, survey
+from lidardesign.scoring.baselines.views import TrainingViews
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import DesignSpace, direction
 
 AHEAD = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))

@@ -11,9 +11,9 @@ from support.scoring import HitTask, design, make_request
 from support.tables import each_row
 
 from lidardesign.errors import ThresholdError
-from lidardesign.evaluate.results import Evaluation, Paired, verdict
-from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.thresholds import check_better, check_limit, difference_text
+from lidardesign.scoring.evaluation.results import Evaluation, Paired, verdict
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.evaluation.thresholds import check_better, check_limit, difference_text
 
 
 @each_row(

@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 from support.small_runs import shifted
 
+from lidardesign.api import scores as scoring
 from lidardesign.config import load_run_config, resolve, save_run_config
 from lidardesign.density.learn import learn
 from lidardesign.density.learned import load_flow, remeasured, seconds_at
-from lidardesign.density.training import training as steps
+from lidardesign.density.training import trainer as steps
 from lidardesign.density.training.quality import draw_probes
-from lidardesign.density.training.training import Trainer
+from lidardesign.density.training.trainer import Trainer
 from lidardesign.errors import DataError, NumericalError
-from lidardesign.evaluate.accuracy import sweeps as accuracy
-from lidardesign.evaluate.accuracy import training
-from lidardesign.evaluate.accuracy.probes import AccuracyRequest
-from lidardesign.evaluate.accuracy.settings import Accuracy
-from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
+from lidardesign.scoring.accuracy import sweeps as accuracy
+from lidardesign.scoring.accuracy import training
+from lidardesign.scoring.accuracy.probes import AccuracyRequest
+from lidardesign.scoring.accuracy.settings import Accuracy
+from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.task import random_generator, scenes_of
-from lidardesign.workflow import evaluate as scoring
 
 SMALL = (
     "learning.batch=128", "learning.layers=1", "learning.hidden=16", "learning.bins=8", "learning.samples=2000",
@@ -193,7 +193,7 @@ def test_a_time_budget_ends_at_the_clock_and_writes_its_steps_into_the_configura
 
 
 def test_a_run_that_ends_by_the_clock_is_resumed_by_one_and_says_so(lidardesign, tmp_path, monkeypatch):
-    monkeypatch.setattr("lidardesign.density.training.training.PROGRESS_STEPS", 1)
+    monkeypatch.setattr("lidardesign.density.training.trainer.PROGRESS_STEPS", 1)
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "_report", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         stopped = flatland(lidardesign, "run", "--time-budget", "60")

@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 from support.tables import each_row
 
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.files import design_document
-from lidardesign.design.fit import fit, rays_at
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.evaluate.baselines.candidates import mean_mbps
-from lidardesign.evaluate.baselines.simple import TwinCandidate, fitted_twin
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.fit import fit, rays_at
 from lidardesign.samples import Samples
+from lidardesign.scoring.baselines.candidates import mean_mbps
+from lidardesign.scoring.baselines.simple import TwinCandidate, fitted_twin
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.design_file import design_document
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))

@@ -16,9 +16,9 @@ from support.command_line import make_run, program
 from support.workers import make_request, results, without_times
 
 from lidardesign.errors import ConfigError, NumericalError, PluginError
-from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.workers import scorer_of
 from lidardesign.registry import load_task
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.evaluation.workers import scorer_of
 
 
 def test_processes_score_as_this_one_does_and_end():
@@ -60,7 +60,7 @@ def test_a_script_is_not_run_again_by_its_workers(tmp_path):
     script.write_text(
         "print('begun', flush=True)\n"
         "from support.workers import make_request\n"
-        "from lidardesign.evaluate.workers import scorer_of\n"
+        "from lidardesign.scoring.evaluation.workers import scorer_of\n"
         "request = make_request()\n"
         "with scorer_of(2, request.task, 2) as scorer:\n"
         "    print(len(scorer(request.scene_pass(lambda number: [], request.planner), None)))\n"

@@ -16,9 +16,9 @@ from support.workers import make_request, random_rays, results
 
 from lidardesign import errors
 from lidardesign.errors import ConfigError, LidardesignError, PluginError
-from lidardesign.evaluate import workers
-from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.workers import check_workers, scorer_of
+from lidardesign.scoring.evaluation import workers
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.evaluation.workers import check_workers, scorer_of
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner
 from lidardesign.task import Score

@@ -11,10 +11,10 @@ import pytest
 from support.rigs import even, farthest_nearest, sensor
 from support.tables import each_row
 
-from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError
-from lidardesign.export.registry import EXPORTERS
-from lidardesign.geometry.rays import Rays
+from lidardesign.formats.registry import EXPORTERS
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 
 ONE = DesignSpec("one", (Sensor("one", 1.0, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.1),))
 

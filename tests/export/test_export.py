@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from support.tables import each_row
 
-from lidardesign.design.files import load_design
-from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
-from lidardesign.export.galvo import read_galvo
-from lidardesign.export.mounts import angles_between
-from lidardesign.export.registry import EXPORTERS
+from lidardesign.formats.galvo import read_galvo
+from lidardesign.formats.galvo_angles import SPEED_OF_LIGHT_M_PER_PS
+from lidardesign.formats.mounts import angles_between
+from lidardesign.formats.registry import EXPORTERS
+from lidardesign.layouts.rays import lay_out
+from lidardesign.sensors.design_file import load_design
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 
 
 def design(count=2):

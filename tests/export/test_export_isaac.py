@@ -1,12 +1,11 @@
 """Isaac Sim's sensors as USD: fields, types, lengths, and where rays go."""
 
-
 import numpy as np
 import pytest
 from support.rigs import rig
 
 from lidardesign.errors import ConfigError
-from lidardesign.export.registry import EXPORTERS
+from lidardesign.formats.registry import EXPORTERS
 
 DESIGN, RAYS = rig()
 COUNTS = np.bincount(RAYS.sensor)
@@ -30,6 +29,8 @@ TOKENS = {
     "scanType": "SOLID_STATE", "rayType": "IDEALIZED", "elementsCoordsType": "CARTESIAN",
     "outputFrameOfReference": "SENSOR",
 }  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory):
     usd = pytest.importorskip("pxr.Usd", reason="needs usd-core: the extra `consumers`")

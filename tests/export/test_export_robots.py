@@ -13,17 +13,17 @@ import pytest
 from support.rigs import NASTY, even, farthest_nearest, read_sdf, rig, sdf_reader, spinning
 from support.tables import each_row
 
-from lidardesign.design.files import load_design
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec
+from lidardesign.api.export import DesignSource, ExportRequest
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.export.mounts import mounts, quaternion
-from lidardesign.export.names import identifier
-from lidardesign.export.registry import EXPORTERS
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.mujoco_model import RobotFile, bodies_from_mujoco, load_model
-from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
-from lidardesign.workflow.export import DesignSource, ExportRequest
+from lidardesign.formats.mounts import mounts, quaternion
+from lidardesign.formats.names import identifier
+from lidardesign.formats.registry import EXPORTERS
+from lidardesign.layouts.rays import lay_out
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.mujoco_models import RobotFile, bodies_from_mujoco, load_model
+from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
+from lidardesign.sensors.design_file import load_design
+from lidardesign.sensors.sensor import DesignSpec
 
 ROBOTS = ("mjcf", "sdf", "urdf", "xacro", "carla", "isaac-usd")
 GRIDS = ("sdf", "urdf", "xacro", "carla")

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from support.tables import each_row
 
-from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.export.mounts import mounts
-from lidardesign.export.registry import EXPORTERS
-from lidardesign.geometry.rays import Rays
+from lidardesign.formats.mounts import mounts
+from lidardesign.formats.registry import EXPORTERS
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 
 SCHEMAS = Path(__file__).parents[1] / "schemas"
 MINE = ("helios", "osi", "rgl", "mitsuba", "ply", "stl")

@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 from support.rigs import even, farthest_nearest, sensor
 from support.tables import each_row
 
-from lidardesign.design.layouts.grid import grid_tangent
-from lidardesign.design.sensor import DesignSpec, tangent_directions
-from lidardesign.export.mounts import grid_losses, mounts, nearest_grid, quaternion
-from lidardesign.export.names import (
+from lidardesign.formats.mounts import grid_losses, mounts, nearest_grid, quaternion
+from lidardesign.formats.names import (
     distinct,
     document,
     element,
@@ -19,8 +17,10 @@ from lidardesign.export.names import (
     renamed_note,
     xml_text,
 )
-from lidardesign.geometry.frames import rotation_of_quaternion
-from lidardesign.geometry.rays import Rays
+from lidardesign.layouts.grid import grid_tangent
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.receivers import rotation_of_quaternion
+from lidardesign.sensors.sensor import DesignSpec, tangent_directions
 from lidardesign.space import angles, direction
 
 angle = st.floats(-1.2, 1.2)

@@ -18,8 +18,8 @@ from fuzz.fuzz_runs import SMALL, checkpoints, rerecord, small_config
 from fuzz.fuzz_targets import TEXTS
 from fuzz.mutators import mutate_bytes, mutate_yaml
 from lidardesign.config import save_run_config
-from lidardesign.design.files import save_design
 from lidardesign.errors import LidardesignError
+from lidardesign.sensors.design_file import save_design
 
 KNOWN_CODES = (0, 1, 2, 3, 4, 5, 6)
 NUMERICAL = 5

@@ -17,15 +17,15 @@ from support.captures import BIN_PS, BINS, make_capture
 from support.command_line import make_run
 
 from lidardesign.config import resolve
-from lidardesign.design.files import design_document
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.rigs.ray_lists import QUERY_COLUMN, write_sensor_csv
-from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, Track
-from lidardesign.export.galvo import write_galvo
-from lidardesign.geometry.rays import Rays
+from lidardesign.formats.galvo import write_galvo
+from lidardesign.formats.ray_lists import QUERY_COLUMN, write_sensor_csv
+from lidardesign.layouts.rays import lay_out
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, read_manifest
 from lidardesign.run.yaml import dump_yaml
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.design_file import design_document
+from lidardesign.sensors.sensor import Coupling, DesignSpec, Sensor, Track
 from lidardesign.simulate.detector.files import FOLDER as DETECTORS
 
 ROOT = Path(__file__).parents[2]

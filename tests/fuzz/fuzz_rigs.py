@@ -19,10 +19,10 @@ from fuzz.attempts import Read, of_file
 from fuzz.containers import mutate_npz
 from fuzz.fuzz_runs import rerecord
 from fuzz.mutators import Mutator, mutate_bytes, mutate_json, mutate_text, mutate_yaml
-from lidardesign.design.catalog.library import FOLDER as PARTS
-from lidardesign.design.files import save_design
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.export.registry import EXPORTERS
+from lidardesign.formats.registry import EXPORTERS
+from lidardesign.layouts.rays import lay_out
+from lidardesign.parts.catalogue import FOLDER as PARTS
+from lidardesign.sensors.design_file import save_design
 
 ROBOT = """<mujoco model="arm"><default><geom rgba="1 0 0 1"/></default><worldbody>
 <geom name="ground" type="box" size="2 2 .1" pos="0 0 -.1"/>
@@ -64,7 +64,7 @@ def models(_: Path) -> list[bytes]:
 
 def read_model(path: Path) -> object:
     """As the task mujoco does."""
-    from lidardesign.mujoco_model import load_model
+    from lidardesign.scenes.mujoco_models import load_model
 
     model, notes = load_model(path)
     return model.nq, list(notes)
@@ -132,7 +132,7 @@ def part_files(_: Path) -> list[bytes]:
 
 def read_part_file(path: Path) -> object:
     """As `fit --parts FILE` does: the part in all its modes, and what it fires."""
-    from lidardesign.design.catalog.library import find_part
+    from lidardesign.parts.catalogue import find_part
 
     part = find_part(path)
     return part.as_dict() if hasattr(part, "as_dict") else part
@@ -198,8 +198,8 @@ def _recorded(files: dict[str, bytes]) -> dict[str, bytes]:
 
 def open_run_folders(folder: Path) -> Read:
     """As `evaluate RUN` does, up to the scenes."""
+    from lidardesign.api.scores import ScoreOptions, ScoreRequest
     from lidardesign.samples import load_samples
-    from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
 
     def read(content: bytes) -> object:
         run = folder / "input_run"

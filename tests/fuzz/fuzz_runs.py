@@ -96,9 +96,9 @@ def _trainer(run: Path) -> object:
     """A trainer at its first step, with a small flow and nothing to train on."""
     import torch
 
-    from lidardesign.density.flow.objective import Coordinates
+    from lidardesign.density.flow.coordinates import Coordinates
     from lidardesign.density.learn import make_flow
-    from lidardesign.density.training.training import Trainer
+    from lidardesign.density.training.trainer import Trainer
 
     config = small_config()
     generator = torch.Generator().manual_seed(0)

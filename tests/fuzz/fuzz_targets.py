@@ -43,8 +43,8 @@ def open_overrides(_: Path) -> Read:
     """As `--set` does, for a configuration and for constraints."""
     from lidardesign.config import resolve
     from lidardesign.errors import LidardesignError
+    from lidardesign.fitting.request import load_constraints
     from lidardesign.registry import load_task
-    from lidardesign.workflow.fit import load_constraints
 
     def configured(text: str) -> object:
         return resolve(load_task("flatland"), overrides=[text])
@@ -74,10 +74,10 @@ def _spaces() -> list[object]:
 
 def read_constraints(path: Path) -> object:
     """As `constrain --constraints` does, up to the check that any design can satisfy them."""
-    from lidardesign.design.constraints.feasibility import check_feasible
+    from lidardesign.constraints.feasibility import check_feasible
     from lidardesign.errors import InfeasibleError
+    from lidardesign.fitting.request import load_constraints
     from lidardesign.run.yaml import dump_yaml, parse_yaml
-    from lidardesign.workflow.fit import load_constraints
 
     constraints = load_constraints(path)
     parse_yaml(dump_yaml(constraints.as_document()), where="written again")
@@ -94,9 +94,9 @@ def read_constraints(path: Path) -> object:
 
 def read_design(path: Path) -> object:
     """As `show` and `export` do: what was read can be written and read again, and its rays are rays."""
-    from lidardesign.design.files import design_document, design_from_document, load_design
-    from lidardesign.design.layouts.rays import lay_out
+    from lidardesign.layouts.rays import lay_out
     from lidardesign.run.yaml import dump_yaml, parse_yaml
+    from lidardesign.sensors.design_file import design_document, design_from_document, load_design
 
     design = load_design(path)
     again = design_from_document(parse_yaml(dump_yaml(design_document(design)), where="written again").value)
@@ -114,12 +114,12 @@ def _own(place: str) -> Callable[[Path], object]:
 
 
 read_detector = _own("simulate.detector.files:load_detector")
-read_steering = _own("export.galvo:read_galvo")
+read_steering = _own("formats.galvo:read_galvo")
 
 
 def read_mesh(path: Path) -> object:
     """As the task meshes does."""
-    from lidardesign.meshio import load_mesh
+    from lidardesign.scenes.mesh_files import load_mesh
 
     mesh = load_mesh(path)
     return mesh, mesh.bounds_m
@@ -135,7 +135,7 @@ def read_face(path: Path) -> object:
 
 def read_capture(path: Path) -> object:
     """As `capture` does; true ranges may be NaN where nothing is."""
-    from lidardesign.evaluate.captures.capture import load_capture
+    from lidardesign.scoring.captures.capture import load_capture
 
     capture = load_capture(path)
     return replace(capture, true_range_m=None), capture.spacing_rad, capture.background_per_bin

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.triangles import naive_triangle_distance_m
 
-from lidardesign.geometry.closest import TriangleTree
+from lidardesign.scenes.distances import TriangleTree
 
 NANOMETRE = 1e-9
 
@@ -49,7 +49,7 @@ SUBJECTS = {
     "many": corners(150, 0.2),
     "small": corners(150, 1e-4),
     "smallest": corners(150, 1e-9),
-    "huge and tiny": np.concatenate([corners(40, 10.0 ** power, seed=6 + power) for power in range(-6, 2)]),
+    "huge and tiny": np.concatenate([corners(40, 10.0**power, seed=6 + power) for power in range(-6, 2)]),
     "a sheet": sheet(),
     "the same twice": np.repeat(corners(60, 0.2), 2, axis=0),
     "the same many times": np.repeat(corners(1), 100, axis=0),

@@ -14,8 +14,8 @@ from support.meshes import BOX_FACES, BOX_VERTICES, write_box
 from support.tables import each_row
 
 from lidardesign.errors import DataError
-from lidardesign.geometry.mesh_formats import read_off
-from lidardesign.meshio import load_mesh
+from lidardesign.scenes.mesh_files import load_mesh
+from lidardesign.scenes.mesh_formats import read_off
 
 POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 FACES = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"

@@ -12,10 +12,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from support import references
 
-from lidardesign.geometry import triangles
-from lidardesign.geometry.raycast import SceneCaster, shared_caster, trace_each
-from lidardesign.geometry.triangles import mesh_caster
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scenes import triangles
+from lidardesign.scenes.casting import SceneCaster, shared_caster, trace_each
+from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.triangles import mesh_caster
 
 PRIMITIVES = {
     "sphere": Sphere(0.7),

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from support.tables import each_row
 
-from lidardesign.geometry.frames import angles_in_view, in_view, receiver_axes
-from lidardesign.scene import Receiver
+from lidardesign.scenes.receivers import angles_in_view, in_view, receiver_axes
+from lidardesign.scenes.scene import Receiver
 from lidardesign.space import direction
 
 STRAIGHT = Receiver((0.0, 0.0, 0.0), 0.0, 0.0, math.radians(60), math.radians(50), (0.1, 2.0))

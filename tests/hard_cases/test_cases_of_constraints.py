@@ -19,23 +19,23 @@ from support.fits import MOVING, log_target
 from support.hard_cases import hard_case
 from support.tables import each_row
 
-import lidardesign.design.constraints.check as checker
-from lidardesign.design.bandwidth import split_budget
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.feasibility import check_feasible
-from lidardesign.design.files import design_document, design_from_document
-from lidardesign.design.fit import fit
-from lidardesign.design.mixture.bounds import Bounds
-from lidardesign.design.mixture.em import fit_mixture
-from lidardesign.design.mixture.ensemble import admitted_mixture
-from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.mixture.mixture import log_density
-from lidardesign.design.mixture.support import LEAST_MASS
-from lidardesign.design.sensor import interval_factor
+import lidardesign.constraints.check as checker
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.errors import InfeasibleError
-from lidardesign.evaluate.metrics import DRAW_ROUNDS
+from lidardesign.mixture.bounds import Bounds
+from lidardesign.mixture.components import log_density
+from lidardesign.mixture.em import fit_mixture
+from lidardesign.mixture.ensemble import admitted_mixture
+from lidardesign.mixture.features import Axes, Features
+from lidardesign.mixture.fit import fit
+from lidardesign.mixture.support import LEAST_MASS
 from lidardesign.samples import Samples
+from lidardesign.scoring.scenes.metrics import DRAW_ROUNDS
+from lidardesign.sensors.bandwidth import split_budget
+from lidardesign.sensors.design_file import design_document, design_from_document
+from lidardesign.sensors.sensor import interval_factor
 from lidardesign.space import DesignSpace
 
 Z = interval_factor(0.95)
@@ -198,7 +198,7 @@ class TestContradictions:
             raise AssertionError("samples were asked for before the constraints")
 
         for step in ("restrict_samples", "pin_samples", "choose_mounts", "fit_groups"):
-            monkeypatch.setattr(f"lidardesign.design.layouts.layout.{step}", never)
+            monkeypatch.setattr(f"lidardesign.layouts.layout.{step}", never)
         samples = Samples(FACE.sample(10, np.random.default_rng(0)), np.zeros(10), np.zeros(10), FACE)
         files = [(values, {}) for values, _ in CONTRADICTIONS.values()]
         for values, asked in files if kind == "file" else [one[:2] for one in BUDGETS.values()]:
@@ -291,8 +291,8 @@ class TestAlmostNothingLeft:
 
     def test_surfaces_that_hardly_any_ray_sees_are_drawn_a_bounded_number_of_times(self, monkeypatch):
         from lidardesign.errors import DataError
-        from lidardesign.evaluate import metrics
-        from lidardesign.scene import Body, Scene, Sphere
+        from lidardesign.scenes.scene import Body, Scene, Sphere
+        from lidardesign.scoring.scenes import metrics
 
         draws = []
         exact = metrics.sample_body
@@ -423,8 +423,8 @@ class TestBoundsHoldOnTheWrittenFile:
 
     def test_the_checker_shares_no_code_with_the_fit(self):
         # parts have to be looked up, and angles mean what they mean: data and conventions, nothing of the fit
-        parts = {f"lidardesign.design.catalog.{name}" for name in ("library", "part")}
-        conventions = {f"lidardesign.{name}" for name in ("numerics", "errors", "space", "design.sensor")}
+        parts = {f"lidardesign.parts.{name}" for name in ("library", "part")}
+        conventions = {f"lidardesign.{name}" for name in ("numerics", "errors", "space", "sensors.sensor")}
         tree = ast.parse(Path(checker.__file__).read_text(encoding="utf-8"))
         imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
         assert {module for module in imported if module.startswith("lidardesign")} <= parts | conventions

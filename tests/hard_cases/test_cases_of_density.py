@@ -30,22 +30,22 @@ from lidardesign.config import (
     resolve,
 )
 from lidardesign.density.fields.distance import build_field
-from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.flow.coordinates import Coordinates
+from lidardesign.density.flow.network import DesignFlow
 from lidardesign.density.learn import learn
-from lidardesign.density.target.prepare import ROUNDINGS, UNRESOLVED_SHARE, prepare_target
-from lidardesign.density.target.quadrature import Quadrature
-from lidardesign.density.target.surfaces import MovingFrames
-from lidardesign.density.target.target import build_target
-from lidardesign.density.target.visibility import MINIMUM_COSINE, Optics, RayBatch, Raycast
+from lidardesign.density.objective.prepare import ROUNDINGS, UNRESOLVED_SHARE, prepare_target
+from lidardesign.density.objective.quadrature import Quadrature
+from lidardesign.density.objective.surfaces import MovingFrames
+from lidardesign.density.objective.target import build_target
+from lidardesign.density.objective.visibility import MINIMUM_COSINE, Optics, RayBatch, Raycast
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import lay_out
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.fit import fit
 from lidardesign.registry import load_task
 from lidardesign.samples import Samples, load_samples
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.space import ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
 from lidardesign.task import TaskConfig
 

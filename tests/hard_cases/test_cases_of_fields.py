@@ -22,13 +22,13 @@ from lidardesign.config import DensitySettings
 from lidardesign.density.fields import grids
 from lidardesign.density.fields.bodies import collect_bodies
 from lidardesign.density.fields.distance import BodyField, TableField, build_field
-from lidardesign.density.target.surfaces import SceneTable, near_pairs
-from lidardesign.density.target.target import Target, build_target
-from lidardesign.density.target.visibility import NoVisibility, Optics
+from lidardesign.density.objective.surfaces import SceneTable, near_pairs
+from lidardesign.density.objective.target import Target, build_target
+from lidardesign.density.objective.visibility import NoVisibility, Optics
 from lidardesign.errors import DataError
-from lidardesign.evaluate.accuracy.fields import ExactField
-from lidardesign.meshio import SUFFIXES, check_mesh, load_mesh, signed_volume_m3, unique_rows
-from lidardesign.scene import Body, Box, Capsule, Mesh, Scene, Sphere, rigid
+from lidardesign.scenes.mesh_files import SUFFIXES, check_mesh, load_mesh, signed_volume_m3, unique_rows
+from lidardesign.scenes.scene import Body, Box, Capsule, Mesh, Scene, Sphere, rigid
+from lidardesign.scoring.accuracy.fields import ExactField
 from lidardesign.space import DesignSpace
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)

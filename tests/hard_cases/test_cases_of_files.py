@@ -16,14 +16,14 @@ from support.tables import each_row
 
 from lidardesign.config import resolve
 from lidardesign.density.training.checkpoint import FORMAT, load_arrays, save_arrays
-from lidardesign.density.training.training import CHECKPOINT
-from lidardesign.design.files import load_design
+from lidardesign.density.training.trainer import CHECKPOINT
 from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.fitting.request import load_constraints
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import parse_yaml
+from lidardesign.sensors.design_file import load_design
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.workflow.fit import load_constraints
 
 BOMB_LEVELS = 7
 REFUSED = {
@@ -254,9 +254,9 @@ def fresh_trainer(run, hidden):
     """A trainer of a small flow at its first step, with nothing to train on."""
     import torch
 
-    from lidardesign.density.flow.objective import Coordinates
+    from lidardesign.density.flow.coordinates import Coordinates
     from lidardesign.density.learn import make_flow
-    from lidardesign.density.training.training import Trainer
+    from lidardesign.density.training.trainer import Trainer
 
     small = [f"learning.hidden={hidden}", "learning.layers=1", "learning.bins=4"]
     config = resolve(load_task("flatland"), preset="draft", overrides=small)

@@ -22,14 +22,14 @@ from lidardesign.cli.main import run as run_program
 from lidardesign.config import DensitySettings
 from lidardesign.density.flow.splines import BoundedSpline
 from lidardesign.density.learn import learn, make_trainer, prepare_training_data
-from lidardesign.density.target.target import Target
+from lidardesign.density.objective.target import Target
 from lidardesign.density.training import quality as measure
-from lidardesign.density.training import training
+from lidardesign.density.training import trainer as training
 from lidardesign.density.training.checkpoint import load_arrays
 from lidardesign.density.training.losses import TOLERANCE_NATS, round_trip_nats
 from lidardesign.errors import DivergenceError
 from lidardesign.samples import load_samples
-from lidardesign.scene import Body, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 
 
@@ -376,6 +376,7 @@ class TestTargetsWithoutShape:
         assert result.kl_nats < 0.5
         assert any("flat" in note for note in result.notes)
         assert samples.space.log_volume >= -samples.log_prob.mean()  # no density has more entropy
+
 
 TINY = (
     "train=4", "learning.steps=200", "learning.batch=64", "learning.layers=1", "learning.hidden=16",

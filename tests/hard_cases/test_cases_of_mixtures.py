@@ -13,13 +13,13 @@ from support.hard_cases import hard_case
 from support.mixtures import POINT, WHOLE, Z, drawn, features_of, random_mixture
 from support.tables import each_row
 
-from lidardesign.design.files import design_document
-from lidardesign.design.fit import fit
-from lidardesign.design.mixture.bounds import Bounds, Floors
-from lidardesign.design.mixture.em import fit_mixture, run_em
-from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.mixture.mixture import Mixture, expect, log_density, responsibilities
+from lidardesign.mixture.bounds import Bounds, Floors
+from lidardesign.mixture.components import Mixture, expect, log_density, responsibilities
+from lidardesign.mixture.em import fit_mixture, run_em
+from lidardesign.mixture.features import Axes, Features
+from lidardesign.mixture.fit import fit
 from lidardesign.samples import Samples
+from lidardesign.sensors.design_file import design_document
 from lidardesign.space import DesignSpace
 
 # rounding of a log-likelihood of some hundred nats that is summed over some thousand samples

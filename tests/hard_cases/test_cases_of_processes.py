@@ -108,7 +108,7 @@ class TestKillsFullDisksAndTwoWriters:
         assert files_under(run) == before
 
     def test_a_second_writer_is_told_who_writes_and_changes_nothing(self, tmp_path, lidardesign, monkeypatch):
-        monkeypatch.setattr("lidardesign.workflow.designs.WAIT_S", 0.05)
+        monkeypatch.setattr("lidardesign.api.design.WAIT_S", 0.05)
         run = make_run(tmp_path / "run", count=1000)
         before = files_under(run)
         with run_lock(run):

@@ -14,14 +14,14 @@ from support import references
 from support.hard_cases import hard_case
 from support.tables import each_row
 
-from lidardesign.design.files import design_from_document
 from lidardesign.errors import ConfigError, LidardesignError
-from lidardesign.evaluate.scene_scores import score_in_scene
-from lidardesign.evaluate.score import slipped_notes
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.triangles import BESIDE_SHARE, SecondCasts, Triangles
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.triangles import BESIDE_SHARE, SecondCasts, Triangles
+from lidardesign.scoring.evaluation.score import slipped_notes
+from lidardesign.scoring.scenes.scene_scores import score_in_scene
+from lidardesign.sensors.design_file import design_from_document
 from lidardesign.simulate.plan import Planner
 from lidardesign.task import Metric, Score
 

@@ -28,7 +28,7 @@ from support.robots import TOOL_M, mjcf, written
 from support.tables import each_row
 
 from lidardesign.errors import DataError
-from lidardesign.mujoco_model import MAX_INCLUDES, model_files, mujoco_warnings
+from lidardesign.scenes.mujoco_models import MAX_INCLUDES, model_files, mujoco_warnings
 
 TASK = ArmTask()
 FREE = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"

@@ -23,24 +23,24 @@ from support.tables import each_row
 
 from lidardesign.density.learn import refuse_blind_receiver
 from lidardesign.errors import DataError
-from lidardesign.evaluate.metrics import (
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Outcome, Rays
+from lidardesign.scenes.receivers import path_of_range, path_windows, range_of_path
+from lidardesign.scenes.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.scenes.surface import sample_triangles
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.scenes.metrics import (
     SurfaceCloud,
     chamfer_m,
     delaunay_surface,
     discrete_frechet_m,
     visible_surface,
 )
-from lidardesign.evaluate.scene_scores import checked_score
-from lidardesign.evaluate.score import evaluate
-from lidardesign.geometry.frames import path_of_range, path_windows, range_of_path
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays
-from lidardesign.geometry.surface import sample_triangles
-from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import IDEAL, Detector, Physics
+from lidardesign.scoring.scenes.scene_scores import checked_score
 from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.physics import IDEAL, Detector, Physics
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace, direction
 from lidardesign.task import conditions_of
 
@@ -116,6 +116,7 @@ class TestHitsAtTheEdgesOfGates:
         # as gates move outwards a ray is late, then returns, then is hidden
         rank = np.select([outcomes == Outcome.AFTER_GATE, outcomes == Outcome.RETURN], [0, 1], 2)
         assert (np.diff(rank[:, np.isfinite(first)], axis=0) >= 0).all()
+
 
 TASKS = {
     "flatland": (FlatlandTask, {"train": 1, "test": 1}),
@@ -216,6 +217,7 @@ class TestEffectsNotCalledFor:
         (measured,) = simulate(head, face_rays(), physics=Physics(thin, frozenset({effect})))
         for name in ("outcome", "range_m", "body"):
             assert getattr(alone, name).tobytes() == getattr(measured, name).tobytes()
+
 
 def looking_away(place, **changes):
     """A receiver that looks along -x, where nothing is."""

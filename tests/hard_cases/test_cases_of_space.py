@@ -15,12 +15,12 @@ from support.hard_cases import hard_case
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings, resolve
-from lidardesign.density.target.target import MINIMUM_POLE_COSINE, build_target
-from lidardesign.design.files import load_design
-from lidardesign.design.rigs.ray_lists import SENSOR_COLUMNS
+from lidardesign.density.objective.target import MINIMUM_POLE_COSINE, build_target
 from lidardesign.errors import ConfigError, DataError, NumericalError
+from lidardesign.formats.ray_lists import SENSOR_COLUMNS
 from lidardesign.registry import load_task
-from lidardesign.scene import Body, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Body, Plane, Scene, Sphere, rigid
+from lidardesign.sensors.design_file import load_design
 from lidardesign.space import (
     AZIMUTH,
     DIMENSIONS,
@@ -91,6 +91,7 @@ class TestAzimuthAcrossTheSeam:
         step = np.abs(target.log_density(before) - target.log_density(after))
         assert (step <= 2e-9 * (2 * slopes + 1) + 1e-8).all()
 
+
 @hard_case(
     "2",
     "Elevation at +-pi/2, where the azimuth says nothing",
@@ -151,6 +152,7 @@ class TestElevationAtThePoles:
         # by Archimedes, heights are uniform
         middle, spread = (1 + math.cos(0.3)) / 2, (1 - math.cos(0.3)) / math.sqrt(12)
         assert abs(height.mean() - middle) < references.STANDARD_ERRORS * spread / math.sqrt(20_000)
+
 
 TAUS = {"negative": -0.1, "infinite": math.inf, "not a number": math.nan}
 

@@ -27,26 +27,26 @@ from support.tables import each_row
 
 from lidardesign.cli.main import run as run_program
 from lidardesign.config import DensitySettings, LearningSettings
-from lidardesign.density.target.target import build_target
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.density.objective.target import build_target
 from lidardesign.density.training.checkpoint import load_arrays, save_arrays
 from lidardesign.density.training.quality import coverage, quality
-from lidardesign.design.bandwidth import split_budget
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.errors import LidardesignError
-from lidardesign.evaluate.scene_scores import checked_score
-from lidardesign.evaluate.statistics import mean_interval
-from lidardesign.geometry.rays import Rays
+from lidardesign.fitting import fit as fit_design
+from lidardesign.mixture.fit import fit
+from lidardesign.mixture.quantise import lloyd
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples
-from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Scene, Sphere, rigid
-from lidardesign.simulate.simulate import simulate
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Scene, Sphere, rigid
+from lidardesign.scoring.scenes.scene_scores import checked_score
+from lidardesign.scoring.scenes.statistics import mean_interval
+from lidardesign.sensors.bandwidth import split_budget
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score
-from lidardesign.workflow import fit_design
 
 FLATLAND = (
     "learn", "flatland", "--preset", "draft", "--seed", str(shifted(3)),
@@ -116,6 +116,7 @@ class TestTheSameBytes:
         subprocess.run(command, env=environment, check=True, capture_output=True)
         here, there = ((flat / "designs" / f"{name}.yaml").read_text() for name in ("here", "there"))
         assert here.replace("here", "there") == there
+
 
 BALL = Scene((Body(Sphere(0.5), poses=rigid(translation_m=(1.5, 0, 0))),))
 SPACE = DesignSpace((0, 0, 0, -0.4, -0.4, 0.2), (0, 0, 0, 0.4, 0.4, 2.5))
@@ -265,6 +266,7 @@ class TestKilledAtAnyTime:
         save_arrays(tmp_path, "checkpoint.safetensors", {"weights": np.ones(3)}, {"step": 1})
         left = {path.name for path in tmp_path.iterdir()}
         assert left == {"manifest.json", "checkpoint.safetensors"}
+
 
 class Payload:
     """What runs when it is unpickled."""

@@ -17,20 +17,20 @@ from support.tables import each_row
 
 from lidardesign.config import load_run_config
 from lidardesign.density.training.checkpoint import load_arrays
-from lidardesign.design.catalog.library import read_part
-from lidardesign.design.files import load_design
-from lidardesign.design.rigs.ray_lists import read_ray_csv, read_sensor_csv
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.evaluate.captures.capture import load_capture
-from lidardesign.export.galvo import read_galvo
-from lidardesign.meshio import SUFFIXES, list_mesh_files, load_mesh
-from lidardesign.mujoco_model import model_files
+from lidardesign.formats.galvo import read_galvo
+from lidardesign.formats.ray_lists import read_ray_csv, read_sensor_csv
+from lidardesign.parts.catalogue import read_part
 from lidardesign.run import inputs
 from lidardesign.run.arrays import read_npz
 from lidardesign.run.files import FILE_NAME, run_lock, sha256_file, write_atomic
 from lidardesign.run.manifest import read_manifest
 from lidardesign.run.xml import read_xml
 from lidardesign.run.yaml import load_yaml
+from lidardesign.scenes.mesh_files import SUFFIXES, list_mesh_files, load_mesh
+from lidardesign.scenes.mujoco_models import model_files
+from lidardesign.scoring.captures.capture import load_capture
+from lidardesign.sensors.design_file import load_design
 from lidardesign.simulate.detector.files import load_detector
 
 DOCS = Path(__file__).parents[2] / "docs" / "formats.md"

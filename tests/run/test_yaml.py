@@ -138,12 +138,7 @@ def test_an_empty_file_is_an_empty_mapping_and_a_list_is_none():
         _ = parse_yaml("[1]", where="f").mapping
 
 
-scalars = (
-    st.none()
-    | st.booleans()
-    | st.integers(-(10**18), 10**18)
-    | st.floats(allow_nan=False, allow_infinity=False)
-)
+scalars = st.none() | st.booleans() | st.integers(-(10**18), 10**18) | st.floats(allow_nan=False, allow_infinity=False)
 printable = st.text(
     st.characters(exclude_categories=["Cs", "Cc"], exclude_characters="\ufeff\ufffe\uffff\u2028\u2029\x85")
 )

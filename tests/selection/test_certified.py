@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.coverages import small
 
-from lidardesign.selection.choice import RayCounts, choose
-from lidardesign.selection.select import SelectionProblem, are_enough
+from lidardesign.rays.choice import RayCounts, choose
+from lidardesign.rays.selection import SelectionProblem, are_enough
 
 fields = ("rays", "gates", "informs", "scenes", "bandwidth", "one_gate", "most_scenes")
 PROBLEM = SelectionProblem(**dict.fromkeys(fields), visits=[slice(0, 7)], shares=None, limit_mbps=np.inf, name="small")

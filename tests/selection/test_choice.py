@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from support.coverages import SUMS, relaxed_by_highs, small
 
 from lidardesign.errors import PluginError
-from lidardesign.selection.certificate import certify
-from lidardesign.selection.choice import RayCounts, choose, choose_within
-from lidardesign.selection.coverage import LARGEST, InformedScene, gather
+from lidardesign.rays.certificate import certify
+from lidardesign.rays.choice import RayCounts, choose, choose_within
+from lidardesign.rays.coverage import LARGEST, InformedScene, gather
 from lidardesign.task import Information
 
 seeds = st.integers(0, 10_000)

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.coverages import SUMS, small
 
-from lidardesign.selection.certificate import certify
-from lidardesign.selection.choice import RayCounts, choose
-from lidardesign.selection.coverage import LARGEST
+from lidardesign.rays.certificate import certify
+from lidardesign.rays.choice import RayCounts, choose
+from lidardesign.rays.coverage import LARGEST
 
 seeds = st.integers(0, 10_000)
 

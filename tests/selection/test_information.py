@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.rays import rays_along
 
-from lidardesign.geometry.rays import Outcome, Returns
-from lidardesign.selection.information import (
+from lidardesign.rays.information import (
     CHOSEN_SHARE,
     REACH_SPACINGS,
     return_reach_m,
     scattered_area_m2,
     surface_information,
 )
+from lidardesign.scenes.rays import Outcome, Returns
 
 seeds = st.integers(0, 10_000)
 SIDE_M, HEIGHT_M = 0.3, 1.0

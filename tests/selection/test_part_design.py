@@ -10,18 +10,19 @@ import pytest
 from support.command_line import caller, make_run
 from support.tables import each_row
 
-from lidardesign.design.catalog.library import find_part, part_rays
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.files import design_document
-from lidardesign.design.layouts.rays import certificates_of, lay_out
+from lidardesign.api.run import open_run
+from lidardesign.constraints.check import check_design
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.fitting import part_design
+from lidardesign.fitting.part_bundle import COARSE_CELL_RAD, PartBundle, cells_of, part_table, parts_inform
+from lidardesign.fitting.part_sets import SetLimits, choose_set
+from lidardesign.layouts.rays import certificates_of, lay_out
+from lidardesign.parts.catalogue import find_part, part_rays
+from lidardesign.rays import information
 from lidardesign.samples import load_samples
-from lidardesign.selection import information, part_design
-from lidardesign.selection.parts import COARSE_CELL_RAD, PartBundle, cells_of, part_table, parts_inform
-from lidardesign.selection.sets import SetLimits, choose_set
-from lidardesign.simulate.simulate import simulate_many
+from lidardesign.sensors.design_file import design_document
+from lidardesign.simulate.returns import simulate_many
 from lidardesign.task import Information
-from lidardesign.workflow.runs import open_run
 
 THREE = ["vl53l5cx", "vl53l5cx:4x4", "tmf8828"]
 

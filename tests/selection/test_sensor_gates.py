@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from support.coverages import scene_of
 from support.rays import random_fan, rays_along
 
-from lidardesign.selection.candidates import SENSOR_LEVELS, gate_choices, sensor_gates
-from lidardesign.selection.coverage import LARGEST, InformedScene, gather
-from lidardesign.selection.select import _shared_gates
+from lidardesign.rays.coverage import LARGEST, InformedScene, gather
+from lidardesign.rays.gates import SENSOR_LEVELS, gate_choices, sensor_gates
+from lidardesign.rays.selection import _shared_gates
 from lidardesign.task import Information
 
 seeds = st.integers(0, 10_000)

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.coverages import SUMS, relaxed_by_highs, small
 
-from lidardesign.selection import sets
-from lidardesign.selection.coverage import LARGEST
-from lidardesign.selection.sets import SetLimits, choose_set
+from lidardesign.fitting import part_sets as sets
+from lidardesign.fitting.part_sets import SetLimits, choose_set
+from lidardesign.rays.coverage import LARGEST
 
 seeds = st.integers(0, 10_000)
 

@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from support.command_line import caller, make_run
 from support.coverages import SUMS, small
 
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.files import design_document, load_design, save_design
-from lidardesign.design.layouts.rays import certificates_of, lay_out
+from lidardesign.api.run import open_run
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError
+from lidardesign.fitting import spinning
+from lidardesign.fitting.spinning import RingCandidates, chosen_rings, finer, places_of
+from lidardesign.layouts.rays import certificates_of, lay_out
 from lidardesign.numerics import FULL_TURN
-from lidardesign.selection import spinning
-from lidardesign.selection.coverage import LARGEST
-from lidardesign.selection.spinning import RingCandidates, chosen_rings, finer, places_of
+from lidardesign.rays.coverage import LARGEST
+from lidardesign.sensors.design_file import design_document, load_design, save_design
 from lidardesign.space import DesignSpace
-from lidardesign.workflow.runs import open_run
 
 RINGS = RingCandidates(np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 2.0]]), np.radians([-20.0, -5.0, 3.0]), 8, (1.0, 60.0))
 

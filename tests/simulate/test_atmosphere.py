@@ -13,15 +13,15 @@ from scipy.special import exp1
 from support.rays import rays_along
 from support.tables import each_row
 
-from lidardesign.geometry.frames import path_windows
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Body, Box, Medium, Receiver, Scene, rigid
-from lidardesign.simulate.detector.detector import IDEAL, Detector, Photons
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.receivers import path_windows
+from lidardesign.scenes.scene import Body, Box, Medium, Receiver, Scene, rigid
+from lidardesign.simulate.detector.light import Background, Beams, direct_echoes
+from lidardesign.simulate.detector.physics import IDEAL, Detector, Photons
 from lidardesign.simulate.effects.atmosphere import through_air
 from lidardesign.simulate.effects.expected_counts import haze_per_pulse
 from lidardesign.simulate.effects.first_hits import FirstHits
 from lidardesign.simulate.effects.footprint import split_beams
-from lidardesign.simulate.light import Background, Beams, direct_echoes
 
 PHOTONS = Photons(905e-9, 1e-6, 1e4, "scanned", 1e6, 1e-6, 1e-4, 0.2, 1e-9, 1e3, 0.0)
 COUNTING = Detector("counting", photons=PHOTONS)

@@ -27,8 +27,8 @@ from support.planning import (
 from support.rays import rays_along
 from support.tables import each_row
 
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import (
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import (
     Ambient,
     Body,
     Box,
@@ -43,7 +43,7 @@ from lidardesign.scene import (
     Sphere,
     rigid,
 )
-from lidardesign.simulate.detector.detector import Physics, metres
+from lidardesign.simulate.detector.physics import Physics, metres
 from lidardesign.simulate.effects.expected_counts import (
     Blindness,
     estimate_error_m,
@@ -56,7 +56,7 @@ from lidardesign.simulate.effects.first_hits import FirstHits, edge_probability
 from lidardesign.simulate.effects.motion import entered_rays, moving_tracer, point_velocities
 from lidardesign.simulate.effects.multipath import _detours, _moved_m
 from lidardesign.simulate.plan import Planner, Tolerance
-from lidardesign.simulate.simulate import followed_light, photon_histograms, simulate
+from lidardesign.simulate.returns import followed_light, photon_histograms, simulate
 
 
 def bound(name, scene, detector, rays=None):

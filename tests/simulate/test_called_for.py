@@ -9,16 +9,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from support.heads import ARM, EVERYTHING, FACE, FLATLAND, face_rays, heads, rays_of
 
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.evaluate.baselines.candidates import rays_at
-from lidardesign.evaluate.baselines.even import even_placement
-from lidardesign.evaluate.results import Audit, AuditRow
-from lidardesign.geometry.rays import fire_times
-from lidardesign.scene import Body, Box, rigid
-from lidardesign.simulate.detector.detector import Detector, Physics
+from lidardesign.scenes.rays import fire_times
+from lidardesign.scenes.scene import Body, Box, rigid
+from lidardesign.scoring.baselines.candidates import rays_at
+from lidardesign.scoring.baselines.even import even_placement
+from lidardesign.scoring.evaluation.results import Audit, AuditRow
+from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.physics import Detector, Physics
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import direction
 
 SINGLE_PHOTON = load_detector("single-photon")

@@ -20,9 +20,9 @@ from support.synthetic_light import (
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.simulate.detector.detection import PHOTONS_ONE_BY_ONE
-from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector, Photons, metres
-from lidardesign.simulate.light import Background, Echoes
+from lidardesign.simulate.detection import PHOTONS_ONE_BY_ONE
+from lidardesign.simulate.detector.light import Background, Echoes
+from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Detector, Photons, metres
 
 RAYS = 4000
 SIGMA_S = 50e-12

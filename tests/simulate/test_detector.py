@@ -10,8 +10,8 @@ import pytest
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, IDEAL, metres
 from lidardesign.simulate.detector.files import CHOICES, FOLDER, QUANTITIES, detector_names, load_detector
+from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, IDEAL, metres
 
 ROOT = Path(__file__).parents[2]
 LIGHT = """\

@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.tables import each_row
 
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import Body, Box, Plane, Scene, rigid
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Body, Box, Plane, Scene, rigid
+from lidardesign.simulate.detector.light import Beams, direct_echoes
+from lidardesign.simulate.detector.physics import Detector
 from lidardesign.simulate.effects.footprint import even_disc, split_beams
-from lidardesign.simulate.light import Beams, direct_echoes
 from lidardesign.space import direction
 
 HALF_RAD = 0.02

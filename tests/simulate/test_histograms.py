@@ -13,13 +13,13 @@ from support.synthetic_light import PHOTON_EFFECTS
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Outcome
-from lidardesign.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Box, Plane, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import PLANCK_J_S, Physics, metres
+from lidardesign.scenes.rays import Outcome
+from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Box, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.light import FIRST_NM, LED_AT_1_LUX, STEP_NM, SUN_AT_100_KLUX, spectral_irradiance
+from lidardesign.simulate.detector.light import FIRST_NM, LED_AT_1_LUX, STEP_NM, SUN_AT_100_KLUX, spectral_irradiance
+from lidardesign.simulate.detector.physics import PLANCK_J_S, Physics, metres
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.simulate import build_casters, followed_light, photon_histograms, simulate
+from lidardesign.simulate.returns import build_casters, followed_light, photon_histograms, simulate
 
 DETECTOR = load_detector("single-photon")
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])

@@ -18,13 +18,25 @@ from support.tables import each_row
 from support.transients import binned, flood, needs_simulator, pixel_rays, rays_from, spiral, spot
 
 from lidardesign.errors import ConfigError, NumericalError
-from lidardesign.geometry.raycast import shared_caster
-from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.scenes.casting import shared_caster
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import (
+    Body,
+    Box,
+    Capsule,
+    Cylinder,
+    Ellipsoid,
+    Mesh,
+    Plane,
+    Receiver,
+    Scene,
+    Sphere,
+    rigid,
+)
+from lidardesign.simulate.detector.light import Beams, Echoes, direct_echoes
 from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.shadowing import visible_echoes
-from lidardesign.simulate.light import Beams, Echoes, direct_echoes
 from lidardesign.simulate.light_transport import transport as process
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient
 
@@ -201,9 +213,7 @@ def test_mirrors_and_glass_take_their_shares_of_matt_light():
     rays = rays_from((0, 0, 0), np.array([[1.0, 0, 0]]))
     for shares in ({}, {"specular": 0.4}, {"transmission": 0.4}, {"specular": 0.3, "transmission": 0.4}):
         wall = Body(Box((0.1, 1, 1)), reflectance=0.3, poses=rigid(translation_m=(2.1, 0.02, 0.03)), **shares)
-        found = render_transient(
-            Scene((wall,)), 0, rays, flood(np.zeros((1, 3))), PathBins(0.1, 100), samples=4096
-        )
+        found = render_transient(Scene((wall,)), 0, rays, flood(np.zeros((1, 3))), PathBins(0.1, 100), samples=4096)
         assert found.steady[0] == pytest.approx(0.3 / (math.pi * 4), rel=0.08)
 
 
@@ -323,7 +333,7 @@ def test_the_simulator_runs_from_any_folder_and_is_imported_in_its_own_process_a
         "import sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
         "import numpy as np\n"
-        "from lidardesign.scene import Body, Scene, Sphere, rigid\n"
+        "from lidardesign.scenes.scene import Body, Scene, Sphere, rigid\n"
         "from lidardesign.simulate.light_transport.transport import PathBins, render_transient\n"
         "from support.transients import flood, rays_from, spiral\n"
         "ball = Scene((Body(Sphere(0.12), poses=rigid(translation_m=(0.45, 0.01, 0.02))),))\n"

@@ -11,8 +11,8 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from support.tables import each_row
 
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.effects.motion import Screw, moving_tracer, path_of
 from lidardesign.space import direction
 

@@ -10,15 +10,15 @@ import pytest
 from support.tables import each_row
 from support.transients import binned, needs_simulator, rays_from, spiral, spot
 
-from lidardesign.geometry.raycast import shared_caster
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import Detector, Physics
+from lidardesign.scenes.casting import shared_caster
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.light import Beams, direct_echoes
+from lidardesign.simulate.detector.light import Beams, direct_echoes
+from lidardesign.simulate.detector.physics import Detector, Physics
 from lidardesign.simulate.light_transport.detours import Detours, lamp_bound, pixel_bound, series
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.returns import simulate
 
 REFLECTANCE = 0.6
 FLOOD, SCANNED = load_detector("consumer-8x8"), load_detector("single-photon")

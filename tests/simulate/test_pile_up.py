@@ -10,15 +10,15 @@ from support.synthetic_light import PULSES, background, counted, counting_detect
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
+from lidardesign.simulate.detection import coates
 from lidardesign.simulate.detector.dead_time import (
     DRAWS_PER_BIN,
     _across_pulses,
     _hit_pulses,
     _within_pulses,
 )
-from lidardesign.simulate.detector.detection import coates
-from lidardesign.simulate.detector.detector import metres
-from lidardesign.simulate.streams import uniform
+from lidardesign.simulate.detector.physics import metres
+from lidardesign.simulate.detector.streams import uniform
 
 BIN_S = 1e-9
 BIN_M = metres(BIN_S)

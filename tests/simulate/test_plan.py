@@ -10,11 +10,11 @@ from support.planning import CONSUMER, SINGLE, TIMED, decisions, grid, room
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate import plan as plan_module
-from lidardesign.simulate.detector.detector import EFFECTS, IDEAL
+from lidardesign.simulate.detector.physics import EFFECTS, IDEAL
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
-from lidardesign.simulate.simulate import build_casters
+from lidardesign.simulate.returns import build_casters
 from lidardesign.task import Metric
 
 EVERYTHING = {
@@ -102,9 +102,10 @@ def test_lists_without_rays_and_rays_without_hits_are_planned_for():
     nothing = grid().subset(np.zeros(144, dtype=bool))
     assert not Planner(SINGLE).plan(room(), [nothing]).effects
     with_some = Planner(SINGLE).plan(room(), [nothing, grid()])
-    assert decisions(with_some)["photon_noise"].bound == decisions(Planner(SINGLE).plan(room(), [grid()]))[
-        "photon_noise"
-    ].bound
+    assert (
+        decisions(with_some)["photon_noise"].bound
+        == decisions(Planner(SINGLE).plan(room(), [grid()]))["photon_noise"].bound
+    )
     away = replace(grid(), direction=-grid().direction)
     for decision in Planner(SINGLE).plan(room(**EVERYTHING), [away]).decisions:
         assert np.isfinite(decision.bound.range_m)

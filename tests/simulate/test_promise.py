@@ -13,11 +13,11 @@ from soak.promise import kept_promise, random_case
 from support.planning import CONSUMER, SINGLE, TIMED, decisions, facing_wall, grid, sight
 from support.tables import each_row
 
-from lidardesign.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Physics
+from lidardesign.scenes.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.kernels import find_returns
+from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Physics
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.returns import simulate
 
 
 @each_row("seed", range(60))

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from support.rays import random_fan, rays_along
 from support.tables import each_row
 
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.simulate.detector.light import Beams, direct_echoes
 from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.shadowing import visible_echoes
-from lidardesign.simulate.light import Beams, direct_echoes
 from lidardesign.space import direction
 
 BESIDE = Receiver((0.0, 1.0, 0.0), 0.0, 0.0, 3.0, 3.0, (0.0, 1e6))

@@ -14,13 +14,13 @@ from support.rays import random_fan, rays_along
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome
-from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import EFFECTS, IDEAL, Physics
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Outcome
+from lidardesign.scenes.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.light import Beams, direct_echoes
-from lidardesign.simulate.simulate import build_casters, simulate, simulate_many
+from lidardesign.simulate.detector.light import Beams, direct_echoes
+from lidardesign.simulate.detector.physics import EFFECTS, IDEAL, Physics
+from lidardesign.simulate.returns import build_casters, simulate, simulate_many
 
 
 def make_rays(origins, directions, gate=(0.0, 10.0)):

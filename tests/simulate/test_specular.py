@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 from support.rays import random_fan, rays_along
 from support.tables import each_row
 
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.simulate.detector.light import Beams, direct_echoes
+from lidardesign.simulate.detector.physics import Detector
 from lidardesign.simulate.effects import specular
 from lidardesign.simulate.effects.footprint import split_beams
 from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.specular import MAXIMUM_TURNS, detours
-from lidardesign.simulate.light import Beams, direct_echoes
 from lidardesign.space import direction
 
 EVERYWHERE = {"azimuth_rad": 0.0, "elevation_rad": 0.0, "horizontal_rad": 3.1, "vertical_rad": 3.1}

@@ -8,7 +8,7 @@ from scipy.stats import chi2, kstest, poisson
 from support.references import STANDARD_ERRORS
 from support.tables import each_row
 
-from lidardesign.simulate.streams import (
+from lidardesign.simulate.detector.streams import (
     MOST_COUNTS,
     normal,
     normal_quantile,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.scene import Body, Capsule, Scene
+from lidardesign.scenes.scene import Body, Capsule, Scene
 from lidardesign.space import DesignSpace, observed_point
 from lidardesign.task import random_generator
 from soak.scaled_flatland import NAME, ScaledFlatlandConfig, ScaledFlatlandTask

@@ -13,12 +13,12 @@ import numpy as np
 import trimesh
 from support.planning import CONSUMER, SINGLE, TIMED, grid, random_shapes
 
-from lidardesign.geometry.rays import Rays, Returns
-from lidardesign.scene import Ambient, Body, Box, Medium, Mesh, Receiver, Scene, rigid
-from lidardesign.simulate.detector.detector import EFFECTS, Detector, Physics
+from lidardesign.scenes.rays import Rays, Returns
+from lidardesign.scenes.scene import Ambient, Body, Box, Medium, Mesh, Receiver, Scene, rigid
+from lidardesign.simulate.detector.physics import EFFECTS, Detector, Physics
 from lidardesign.simulate.effects.first_hits import FirstHits
 from lidardesign.simulate.plan import Planner, Tolerance
-from lidardesign.simulate.simulate import build_casters, simulate
+from lidardesign.simulate.returns import build_casters, simulate
 
 SIMULATED = frozenset(EFFECTS) - {"multipath"}
 # Each is measured so many times with other chance, and compared within so many standard errors.

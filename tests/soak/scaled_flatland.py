@@ -11,9 +11,9 @@ import numpy as np
 from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask, reconstruct_curve
 from pydantic import Field
 
-from lidardesign.evaluate.metrics import chamfer_m
-from lidardesign.geometry.rays import Returns
-from lidardesign.scene import Body, Scene
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Body, Scene
+from lidardesign.scoring.scenes.metrics import chamfer_m
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, Split
 

@@ -11,9 +11,9 @@ import pytest
 from support.tables import each_row
 
 from lidardesign.config import resolve
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.feasibility import check_feasible
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.errors import InfeasibleError
 from lidardesign.registry import load_task
 from lidardesign.run.yaml import dump_yaml

@@ -27,4 +27,5 @@ def shelves(count=12_000, seed=0, space=AISLE):
     points[:, 4], points[:, 5] = np.arctan2(height, wall), np.hypot(height, wall)
     return Samples(points, np.zeros(count), np.zeros(count), space)
 
+
 SAMPLES = shelves()

@@ -76,4 +76,5 @@ def room_samples(count=6000):
     points = ROOM.sample(count, generator)
     return Samples(points, np.zeros(count), generator.normal(0, 0.5, count), ROOM)
 
+
 SAMPLES = room_samples()

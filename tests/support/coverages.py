@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from lidardesign.selection.coverage import LARGEST, Coverage, InformedScene, gather
+from lidardesign.rays.coverage import LARGEST, Coverage, InformedScene, gather
 from lidardesign.task import Information
 
 SUMS = np.array([0.0, 1.0, 1.6, 1.9, 2.0])

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from lidardesign.design.bandwidth import split_budget
-from lidardesign.design.sensor import (
+from lidardesign.samples import Samples
+from lidardesign.sensors.bandwidth import split_budget
+from lidardesign.sensors.sensor import (
     Sensor,
     tangent_directions,
 )
-from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, aim, angles
 
 SPACE = DesignSpace((-5, -5, -5, 0, -math.pi / 2, 0), (5, 5, 5, 2 * math.pi, math.pi / 2, 10))
@@ -47,6 +47,7 @@ def drawn_from(design, count=6000, seed=0):
     points = np.concatenate(parts)
     log_weights = generator.normal(0, 0.3, len(points))
     return Samples(points, np.zeros(len(points)), log_weights, SPACE)
+
 
 CEILING = DesignSpace((-0.6, -0.5, 1.0, 0.0, -math.pi / 2, 0.2), (0.6, 0.7, 1.0, 2 * math.pi, -0.9, 1.3))
 

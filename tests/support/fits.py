@@ -29,4 +29,5 @@ def blob(space, count=8000, seed=0):
     target = log_target(points)
     return Samples(points, target + 2 * np.log(points[:, 5]), target, space)
 
+
 FIXED, MOVING = blob(FACE), blob(FREE)

@@ -10,8 +10,8 @@ from lidardesign_tasks.arm import ArmTask
 from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 
-from lidardesign.geometry.rays import Rays, fire_times
-from lidardesign.simulate.detector.detector import EFFECTS
+from lidardesign.scenes.rays import Rays, fire_times
+from lidardesign.simulate.detector.physics import EFFECTS
 from lidardesign.space import direction
 
 # Detours by matt surfaces are rendered by another program, and tested with it.

@@ -10,8 +10,8 @@ import lidardesign.density.learn as density_learn
 from lidardesign.config import DensitySettings, LearningSettings, RunConfig
 from lidardesign.density import learn as learning
 from lidardesign.density.learn import prepare_training_data
-from lidardesign.density.training import training
-from lidardesign.scene import Body, Scene, Sphere, rigid
+from lidardesign.density.training import trainer as training
+from lidardesign.scenes.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig
 from support.small_runs import shifted

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidardesign.scene import Mesh
+from lidardesign.scenes.scene import Mesh
 
 BOX_VERTICES = np.array([(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.mixture.mixture import Mixture
-from lidardesign.design.sensor import interval_factor, tangent_directions
+from lidardesign.mixture.components import Mixture
+from lidardesign.mixture.features import Axes, Features
+from lidardesign.sensors.sensor import interval_factor, tangent_directions
 from lidardesign.space import DesignSpace, angles
 
 Z = interval_factor(0.95)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import Body, Box, Capsule, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import EFFECTS, Detector
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Body, Box, Capsule, Scene, Sphere, rigid
 from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.physics import EFFECTS, Detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import FirstHits
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import direction
 
 SINGLE, CONSUMER = load_detector("single-photon"), load_detector("consumer-8x8")
@@ -50,6 +50,7 @@ def room(ball=None, wall=None, **scene):
 
 def decisions(plan):
     return {decision.name: decision for decision in plan.decisions}
+
 
 # one receiver for all rays and light by way of other surfaces have their own tests
 SIMULATED = frozenset(EFFECTS) - {"multipath", "shadowing"}

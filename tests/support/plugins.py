@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 # A small whole task that keeps the contract; broken ones are made of it by replacing words.
-GOOD = '''
+GOOD = """
 import numpy as np
-from lidardesign.scene import Body, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, TaskConfig, random_generator
 
@@ -36,7 +36,7 @@ class Task:
             return Score(self.metric.worst, failed=True)
         off = np.abs(np.linalg.norm(points - scene.truth["at"], axis=1) - 0.3).mean()
         return Score(min(1000 * off + 50 / len(points), 100.0))
-'''
+"""
 
 
 def install_plugins(place: Path, sources: dict[str, str], package: str = "plugins", module: str = "") -> None:

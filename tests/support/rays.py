@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.geometry.rays import Rays
+from lidardesign.scenes.rays import Rays
 from lidardesign.space import direction
 
 

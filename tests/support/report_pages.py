@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.design.constraints.check import ConstraintCheck
-from lidardesign.design.constraints.slack import constraint_slack
-from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.evaluate.report.density_views import density_view
-from lidardesign.evaluate.report.report import Report
-from lidardesign.evaluate.report.scene_figure import scene_figure
-from lidardesign.evaluate.report.tables import CommandTimes, Reproduction
-from lidardesign.evaluate.results import Evaluation, Paired, Row
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays, gate_outcomes
+from lidardesign.constraints.check import ConstraintCheck
+from lidardesign.constraints.slack import constraint_slack
+from lidardesign.report.density_views import density_view
+from lidardesign.report.page import Report
+from lidardesign.report.scene_figure import scene_figure
+from lidardesign.report.tables import CommandTimes, Reproduction
 from lidardesign.samples import Samples
-from lidardesign.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
+from lidardesign.scenes.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
+from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.geometry.rays import Rays
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 from lidardesign.space import angles, direction
 
 NASTY = 'b</script> "&amp;" \\ ö\'{x}${y}'

@@ -25,4 +25,5 @@ def ring(count=12_000, seed=0):
     level = np.zeros(len(points))
     return Samples(points, level, level, CEILING)
 
+
 RING = ring()

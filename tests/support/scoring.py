@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
 from support.rivals import balls

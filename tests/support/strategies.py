@@ -7,7 +7,7 @@ import math
 import numpy as np
 from hypothesis import strategies as st
 
-from lidardesign.design.sensor import DEFAULT_LEVEL, Coupling, Sensor, interval_factor
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, Coupling, Sensor, interval_factor
 
 finite = st.floats(-1e6, 1e6)
 length = st.floats(0, 1e5)

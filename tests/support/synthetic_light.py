@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.scene import Body, Scene, Sphere
-from lidardesign.simulate.detector.detection import ArrivingLight, count_photons, detect
-from lidardesign.simulate.detector.detector import Detector, Photons, Physics
-from lidardesign.simulate.light import Background, Echoes
+from lidardesign.scenes.scene import Body, Scene, Sphere
+from lidardesign.simulate.detection import ArrivingLight, count_photons, detect
+from lidardesign.simulate.detector.light import Background, Echoes
+from lidardesign.simulate.detector.physics import Detector, Photons, Physics
 
 WAVELENGTH_M = 905e-9
 PULSES = 1000

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidardesign.geometry.frames import receiver_axes
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import Receiver
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.receivers import receiver_axes
+from lidardesign.scenes.scene import Receiver
 from lidardesign.simulate.light_transport import transport as process
 from lidardesign.simulate.light_transport.transport import Lights, Transients
 from support.rays import rays_along

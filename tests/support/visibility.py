@@ -8,9 +8,9 @@ import numpy as np
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import build_field
-from lidardesign.density.target.quadrature import Quadrature
-from lidardesign.density.target.visibility import Optics, RayBatch, Raycast
-from lidardesign.scene import Body, Box, Plane, rigid
+from lidardesign.density.objective.quadrature import Quadrature
+from lidardesign.density.objective.visibility import Optics, RayBatch, Raycast
+from lidardesign.scenes.scene import Body, Box, Plane, rigid
 from lidardesign.space import DesignSpace
 
 FACING = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])

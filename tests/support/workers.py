@@ -7,9 +7,9 @@ import math
 import numpy as np
 from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask
 
-from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.evaluate.request import EvaluationRequest
-from lidardesign.geometry.rays import Rays
+from lidardesign.scenes.rays import Rays
+from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.sensors.sensor import DesignSpec, Sensor
 
 SEED = 3
 

@@ -32,12 +32,12 @@ from support.references import recursive_frechet
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.metrics import discrete_frechet_m
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Returns
-from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
-from lidardesign.selection.information import checked_information
-from lidardesign.simulate.simulate import simulate
+from lidardesign.rays.information import checked_information
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Outcome, Returns
+from lidardesign.scenes.scene import Body, Mesh, Scene, Sphere, rigid
+from lidardesign.scoring.scenes.metrics import discrete_frechet_m
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import ELEVATION, aim
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "iiwa14" / "iiwa14.xml"

@@ -15,7 +15,7 @@ from support.robots import PIECE, TOOL_M, mjcf, written
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.scene import Box, Capsule, Cylinder, Mesh, Sphere
+from lidardesign.scenes.scene import Box, Capsule, Cylinder, Mesh, Sphere
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "iiwa14" / "iiwa14.xml"
 needs_real = pytest.mark.skipif(not REAL.exists(), reason="the real arm's model is not at ../shared/data/iiwa14")

@@ -15,25 +15,25 @@ from support.rays import rays_of_points
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.target.proposals import propose
-from lidardesign.density.target.target import build_target
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.evaluate.metrics import is_received, is_visible, trial_origins
-from lidardesign.geometry.frames import in_view, path_of_range, range_of_path
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome
+from lidardesign.constraints.document import Constraints
+from lidardesign.density.objective.proposals import propose
+from lidardesign.density.objective.target import build_target
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.fit import fit
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.samples import Samples
-from lidardesign.scene import Body, Box, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import EFFECTS, IDEAL, Physics
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Outcome
+from lidardesign.scenes.receivers import in_view, path_of_range, range_of_path
+from lidardesign.scenes.scene import Body, Box, Receiver, Scene, Sphere, rigid
+from lidardesign.scoring.scenes.metrics import is_received, is_visible, trial_origins
 from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.light import Beams, direct_echoes
+from lidardesign.simulate.detector.physics import EFFECTS, IDEAL, Physics
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import FirstHits
 from lidardesign.simulate.effects.multipath import _hidden, bound
-from lidardesign.simulate.light import Beams, direct_echoes
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import RANGE, aim
 
 SMALL = {"train": 4, "test": 2, "truth_points": 800}

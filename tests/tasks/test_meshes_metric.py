@@ -11,9 +11,9 @@ from support.meshes import write_ball
 from support.tables import each_row
 
 from lidardesign.errors import PluginError
-from lidardesign.evaluate.baselines.candidates import rays_at
-from lidardesign.evaluate.scene_scores import checked_score
-from lidardesign.simulate.simulate import simulate
+from lidardesign.scoring.baselines.candidates import rays_at
+from lidardesign.scoring.scenes.scene_scores import checked_score
+from lidardesign.simulate.returns import simulate
 from lidardesign.task import Metric, metric_of
 
 TASK = MeshesTask()

@@ -19,17 +19,17 @@ from support.robots import written
 from support.tables import each_row
 
 from lidardesign.config import resolve, save_run_config
+from lidardesign.contract import contract_of
+from lidardesign.contract.contract import LAWS
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Returns
-from lidardesign.geometry.surface import sample_body
+from lidardesign.rays.information import require_valid
 from lidardesign.run.manifest import note, start_manifest
-from lidardesign.scene import Sphere
-from lidardesign.selection.information import require_valid
+from lidardesign.run_folder import RunFolder, input_hashes
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Outcome, Returns
+from lidardesign.scenes.scene import Sphere
+from lidardesign.scenes.surface import sample_body
 from lidardesign.space import aim
-from lidardesign.testing import contract_of
-from lidardesign.testing.contract import LAWS
-from lidardesign.workflow.run_folder import RunFolder, input_hashes
 
 TASK = MujocoTask()
 ROBOT = """<mujoco><worldbody>

@@ -21,12 +21,12 @@ from support.meshes import write_ball
 from support.rays import rays_along, rays_of_points
 from support.tables import each_row
 
-from lidardesign.evaluate.baselines.candidates import rays_at
-from lidardesign.evaluate.scene_scores import checked_score, score_lists
-from lidardesign.geometry.rays import Outcome
-from lidardesign.scene import Body, Box, Mesh, Scene, rigid
-from lidardesign.simulate.detector.detector import Detector, Physics
-from lidardesign.simulate.simulate import build_casters, simulate
+from lidardesign.scenes.rays import Outcome
+from lidardesign.scenes.scene import Body, Box, Mesh, Scene, rigid
+from lidardesign.scoring.baselines.candidates import rays_at
+from lidardesign.scoring.scenes.scene_scores import checked_score, score_lists
+from lidardesign.simulate.detector.physics import Detector, Physics
+from lidardesign.simulate.returns import build_casters, simulate
 from lidardesign.space import DIMENSIONS, RANGE, DesignSpace
 from lidardesign.task import Metric, Score, conditions_of, scenes_of
 

@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.meshio import Painted, check_mesh, load_mesh
+from lidardesign.scenes.mesh_files import Painted, check_mesh, load_mesh
 
 SENSOR = np.array([3.0, 0.5, 0.2])
 COLOURED = ("ply", "glb", "gltf", "obj")

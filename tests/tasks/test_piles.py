@@ -17,9 +17,9 @@ from support.meshes import write_ball
 from support.tables import each_row
 
 from lidardesign.errors import DataError
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import Box, Mesh
-from lidardesign.simulate.simulate import simulate
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Box, Mesh
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import aim
 
 MILLIMETRE = 1e-3

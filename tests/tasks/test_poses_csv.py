@@ -22,10 +22,10 @@ from support.rays import rays_of_points
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.geometry.frames import rotation_of_quaternion, rotation_of_rpy
-from lidardesign.scene import rigid
-from lidardesign.selection.information import checked_information
-from lidardesign.simulate.simulate import simulate
+from lidardesign.rays.information import checked_information
+from lidardesign.scenes.receivers import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.scenes.scene import rigid
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import aim
 
 EXACT = 1e-9

@@ -19,12 +19,12 @@ from lidardesign_tasks.warehouse import WarehouseTask
 from support.rays import rays_along
 from support.tables import each_row
 
-from lidardesign.geometry.raycast import shared_caster
-from lidardesign.scene import Ambient
-from lidardesign.simulate.detector.detector import Physics
+from lidardesign.scenes.casting import shared_caster
+from lidardesign.scenes.scene import Ambient
 from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import direction
 
 TASKS = {task.name: task() for task in (FaceTask, EmitterTask, MeshesTask, ArmTask, WarehouseTask, FlatlandTask)}

@@ -19,17 +19,17 @@ from support.meshes import write_ball
 from support.rays import rays_of_points
 from support.tables import each_row
 
+from lidardesign.contract import contract_of
+from lidardesign.contract.contract import LAWS
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.numerics import COARSE_SLACK
-from lidardesign.scene import Scene, group_numbers
-from lidardesign.selection.coverage import InformedScene, gather
-from lidardesign.selection.information import checked_information
-from lidardesign.simulate.simulate import simulate
+from lidardesign.rays.coverage import InformedScene, gather
+from lidardesign.rays.information import checked_information
+from lidardesign.scenes.rays import Outcome, Rays, Returns
+from lidardesign.scenes.scene import Scene, group_numbers
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import aim
 from lidardesign.task import conditions_of, scenes_of
-from lidardesign.testing import contract_of
-from lidardesign.testing.contract import LAWS
 
 REAL_MODEL = Path(__file__).parents[3] / "shared" / "data" / "ict_face.h5"
 SMALL = {"train": 2, "test": 2, "truth_points": 800}
@@ -285,9 +285,7 @@ def test_turning_the_up_axis_keeps_handedness(folders, up):
     assert np.ptp(mesh.bounds_m[:, 2]) == pytest.approx(height, rel=0.02)
 
 
-@each_row(
-    "origin", [None, (0.0, 0.0, 1.0), (-0.7, 0.7, 0.4), (0.0, 0.0, 0.0), (0.5, 0.0, -0.6)]
-)
+@each_row("origin", [None, (0.0, 0.0, 1.0), (-0.7, 0.7, 0.4), (0.0, 0.0, 0.0), (0.5, 0.0, -0.6)])
 @each_row("box", [0.0, 0.1])
 def test_the_derived_design_space_sees_the_whole_of_every_mesh(folders, origin, box):
     config = MeshesTask.Config(folder=str(folders / "one"), origin_m=origin, origin_box_m=box)

@@ -13,11 +13,11 @@ from support.rays import rays_along
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays, Returns
-from lidardesign.scene import Body, Box, Scene, rigid
-from lidardesign.selection.information import checked_information
-from lidardesign.simulate.simulate import simulate
+from lidardesign.rays.information import checked_information
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Outcome, Rays, Returns
+from lidardesign.scenes.scene import Body, Box, Scene, rigid
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import ELEVATION, RANGE, DesignSpace, direction
 from lidardesign.task import conditions_of, scenes_of
 

@@ -12,13 +12,13 @@ import pytest
 from support.plugins import GOOD
 from support.tables import each_row
 
+from lidardesign.contract import BrokenLawError, check_task, contract_of
+from lidardesign.contract.contract import LAWS
+from lidardesign.contract.fingerprint import fingerprint, geometry_fingerprint
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import load_task
-from lidardesign.scene import Body, Medium, Mesh, Scene, Sphere
+from lidardesign.scenes.scene import Body, Medium, Mesh, Scene, Sphere
 from lidardesign.task import mount_of
-from lidardesign.testing import BrokenLawError, check_task, contract_of
-from lidardesign.testing.contract import LAWS
-from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
 
 METRIC = 'Metric("radius error", "mm", "lower", worst=100.0, tolerance=0.5)'
 DEFAULTS = 'Defaults(density={"sigma_m": 0.05})'

@@ -12,12 +12,12 @@ from support.plugins import GOOD, install_plugins
 from support.tables import each_row
 
 from lidardesign import registry
+from lidardesign.contract import process
+from lidardesign.contract.contract import LAWS
+from lidardesign.contract.law import Finding
+from lidardesign.contract.process import CheckRequest, check_in_process
 from lidardesign.errors import ConfigError
 from lidardesign.run.child import START_SECONDS, ChildError
-from lidardesign.testing import process
-from lidardesign.testing.contract import LAWS
-from lidardesign.testing.law import Finding
-from lidardesign.testing.process import CheckRequest, check_in_process
 
 SCENES = "    def scenes(self, config, split, seed):\n"
 

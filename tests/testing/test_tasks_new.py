@@ -20,10 +20,10 @@ from support.docs_session import COLUMNS
 from support.plugins import GOOD, install_plugins
 from support.tables import each_row
 
+from lidardesign.contract.contract import LAWS
+from lidardesign.contract.law import LOADS
+from lidardesign.contract.scaffold import LONGEST_NAME, new_task
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.testing.contract import LAWS
-from lidardesign.testing.law import LOADS
-from lidardesign.testing.scaffold import LONGEST_NAME, new_task
 
 pytest_plugins = ["pytester"]
 ROOT = Path(__file__).parents[2]

@@ -11,11 +11,11 @@ import pytest
 from support.small_runs import shifted
 
 import lidardesign
-from lidardesign.design.fit import fit
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
+from lidardesign.mixture.fit import fit
 from lidardesign.samples import load_samples
 
-SCRIPT = '''
+SCRIPT = """
 import lidardesign as ld
 
 run = ld.learn("face", preset="draft", out="runs/face", seed=0)        # or ld.open_run("runs/face")
@@ -29,7 +29,7 @@ best.save(); best.export("rays.csv"); rays = best.rays(196)
 
 scores = run.evaluate([free, kept, best], rays=[196], baselines=["bounding"])
 scores.rows, scores.paired, scores.to_csv("scores.csv"), scores.report("report.html")
-'''
+"""
 SMALL_FACE = {
     "learning.steps": 60, "learning.batch": 128, "learning.samples": 10_000, "density.sigma_m": 0.04,
     "truth_points": 300, "train": 2, "test": 1,

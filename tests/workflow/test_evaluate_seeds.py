@@ -14,7 +14,7 @@ from support.tables import each_row
 import lidardesign as package
 from lidardesign.config import load_run_config, save_run_config, with_task_settings
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.evaluate.seeds import two_way_interval
+from lidardesign.scoring.evaluation.seeds import two_way_interval
 
 SMALL = ("--rays", 8, "--set", "test=5")
 OPTIONS = {"rays": [8], "settings": {"test": 5}}
@@ -44,9 +44,7 @@ def test_designs_of_one_name_are_one_row_over_seeds_and_scenes(lidardesign, runs
     assert [row["design"] for row in found["rows"]] == ["two", "uniform", "random", "bounding", "silhouette", "greedy"]
     assert any("in the held-out scenes of seed 1" in note for note in found["notes"])
     assert all(path.exists() for path in files.values())
-    alone = [
-        package.open_run(run).evaluate([run / "designs" / "two.yaml"], scenes_seed=1, **OPTIONS) for run in runs
-    ]
+    alone = [package.open_run(run).evaluate([run / "designs" / "two.yaml"], scenes_seed=1, **OPTIONS) for run in runs]
     for number, row in enumerate(found["rows"]):
         table = np.stack([scores.rows[number].per_scene for scores in alone])
         assert (row["value"], row["ci_low"], row["ci_high"]) == pytest.approx(two_way_interval(table))

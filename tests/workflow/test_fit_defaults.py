@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from support.command_line import make_run
 from support.tables import each_row
 
-from lidardesign.design.fit import fit
+from lidardesign.api.run import open_run
 from lidardesign.errors import InfeasibleError
+from lidardesign.fitting import fit as fit_design
+from lidardesign.fitting import request as fit_choices
+from lidardesign.fitting.fit import Trial, best_of, trials_of
+from lidardesign.fitting.request import BEST, CHOSEN_LEVEL, FitOptions, FitRequest
+from lidardesign.mixture.fit import fit
+from lidardesign.run_folder import RunFolder
 from lidardesign.samples import load_samples
-from lidardesign.workflow import fit as fit_choices
-from lidardesign.workflow import fit_design
-from lidardesign.workflow.fit import BEST, CHOSEN_LEVEL, FitOptions, FitRequest
-from lidardesign.workflow.fit_design import Trial, best_of, trials_of
-from lidardesign.workflow.run_folder import RunFolder
-from lidardesign.workflow.runs import open_run
 
 MOUNTS = {"origin": {"mounts_m": [[0.2, 0, 0], [0.8, 0, 0]]}}
 

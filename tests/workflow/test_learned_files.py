@@ -13,11 +13,11 @@ from support.command_line import caller
 from support.meshes import write_ball
 
 import lidardesign as ld
+from lidardesign.api.learn import LearnOptions, LearnRequest
 from lidardesign.config import with_task_settings
 from lidardesign.errors import DataError
 from lidardesign.run.manifest import read_manifest
-from lidardesign.workflow.learn import LearnOptions, LearnRequest
-from lidardesign.workflow.run_folder import RunFolder, input_hashes
+from lidardesign.run_folder import RunFolder, input_hashes
 
 NAMES = [f"{letter}.stl" for letter in "cdefgh"]
 SMALL = {

@@ -13,11 +13,11 @@ from support.tables import each_row
 
 import lidardesign as package
 from lidardesign.config import load_run_config, save_run_config, with_task_settings
-from lidardesign.design.compare import outside_space
-from lidardesign.design.files import load_design
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.thresholds import difference_text
-from lidardesign.geometry.rays import Rays
+from lidardesign.scenes.rays import Rays
+from lidardesign.scoring.evaluation.thresholds import difference_text
+from lidardesign.sensors.compare import outside_space
+from lidardesign.sensors.design_file import load_design
 from lidardesign.space import DIMENSIONS, direction
 
 LAYOUTS = ("grid", "selected")

@@ -11,16 +11,16 @@ from support import references
 from support.command_line import caller
 
 from lidardesign.config import resolve, save_run_config
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.files import load_design, save_design
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.evaluate.request import EvaluationRequest
-from lidardesign.evaluate.score import evaluate
+from lidardesign.constraints.document import Constraints
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.fit import fit
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import Samples, save_samples
-from lidardesign.scene import Body, Capsule, Mesh, Scene, Sphere, rigid
+from lidardesign.scenes.scene import Body, Capsule, Mesh, Scene, Sphere, rigid
+from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.sensors.design_file import load_design, save_design
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
 
@@ -147,7 +147,7 @@ def test_rows_of_a_fitted_design_stay_when_the_world_turns_by_a_quarter(layout):
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process; the target density is the planted one."""
-    monkeypatch.setattr("lidardesign.workflow.run_samples.RunTarget.__call__", lambda self, points: log_shelf(points))
+    monkeypatch.setattr("lidardesign.fitting.run_samples.RunTarget.__call__", lambda self, points: log_shelf(points))
     return caller(capsys, tmp_path, monkeypatch)
 
 

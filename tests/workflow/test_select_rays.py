@@ -11,19 +11,19 @@ import pytest
 from support.command_line import caller, make_run
 from support.tables import each_row
 
-from lidardesign.density.target.proposals import samples_without_visibility
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.files import design_document, load_design, save_design
-from lidardesign.design.layouts.rays import certificates_of, gates_of, lay_out
-from lidardesign.design.sensor import tangent_coordinates
+from lidardesign.api.run import open_run
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.density.objective.proposals import samples_without_visibility
 from lidardesign.errors import ConfigError
+from lidardesign.fitting import select_rays
+from lidardesign.layouts.rays import certificates_of, gates_of, lay_out
+from lidardesign.run_folder import RunFolder
 from lidardesign.samples import save_samples
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.design_file import design_document, load_design, save_design
+from lidardesign.sensors.sensor import tangent_coordinates
 from lidardesign.task import Information
-from lidardesign.workflow import select_rays
-from lidardesign.workflow.run_folder import RunFolder
-from lidardesign.workflow.runs import open_run
 
 
 @pytest.fixture
@@ -184,7 +184,7 @@ class TestTheCommand:
         assert len(chosen(run, sensors=1, rays=1, gates="ray").specification.ray_table) == 1
 
     def test_a_task_that_does_not_say_what_returns_tell_is_refused(self, lidardesign, run, monkeypatch):
-        monkeypatch.setattr("lidardesign.workflow.fit.informs_rays", lambda task: False)
+        monkeypatch.setattr("lidardesign.fitting.request.informs_rays", lambda task: False)
         refused = lidardesign("fit", run, "--layout", "selected")
         assert refused.code == 2
         assert "has no method informs" in refused.err

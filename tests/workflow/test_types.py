@@ -11,18 +11,18 @@ from pathlib import Path
 import pytest
 
 import lidardesign
-from lidardesign.testing.scaffold import new_task
+from lidardesign.contract.scaffold import new_task
 
 pytest.importorskip("mypy", reason="the extra `dev` is not installed")
 
 ROOT = Path(__file__).parents[2]
 REVEALED = {
-    'ld.learn("x")': "lidardesign.workflow.runs.Run",
-    'ld.open_run("x").fit(sensors=2)': "lidardesign.workflow.designs.Design",
-    'ld.load_design("x").constrain(rays=8)': "lidardesign.workflow.designs.Design",
-    'ld.open_run("x").evaluate([], rays=[8])': "lidardesign.workflow.evaluate.Scores",
-    'ld.load_design("x").rays(8)': "lidardesign.geometry.rays.Rays",
-    "ld.evaluate_seeds([])": "lidardesign.workflow.evaluate.Scores",
+    'ld.learn("x")': "lidardesign.api.run.Run",
+    'ld.open_run("x").fit(sensors=2)': "lidardesign.api.design.Design",
+    'ld.load_design("x").constrain(rays=8)': "lidardesign.api.design.Design",
+    'ld.open_run("x").evaluate([], rays=[8])': "lidardesign.api.scores.Scores",
+    'ld.load_design("x").rays(8)': "lidardesign.scenes.rays.Rays",
+    "ld.evaluate_seeds([])": "lidardesign.api.scores.Scores",
 }
 WRONG = {
     'ld.lern("x")': "attr-defined",

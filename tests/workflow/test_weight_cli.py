@@ -11,18 +11,18 @@ from support.command_line import make_run
 
 from lidardesign import open_run
 from lidardesign.config import resolve, save_run_config
-from lidardesign.design.files import load_design
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.evaluate.scene_scores import checked_score
-from lidardesign.geometry.rays import Rays
+from lidardesign.fitting.run_samples import RunTarget, Weighting, weighted_samples
+from lidardesign.layouts.rays import lay_out
+from lidardesign.mixture.fit import fit
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import Samples, load_samples, save_samples
-from lidardesign.simulate.simulate import simulate
+from lidardesign.scenes.rays import Rays
+from lidardesign.scoring.scenes.scene_scores import checked_score
+from lidardesign.sensors.design_file import load_design
+from lidardesign.simulate.returns import simulate
 from lidardesign.space import RANGE, direction
 from lidardesign.task import scenes_of
-from lidardesign.workflow.run_samples import RunTarget, Weighting, weighted_samples
 
 SEED = 3
 

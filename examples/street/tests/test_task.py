@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from lidardesign import Rays
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.returns import simulate
 
 from lidardesign_street.scenes import BANDS_M, OWN, SIZES_M, User, scene_of, user_of
 from lidardesign_street.task import StreetTask

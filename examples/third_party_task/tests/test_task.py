@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from lidardesign import Body, Box, Plane, Rays, Scene, rigid
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.returns import simulate
 
 from lidardesign_landing.hazards import seen
 from lidardesign_landing.task import LandingTask

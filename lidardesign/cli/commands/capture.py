@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli import options
-from lidardesign.cli.completion import words
-from lidardesign.cli.output import Output, command, keep_times
-from lidardesign.cli.output_files import claim_outputs
 from lidardesign.cli.tables.grids import RichConsole, number, print_table
+from lidardesign.cli.terminal import options
+from lidardesign.cli.terminal.completion import words
+from lidardesign.cli.terminal.output import Output, command, keep_times
+from lidardesign.cli.terminal.output_files import claim_outputs
 from lidardesign.errors import ConfigError, DataError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.captures.score import CaptureEvaluation
-    from lidardesign.geometry.rays import Rays
+    from lidardesign.scenes.rays import Rays
+    from lidardesign.scoring.captures.score import CaptureEvaluation
 
 COLUMNS = {
     "rays": "rays",
@@ -98,9 +98,9 @@ def capture(
             raise ConfigError(f"{outlier_mm}", where="--outlier-mm", allowed="a finite number above 0")
         check_choice(estimator, "--estimator", ("peak", "matched"))
         with phase("libraries"):
-            from lidardesign.evaluate.captures.capture import load_capture
-            from lidardesign.evaluate.captures.scan import Estimation, default_within_rad
-            from lidardesign.evaluate.captures.score import CaptureSettings, evaluate_capture, write_csv
+            from lidardesign.scoring.captures.capture import load_capture
+            from lidardesign.scoring.captures.scan import Estimation, default_within_rad
+            from lidardesign.scoring.captures.score import CaptureSettings, evaluate_capture, write_csv
 
         place = options.parse_at(at)
         scanned = [_rays_and_run(path, rays, place, output) for path in designs]
@@ -134,9 +134,9 @@ def capture(
 
 def _rays_and_run(path: Path, count: int | None, at: dict[str, float], output: Output) -> tuple[Rays, Path | None]:
     """The rays of a design file, or of what was exported of it for a scanner, at least one; and its run's folder."""
-    from lidardesign.export.galvo import is_galvo_file, read_galvo
-    from lidardesign.workflow.export import DesignSource
-    from lidardesign.workflow.run_folder import folder_of, read_design
+    from lidardesign.api.export import DesignSource
+    from lidardesign.formats.galvo import is_galvo_file, read_galvo
+    from lidardesign.run_folder import folder_of, read_design
 
     folder = None
     if not path.exists():

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli import completion, options
-from lidardesign.cli.output import Output, command
+from lidardesign.cli.terminal import completion, options
+from lidardesign.cli.terminal.output import Output, command
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
-    from lidardesign.design.catalog.part import Part
-    from lidardesign.design.sensor import DesignSpec
+    from lidardesign.parts.part import Part
+    from lidardesign.sensors.sensor import DesignSpec
 
 # How several parts at one place are turned against each other.
 ARRANGEMENTS = ("interleaved", "beside")
@@ -68,7 +68,7 @@ def list_(
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.cli.tables.parts import part_entry, show_parts
-            from lidardesign.design.catalog.library import load_library
+            from lidardesign.parts.catalogue import load_library
 
         _check_conditions(reflectance, klux)
         parts, vouched = load_library(own or ()).every_mode(), []
@@ -138,8 +138,8 @@ def show(
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.cli.tables.parts import part_document, show_part
-            from lidardesign.design.catalog.library import find_part
-            from lidardesign.design.files import MOST_TABLE_RAYS, save_design
+            from lidardesign.parts.catalogue import find_part
+            from lidardesign.sensors.design_file import MOST_TABLE_RAYS, save_design
 
         _check_conditions(reflectance, klux)
         part = _under(find_part(name, own or ()), reflectance, klux)
@@ -186,9 +186,9 @@ def _under(part: Part, reflectance: float | None, klux: float | None) -> Part:
 def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> DesignSpec:
     import numpy as np
 
-    from lidardesign.design.catalog.library import Pose, interleaved, part_design, parts_for, side_by_side
-    from lidardesign.design.sensor import MOST_RAYS
+    from lidardesign.parts.catalogue import Pose, interleaved, part_design, parts_for, side_by_side
     from lidardesign.run.yaml import plain_number
+    from lidardesign.sensors.sensor import MOST_RAYS
     from lidardesign.space import FARTHEST_M
 
     count, number = given["--rays"], given["--parts"]

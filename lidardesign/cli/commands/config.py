@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from lidardesign.cli import options
-from lidardesign.cli.completion import tasks, words
-from lidardesign.cli.output import Output, command
-from lidardesign.cli.output_files import announce
+from lidardesign.cli.terminal import options
+from lidardesign.cli.terminal.completion import tasks, words
+from lidardesign.cli.terminal.output import Output, command
+from lidardesign.cli.terminal.output_files import announce
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_writable
@@ -41,8 +41,8 @@ def init(
     with command(json=json, quiet=quiet) as output:
         _check_new(out)
         with phase("libraries"):
+            from lidardesign.api.config_reference import config_template
             from lidardesign.registry import load_task
-            from lidardesign.workflow.config_reference import config_template
 
         plugin = load_task(task)
         document, text = config_template(plugin, preset=preset, overrides=overrides or (), seed=seed)
@@ -72,8 +72,8 @@ def schema(
     """Print a JSON Schema. KIND is config, constraints, design, or evaluate for what `evaluate --json` prints."""
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
+            from lidardesign.api.config_reference import SCHEMA_KINDS, schema_of
             from lidardesign.registry import load_task
-            from lidardesign.workflow.config_reference import SCHEMA_KINDS, schema_of
 
         check_choice(kind, "KIND", SCHEMA_KINDS)
         if task is not None and kind != "config":

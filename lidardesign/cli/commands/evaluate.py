@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidardesign.cli import options
-from lidardesign.cli.completion import detectors, words
-from lidardesign.cli.output import Output, command, keep_times
-from lidardesign.cli.output_files import claim_outputs
 from lidardesign.cli.tables.grids import RichConsole
 from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
+from lidardesign.cli.terminal import options
+from lidardesign.cli.terminal.completion import detectors, words
+from lidardesign.cli.terminal.output import Output, command, keep_times
+from lidardesign.cli.terminal.output_files import claim_outputs
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
-    from lidardesign.cli.progress import ProgressDisplay
-    from lidardesign.evaluate.baselines.cma import Show
-    from lidardesign.workflow.evaluate import ScoreRequest, Scores
-    from lidardesign.workflow.seeds import SeedsRequest
+    from lidardesign.api.scores import ScoreRequest, Scores
+    from lidardesign.api.seeds import SeedsRequest
+    from lidardesign.cli.terminal.progress import ProgressDisplay
+    from lidardesign.scoring.baselines.cma import Show
 
 BASELINE_HELP = (
     "A baseline in addition to uniform, random, bounding, silhouette and greedy: lloyd (like silhouette, denser where "
@@ -201,9 +201,9 @@ def evaluate(
     with command(json=json, quiet=quiet, verbose=verbose) as output:
         claim_outputs(output, csv=csv, report=report)
         with phase("libraries"):
-            from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest, check_scores
-            from lidardesign.workflow.run_folder import RunFolder
-            from lidardesign.workflow.seeds import SeedsRequest, differing_seeds
+            from lidardesign.api.scores import ScoreOptions, ScoreRequest, check_scores
+            from lidardesign.api.seeds import SeedsRequest, differing_seeds
+            from lidardesign.run_folder import RunFolder
 
         chosen = ScoreOptions(
             rays=rays,

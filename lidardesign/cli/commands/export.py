@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
-from lidardesign.cli import options
-from lidardesign.cli.completion import formats
-from lidardesign.cli.output import Output, command, keep_times
-from lidardesign.cli.output_files import announce, written_file
 from lidardesign.cli.tables.grids import RichConsole, text_table
+from lidardesign.cli.terminal import options
+from lidardesign.cli.terminal.completion import formats
+from lidardesign.cli.terminal.output import Output, command, keep_times
+from lidardesign.cli.terminal.output_files import announce, written_file
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
@@ -70,13 +70,13 @@ def export(
     """Write a design in another program's format."""
     with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
-            from lidardesign.workflow.export import (
+            from lidardesign.api.export import (
                 DesignSource,
                 ExportRequest,
                 export_target,
                 exporter_of,
             )
-            from lidardesign.workflow.run_folder import read_design
+            from lidardesign.run_folder import read_design
 
         if list_formats:
             return _list(output)
@@ -110,7 +110,7 @@ def export(
 
 
 def _list(output: Output) -> None:
-    from lidardesign.export.registry import EXPORTERS
+    from lidardesign.formats.registry import EXPORTERS
 
     keys = ("suffix", "summary", "reader", "checked", "folder")
     formats = [{"name": name, **{key: getattr(exporter, key) for key in keys}} for name, exporter in EXPORTERS.items()]

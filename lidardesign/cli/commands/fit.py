@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidardesign.cli import options
-from lidardesign.cli.completion import constraint_keys
-from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.cli.tables.designs import show_fit
 from lidardesign.cli.tables.grids import RichConsole
+from lidardesign.cli.terminal import options
+from lidardesign.cli.terminal.completion import constraint_keys
+from lidardesign.cli.terminal.output import Output, command, keep_times
 from lidardesign.errors import LidardesignError
 from lidardesign.run.clock import WAIT_S, phase
 from lidardesign.run.files import check_lock
 from lidardesign.run.outputs import check_writable
 
 if TYPE_CHECKING:
-    from lidardesign.workflow.fit import FitRequest
+    from lidardesign.fitting.request import FitRequest
 
 
 def fit(
@@ -42,8 +42,8 @@ def fit(
     """Fit sensors to the density of RUN."""
     with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
-            from lidardesign.workflow.fit import FitOptions, FitRequest
-            from lidardesign.workflow.run_folder import RunFolder
+            from lidardesign.fitting.request import FitOptions, FitRequest
+            from lidardesign.run_folder import RunFolder
 
         chosen = FitOptions(
             sensors=options.sensor_count(sensors),
@@ -64,8 +64,8 @@ def fit(
 
 def run_fit(request: FitRequest, output: Output) -> None:
     """Fit the design of a request, save it, and give the result."""
-    from lidardesign.design.files import design_text
-    from lidardesign.workflow.designs import Design
+    from lidardesign.api.design import Design
+    from lidardesign.sensors.design_file import design_text
 
     path = request.run.design_path(request.name)
     label = "design (replaced)" if path.exists() else "design"
@@ -127,9 +127,9 @@ def constrain(
     """Fit sensors again under constraints; nothing is learned again."""
     with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
-            from lidardesign.design.constraints.document import Constraints
-            from lidardesign.workflow.fit import FitOptions, FitRequest, load_constraints
-            from lidardesign.workflow.run_folder import need_run, open_target
+            from lidardesign.constraints.document import Constraints
+            from lidardesign.fitting.request import FitOptions, FitRequest, load_constraints
+            from lidardesign.run_folder import need_run, open_target
 
         chosen = FitOptions(
             sensors=options.sensor_count(sensors),

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli import options
-from lidardesign.cli.completion import tasks, words
-from lidardesign.cli.output import command, keep_times
 from lidardesign.cli.tables.grids import RichConsole, duration, text_table
+from lidardesign.cli.terminal import options
+from lidardesign.cli.terminal.completion import tasks, words
+from lidardesign.cli.terminal.output import command, keep_times
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
-    from lidardesign.cli.progress import ProgressDisplay
+    from lidardesign.cli.terminal.progress import ProgressDisplay
     from lidardesign.density.learn import LearnProgress, LearnResult
 
 BYTES_PER_MEGABYTE = 1e6
@@ -95,7 +95,7 @@ def learn(
     """Learn where rays are worth firing for TASK, into a run folder."""
     with command(json=json, quiet=quiet, verbose=verbose) as output:
         with phase("libraries"):
-            from lidardesign.workflow.learn import LearnOptions, LearnRequest, check_tolerance, result_document
+            from lidardesign.api.learn import LearnOptions, LearnRequest, check_tolerance, result_document
 
         chosen = LearnOptions(
             out=out,

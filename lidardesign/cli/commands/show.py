@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli import options
-from lidardesign.cli.output import Output, command
 from lidardesign.cli.tables.designs import show_constraints, show_design
 from lidardesign.cli.tables.grids import RichConsole, difference_cell, duration, number, print_table, value_cells
+from lidardesign.cli.terminal import options
+from lidardesign.cli.terminal.output import Output, command
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
-    from lidardesign.design.compare import BandwidthUse
-    from lidardesign.design.sensor import DesignSpec
+    from lidardesign.sensors.compare import BandwidthUse
+    from lidardesign.sensors.sensor import DesignSpec
 
 DESIGN_COLUMNS, VALUE_COLUMNS = ("design", "layout", "sensors", "rays"), ("value", "95 % interval", "difference")
 IDEAL = "ideal"
@@ -48,12 +48,12 @@ def show(
         if design.is_dir() and other is None:
             return _show_run(design, {"--at": at, "--in": space_of}, output)
         with phase("libraries"):
-            from lidardesign.design.compare import outside_notes, readout_of
-            from lidardesign.design.constraints.check import check_design
-            from lidardesign.design.constraints.slack import room_of
-            from lidardesign.design.files import design_document, track_document
-            from lidardesign.design.layouts.track import placed
-            from lidardesign.workflow.run_folder import RunFolder, reach_beside, reach_of, read_design, run_of
+            from lidardesign.constraints.check import check_design
+            from lidardesign.constraints.slack import room_of
+            from lidardesign.layouts.track import placed
+            from lidardesign.run_folder import RunFolder, reach_beside, reach_of, read_design, run_of
+            from lidardesign.sensors.compare import outside_notes, readout_of
+            from lidardesign.sensors.design_file import design_document, track_document
 
         condition = options.parse_at(at)
         run = None if space_of is None else RunFolder.open(space_of)
@@ -106,7 +106,7 @@ def show(
 
 def _show_run(folder: Path, given: Mapping[str, Any], output: Output) -> None:
     with phase("libraries"):
-        from lidardesign.workflow.runs import open_run
+        from lidardesign.api.run import open_run
 
     for option in (option for option, value in given.items() if value):
         raise ConfigError("is for a design", where=option, hint="give a design of the run, or leave it out")
@@ -172,8 +172,8 @@ def _show_readout(readout: BandwidthUse, rich: RichConsole) -> None:
 
 def _show_differences(files: Sequence[Path], designs: Sequence[DesignSpec], output: Output) -> None:
     """The sensors of two designs in pairs, what both cost, and the constraints that only one has or that differ."""
-    from lidardesign.design.compare import paired_sensors, readout_of
     from lidardesign.run.yaml import leaves
+    from lidardesign.sensors.compare import paired_sensors, readout_of
 
     ours, theirs = (dict(leaves(design.constraints)) for design in designs)
     keys = [key for key in {**ours, **theirs} if key and ours.get(key) != theirs.get(key)]

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from lidardesign.cli import completion, options
-from lidardesign.cli.output import command
 from lidardesign.cli.tables.grids import RichConsole, text_table
+from lidardesign.cli.terminal import completion, options
+from lidardesign.cli.terminal.output import command
 from lidardesign.run.clock import phase
 
 OUTCOMES = {"pass": ("pass", "green"), "fail": ("FAIL", "bold red"), "skip": ("skip", "dim")}
@@ -62,8 +62,8 @@ def show(
     """Show a task. It has a metric, a design space and keys of its configuration."""
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
+            from lidardesign.api.config_reference import describe_task
             from lidardesign.registry import load_task
-            from lidardesign.workflow.config_reference import describe_task
 
         document = describe_task(load_task(name))
         output.result(document, lambda rich: _show_task(document, rich), show_costs=False)
@@ -130,8 +130,8 @@ def check(
     """Check that a task keeps the contract. Every law is tried; exit 6 where one does not hold."""
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
-            from lidardesign.testing.contract import LAWS, refuse_broken
-            from lidardesign.testing.process import CheckRequest, check_in_process
+            from lidardesign.contract.contract import LAWS, refuse_broken
+            from lidardesign.contract.process import CheckRequest, check_in_process
 
         request = CheckRequest(name, config, tuple(overrides or ()), seed, seconds)
         findings = []
@@ -179,7 +179,7 @@ def new(
     """Write an installable package of a new task. It keeps the contract and passes its own tests as it is."""
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
-            from lidardesign.testing.scaffold import new_task
+            from lidardesign.contract.scaffold import new_task
 
         written = new_task(name, out)
         folder = written[0].parent

@@ -11,8 +11,8 @@ from lidardesign.cli.tables.grids import RichConsole, number, print_table, text_
 if TYPE_CHECKING:
     import numpy as np
 
-    from lidardesign.design.constraints.check import ConstraintCheck
-    from lidardesign.design.sensor import DesignSpec, Track
+    from lidardesign.constraints.check import ConstraintCheck
+    from lidardesign.sensors.sensor import DesignSpec, Track
 
 MOST_ROWS = 20
 MOST_NAMED = 4
@@ -57,7 +57,7 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
 
 def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
     """Print what chosen rays leave unknown, and how much less any other choice of the same candidates could leave."""
-    from lidardesign.design.layouts.rays import certificates_of
+    from lidardesign.layouts.rays import certificates_of
 
     columns = ("rays", "loss", "on other scenes", "less by at most", "candidates", "scenes")
     rows = [
@@ -79,7 +79,7 @@ def _show_track(design: DesignSpec, track: Track, rich: RichConsole) -> None:
     """Print the rays of a track as a table: from where to where each looks and listens over its travel."""
     from numpy import degrees
 
-    from lidardesign.design.layouts.track import travels
+    from lidardesign.layouts.track import travels
 
     first, last = travels(track)
     title = f"{design.name}: {len(track.sensor)} rays at every {track.dimension} from {first:g} to {last:g}"
@@ -128,7 +128,7 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
     """
     from rich.text import Text
 
-    from lidardesign.design.constraints.slack import room_of
+    from lidardesign.constraints.slack import room_of
 
     rows = []
     for check in checks:
@@ -179,7 +179,7 @@ def show_fit(
 
 def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:
     """A line per sensor; rays are those of the largest number that was chosen."""
-    from lidardesign.design.layouts.rays import certificates_of
+    from lidardesign.layouts.rays import certificates_of
 
     counts = [str(entry["rays"]) for entry in certificates_of(design)] or [str(design.rays)] * bool(design.rays)
     several = f"{', '.join(counts[:-1])} or " if counts[:-1] else ""
@@ -201,7 +201,7 @@ def _frames(design: DesignSpec) -> str:
     """Where so many rays are fired: in every frame, or at every value of a condition."""
     if design.track is None:
         return "per frame"
-    from lidardesign.design.layouts.track import travels
+    from lidardesign.layouts.track import travels
 
     first, last = travels(design.track)
     return f"at every {design.track.dimension} from {first:g} to {last:g}"
@@ -209,7 +209,7 @@ def _frames(design: DesignSpec) -> str:
 
 def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
     """Among how many rays, on how many scenes, and how far from the best choice that may be."""
-    from lidardesign.design.layouts.rays import certificates_of
+    from lidardesign.layouts.rays import certificates_of
 
     entries = certificates_of(design)
     if entries:
@@ -224,7 +224,7 @@ def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
 
 def _tight(checks: Sequence[ConstraintCheck], sensors: Sequence[str]) -> str:
     """The constraints that limit the design, with the sensors that lean on them."""
-    from lidardesign.design.constraints.slack import room_of, split_name
+    from lidardesign.constraints.slack import room_of, split_name
 
     tight: dict[str, list[str]] = {}
     for check in checks:

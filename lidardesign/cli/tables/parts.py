@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from lidardesign.cli.tables.grids import RichConsole, number, text_table
-from lidardesign.design.catalog.part import Part, conditions_of, disagreements
+from lidardesign.parts.part import Part, conditions_of, disagreements
 
 FIGURES = ("rays", "field of view\n[deg]", "range [m]", "rate\n[Hz]", "histogram\n[Mbit/s]", "processed\n[Mbit/s]")
 COLUMNS = ("part", "kind", *FIGURES[:3], "range holds", *FIGURES[3:])

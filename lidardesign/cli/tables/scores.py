@@ -11,8 +11,8 @@ from lidardesign.cli.tables.grids import RichConsole, difference_cell, duration,
 from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.accuracy.settings import Accuracy, Measurement, Sweep
-    from lidardesign.evaluate.results import Evaluation, Paired
+    from lidardesign.scoring.accuracy.settings import Accuracy, Measurement, Sweep
+    from lidardesign.scoring.evaluation.results import Evaluation, Paired
 
 
 Entry = dict[str, Any]
@@ -37,7 +37,7 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
     """A row of every design, against the strongest rival; what else was asked for in a line each."""
-    from lidardesign.evaluate.thresholds import difference_text
+    from lidardesign.scoring.evaluation.thresholds import difference_text
 
     rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
     rival = evaluation.strongest_rival
@@ -81,8 +81,8 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
 
 def sentence(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
     """What designs are against the strongest rival, in one sentence."""
-    from lidardesign.evaluate.results import verdict
-    from lidardesign.evaluate.thresholds import difference_text
+    from lidardesign.scoring.evaluation.results import verdict
+    from lidardesign.scoring.evaluation.thresholds import difference_text
 
     metric, rival = evaluation.metric, pairs[0].b
     if len(pairs) == 1:
@@ -200,7 +200,7 @@ def _show_grid(title: str, places: Sequence[tuple[str, int, str]], cells: Sequen
 
 def _show_effects(document: Entry, rich: RichConsole) -> None:
     """What was simulated and why; one line where nothing is called for."""
-    from lidardesign.evaluate.report.tables import plain_number
+    from lidardesign.report.tables import plain_number
 
     detector, effects = document["detector"], document["effects"]
     if not any(effect["on"] or effect["bound"] or effect["lost"] for effect in effects):

@@ -18,7 +18,8 @@ from numba import njit
 from lidardesign.density.fields.bodies import GROUP_COLUMNS
 from lidardesign.density.fields.distance_kernels import primitive_distance, primitive_gradient
 from lidardesign.density.fields.table_kernels import along_axis
-from lidardesign.geometry.primitive_kernels import (
+from lidardesign.numerics import TINY
+from lidardesign.scenes.primitive_kernels import (
     box_roots,
     normal_at_range,
     placed,
@@ -27,8 +28,7 @@ from lidardesign.geometry.primitive_kernels import (
     turned,
     turned_back,
 )
-from lidardesign.geometry.primitives import GRID
-from lidardesign.numerics import TINY
+from lidardesign.scenes.primitives import GRID
 
 
 @njit(cache=True, nogil=True)

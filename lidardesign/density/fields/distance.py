@@ -17,7 +17,7 @@ from lidardesign.density.fields import grids
 from lidardesign.density.fields.bodies import Bodies, Pairs, own_grid, place_bodies
 from lidardesign.density.fields.grids import Grid, GridTable, cached_distance_grids, grid_around
 from lidardesign.errors import ConfigError
-from lidardesign.scene import Body, Mesh, Scene
+from lidardesign.scenes.scene import Body, Mesh, Scene
 
 MAXIMUM_TABLE_BYTES = 6 * 2**30
 FAR_M = np.float32(1e9)  # the distance of a column without a mesh in the table

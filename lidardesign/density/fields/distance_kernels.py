@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
-from lidardesign.geometry.primitives import BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, SPHERE
 from lidardesign.numerics import EPSILON
+from lidardesign.scenes.primitives import BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, SPHERE
 
 # A point is taken to be at least so far from the middle plane of an ellipsoid, as a share of its smallest semi-axis:
 # below it the two nearest points, above and below the plane, are one.

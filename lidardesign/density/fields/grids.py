@@ -26,7 +26,7 @@ import numpy as np
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.numerics import SLACK
 from lidardesign.run.inputs import MESH, read_file
-from lidardesign.scene import Mesh
+from lidardesign.scenes.scene import Mesh
 
 ALGORITHM = "3 cells by a tree, flat triangles as segments; sign by winding number; distance transform; float32"
 BAND_CELLS = 3.0
@@ -138,7 +138,7 @@ def narrow_band(
     points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, grid: Grid
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Exact unsigned distances within the band (infinite beyond), the closest faces and the closest surface points."""
-    from lidardesign.geometry.closest import TriangleTree
+    from lidardesign.scenes.distances import TriangleTree
 
     tree = TriangleTree(vertices[faces])
     distance, face, closest = tree.closest(points, BAND_CELLS * grid.step)

@@ -36,7 +36,7 @@ from lidardesign.density.fields.grids import (
 )
 from lidardesign.errors import BackgroundNote
 from lidardesign.numerics import safe_divide
-from lidardesign.scene import Body, Mesh, Scene
+from lidardesign.scenes.scene import Body, Mesh, Scene
 
 ALGORITHM = "log importance at the nearest surface point, flat triangles as segments, 3 cells; distance transform"
 

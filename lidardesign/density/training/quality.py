@@ -30,8 +30,8 @@ import numpy as np
 import torch
 from scipy.optimize import brentq
 
-from lidardesign.density.target.proposals import independent_points
-from lidardesign.density.target.target import Target
+from lidardesign.density.objective.proposals import independent_points
+from lidardesign.density.objective.target import Target
 from lidardesign.density.training.losses import TOLERANCE_NATS, round_trip_nats
 from lidardesign.density.training.sampling import (
     CONDITION_GROUPS,

@@ -25,9 +25,9 @@ import numpy as np
 import torch
 from scipy.optimize import brentq
 
-from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates
-from lidardesign.density.target.target import Target
+from lidardesign.density.flow.coordinates import Coordinates
+from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.objective.target import Target
 from lidardesign.numerics import logsumexp
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
@@ -125,6 +125,7 @@ def _log_kept(log_weights: np.ndarray, log_least: float) -> float:
 
 def _log_least(log_weights: np.ndarray, most: float) -> float:
     """log of the largest least weight, up to `most`, at which `LEAST_GROUP_SHARE` of samples is kept."""
+
     def excess(log_least: float) -> float:
         return _log_kept(log_weights, log_least) - math.log(LEAST_GROUP_SHARE)
 

@@ -25,7 +25,7 @@ from lidardesign.simulate.detector.kernels import (
     pulse_shape,
     vertex,
 )
-from lidardesign.simulate.streams import normal, uniform
+from lidardesign.simulate.detector.streams import normal, uniform
 
 # More photons in one bin than this are counted together, by mean and variance of how many pulses they fall into
 ONE_BY_ONE = 32

@@ -16,7 +16,7 @@ from typing import Any
 from lidardesign.errors import ConfigError, page
 from lidardesign.run.validation import is_name, suggest
 from lidardesign.run.yaml import Document, load_yaml
-from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, MOST_BINS, Detector, Photons
+from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, MOST_BINS, Detector, Photons
 
 FOLDER = Path(__file__).parent / "presets"
 TIMES = {"ps": 1e-12, "ns": 1e-9}

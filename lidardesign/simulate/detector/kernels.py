@@ -23,7 +23,7 @@ import numpy as np
 from numba import njit
 
 from lidardesign.numerics import ROUNDING
-from lidardesign.simulate.streams import poisson_quantile, uniform
+from lidardesign.simulate.detector.streams import poisson_quantile, uniform
 
 # Beyond so many standard deviations a Gaussian pulse holds less than one photon in 10^15
 REACH = 8.0

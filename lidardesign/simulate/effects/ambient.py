@@ -27,10 +27,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.numerics import safe_divide
-from lidardesign.scene import SPEED_OF_LIGHT_M_S, Scene
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.scenes.rays import Hits, Rays
+from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Scene
+from lidardesign.simulate.detector.light import Background, Beams, spectral_irradiance
+from lidardesign.simulate.detector.physics import Detector
 from lidardesign.simulate.effects.expected_counts import (
     Blindness,
     Counts,
@@ -40,7 +41,6 @@ from lidardesign.simulate.effects.expected_counts import (
     variance_of_missing,
 )
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
-from lidardesign.simulate.light import Background, Beams, spectral_irradiance
 
 # Brighter light is no brighter: every pulse of any detector counts it at once
 MOST_PER_METRE = 1e12

@@ -25,14 +25,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.geometry.frames import in_view, path_of_range, range_of_path
-from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.numerics import safe_divide
-from lidardesign.scene import Medium, Receiver, Scene
-from lidardesign.simulate.detector.detector import Detector, Photons
+from lidardesign.scenes.rays import Hits, Rays
+from lidardesign.scenes.receivers import in_view, path_of_range, range_of_path
+from lidardesign.scenes.scene import Medium, Receiver, Scene
+from lidardesign.simulate.detector.light import Background, Beams, Echoes
+from lidardesign.simulate.detector.physics import Detector, Photons
 from lidardesign.simulate.effects.expected_counts import Blindness, Counts, Echo, changed_share
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
-from lidardesign.simulate.light import Background, Beams, Echoes
 
 # Cells of haze along a ray, each longer than the one before by the same factor: counts are even within a cell, and
 # over a gate from 1 cm to 10 m its profile falls by a third from each to the next.

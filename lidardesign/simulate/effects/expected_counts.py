@@ -23,12 +23,12 @@ from functools import cached_property
 
 import numpy as np
 
-from lidardesign.geometry.frames import range_of_path
 from lidardesign.numerics import COARSE_SLACK, EPSILON, SQUARABLE, TINY, safe_divide
-from lidardesign.scene import SPEED_OF_LIGHT_M_S
-from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, MOST_COUNTS, Detector, bin_width_m, metres
+from lidardesign.scenes.receivers import range_of_path
+from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S
+from lidardesign.simulate.detector.light import spectral_irradiance
+from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, MOST_COUNTS, Detector, bin_width_m, metres
 from lidardesign.simulate.effects.first_hits import FirstHits
-from lidardesign.simulate.light import spectral_irradiance
 
 # Rays pass a receiver no nearer than this share of their way: differences of arctangents are then exact to 1e-9.
 NEAREST_SHARE = COARSE_SLACK

@@ -8,13 +8,13 @@ from functools import cached_property
 
 import numpy as np
 
-from lidardesign.geometry.frames import path_of_range, path_windows
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Hits, Outcome, Rays, gate_outcomes
 from lidardesign.numerics import safe_divide
-from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector, bins_start, ends_of_bins, metres, resolution_m
-from lidardesign.simulate.light import Beams, direct_echoes
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Hits, Outcome, Rays, gate_outcomes
+from lidardesign.scenes.receivers import path_of_range, path_windows
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.light import Beams, direct_echoes
+from lidardesign.simulate.detector.physics import Detector, bins_start, ends_of_bins, metres, resolution_m
 
 # A surface that is grazed more flatly than this counts as met at it: ranges then change by up to 50 times a step aside.
 FLATTEST_COSINE = 0.02

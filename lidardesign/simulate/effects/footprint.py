@@ -20,12 +20,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.light import Beams
+from lidardesign.simulate.detector.physics import Detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import FLATTEST_COSINE, STEEPER, EffectBound, FirstHits, edge_probability
-from lidardesign.simulate.light import Beams
 from lidardesign.simulate.light_transport.detours import GOLDEN_ANGLE_RAD
 
 # Pairs of opposite points are turned by the golden share of a half turn from one to the next: the most even spiral

@@ -18,9 +18,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector, metres
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.physics import Detector, metres
 from lidardesign.simulate.effects.expected_counts import Blindness, Counts, Echo, estimate_error_m
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 
@@ -32,7 +32,7 @@ def add_timing_errors(
     if detector.jitter_sigma_s == 0:
         return path_m
     # compiled, which bounds do without
-    from lidardesign.simulate.streams import normals
+    from lidardesign.simulate.detector.streams import normals
 
     return path_m + metres(detector.jitter_sigma_s) * normals(key, ray, order)
 

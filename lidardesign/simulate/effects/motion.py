@@ -24,15 +24,15 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lidardesign.geometry.primitives import BALL_SLACK, bounding_radius_m
-from lidardesign.geometry.raycast import Primitives, SceneCaster, shared_caster
-from lidardesign.geometry.rays import Hits, Rays
-from lidardesign.geometry.triangles import SecondCasts, mesh_caster
-from lidardesign.scene import Body, Mesh, Scene, Shape, inverse_rigid
-from lidardesign.simulate.detector.detector import IDEAL, Detector
+from lidardesign.scenes.casting import Primitives, SceneCaster, shared_caster
+from lidardesign.scenes.primitives import BALL_SLACK, bounding_radius_m
+from lidardesign.scenes.rays import Hits, Rays
+from lidardesign.scenes.scene import Body, Mesh, Scene, Shape, inverse_rigid
+from lidardesign.scenes.triangles import SecondCasts, mesh_caster
+from lidardesign.simulate.detector.light import Tracer
+from lidardesign.simulate.detector.physics import IDEAL, Detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits, edge_probability
-from lidardesign.simulate.light import Tracer
 
 # Rays (N, 3), (N, 3) in a body's own frame and limits (N,) to ranges (N,), infinite on a miss, and normals (N, 3).
 LocalTracer = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]

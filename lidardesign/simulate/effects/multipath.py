@@ -48,15 +48,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.geometry.frames import in_view, path_windows
-from lidardesign.geometry.raycast import shared_caster
-from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.numerics import EPSILON_FLOAT32, safe_divide
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere
-from lidardesign.simulate.detector.detector import Detector, Physics, resolution_m
+from lidardesign.scenes.casting import shared_caster
+from lidardesign.scenes.rays import Hits, Rays
+from lidardesign.scenes.receivers import in_view, path_windows
+from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere
+from lidardesign.simulate.detector.light import Beams, Echoes, direct_echoes
+from lidardesign.simulate.detector.physics import Detector, Physics, resolution_m
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
-from lidardesign.simulate.light import Beams, Echoes, direct_echoes
 from lidardesign.simulate.light_transport.detours import Detours, lamp_bound, pixel_bound
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, Transients, render_transient
 

@@ -20,10 +20,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import SQUARABLE
-from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.physics import Detector
 from lidardesign.simulate.effects.expected_counts import Blindness, Counts, missed_behind
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 
@@ -41,7 +41,7 @@ def draw_numbers(expected: np.ndarray, rays: np.ndarray, key: int) -> np.ndarray
 
 def draw_places(ray: np.ndarray, order: np.ndarray, key: int) -> tuple[np.ndarray, np.ndarray]:
     """For photons, by ray and order in it: a number in (0, 1) that chooses an echo, and a normal one for the pulse."""
-    from lidardesign.simulate.streams import normals, uniforms
+    from lidardesign.simulate.detector.streams import normals, uniforms
 
     draw = FIRST_PHOTON + 2 * order
     return uniforms(key, ray, draw), normals(key, ray, draw + 1)

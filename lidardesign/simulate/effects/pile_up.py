@@ -17,9 +17,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Bins, Detector, Photons, metres
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.physics import Bins, Detector, Photons, metres
 from lidardesign.simulate.effects.expected_counts import (
     Blindness,
     Counts,

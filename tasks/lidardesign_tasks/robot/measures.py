@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.geometry.rays import Outcome, Returns
-from lidardesign.scene import Scene
+from lidardesign.scenes.rays import Outcome, Returns
+from lidardesign.scenes.scene import Scene
 from lidardesign.space import DesignSpace
 from lidardesign.task import Information, Metric, Score
 from lidardesign_tasks.moving_surface import SURFACES, moving_informs, moving_score, with_moving_truth

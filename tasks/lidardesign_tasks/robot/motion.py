@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.mujoco_model import import_mujoco, mujoco_warnings
+from lidardesign.scenes.mujoco_models import import_mujoco, mujoco_warnings
 from lidardesign.task import Split, random_generator
 from lidardesign_tasks.robot.recordings import Recording
 

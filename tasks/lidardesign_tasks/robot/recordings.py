@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.mujoco_model import import_mujoco
 from lidardesign.numerics import unit_vectors
 from lidardesign.run.arrays import csv_rows, read_npz
 from lidardesign.run.inputs import TABLE
 from lidardesign.run.validation import suggest
 from lidardesign.run.yaml import plain_number
+from lidardesign.scenes.mujoco_models import import_mujoco
 from lidardesign.task import FolderConfig
 
 if TYPE_CHECKING:

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.surface import half_extents_m, sample_body
-from lidardesign.mujoco_model import FileState, ModelGeom, body_poses, load_model, model_files, visible_geoms
 from lidardesign.numerics import SLACK
 from lidardesign.run.validation import suggest
-from lidardesign.scene import Body, Mesh, Plane, Scene, inverse_rigid
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.mujoco_models import FileState, ModelGeom, body_poses, load_model, model_files, visible_geoms
+from lidardesign.scenes.scene import Body, Mesh, Plane, Scene, inverse_rigid
+from lidardesign.scenes.surface import half_extents_m, sample_body
 from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 from lidardesign_tasks.robot.recordings import listed

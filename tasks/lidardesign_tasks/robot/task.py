@@ -16,8 +16,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Returns
-from lidardesign.scene import Scene
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Scene
 from lidardesign.space import DesignSpace
 from lidardesign.task import (
     Defaults,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidardesign.geometry.rays import Returns
+from lidardesign.scenes.rays import Returns
 from lidardesign.task import Information
 
 # A ball hit evenly over its disc is hit, on average, this share of its radius in front of its centre's plane

@@ -1,0 +1,1 @@
+"""What `import lidardesign` offers: runs, designs and scores as whole steps."""

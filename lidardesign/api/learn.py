@@ -1,0 +1,475 @@
+"""Learning a task into a run folder: what is asked for, and the folder started, resumed, or taken away again."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from shlex import quote
+from typing import TYPE_CHECKING, Any
+
+from lidardesign.config import RunConfig, load_run_config, resolve, save_run_config
+from lidardesign.errors import BackgroundNote, ConfigError, DataError, ThresholdError, check_choice, check_number
+from lidardesign.registry import distribution_of, load_task, plugin_guard, task_names
+from lidardesign.run.clock import WAIT_S, Clock, outermost_clock, phase
+from lidardesign.run.files import is_temporary, run_lock, writer
+from lidardesign.run.manifest import note, start_manifest
+from lidardesign.run.outputs import check_writable
+from lidardesign.run.yaml import leaves, load_yaml
+from lidardesign.run_folder import (
+    CONFIGURATION,
+    DESIGN_FOLDER,
+    INPUTS,
+    MANIFEST,
+    SAMPLES,
+    Notes,
+    RunFolder,
+    input_hashes,
+    input_paths,
+    log_note,
+    settings_texts,
+)
+from lidardesign.task import FolderConfig, Task, notes_of
+
+if TYPE_CHECKING:
+    from lidardesign.density.learn import LearnProgress, LearnResult
+
+LOCK = ".lock"
+# Endings of the folders beside a run that is replaced: of the new run, and of the old one for an instant.
+NEW, OLD = ".new", ".old"
+# A run has begun once it has its configuration, which is written last; snapshots are of no use without a checkpoint.
+STARTED_FILES = {CONFIGURATION, MANIFEST, "progress.jsonl", "snapshots"}
+CHECKPOINTS = "checkpoint*"
+LEARNED_FILES = (
+    CONFIGURATION, MANIFEST, "progress.jsonl", "checkpoint.safetensors", "flow.safetensors", SAMPLES, "snapshots/",
+)  # fmt: skip
+# A misplaced share that can be told apart from nothing and from all; a longer time is a mistake in the unit.
+TOLERANCES, TIME_BUDGETS_S = (1e-4, 0.9999), (1.0, 366 * 24 * 3600.0)
+# A tolerance is met where the measured share is at most so many standard errors above it.
+STANDARD_ERRORS = 2.0
+# Of a run that ends by the clock; config.yaml has the steps that it took once it has ended.
+MOST_STEPS = 100_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnOptions:
+    """A user's choices for learning.
+
+    Arguments:
+        out: The run folder to make; runs/TASK by default.
+        preset: draft, standard or fine.
+        settings: Settings by dotted keys, such as {"learning.steps": 60} or ["learning.steps=60"].
+        config: A YAML file of settings.
+        seed: Seed of all random numbers.
+        device: auto, cpu or cuda.
+        resume: Continue an interrupted run.
+        overwrite: Replace a run that is in the folder, once the new one is learned.
+        tolerance: The setting learning.misplaced, which has to be reached.
+        time_budget_s: Steps are taken until this time has passed, however many they are [s].
+        command: What the manifest says that the run was made by.
+
+    Raises:
+        ConfigError: A device, a tolerance or a time that cannot be.
+    """
+
+    out: Path | str | None = None
+    preset: str | None = None
+    settings: Sequence[str] | Mapping[str, Any] = ()
+    config: Path | str | None = None
+    seed: int | None = None
+    device: str = "auto"
+    resume: bool = False
+    overwrite: bool = False
+    tolerance: float | None = None
+    time_budget_s: float | None = None
+    command: Sequence[str] = field(default_factory=lambda: tuple(sys.argv))
+
+    def __post_init__(self) -> None:
+        check_choice(self.device, "--device", ("auto", "cpu", "cuda"))
+        if self.tolerance is not None:
+            check_number(self.tolerance, "--tolerance", *TOLERANCES)
+        if self.time_budget_s is not None:
+            check_number(self.time_budget_s, "--time-budget", *TIME_BUDGETS_S)
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """The settings, and those that a time budget and a tolerance stand for."""
+        endless = () if self.time_budget_s is None else (f"learning.steps={MOST_STEPS}", "learning.misplaced=0")
+        reached = () if self.tolerance is None else (f"learning.misplaced={self.tolerance}",)
+        return (*endless, *settings_texts(self.settings), *reached)
+
+
+@dataclass(frozen=True, eq=False)
+class LearnRequest:
+    """A task to learn, with its settings and its folder.
+
+    Arguments:
+        task: The task.
+        folder: The run folder.
+        settings: The whole configuration.
+        options: The user's choices.
+        begun: Whether a run is gone on with.
+        replaces: Whether a run is in the folder, to be replaced once the new one is learned.
+    """
+
+    task: Task
+    folder: Path
+    settings: RunConfig
+    options: LearnOptions
+    begun: bool = False
+    replaces: bool = False
+
+    @classmethod
+    def resolve(cls, task: str | None, options: LearnOptions, notes: Notes = log_note) -> LearnRequest:
+        """The request of a user's choices; without a task, the one that its files name.
+
+        Raises:
+            ConfigError: An unknown task, impossible settings, or a folder that is not empty.
+            DataError: There is no run to resume.
+        """
+        config_file = None if options.config is None else Path(options.config)
+        choices = {
+            "preset": options.preset,
+            "config_file": config_file,
+            "overrides": options.overrides,
+            "seed": options.seed,
+        }
+        task = task or _task_named(config_file, Path(options.out) if options.resume and options.out else None)
+        plugin = load_task(task)
+        folder = Path("runs") / task if options.out is None else Path(options.out)
+        replaces = options.overwrite and _holds_run(folder)
+        place = next_to(folder, NEW) if replaces else folder
+        if options.resume and not place.is_dir():
+            raise DataError("there is no run to resume", where=str(place), hint="leave out --resume to start one")
+        begun = options.resume and not _was_killed_before_it_began(place)
+        if begun:
+            plugin, settings = _resumed_settings(plugin, place, choices)
+            if settings.learning.steps == MOST_STEPS and options.time_budget_s is None:
+                raise ConfigError("the run ends by the clock", where="--resume", hint="add --time-budget SECONDS")
+        else:
+            if options.resume:
+                notes("the run has nothing to resume from yet; it starts from the beginning")
+            check_can_start(place)
+            settings = _with_inputs(resolve(plugin, **choices))
+        request = cls(plugin, folder, settings, options, begun, replaces)
+        if replaces:
+            notes(f"once it is learned it replaces the run {folder}{request._lost_designs()}")
+        for line in RunFolder(place, plugin, settings).input_notes() if begun else ():
+            notes(line)
+        if begun and not request.has_checkpoint:
+            notes("the run has no checkpoint yet; it starts from the beginning")
+        return request
+
+    @property
+    def place(self) -> Path:
+        """The folder that is learned in: beside the run's own as long as that holds the run to be replaced."""
+        return next_to(self.folder, NEW) if self.replaces else self.folder
+
+    def _lost_designs(self) -> str:
+        """The designs that go with the run that is replaced, in words."""
+        designs = ", ".join(sorted(path.stem for path in (self.folder / DESIGN_FOLDER).glob("*.yaml")))
+        return f", with its designs ({designs})" if designs else ""
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """True where a run is resumed that has a checkpoint."""
+        return self.begun and any(self.place.glob(CHECKPOINTS))
+
+    @phase("scenes")
+    def task_notes(self) -> list[str]:
+        """The task's own notes on its configuration, before anything takes time."""
+        with plugin_guard(self.task.name):
+            return notes_of(self.task, self.settings.task, self.settings.space)
+
+    def scale_notes(self) -> list[str]:
+        """Notes on lengths that do not fit together: of training scenes, which are made for it, the space and sigma.
+
+        Raises:
+            DataError: There are no training scenes.
+        """
+        from lidardesign.density.objective.prepare import training_scenes
+        from lidardesign.density.objective.scale import scale_notes
+
+        return scale_notes(training_scenes(self.task, self.settings), self.settings)
+
+    def plan(self, remark: Notes | None = None) -> dict[str, Any]:
+        """The document of `--dry-run --json`: what would be learned and written, how long it takes and how much memory.
+
+        Arguments:
+            remark: Called with what is wrong with lengths.
+
+        Raises:
+            ConfigError, DataError: Unusable settings or scenes, or a folder that cannot be written.
+        """
+        with phase("libraries"):
+            from lidardesign.density.learn import forecast, prepare_training_data
+
+        settings, writes = self.settings, [f"{self.folder}/{name}" for name in LEARNED_FILES]
+        for path in writes:
+            check_writable(Path(path), is_folder=path.endswith("/"))
+        data = prepare_training_data(self.task, settings, remark)
+        return {
+            "dry_run": True,
+            "reads": [str(path) for path in (self.options.config, *input_paths(settings.task)) if path],
+            "writes": writes,
+            "settings": settings.as_document(),
+            "forecast": forecast(data, settings, self.place, self.options.device, self.options.time_budget_s),
+        }
+
+    def run(self, progress: Callable[[LearnProgress], None] | None = None, remark: Notes | None = None) -> LearnResult:
+        """Learn into the folder; what failed before anything was learned is taken away again.
+
+        Arguments:
+            progress: Called about every tenth step.
+            remark: Called with what is wrong with lengths, before anything is learned.
+
+        Raises:
+            ConfigError, DataError: Unusable settings or scenes, or a folder that cannot be written.
+            DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
+        """
+        clock = outermost_clock() or Clock()
+        result = self._learned(clock, progress, remark)
+        if not self.replaces:
+            return result
+        put_in_place(self.folder)
+        note(self.folder, learn={"run": str(self.folder)})
+        return replace(result, run=str(self.folder))
+
+    def _learned(
+        self, clock: Clock, progress: Callable[[LearnProgress], None] | None, remark: Notes | None
+    ) -> LearnResult:
+        with phase("libraries"):
+            from lidardesign.density.learn import learn
+
+        folder, settings, budget_s = self.place, self.settings, self.options.time_budget_s
+        with _new_folder(folder), run_lock(folder):
+            if not self.begun:
+                check_can_start(folder)  # another process may have been faster
+            with self._undone_on_failure():
+                if not self.begun:
+                    # Write what the run is before anything is learned; the configuration last
+                    start_manifest(folder, command=list(self.options.command), seed=settings.seed)
+                    note(folder, plugin=distribution_of(self.task.name), **{INPUTS: input_hashes(settings.task)})
+                    save_run_config(settings, folder)
+                try:
+                    result = learn(
+                        self.task,
+                        settings,
+                        folder,
+                        resume=self.has_checkpoint,
+                        device=self.options.device,
+                        progress=progress,
+                        is_over=None if budget_s is None else lambda _: clock.seconds >= budget_s,
+                        remark=remark,
+                    )
+                except DataError as error:
+                    # of errors about data, those that only ended the writing: a full disk
+                    if not isinstance(error.__cause__, OSError):
+                        raise
+                    hint = f"{error.hint}; {self.resume_hint()}"
+                    raise type(error)(error.message, where=error.where, hint=hint) from error.__cause__
+        if budget_s is None:
+            return result
+        learning = settings.learning.model_copy(update={"steps": result.steps})
+        save_run_config(replace(settings, learning=learning), folder)
+        return replace(result, notes=(*result.notes, BackgroundNote(f"{result.steps} steps in {budget_s:g} s")))
+
+    def resume_hint(self) -> str:
+        """The last checkpoint and the command that goes on from there, after an interruption."""
+        checkpoints = sorted(path.name for path in self.place.glob(CHECKPOINTS))
+        if checkpoints:
+            rest = f"the last checkpoint is {self.place / checkpoints[-1]}"
+        else:
+            return "before the first checkpoint; nothing was kept"
+        again = f"--out {quote(str(self.folder))} {'--overwrite ' if self.replaces else ''}--resume"
+        for option, value in (("--tolerance", self.options.tolerance), ("--time-budget", self.options.time_budget_s)):
+            again += "" if value is None else f" {option} {value:g}"
+        return f"{rest}\n  continue with: lidardesign learn {self.task.name} {again}"
+
+    @contextlib.contextmanager
+    def _undone_on_failure(self) -> Iterator[None]:
+        """When a new run fails before anything was learned, take away what was put there."""
+        try:
+            yield
+        except BaseException:
+            entries = [entry for entry in self.place.iterdir() if entry.name != LOCK]
+            nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
+            if not self.begun and nothing_learned:
+                with contextlib.suppress(OSError):
+                    # without its configuration a run has not begun, whatever else is left of it
+                    (self.place / CONFIGURATION).unlink(missing_ok=True)
+                    for entry in entries:
+                        shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
+            raise
+
+
+def result_document(result: LearnResult) -> dict[str, Any]:
+    """The document of `lidardesign learn --json`."""
+    figures = ("task", "seconds", "steps", "ess", "kl_nats", "log_z", "coverage", "misplaced")
+    return {
+        "run": str(result.run),
+        **{name: getattr(result, name) for name in figures},
+        "verdict": result.verdict.word,
+        "notes": list(result.notes),
+        "error_estimates": result.as_dict()["error_estimates"],
+    }
+
+
+def check_tolerance(result: LearnResult, tolerance: float | None) -> None:
+    """Exit 1 where a tolerance was not reached.
+
+    Raises:
+        ThresholdError: With what was reached.
+    """
+    error = result.error_estimates["misplaced"].error
+    # without coverage nothing knows what the density dropped
+    if tolerance is None or (result.coverage > 0 and result.misplaced <= tolerance + STANDARD_ERRORS * (error or 0.0)):
+        return
+    doubt = "" if error is None else f" +- {error:.2g}"
+    raise ThresholdError(
+        f"{result.misplaced:.3g}{doubt} of the density's mass is in the wrong place after {result.steps} steps",
+        where="--tolerance",
+        allowed=f"at most {tolerance:g}",
+        hint="a larger learning.steps, or --preset fine; the run is finished and can be used as it is",
+    )
+
+
+def _task_named(config_file: Path | None, run: Path | None) -> str:
+    """The task that a configuration file names, or that of the run to resume.
+
+    Raises:
+        ConfigError: Neither names one.
+    """
+    resumed = () if run is None or not (run / CONFIGURATION).is_file() else (run / CONFIGURATION,)
+    files = (*(() if config_file is None else (config_file,)), *resumed)
+    named = [load_yaml(file, empty_sections=True).mapping.get("task_name") for file in files]
+    if not any(named):
+        raise ConfigError(
+            "no task was named",
+            where="TASK",
+            allowed=", ".join(task_names()),
+            hint="lidardesign learn TASK, or task_name: TASK in the file of --config",
+        )
+    return next(str(name) for name in named if name)
+
+
+def check_can_start(run: Path) -> None:
+    """Refuse a folder that holds anything, so that no run is ever overwritten.
+
+    Raises:
+        ConfigError: It is a file, or not empty.
+    """
+    if run.is_file():
+        raise ConfigError("is a file", where=f"--out {run}", allowed="a folder that is new or empty")
+    if run.is_dir() and not _was_killed_before_it_began(run):
+        hint = "continue it with --resume, replace it with --overwrite, or give another --out"
+        if run.name.endswith(NEW):
+            hint = "an interrupted replacement: continue it with --overwrite --resume, or remove it"
+        raise ConfigError("the folder is not empty", where=f"--out {run}", allowed="a new or empty folder", hint=hint)
+
+
+def _holds_run(folder: Path) -> bool:
+    """True where a folder has a run to replace; a folder without anything in it has none.
+
+    Raises:
+        ConfigError: It holds something else, somebody is writing it, or what replaced a run before is left.
+    """
+    where, aside = f"--out {folder}", next_to(folder, OLD)
+    if aside.exists():
+        hint = "move or remove it"
+        if not folder.exists():
+            hint = f"the new run is finished: mv {quote(str(next_to(folder, NEW)))} {quote(str(folder))}"
+        raise ConfigError("is left of a replacement that was killed", where=str(aside), hint=hint)
+    if not folder.is_dir() or _was_killed_before_it_began(folder):
+        return False
+    if not (folder / MANIFEST).is_file():
+        raise ConfigError("holds no run", where=where, allowed="--overwrite replaces runs", hint="give another --out")
+    if at_work := writer(folder):
+        raise ConfigError(f"{at_work} is writing this run", where=where, hint="wait for it, or use another --out")
+    return True
+
+
+def next_to(folder: Path, suffix: str) -> Path:
+    """The folder of another name beside a run's, wherever a link to it leads."""
+    folder = folder.resolve() if folder.is_symlink() or folder.name in ("", "..") else folder
+    return folder.with_name(folder.name + suffix)
+
+
+def put_in_place(folder: Path) -> None:
+    """Put the run that was learned beside a folder into its place; the old one goes last.
+
+    Raises:
+        DataError: Somebody is writing the old one, or the folders cannot be renamed; both are kept.
+    """
+    place, new, aside = (next_to(folder, suffix) for suffix in ("", NEW, OLD))
+    try:
+        with run_lock(place, wait_s=WAIT_S):
+            place.rename(aside)
+            try:
+                new.rename(place)
+            except OSError:
+                aside.rename(place)
+                raise
+    except (ConfigError, OSError) as error:
+        reason = error.message if isinstance(error, ConfigError) else error.strerror or error
+        hint = "the new run is finished: use it where it is, or move it"
+        raise DataError(f"cannot replace {folder}: {reason}", where=str(new), hint=hint) from error
+    # what cannot be removed is named by the next replacement
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def _was_killed_before_it_began(run: Path) -> bool:
+    """True for a folder that is empty, or holds only what a start that was killed leaves."""
+    names = {entry.name for entry in run.iterdir()}
+    return CONFIGURATION not in names and all(
+        name in STARTED_FILES or name == LOCK or is_temporary(name) for name in names
+    )
+
+
+def _with_inputs(settings: RunConfig) -> RunConfig:
+    """The configuration of a new run with the files that are there now, where its task keeps them."""
+    if not isinstance(settings.task, FolderConfig):
+        return settings
+    return replace(settings, task=settings.task.model_copy(update={INPUTS: input_hashes(settings.task)}))
+
+
+def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tuple[Task, RunConfig]:
+    """The task and configuration of a run; another configuration is refused, repeating its own options is fine."""
+    task, stored = load_run_config(run)
+    wanted = resolve(
+        task if task.name == plugin.name else plugin,
+        preset=choices["preset"] or stored.preset,
+        config_file=choices["config_file"] or run / CONFIGURATION,
+        overrides=choices["overrides"],
+        seed=stored.seed if choices["seed"] is None else choices["seed"],
+    )
+    old, new = dict(leaves(stored.as_document())), dict(leaves(wanted.as_document()))
+    for path in [*old, *new]:
+        # what was there at first is no setting of a user's
+        if path[:2] != ("task", INPUTS) and old.get(path) != new.get(path):
+            raise ConfigError(
+                f"the run was started with {'.'.join(map(str, path))} = {old.get(path)!r}, not {new.get(path)!r}",
+                where=str(run / CONFIGURATION),
+                hint="resume without options, or start a new run with another --out",
+            )
+    return task, stored
+
+
+@contextlib.contextmanager
+def _new_folder(run: Path) -> Iterator[None]:
+    """Make the folder; after a failure take it away again where it is empty."""
+    new = [folder for folder in (run, *run.parents) if not folder.exists()]
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"cannot be made: {error.strerror or error}", where=f"--out {run}") from None
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for folder in new:
+                folder.rmdir()
+        raise

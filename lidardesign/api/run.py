@@ -1,0 +1,432 @@
+"""Runs as users hold them: a task that was learned, whose density is fitted to, and whose scenes judge designs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from shlex import quote
+from typing import TYPE_CHECKING, Any
+
+from lidardesign.api.design import Design, html_table
+from lidardesign.api.learn import LearnOptions, LearnRequest, check_tolerance
+from lidardesign.constraints.document import Constraints
+from lidardesign.errors import DataError, LidardesignError, names_arguments
+from lidardesign.fitting.request import FitOptions, FitRequest
+from lidardesign.run.clock import Progress
+from lidardesign.run.files import writer
+from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
+from lidardesign.run_folder import (
+    MANIFEST,
+    Notes,
+    RunFolder,
+    folder_of,
+    log_note,
+    reach_of,
+    read_design,
+)
+
+if TYPE_CHECKING:
+    from lidardesign.api.scores import Scores
+    from lidardesign.density.learned import LearnedDensity
+    from lidardesign.density.verdict import Verdict
+
+FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
+
+
+@dataclass(frozen=True)
+class LearnedQuality:
+    """The quality of a learned density.
+
+    Arguments:
+        ess: Effective share of the samples, 0 to 1.
+        kl_nats: Divergence from the learned density to the target [nats].
+        log_z: Log of the target's normalisation.
+        coverage: Share of the target's mass that the density reaches.
+        misplaced: Share of the density's mass in the wrong place.
+        errors: The standard errors of these, where they are known.
+    """
+
+    ess: float
+    kl_nats: float
+    log_z: float
+    coverage: float
+    misplaced: float
+    errors: Mapping[str, float | None] = field(default_factory=dict)
+
+    @property
+    def verdict(self) -> str:
+        """good, usable or poor."""
+        return self._verdict.word
+
+    def advice(self, preset: str) -> str | None:
+        """Why it is not better, and what to do next after a preset; None where it is good."""
+        return self._verdict.advice(preset) if self._verdict.why else None
+
+    @property
+    def _verdict(self) -> Verdict:
+        from lidardesign.density.verdict import Verdict
+
+        return Verdict.of(self.misplaced, self.kl_nats, self.ess)
+
+
+class Run(RunFolder):
+    """A run folder: a task with its configuration, the density that was learned, and the designs fitted to it.
+
+    `lidardesign.learn(task)` makes one, `lidardesign.open_run(folder)` opens one. Everything about it is in its folder,
+    so commands and scripts can share runs.
+
+    Arguments:
+        folder: The folder.
+        task: The task.
+        config: The whole configuration.
+
+    Example:
+        >>> run = lidardesign.open_run(folder)
+        >>> 0 < run.quality.ess <= 1
+        True
+        >>> run.density.sample(5).shape
+        (5, 6)
+        >>> design = run.fit(sensors=2, name="two")
+        >>> design.save().name, [design.name for design in run.designs()]
+        ('two.yaml', ['two'])
+        >>> scores = run.evaluate([design], rays=[16])
+        >>> scores.rows[0].design
+        'two'
+    """
+
+    @property
+    def quality(self) -> LearnedQuality:
+        """The quality of the learned density.
+
+        Raises:
+            DataError: Learning did not end, or the manifest is damaged.
+        """
+        learned, where = read_manifest(self.folder).get("learn"), str(self.folder / MANIFEST)
+        if learned is None:
+            raise DataError("learning of the run was not finished", where=where, hint="continue with --resume")
+        try:
+            estimates = learned.get("error_estimates") or {}
+            errors = {name: estimates[name].get("error") for name in FIGURES if name in estimates}
+            return LearnedQuality(*(float(learned[name]) for name in FIGURES), errors)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise DataError("the record of learning is damaged", where=where, hint=DAMAGED_HINT) from None
+
+    @property
+    def density(self) -> LearnedDensity:
+        """The learned density: `sample(count)` and `log_prob(points)`; needs torch, and makes the training scenes."""
+        from lidardesign.density.learned import LearnedDensity
+
+        return LearnedDensity(self.folder, self.task, self.config)
+
+    @names_arguments
+    def fit(
+        self,
+        *,
+        sensors: int | str | None = None,
+        constraints: Constraints | Mapping[str, Any] | Path | str | None = None,
+        rays: int | None = None,
+        layout: str | None = None,
+        channels: int | None = None,
+        gates: str | None = None,
+        level: float | None = None,
+        at: Mapping[str, float] | None = None,
+        weights: Sequence[str] | Mapping[str, Any] = (),
+        parts: Sequence[str] | str | None = None,
+        like: Path | str | None = None,
+        name: str | None = None,
+        seed: int | None = None,
+        notes: Notes = log_note,
+        progress: Progress | None = None,
+    ) -> Design:
+        """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
+
+        Arguments:
+            sensors: How many, or "best" (the default): as many as score best on training scenes.
+            constraints: Constraints, a mapping of them, or a YAML file of them.
+            rays: Rays per frame over all sensors.
+            layout: grid, density, scan, distributed, selected or spinning; by default selected, where the task
+                has a method `informs`.
+            channels: Rings of each sensor of the layout spinning.
+            gates: "sensor" or "ray": one gate per sensor, or one per ray.
+            level: The share of rays and returns that fields of view and gates contain.
+            at: Values of conditions that the design is for, such as {"x_m": 0.37}.
+            weights: Settings of the task towards which the learned density is weighted.
+            parts: Real parts that the design is made of: names, NAME:MODE, paths of part files, or "catalog".
+            like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
+            name: The design's name.
+            seed: Seed of all random numbers; the run's by default.
+            notes: Called with every note; they are logged by default.
+            progress: Called with every step, as "choosing 361 rays", and twice None.
+
+        Raises:
+            ConfigError: Choices that do not fit together.
+            DataError: The density is too rough to fit to.
+            InfeasibleError: Constraints that contradict each other, or hold too little of the density.
+        """
+        options = FitOptions(
+            sensors=sensors,
+            constraints=constraints,
+            rays=rays,
+            layout=layout,
+            channels=channels,
+            gates=gates,
+            level=level,
+            at=at or {},
+            weights=weights,
+            parts=parts,
+            like=like,
+            name=name,
+            seed=seed,
+        )
+        return Design.fitted(FitRequest.resolve(self, options, notes=notes), notes=notes, progress=progress)
+
+    def designs(self) -> list[Design]:
+        """The designs that are saved in the run, by name."""
+        return [Design(read_design(path), self, path) for path in self.design_paths()]
+
+    def summary(self) -> dict[str, Any]:
+        """The quality of the density, the designs with their last scores, and commands that go on from here.
+
+        Raises:
+            DataError: The manifest is damaged.
+        """
+        manifest, config, at_work = read_manifest(self.folder), self.config, writer(self.folder)
+        learned = manifest.get("learn")
+        quality = None if learned is None else self.quality
+        designs = [_design_entry(path, manifest) for path in self.design_paths()]
+        return {
+            "run": str(self.folder),
+            "task": config.task_name,
+            "preset": config.preset,
+            "seed": config.seed,
+            "metric": {"name": self.metric.name, "unit": self.metric.unit, "better": self.metric.better},
+            "quality": None if quality is None else {name: getattr(quality, name) for name in FIGURES},
+            "verdict": None if quality is None else quality.verdict,
+            "advice": None if quality is None else quality.advice(config.preset),
+            **{name: _figure(learned, name) for name in ("seconds", "steps")},
+            "designs": designs,
+            "writer": at_work,
+            "next": [] if learned is None and at_work else self._next_commands(designs, finished=learned is not None),
+        }
+
+    def _next_commands(self, designs: Sequence[Mapping[str, Any]], *, finished: bool) -> list[str]:
+        """Command lines that go on from here."""
+        run = quote(str(self.folder))
+        if not finished:
+            return [f"lidardesign learn {self.config.task_name} --out {run} --resume"]
+        scored = [entry for entry in designs if entry["score"] is not None]
+        unscored = [entry for entry in designs if entry["score"] is None and "error" not in entry]
+        evaluating = [f"lidardesign evaluate {run} --report report.html"] if unscored else []
+        if not scored:
+            return evaluating or [f"lidardesign fit {run}"]
+        best = (min if self.metric.better == "lower" else max)(scored, key=lambda entry: entry["score"]["value"])
+        rays = best["score"]["rays"]
+        return [
+            *evaluating,
+            f"lidardesign constrain {run} --set budget.rays={max(rays // 2, 1)} --name fewer",
+            f"lidardesign export {quote(best['path'])} --format csv --rays {rays} --out rays.csv",
+        ]
+
+    @names_arguments
+    def evaluate(
+        self,
+        designs: Sequence[Design | Path | str] | None = None,
+        *,
+        rays: Sequence[int] | None = None,
+        baselines: Sequence[str] = (),
+        seed: int | None = None,
+        scenes_seed: int | None = None,
+        effects: str = "auto",
+        detector: str = "ideal",
+        range_tolerance_mm: float | None = None,
+        return_tolerance: float | None = None,
+        settings: Sequence[str] | Mapping[str, Any] = (),
+        mount_error: str | None = None,
+        workers: int | str = 1,
+        cma_seconds: float | None = None,
+        accuracy: bool = False,
+        fail_above: float | None = None,
+        fail_unless_better: str | None = None,
+        progress: Progress | None = None,
+        notes: Notes = log_note,
+    ) -> Scores:
+        """Score designs on held-out scenes against uniform, random, bounding, silhouette and greedy.
+
+        Arguments:
+            designs: Designs and design files, of other runs too; all that are saved in the run by default.
+            rays: Numbers of rays per frame; the task's by default.
+            baselines: Further baselines: "lloyd", "occupancy", "no-visibility" or "cma"; ["none"] leaves out all.
+            seed: Seed of all random numbers; the run's by default.
+            scenes_seed: Seed of the held-out scenes; `seed` by default.
+            effects: Physical effects: "auto", "all", "none", "audit" or names separated by commas.
+            detector: The name of a detector, or a YAML file.
+            range_tolerance_mm: What all skipped effects together may change of ranges [mm].
+            return_tolerance: Share of returns that all skipped effects together may change.
+            settings: Settings of the task, to score in scenes other than the learned ones.
+            mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
+            workers: Processes that score scenes, or the address of a dask scheduler, tcp://HOST:PORT.
+            cma_seconds: Wall time of each search of the baseline cma [s].
+            accuracy: Whether what accuracy costs is measured, too; takes minutes.
+            fail_above: What no design may be worse than, in the metric's unit; `Scores.check()` sees to it.
+            fail_unless_better: A baseline or design that every other design must be better than; so does this.
+            progress: Called with the name of the scene, the scenes done, and all scenes.
+            notes: Called with every note.
+
+        Raises:
+            ConfigError: Choices that cannot be.
+            DataError: There are no designs, or one is not there.
+        """
+        from lidardesign.api.scores import ScoreOptions, ScoreRequest
+
+        options = ScoreOptions(
+            rays=rays,
+            baselines=baselines,
+            seed=seed,
+            scenes_seed=scenes_seed,
+            effects=effects,
+            detector=detector,
+            range_tolerance_mm=range_tolerance_mm,
+            return_tolerance=return_tolerance,
+            settings=settings,
+            mount_error=mount_error,
+            workers=workers,
+            cma_seconds=cma_seconds,
+            accuracy=accuracy,
+            fail_above=fail_above,
+            fail_unless_better=fail_unless_better,
+        )
+        chosen = self.designs() if designs is None else designs
+        targets = [design if isinstance(design, Design) else Path(design) for design in chosen]
+        scores = ScoreRequest.resolve(targets, options, self, notes).score(progress)
+        return scores.with_accuracy(progress) if options.accuracy else scores
+
+    def __repr__(self) -> str:
+        return f"<Run {self.folder}: task {self.task.name}, preset {self.config.preset}, seed {self.config.seed}>"
+
+    def _repr_html_(self) -> str:
+        quality = self.quality
+        rows: list[tuple[str, object]] = [
+            ("task", self.task.name),
+            ("preset", self.config.preset),
+            ("seed", self.config.seed),
+            *((name, f"{getattr(quality, name):.3f}") for name in FIGURES),
+            ("designs", ", ".join(path.stem for path in self.design_paths()) or "none"),
+        ]
+        return html_table(f"run {self.folder}", (), rows)
+
+
+def _figure(learned: Mapping[str, Any] | None, name: str) -> float | None:
+    value = (learned or {}).get(name)
+    return value if isinstance(value, int | float) else None
+
+
+def _design_entry(path: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """A design of a run and its last score; one that cannot be read says why."""
+    from lidardesign.scoring.evaluation.last_scores import last_score
+
+    entry: dict[str, Any] = {"name": path.stem, "path": str(path), "score": None}
+    try:
+        design, score = read_design(path), last_score(manifest, path)
+    except LidardesignError as error:
+        return {**entry, "error": error.message}
+    shape = {"sensors": len(design.sensors), "rays": design.rays, "layout": design.layout}
+    return {**entry, **shape, "score": None if score is None else asdict(score)}
+
+
+def open_run(folder: Path | str) -> Run:
+    """Open a run folder that `learn` made.
+
+    Raises:
+        DataError: There is none, or it is damaged.
+    """
+    return Run.open(folder)
+
+
+@names_arguments
+def learn(
+    task: str | None = None,
+    *,
+    preset: str | None = None,
+    out: Path | str | None = None,
+    seed: int | None = None,
+    settings: Mapping[str, Any] | Sequence[str] = (),
+    config: Path | str | None = None,
+    device: str = "auto",
+    resume: bool = False,
+    overwrite: bool = False,
+    tolerance: float | None = None,
+    time_budget_s: float | None = None,
+    progress: Progress | None = None,
+    notes: Notes = log_note,
+) -> Run:
+    """Learn where rays are worth firing for a task, into a run folder.
+
+    Arguments:
+        task: The name of a task; `lidardesign tasks` lists them. By default the one that `config` names.
+        preset: Effort: draft, standard or fine.
+        out: The folder to make; runs/TASK by default.
+        seed: Seed of all random numbers.
+        settings: Settings by dotted keys, such as {"learning.steps": 60, "density.sigma_m": 0.01}.
+        config: A YAML file of settings.
+        device: auto, cpu or cuda.
+        resume: Continue an interrupted run.
+        overwrite: Replace a run that is in the folder, once the new one is learned.
+        tolerance: The setting learning.misplaced, which has to be reached: the share of mass in the wrong place.
+        time_budget_s: Steps are taken until this time has passed; measuring comes after [s].
+        progress: Called about every tenth step with "learning", the steps done, and all steps, where that is known.
+        notes: Called with every note; they are logged by default.
+
+    Raises:
+        ConfigError: An unknown task, impossible settings, or a folder that is not empty.
+        ThresholdError: The tolerance was not reached; the run is finished and can be opened.
+    """
+    options = LearnOptions(
+        preset=preset,
+        out=out,
+        seed=seed,
+        settings=settings,
+        config=config,
+        device=device,
+        resume=resume,
+        overwrite=overwrite,
+        tolerance=tolerance,
+        time_budget_s=time_budget_s,
+    )
+    request = LearnRequest.resolve(task, options, notes)
+    said: list[str] = []
+
+    def remark(note: str) -> None:
+        if note not in said:
+            said.append(note)
+            notes(note)
+
+    for note in request.task_notes():
+        remark(note)
+    result = request.run(progress and (lambda now: progress("learning", now.step, now.steps)), remark)
+    for note in (*result.notes, f"the density is {result.verdict.text(request.settings.preset)}"):
+        remark(note)
+    check_tolerance(result, options.tolerance)
+    return open_run(request.folder)
+
+
+def load_design(path: Path | str, run: Run | None = None, notes: Notes = log_note) -> Design:
+    """Load a design file, or the file of a rig: rays as CSV or NPZ, a MuJoCo model, an SDF file.
+
+    Arguments:
+        path: The file.
+        run: The run in which it can be fitted again; by default the one that it names, if that exists.
+        notes: Called with every note.
+
+    Raises:
+        ConfigError, DataError: It cannot be read.
+    """
+    path = Path(path)
+    specification = read_design(path, notes, reach_of([run]) if run else None)
+    folder = folder_of(specification, path)
+    if run is None and folder is not None:
+        try:
+            run = open_run(folder)
+        except LidardesignError as error:
+            notes(f"the run of {path} cannot be opened: {error}")
+    return Design(specification, run, path)

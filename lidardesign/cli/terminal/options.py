@@ -1,0 +1,247 @@
+"""Options that several subcommands share."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from lidardesign.cli.terminal.completion import configuration_keys, words
+from lidardesign.errors import UNSET_HINT, ConfigError
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, for errors too.")]
+Seed = Annotated[
+    int | None,
+    typer.Option("--seed", metavar="N", help="Seed of all random numbers.", show_default="the run's, or 0"),
+]
+Quiet = Annotated[
+    bool,
+    typer.Option("--quiet", "-q", help="Print no notes and no progress; of a result in a file, only its path."),
+]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print everything: all tables and notes.")]
+Name = Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the design: RUN/designs/NAME.yaml.")]
+Layout = Annotated[
+    str | None,
+    typer.Option(
+        "--layout",
+        metavar="grid|density|scan|distributed|selected|spinning",
+        help="Where rays lie: evenly in the field of view, by density, each its own sensor, starting all over the "
+        "origins, chosen on training scenes, or on chosen rings.",
+        show_default="the design's, else selected; grid or scan where rays cannot be chosen",
+        autocompletion=words("grid|density|scan|distributed|selected|spinning"),
+    ),
+]
+At = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--at",
+        metavar="NAME=VALUE",
+        help="Value of a condition, such as the robot's position x_m=0.37; exact, no window. Repeatable.",
+        show_default=False,
+    ),
+]
+RayCount = Annotated[
+    int | None,
+    typer.Option(
+        "--rays",
+        metavar="N",
+        min=1,
+        max=1_000_000,
+        help="Rays per frame, over all sensors.",
+        show_default="left open, or the task's most",
+    ),
+]
+Channels = Annotated[
+    int | None,
+    typer.Option(
+        "--channels",
+        metavar="N",
+        min=1,
+        help="Channels of each sensor of the layout spinning: rings that are chosen.",
+        show_default="the design's, else 16",
+    ),
+]
+Level = Annotated[
+    float | None,
+    typer.Option(
+        "--level",
+        metavar="SHARE",
+        help="Share of rays and returns that fields of view and gates contain, such as 0.99.",
+        show_default="the design's, else 0.999 for chosen rays and the task's for others",
+    ),
+]
+Gates = Annotated[
+    str | None,
+    typer.Option(
+        "--gates",
+        metavar="sensor|ray",
+        help="One gate per sensor, or one per ray; in a scan every ray is a sensor.",
+        show_default="sensor; ray where rays are distributed, or chosen along a condition",
+        autocompletion=words("sensor|ray"),
+    ),
+]
+Sensors = Annotated[
+    str | None,
+    typer.Option(
+        "--sensors",
+        metavar="N|best",
+        help="Number of sensors (a scan has one per ray); best: by the task's score on training scenes.",
+        show_default="the design's, else best",
+    ),
+]
+Parts = Annotated[
+    str | None,
+    typer.Option(
+        "--parts",
+        metavar="NAME,NAME|catalog",
+        help="Make the design of real parts (catalog names, NAME:MODE, part files), chosen with their poses; "
+        "--sensors says how many.",
+        show_default=False,
+    ),
+]
+Weights = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--weight",
+        metavar="KEY=VALUE",
+        help="Weight the learned density for another setting of the task, such as importance; nothing is learned "
+        "again. Repeatable.",
+        show_default=False,
+    ),
+]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        "--preset",
+        metavar="draft|standard|fine",
+        help="Effort: about ten seconds, half a minute, or minutes.",
+        show_default="standard",
+        autocompletion=words("draft|standard|fine"),
+    ),
+]
+Like = Annotated[
+    Path | None,
+    typer.Option(
+        "--like",
+        metavar="RIG",
+        readable=False,
+        help="Use no more than an existing rig (a design, rays as CSV or NPZ, a MuJoCo model, an SDF file): as many "
+        "sensors and rays, its places, fields of view and gates no wider. Your own constraints take precedence.",
+        show_default=False,
+    ),
+]
+SpaceOf = Annotated[
+    Path | None,
+    typer.Option(
+        "--in",
+        metavar="RUN",
+        help="Take the task, its scenes and the design space of this run, for designs of any origin.",
+        show_default="the run that designs came from",
+    ),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Set one value, such as density.sigma_m=0.002 (`tasks show TASK` lists keys); repeatable.",
+        show_default=False,
+        autocompletion=configuration_keys,
+    ),
+]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        metavar="FILE",
+        help="YAML file with any of the sections task, space, density, learning.",
+        show_default=False,
+    ),
+]
+
+
+def parse_at(texts: list[str] | None) -> dict[str, float]:
+    """The values of `--at`, as {"x_m": 0.37}; whether a density has them is for the design space to say.
+
+    Raises:
+        ConfigError: One is not NAME=VALUE with a finite number, or a name is given twice.
+    """
+    from lidardesign.run.yaml import plain_number
+
+    values: dict[str, float] = {}
+    for text in texts or []:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        try:
+            number = plain_number(value)
+        except ValueError:
+            number = math.nan
+        if not (name and equals and math.isfinite(number)):
+            raise ConfigError(f"{text!r}", where="--at", allowed="NAME=VALUE with a finite number, such as x_m=0.37")
+        if name in values:
+            raise ConfigError(f"{name} is given twice: {values[name]:g} and {number:g}", where="--at")
+        values[name] = number
+    return values
+
+
+def sensor_count(text: str | None) -> int | str | None:
+    """The value of `--sensors`: a number, or a word that is left to whoever takes it."""
+    return int(text) if text is not None and re.fullmatch("[0-9]{1,9}", text) else text
+
+
+def part_names(text: str | None) -> list[str] | str | None:
+    """The value of `--parts`: names, or `catalog` for all parts that are shipped.
+
+    Raises:
+        ConfigError: A name is empty.
+    """
+    names = [] if text is None else [name.strip() for name in text.split(",")]
+    if not all(names):
+        raise ConfigError(f"{text!r} has an empty part name", where="--parts", allowed="NAME,NAME or catalog")
+    return text if text in (None, "catalog") else names
+
+
+class StrictCommand(TyperCommand):
+    """A command that takes no values which nobody writes on purpose."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the command line; a value that is empty or -, or `1_0` where a number is asked for, is a mistake.
+
+        Raises:
+            ConfigError: At the option or argument.
+        """
+        rest = list(args)
+        given = {} if ctx.resilient_parsing else self.make_parser(ctx).parse_args(args=rest)[0]
+        texts = [(parameter, text) for parameter in self.get_params(ctx) for text in _texts(given.get(parameter.name))]
+        for parameter, text in texts:
+            if not text.strip():
+                raise ConfigError("is empty", where=_name(parameter), allowed="a value", hint=UNSET_HINT)
+            if text == "-":
+                raise ConfigError(
+                    "'-' is no value", where=_name(parameter), hint="give the name of a file; /dev/stdout is one"
+                )
+        left = super().parse_args(ctx, args)
+        from lidardesign.run.yaml import plain_number
+
+        for parameter, text in texts:
+            value = ctx.params.get(parameter.name)
+            values = value if isinstance(value, list | tuple) else [value]
+            if all(isinstance(each, int | float) and not isinstance(each, bool) for each in values):
+                try:
+                    plain_number(text)
+                except ValueError:
+                    raise ConfigError(repr(text), where=_name(parameter), allowed="a finite number") from None
+        return left
+
+
+def _texts(given: Any) -> list[str]:
+    """The texts of a command line for a parameter: none, one, or several."""
+    return [text for text in (given if isinstance(given, list | tuple) else [given]) if isinstance(text, str)]
+
+
+def _name(parameter: Any) -> str:
+    """A parameter as the command line calls it."""
+    return parameter.opts[0] if parameter.param_type_name == "option" else parameter.metavar or parameter.name

@@ -1,0 +1,336 @@
+"""Output of commands: one JSON document or text for people, messages, exit codes."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import math
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import typer
+
+from lidardesign.cli.tables.grids import duration
+from lidardesign.cli.tables.scores import show_times
+from lidardesign.cli.terminal.environment import TerminatedError
+from lidardesign.cli.terminal.progress import ProgressDisplay
+from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError
+from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
+
+SCHEMA_VERSION = 1
+EXIT_SYSTEM = 3
+EXIT_INTERNAL = 70
+EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141
+EXIT_TERMINATED = 143
+PLAIN_WIDTH = 120
+# Where this is set in the environment, errors show their tracebacks.
+DEBUG = "LIDARDESIGN_DEBUG"
+NUMBA_CACHE = "numba/core/caching.py"
+NO_MEMORY = "can't allocate memory"
+DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+STDOUT, STDERR = 1, 2
+# Commands that only read a run wait for its writer no longer than this.
+SHORT_WAIT_S = 0.5
+
+
+def plain_json(value: Any) -> Any:
+    """Values as JSON has them: numpy becomes lists and numbers, paths text, NaN and infinity null."""
+    if isinstance(value, dict):
+        return {str(key): plain_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_json(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain_json(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+@dataclass
+class Output:
+    """The output of a command.
+
+    Arguments:
+        json: Print one JSON document on stdout and nothing else there.
+        quiet: No progress and no notes, and of a result its files alone.
+        verbose: Everything: all tables, and notes on what was decided.
+        stream: Where the result goes: the program's stdout.
+        when_interrupted: What to say to the user after Ctrl-C or SIGTERM.
+        answered: Whether the one JSON document was printed; an error after it adds none.
+        clock: Where the command's time goes.
+    """
+
+    json: bool = False
+    quiet: bool = False
+    verbose: bool = False
+    stream: TextIO = field(default_factory=lambda: sys.stdout)
+    when_interrupted: Callable[[], str | None] = field(default=lambda: None)
+    answered: bool = False
+    clock: Clock = field(default_factory=Clock)
+
+    def rich(self, *, stderr: bool = False) -> RichConsole:
+        """A rich console; it honours NO_COLOR, prints plain text where there is no terminal, and text as it is."""
+        from rich.console import Console as RichConsole
+
+        file = sys.stderr if stderr else self.stream
+        width = None if file.isatty() or "COLUMNS" in os.environ else PLAIN_WIDTH
+        return RichConsole(file=file, highlight=False, markup=False, width=width)
+
+    def note(self, text: str) -> None:
+        """Print a note on stderr, unless --quiet."""
+        if not self.quiet:
+            print_message(text)
+
+    def says(self, note: str) -> bool:
+        """True where people are told a note."""
+        return not self.quiet and (self.verbose or not isinstance(note, BackgroundNote))
+
+    def remark(self, text: str) -> None:
+        """Print what the program has to remark, marked as a note."""
+        if self.says(text):
+            self.note(f"note: {text}")
+
+    def result(
+        self,
+        document: dict[str, Any],
+        show: Callable[[RichConsole], None],
+        *,
+        files: Mapping[str, Path] | None = None,
+        show_costs: bool = True,
+        says_time: bool = False,
+    ) -> None:
+        """Give the result, as JSON or shown for people, with the time that it took and the files that it is in.
+
+        Arguments:
+            document: The JSON form; `timings` and `peak_memory_bytes` are added.
+            show: Prints the result for people.
+            files: Paths that were written, by what they are; with --quiet they are all that is printed. None where the
+                result is in no file by its nature.
+            show_costs: Whether people are shown the time, and the result is kept where it cannot be shown: not by
+                commands that only look something up.
+            says_time: Whether `show` says the time.
+
+        Raises:
+            OSError: Standard output is full, or was closed.
+        """
+        document = {**document, "timings": self.clock.timings(), "peak_memory_bytes": peak_memory_bytes()}
+        try:
+            if self.json:
+                self.answered = True
+                print_json(document, self.stream)
+            else:
+                self._show(document, show, files, show_costs, says_time)
+                self.stream.flush()
+        except (OSError, SystemExit) as error:
+            if show_costs:  # it was worked for
+                self.keep(f"{json_text(document)}\n", ".json")
+            # rich ends the process by itself where nobody reads
+            raise error if isinstance(error, OSError) else BrokenPipeError from None
+
+    def _show(
+        self,
+        document: dict[str, Any],
+        show: Callable[[RichConsole], None],
+        files: Mapping[str, Path] | None,
+        show_costs: bool,
+        says_time: bool,
+    ) -> None:
+        rich, timings = self.rich(), document["timings"]
+        if self.quiet and files is not None:
+            for path in files.values():
+                rich.print(str(path), soft_wrap=True)
+            return
+        show(rich)
+        if show_costs and self.verbose:
+            show_times(timings, document["peak_memory_bytes"], rich)
+        elif show_costs and not (says_time or self.quiet):
+            rich.print(f"took {duration(self.clock.seconds)}")
+        for label, path in (files or {}).items():
+            rich.print(f"{label}: {path}", soft_wrap=True)
+
+    def keep(self, content: str, suffix: str) -> None:
+        """Keep what cannot be put where it belongs in a temporary file, and say where; without room, print it."""
+        try:
+            descriptor, place = tempfile.mkstemp(prefix="lidardesign-", suffix=suffix)
+            with open(descriptor, "w", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(content)
+        except OSError:
+            print_message(content)
+        else:
+            print_message(f"what could not be written is kept in {place}")
+
+    def progress(self, label: str) -> ProgressDisplay:
+        """A bar of progress on a terminal, elsewhere a line now and then; nothing with --quiet."""
+        on_terminal = not self.quiet and sys.stderr.isatty()
+        return ProgressDisplay(label, self.note, self.rich(stderr=True) if on_terminal else None)
+
+
+def print_message(text: str) -> None:
+    """Print on stderr; where nobody listens there any more, that is no reason to stop working."""
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except (OSError, ValueError):
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
+
+
+def print_json(document: dict[str, Any], output: TextIO | None = None) -> None:
+    """Print the one JSON document of a command, on stdout."""
+    print(json_text(document), file=output or sys.stdout, flush=True)
+
+
+def json_text(document: dict[str, Any]) -> str:
+    """The one JSON document of a command."""
+    return json.dumps({"schema_version": SCHEMA_VERSION, **plain_json(document)}, allow_nan=False, indent=2)
+
+
+@contextlib.contextmanager
+def command(*, json: bool, quiet: bool, verbose: bool = False) -> Iterator[Output]:
+    """Run a command's body: its errors become one message and an exit code.
+
+    With `--json`, whatever plugins and libraries print meanwhile goes to stderr, also by processes of their own.
+    """
+    output = Output(json=json, quiet=quiet, verbose=verbose and not quiet, stream=sys.stdout)
+    try:
+        with _guarded_stdout(output) if json else contextlib.nullcontext(), running(output.clock):
+            yield output
+        output.stream.flush()
+    except typer.Exit:
+        raise
+    except BrokenPipeError:
+        forget_stdout()
+        raise typer.Exit(EXIT_BROKEN_PIPE) from None
+    except (Exception, KeyboardInterrupt) as error:
+        code = report_error(error, output)
+        try:
+            output.stream.flush()
+        except OSError:  # a full disk, which was reported: the last flush would fail once more
+            forget_stdout()
+        raise typer.Exit(code) from None
+
+
+@contextlib.contextmanager
+def _guarded_stdout(output: Output) -> Iterator[None]:
+    """Keep standard output for the one document; plugins, compiled code and their processes print on stderr."""
+    stdout = output.stream
+    with contextlib.redirect_stdout(sys.stderr):
+        if not _is_of_process(stdout):
+            yield
+            return
+        stdout.flush()
+        copy = os.dup(STDOUT)
+        os.dup2(STDERR, STDOUT)
+        try:
+            with open(os.dup(copy), "w", encoding=stdout.encoding, errors=stdout.errors) as output.stream:
+                yield
+        finally:
+            output.stream = stdout
+            os.dup2(copy, STDOUT)
+            os.close(copy)
+
+
+def close_stdout_guard() -> None:
+    """Send what threads and exit handlers of plugins still print to stderr, once the program has answered."""
+    if _is_of_process(sys.stdout):
+        sys.stdout.flush()
+        os.dup2(STDERR, STDOUT)
+
+
+def _is_of_process(stream: TextIO) -> bool:
+    try:
+        return stream.fileno() == STDOUT
+    except (AttributeError, OSError, ValueError):
+        return False
+
+
+def forget_stdout() -> None:
+    """Point stdout nowhere once it was closed, so that the interpreter's last flush is quiet."""
+    sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
+
+
+def report_error(error: BaseException, output: Output) -> int:
+    """Print what went wrong, once, and return the exit code."""
+    document, code, text = describe_error(error, output)
+    if output.json and not output.answered:
+        print_json({"error": document, "exit_code": code}, output.stream)
+    print_message(text)
+    if os.environ.get(DEBUG):
+        traceback.print_exception(error)
+    return code
+
+
+def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any], int, str]:
+    """The JSON form of an error, its exit code, and its text for people."""
+    cause: BaseException | None = error
+    while cause is not None:  # compiled kernels that return into an interruption make it a SystemError
+        if isinstance(cause, KeyboardInterrupt):
+            kind, code = "interrupted", EXIT_INTERRUPTED
+            if isinstance(cause, TerminatedError):
+                kind, code = "terminated", EXIT_TERMINATED
+            further = output.when_interrupted()
+            text = f"{kind}: {further}" if further else kind
+            return {"kind": kind, "message": text}, code, text
+        cause = cause.__cause__
+    if isinstance(error, LidardesignError):
+        return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
+    # torch says so by a name or by words of its own
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or NO_MEMORY in str(error):
+        text = "the computer ran out of memory; a smaller batch, field_resolution or preset needs less"
+        return {"kind": "memory", "message": text}, EXIT_INTERNAL, f"memory error: {text}"
+    if isinstance(error, OSError):
+        name = f"{error.filename}: " if error.filename else ""
+        document = {"kind": "system", "message": f"{name}{error.strerror or error}"}
+        if error.errno in DISK_FULL and not error.filename:
+            document["hint"] = "make room where the output, the temporary files or numba's cache (NUMBA_CACHE_DIR) go"
+    elif folder := _damaged_cache(error):
+        document = {
+            "kind": "system",
+            "message": f"{folder}: the cache of compiled code is damaged",
+            "hint": "remove its files *.nbi and *.nbc",
+        }
+    else:
+        text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        hint = "this is a bug in lidardesign: please report it; LIDARDESIGN_DEBUG=1 shows where"
+        document = {"kind": "internal", "message": text, "hint": hint}
+        return document, EXIT_INTERNAL, f"internal error: {text}\n  {hint}"
+    attempt = f"\n  try: {document['hint']}" if "hint" in document else ""
+    return document, EXIT_SYSTEM, f"system error: {document['message']}{attempt}"
+
+
+def _damaged_cache(error: BaseException) -> str | None:
+    """The folder of numba's cache where an error came of reading it: files that are cut or changed are no pickles."""
+    trace = error.__traceback__
+    while trace is not None:
+        frame, trace = trace.tb_frame, trace.tb_next
+        if frame.f_code.co_filename.replace(os.sep, "/").endswith(NUMBA_CACHE):
+            folder = getattr(frame.f_locals.get("self"), "_cache_path", None)
+            if folder is not None:
+                return str(folder)
+    return None
+
+
+def keep_times(
+    run: Path, name: str, output: Output, *, wait_s: float = SHORT_WAIT_S, further: Mapping[str, Any] | None = None
+) -> None:
+    """Enter the times of a command, and further entries, in the manifest of its run; where that cannot be, say so.
+
+    The work is done by then: that its times are not kept is no reason to fail.
+    """
+    try:
+        keep_timings(run, name, output.clock, wait_s=wait_s, further=further)
+    except (ConfigError, DataError, OSError) as error:
+        message = error.message if isinstance(error, ConfigError | DataError) else error.strerror or error
+        output.note(f"note: the times of {name} are not kept in {run}: {message}")

@@ -1,0 +1,481 @@
+"""The independent checker: does a written design keep a written constraint file?
+
+It reads plain documents only and shares no code with the fit: intervals are recomputed from means and spreads,
+compared with the reported ones, and bounds are applied to both; `document` has the definitions. An excluded box is
+broken where an interval of origins reaches into its interior along all three axes. A sensor that is to be a part is one
+where its field of view and range are the part's, and every ray that it fires is one of the part's pattern.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.numerics import COARSE_SLACK, ROUNDING, SLACK
+from lidardesign.sensors.sensor import boresight_frame
+from lidardesign.space import direction
+
+if TYPE_CHECKING:
+    from lidardesign.parts.part import Part
+
+# A reported interval may differ from its mean and spread by this share (decimal digits in a file).
+AGREEMENT = COARSE_SLACK
+# The bandwidth model counts a width this share above whole bins as whole bins.
+BIN_ROUNDING = SLACK
+LIGHT_M_PER_S = 299792458.0
+# Places are told to the millimetre: an origin pinned so near to the only one that the space has is that one [m].
+SAME_PLACE_M = 1e-3
+PICOSECOND_S = 1e-12
+AXES = ("x_m", "y_m", "z_m")
+ANGLES = ("horizontal", "vertical")
+
+
+@dataclass(frozen=True)
+class ConstraintCheck:
+    """One verified bound.
+
+    Arguments:
+        name: Sensor and key, as `s0.gate.width_m.max`.
+        bound: What was asked for.
+        value: What the design has.
+        satisfied: Whether it keeps the bound.
+    """
+
+    name: str
+    bound: Any
+    value: Any
+    satisfied: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's JSON form."""
+        return {"name": self.name, "bound": self.bound, "value": self.value, "satisfied": self.satisfied}
+
+
+def check_design(document: Mapping[str, Any], constraints: Any, space: Any = None) -> list[ConstraintCheck]:
+    """Verify every bound of a constraint document on a design document.
+
+    Arguments:
+        document: A design as plain values (the file, or its JSON form).
+        constraints: A constraint file as plain values, or an object with `as_document()`.
+        space: The design space as `DesignSpace` or its `as_dict()`; its range and origin bounds are then checked.
+
+    Returns:
+        One entry per sensor and bound, and one per budget line.
+    """
+    rules = constraints.as_document() if hasattr(constraints, "as_document") else dict(constraints or {})
+    bounds = space.as_dict() if hasattr(space, "as_dict") else space
+    z = NormalDist().inv_cdf((1 + float(document.get("level", 0.95))) / 2)
+    sensors, each = list(document["sensors"]), list(rules.get("each") or [])
+    own_rules = [_over(rules, each[index]) if index < len(each) else rules for index in range(len(sensors))]
+    checks = _between("sensors", len(sensors), rules.get("sensors"))
+    wanted = _get(rules, "sensors", "count")
+    if wanted is not None:
+        checks.append(ConstraintCheck("sensors.count", wanted, len(sensors), wanted == len(sensors)))
+    for index, (sensor, own) in enumerate(zip(sensors, own_rules, strict=True)):
+        name = str(sensor.get("name", index))
+        checks += _consistency(name, sensor, z)
+        checks += _origin(name, sensor, own, bounds) + _boresight(name, sensor, own, bounds)
+        checks += _excluded(name, sensor, own, z) + _intervals(name, sensor, own, z)
+        if bounds is not None:
+            checks += _inside_space(name, sensor, bounds)
+    for table in (document.get("ray_table"), *document.get("further_tables", ())):
+        if table:
+            checks += _table(table, own_rules)
+    for track in (document.get("track"), *document.get("further_tracks", ())):
+        if track:
+            checks += _excluded_travel(track, sensors, rules) + _track(track, rules, bounds)
+    checks += _mounts(sensors, own_rules) + _parts(document, rules.get("parts"))
+    return checks + _budget(document, rules.get("budget") or {})
+
+
+def _over(common: Mapping[str, Any], special: Mapping[str, Any] | None) -> dict[str, Any]:
+    """An entry of `each` over the common keys."""
+    result = dict(common)
+    for key, value in (special or {}).items():
+        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
+        if value is not None:
+            result[key] = _over(result[key], value) if both else value
+    return result
+
+
+def _get(values: Any, *keys: str) -> Any:
+    for key in keys:
+        values = values.get(key) if isinstance(values, Mapping) else None
+    return values
+
+
+def _slack(bound: float) -> float:
+    """Rounding of means, spreads, their product and conversions between radians and degrees."""
+    return ROUNDING * max(abs(bound), 1.0)
+
+
+def _between(name: str, value: float, rules: Any, highest: float | None = None) -> list[ConstraintCheck]:
+    """Checks of `min` on a value and of `max` on it, or on a higher one, where they are given."""
+    checks, highest = [], value if highest is None else highest
+    low, high = _get(rules, "min"), _get(rules, "max")
+    if low is not None:
+        checks.append(ConstraintCheck(f"{name}.min", low, value, bool(value >= low - _slack(low))))
+    if high is not None:
+        checks.append(ConstraintCheck(f"{name}.max", high, highest, bool(highest <= high + _slack(high))))
+    return checks
+
+
+def _within_space(name: str, key: str, space: Mapping[str, Any], *values: float) -> ConstraintCheck:
+    """A check of a value, or of the first and the last of several, against both ends of the space along a dimension."""
+    low, high = (float(end) for end in space[key])
+    kept = values[0] >= low - _slack(low) and values[-1] <= high + _slack(high)
+    value = list(values) if len(values) > 1 else values[0]
+    return ConstraintCheck(f"{name}.space.{key}", [low, high], value, bool(kept))
+
+
+def _consistency(name: str, sensor: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
+    """Reported intervals against means and spreads; agreement is no news, a contradiction is."""
+    spread, view = sensor["spread"], sensor["field_of_view_rad"]
+    pairs = [(f"field_of_view_rad.{axis}", view[axis], 2 * z * spread[f"{axis}_rad"]) for axis in ANGLES]
+    start, end = sensor["gate_m"]["start"], sensor["gate_m"]["end"]
+    mean = sensor.get("range_m")
+    if mean is not None:
+        pairs.append(("gate_m.start", start, max(mean - z * spread["range_m"], 0.0)))
+        pairs.append(("gate_m.end", end, mean + z * spread["range_m"]))
+    elif start > 0:
+        pairs.append(("gate_m.width", end - start, 2 * z * spread["range_m"]))
+    size = max(abs(value) for _, *values in pairs for value in values)
+    return [
+        ConstraintCheck(f"{name}.{key}", expected, found, False)
+        for key, found, expected in pairs
+        if not abs(found - expected) <= AGREEMENT * max(size, SLACK)
+    ]
+
+
+def _origin(
+    name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Mapping[str, Any] | None
+) -> list[ConstraintCheck]:
+    """Origins in their boxes; one that is pinned next to where the space fixes it is kept by standing there."""
+    mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"]["covariance"]
+    checks = []
+    tests = {
+        "low_m": lambda value, bound: value >= bound - _slack(bound),
+        "high_m": lambda value, bound: value <= bound + _slack(bound),
+        "fixed_m": lambda value, bound: abs(value - bound) <= _slack(bound),
+    }
+    for key, test in tests.items():
+        bound = _get(rules, "origin", key)
+        if bound is not None:
+            meant = list(bound)
+            for axis, dimension in enumerate(AXES if key == "fixed_m" and space is not None else ()):
+                low, high = (float(end) for end in space[dimension])
+                if low == high and abs(meant[axis] - low) <= SAME_PLACE_M:
+                    meant[axis] = low
+            kept = all(test(value, limit) for value, limit in zip(mean, meant, strict=True))
+            checks.append(ConstraintCheck(f"{name}.origin.{key}", list(bound), list(mean), bool(kept)))
+    principal = np.sqrt(np.maximum(np.linalg.eigvalsh(np.array(covariance, dtype=np.float64)), 0.0))
+    spread = float(principal[-1])
+    checks += _between(f"{name}.origin.spread_m", spread, {"max": _get(rules, "origin", "spread_m", "max")})
+    checks += _between(f"{name}.origin.thickness_m", float(principal[0]), _get(rules, "origin", "thickness_m"))
+    if _get(rules, "origin", "fixed_m") is not None:
+        checks.append(ConstraintCheck(f"{name}.origin.fixed_m.spread", 0.0, spread, spread == 0.0))
+    return checks
+
+
+def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:
+    """Elevation, and azimuth on the circle; an end that is not given is the space's.
+
+    Without a space a single bound says little: it is then read as the half circle beyond it.
+    """
+    elevation = math.degrees(sensor["boresight"]["elevation_rad"])
+    checks = _between(f"{name}.boresight.elevation_deg", elevation, _get(rules, "boresight", "elevation_deg"))
+    given = _get(rules, "boresight", "azimuth_deg") or {}
+    low, high = given.get("min"), given.get("max")
+    if low is None and high is None:
+        return checks
+    azimuth = math.degrees(sensor["boresight"]["azimuth_rad"])
+    turn = _get(space, "azimuth_rad")
+    if low is None:
+        low = high - 180 if turn is None else math.degrees(turn[0])
+    if high is None:
+        high = low + 180 if turn is None else math.degrees(turn[1])
+    width = high - low if high - low >= 360 else (high - low) % 360
+    past = (azimuth - low) % 360
+    kept = past <= width + _slack(360) or past >= 360 - _slack(360)
+    return [*checks, ConstraintCheck(f"{name}.boresight.azimuth_deg", [low, high], azimuth, bool(kept))]
+
+
+def _intervals(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
+    """Gate and field of view: the worse of the reported and the recomputed interval is checked."""
+    spread, view = sensor["spread"], sensor["field_of_view_rad"]
+    gates = [(sensor["gate_m"]["start"], sensor["gate_m"]["end"])]
+    mean = sensor.get("range_m")
+    if mean is not None:
+        half = z * spread["range_m"]
+        gates.append((max(mean - half, 0.0), mean + half))
+    values = {
+        f"field_of_view.{axis}_deg": [math.degrees(view[axis]), math.degrees(2 * z * spread[f"{axis}_rad"])]
+        for axis in ANGLES
+    }
+    values["gate.start_m"], values["gate.end_m"] = (list(ends) for ends in zip(*gates, strict=True))
+    values["gate.width_m"] = [end - start for start, end in gates]
+    checks = []
+    for key, found in values.items():
+        checks += _between(f"{name}.{key}", min(found), _get(rules, *key.split(".")), max(found))
+    return checks
+
+
+def _inside_space(name: str, sensor: Mapping[str, Any], space: Mapping[str, Any]) -> list[ConstraintCheck]:
+    """Gates and mean origins inside the design space; origins are listed where they are not."""
+    gate = _within_space(name, "range_m", space, float(sensor["gate_m"]["start"]), float(sensor["gate_m"]["end"]))
+    places = zip(AXES, sensor["origin_m"]["mean"], strict=True)
+    origins = [_within_space(name, axis, space, value) for axis, value in places]
+    return [gate, *(check for check in origins if not check.satisfied)]
+
+
+def _mounts(sensors: Sequence[Mapping[str, Any]], own_rules: Sequence[Mapping[str, Any]]) -> list[ConstraintCheck]:
+    """Every mounted sensor is at one of its mounts without any spread, and no other one is there."""
+    checks, taken = [], []
+    for index, (sensor, own) in enumerate(zip(sensors, own_rules, strict=True)):
+        mounts, mean = _get(own, "origin", "mounts_m"), list(sensor["origin_m"]["mean"])
+        if not mounts:
+            continue
+        still = not np.any(sensor["origin_m"]["covariance"])
+        there = [mount for mount in mounts if all(abs(a - b) <= _slack(b) for a, b in zip(mean, mount, strict=True))]
+        kept = bool(there) and there[0] not in taken and still
+        taken += there[:1]
+        checks.append(ConstraintCheck(f"{sensor.get('name', index)}.origin.mounts_m", mounts, mean, kept))
+    return checks
+
+
+def _excluded(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
+    """The interval mean -+ z spread of a sensor's origin along each axis, against every excluded box."""
+    mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"]["covariance"]
+    reach = [z * math.sqrt(max(covariance[axis][axis], 0.0)) for axis in range(3)]
+    low, high = ([m + sign * r for m, r in zip(mean, reach, strict=True)] for sign in (-1, 1))
+    return _outside(name, low, high, rules)
+
+
+def _excluded_travel(
+    track: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], rules: Mapping[str, Any]
+) -> list[ConstraintCheck]:
+    """The excluded boxes that sensors pass through on their way along a track."""
+    axis = AXES.index(track["dimension"])
+    failed: list[ConstraintCheck] = []
+    for sensor in sensors:
+        low, high = list(sensor["origin_m"]["mean"]), list(sensor["origin_m"]["mean"])
+        low[axis], high[axis] = track["knots_m"][0], track["knots_m"][-1]
+        checks = _outside("track", low, high, rules)
+        failed += [check for check in checks if not check.satisfied and check not in failed]
+    return failed
+
+
+def _outside(name: str, low: list[float], high: list[float], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
+    """An interval of origins against every excluded box."""
+    value = {"low_m": low, "high_m": high}
+    return [
+        ConstraintCheck(f"{name}.origin.exclude[{index}]", box, value, not _reaches_into(low, high, box))
+        for index, box in enumerate(_boxes(rules))
+    ]
+
+
+def _boxes(rules: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    return list(_get(rules, "origin", "exclude") or [])
+
+
+def _reaches_into(low: Sequence[float], high: Sequence[float], box: Mapping[str, Any]) -> bool:
+    """Whether an interval of origins meets the interior of a box by more than rounding; flat boxes have none."""
+    return all(
+        bottom < top and end > bottom + _slack(bottom) and start < top - _slack(top)
+        for start, end, bottom, top in zip(low, high, box["low_m"], box["high_m"], strict=True)
+    )
+
+
+def _table(table: Mapping[str, Any], own_rules: Sequence[Mapping[str, Any]]) -> list[ConstraintCheck]:
+    """The gates of explicit rays that break a gate bound of their sensor, and the rays that start in excluded boxes."""
+    owners = [own_rules[sensor] for sensor in table["sensor"]]
+    failed = []
+    for ray, (start, end, own) in enumerate(zip(table["gate_start_m"], table["gate_end_m"], owners, strict=True)):
+        for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
+            failed += [c for c in _between(f"ray{ray}.gate.{key}", value, _get(own, "gate", key)) if not c.satisfied]
+    if any(_boxes(own) for own in own_rules):
+        starts = zip(table["origin_x_m"], table["origin_y_m"], table["origin_z_m"], owners, strict=True)
+        failed += [
+            ConstraintCheck(f"ray{ray}.origin.exclude[{index}]", box, start, False)
+            for ray, (*start, own) in enumerate(starts)
+            for index, box in enumerate(_boxes(own))
+            if _reaches_into(start, start, box)
+        ]
+    return failed
+
+
+def _track(track: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:
+    """Gates and boresights at every knot; in between they are linear, and these bounds are convex.
+
+    Only broken bounds are listed, but for the ends of the track, which must lie in the design space.
+    """
+    failed = []
+    for knot in range(len(track["knots_m"])):
+        rows = (track[key][knot] for key in ("gate_start_m", "gate_end_m", "azimuth_rad", "elevation_rad"))
+        for ray, (start, end, azimuth, elevation) in enumerate(zip(*rows, strict=True)):
+            name = f"ray{ray}.knot{knot}"
+            aimed = {"boresight": {"azimuth_rad": azimuth, "elevation_rad": elevation}}
+            checks = _boresight(name, aimed, rules, space)
+            for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
+                checks += _between(f"{name}.gate.{key}", value, _get(rules, "gate", key))
+            if space is not None:
+                checks.append(_within_space(name, "range_m", space, start, end))
+                checks.append(_within_space(name, "elevation_rad", space, elevation))
+                low, high = (float(value) for value in space["azimuth_rad"])
+                past = (azimuth - low) % (2 * math.pi)
+                inside = past <= high - low + _slack(math.pi) or past >= 2 * math.pi - _slack(math.pi)
+                checks.append(ConstraintCheck(f"{name}.space.azimuth_rad", [low, high], azimuth, bool(inside)))
+            failed += [check for check in checks if not check.satisfied]
+    if space is None:
+        return failed
+    return [*failed, _within_space("track", track["dimension"], space, track["knots_m"][0], track["knots_m"][-1])]
+
+
+def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[ConstraintCheck]:
+    """The number of rays, and their bandwidth: rays times whole bins times bits times frames [Mbit/s]."""
+    bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * PICOSECOND_S / 2
+    widths = _widths(document, bin_m)
+    total = None if widths is None else sum(count for _, count in widths)
+    checks = []
+    declared, limit = document.get("rays"), budget.get("bandwidth_mbps")
+    if declared is not None and total is not None and declared != total:
+        checks.append(ConstraintCheck("rays", declared, total, False))
+    if budget.get("rays") is not None:
+        count = total if total is not None else declared
+        checks.append(ConstraintCheck("budget.rays", budget["rays"], count, count == budget["rays"]))
+    if limit is not None:
+        mbps = None
+        if widths is not None:
+            bins = max(
+                sum(count * max(math.ceil(width / bin_m * (1 - BIN_ROUNDING)), 1) for width, count in each)
+                for each in (
+                    widths,
+                    *map(_table_widths, document.get("further_tables", ())),
+                    *(_track_widths(track, bin_m) for track in document.get("further_tracks", ())),
+                )
+            )
+            mbps = bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6
+        kept = mbps is not None and mbps <= limit + _slack(limit)
+        checks.append(ConstraintCheck("budget.bandwidth_mbps", limit, mbps, kept))
+    return checks
+
+
+def _widths(document: Mapping[str, Any], bin_m: float) -> list[tuple[float, int]] | None:
+    """Gate widths and how many rays have them, of a track where they cost most; None without a number of rays."""
+    table, track, sensors = document.get("ray_table"), document.get("track"), document["sensors"]
+    if table:
+        return _table_widths(table)
+    if not track:
+        is_open = any(sensor.get("rays") is None for sensor in sensors)
+        return None if is_open else [(s["gate_m"]["end"] - s["gate_m"]["start"], int(s["rays"])) for s in sensors]
+    return _track_widths(track, bin_m)
+
+
+def _track_widths(track: Mapping[str, Any], bin_m: float) -> list[tuple[float, int]]:
+    """Gate widths of a track where they cost most.
+
+    They are linear between knots, so bins change only where one crosses a whole number, and one place between each two
+    of these tells all.
+    """
+    width = np.array(track["gate_end_m"], dtype=np.float64) - np.array(track["gate_start_m"], dtype=np.float64)
+    places = [width]
+    for left, right in zip(width[:-1] / bin_m, width[1:] / bin_m, strict=True):
+        crossings = [0.0, 1.0]
+        for one, other in zip(left, right, strict=True):
+            whole = np.arange(math.ceil(min(one, other)), math.floor(max(one, other)) + 1)
+            crossings += [] if one == other else list((whole - one) / (other - one))
+        shares = np.sort(crossings)
+        middle = (shares[1:] + shares[:-1])[:, None] / 2
+        places.append(bin_m * ((1 - middle) * left + middle * right))
+    every = np.concatenate(places)
+    bins = np.maximum(np.ceil(every / bin_m * (1 - BIN_ROUNDING)), 1).sum(axis=1)
+    return [(float(width), 1) for width in every[bins.argmax()]]
+
+
+def _table_widths(table: Mapping[str, Any]) -> list[tuple[float, int]]:
+    return [(end - start, 1) for start, end in zip(table["gate_start_m"], table["gate_end_m"], strict=True)]
+
+
+def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list[ConstraintCheck]:
+    """Whether every sensor is the part that it says to be, one that was asked for, and no part comes too often."""
+    if parts is None:
+        return []
+    named = [] if parts.get("names", "catalog") == "catalog" else list(parts["names"])
+    checks, found = [], []
+    for index, sensor in enumerate(document["sensors"]):
+        name, own = f"{sensor.get('name', index)}.part", sensor.get("part")
+        part = None if own is None else _admitted_part(str(own), named)
+        if part is None:
+            checks.append(ConstraintCheck(name, named or "the catalogue", own or "a sensor of its own", False))
+            continue
+        found.append(part)
+        wrong = _differences(part, index, sensor, document.get("ray_table"))
+        checks.append(ConstraintCheck(name, part.name, wrong or part.name, wrong is None))
+    for own, rule in (parts.get("each") or {}).items():
+        checks += _between(f"parts.each.{own}", sum(part.name == own for part in found), rule)
+    limit = parts.get("power_w")
+    if limit is not None:
+        power = sum(math.inf if part.value("power_w") is None else part.value("power_w") for part in found)
+        checks += _between("parts.power_w", power, {"max": limit})
+    return checks
+
+
+def _admitted_part(name: str, named: Sequence[str]) -> Part | None:
+    """The part that a sensor names, if the constraints admit it."""
+    from lidardesign.parts.catalogue import SUFFIX, load_library
+
+    # an entry is a name or a path, with a mode behind it or not
+    entries: list[tuple[Path | None, str, str]] = []
+    for text in named:
+        path, mode = text.rsplit(":", 1) if f"{SUFFIX}:" in text else (text, "")
+        if path.endswith(SUFFIX) or Path(path).is_dir():
+            entries.append((Path(path), "", mode))
+        else:
+            entries.append((None, *text.partition(":")[::2]))
+    try:
+        library = load_library([path for path, _, _ in entries if path is not None])
+        part = library.part(name)
+    except ConfigError:
+        return None
+    stem = name.partition(":")[0]
+    file = Path(library.origins[stem])
+    admitted = any(
+        (entry == stem if path is None else path in (file, file.parent)) and mode in ("", part.mode)
+        for path, entry, mode in entries
+    )
+    return part if admitted or not named else None
+
+
+def _differences(part: Part, index: int, sensor: Mapping[str, Any], table: Mapping[str, Any] | None) -> str | None:
+    """What a sensor is that the part is not; None where both are the same."""
+    view = sensor["field_of_view_rad"]
+    for key, expected in zip(ANGLES, part.field_of_view_rad, strict=True):
+        if abs(view[key] - expected) > COARSE_SLACK:
+            return f"a {key} field of view of {view[key]:g} instead of {expected:g} rad"
+    (near, far), gate = part.range_m, sensor["gate_m"]
+    if gate["start"] < near - COARSE_SLACK or gate["end"] > far + COARSE_SLACK:
+        return f"a gate of {gate['start']:g} to {gate['end']:g} m, and the part measures {near:g} to {far:g} m"
+    if not table:
+        return "no explicit rays"
+    # loaded here because few designs are of parts
+    from scipy.spatial import cKDTree
+
+    own = np.flatnonzero(np.asarray(table["sensor"]) == index)
+    azimuth, elevation = (np.asarray(table[key], dtype=np.float64)[own] for key in ("azimuth_rad", "elevation_rad"))
+    aimed = sensor["boresight"]
+    frame = boresight_frame(aimed["azimuth_rad"], aimed["elevation_rad"], aimed.get("roll_rad") or 0.0)
+    to_part = (boresight_frame(*part.centre_rad).T @ frame).T
+    away, ray = cKDTree(part.directions).query(direction(azimuth, elevation) @ to_part)
+    starts = np.stack([np.asarray(table[f"origin_{axis}"], dtype=np.float64)[own] for axis in AXES], axis=1)
+    moved = np.abs(starts - np.asarray(sensor["origin_m"]["mean"])).max(axis=1, initial=0.0) > COARSE_SLACK
+    same = len(part.directions) - len(np.unique(part.directions, axis=0))
+    # rays that are none of its part's, or are fired from elsewhere or twice
+    strays = int(((away > COARSE_SLACK) | moved).sum()) + max(len(ray) - len(np.unique(ray)) - same, 0)
+    return f"{strays} rays that the part does not have" if strays else None

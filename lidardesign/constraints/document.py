@@ -1,0 +1,312 @@
+"""The constraint file (design contract, section 6): its keys, its checks, and what each sensor must keep.
+
+What the bounds mean, here and in `check`, which verifies them on the finished file:
+
+- `gate` and `field_of_view` bound the reported intervals, mean -+ z spread;
+- `origin.low_m`, `high_m` bound the sensor's mean origin; samples are taken from inside the box too;
+- `origin.spread_m.max` bounds the standard deviation of the origin along every direction, `thickness_m.max` that
+  along its thinnest principal direction, so that sensors spread over lines or sheets of any tilt;
+- `origin.mounts_m` lists the points where sensors can be fixed, one sensor at each at most (see `mounts`);
+- `origin.exclude` lists boxes whose interior holds no mean origin, no part of its interval, mean -+ z spread along
+  each axis, and no start of a ray; samples are taken from outside them, and where one takes part of the origin box
+  the intervals keep to that box too (see `origins`);
+- `boresight.azimuth_deg` is an interval on the circle: with `min` above `max` it passes through 0;
+- `parts` names real parts that the design is made of, whose fields of view and gates then keep these bounds;
+- every gate stays inside the range bounds of the design space, whatever the file says.
+
+Entries of `each` apply to the first, second, ... sensor over the common keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    model_validator,
+)
+
+from lidardesign.errors import UNSET_HINT, ConfigError
+from lidardesign.run.validation import check_model
+from lidardesign.run.yaml import leaves
+from lidardesign.sensors.sensor import MOST_RAYS
+from lidardesign.space import FARTHEST_M, MOST_TURNS, SHORTEST_M
+
+Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+Vector = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Distance = Annotated[float, Field(ge=0, le=FARTHEST_M)]
+# Between these products of constraints are numbers, whatever is narrowed to them.
+Positive = Annotated[float, Field(ge=SHORTEST_M, le=FARTHEST_M)]
+Angle = Annotated[float, Field(ge=-360 * MOST_TURNS, le=360 * MOST_TURNS)]
+# The boxes between excluded ones grow faster than their number: with so many a fit still takes seconds.
+MOST_EXCLUDED = 32
+# So many components of a mixture over all samples fill some 100 MB; a scan has its rays instead.
+MOST_FITTED = 1000
+Count = Annotated[int, Field(ge=1, le=MOST_FITTED)]
+
+
+class _Keys(BaseModel):
+    """Unknown keys are errors; numbers are numbers, not text."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+
+class SensorCount(_Keys):
+    """`{count: 4}` or `{min: 1, max: 8}`."""
+
+    count: Count | None = None
+    min: Count | None = None
+    max: Count | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> SensorCount:
+        if self.count is not None and (self.min is not None or self.max is not None):
+            raise ValueError("give either count, or min and max")
+        return self
+
+
+class DistanceRange(_Keys):
+    """Bounds on a distance [m]."""
+
+    min: Distance | None = None
+    max: Positive | None = None
+
+
+class AngleRange(_Keys):
+    """Bounds on an azimuth [degrees], any number of turns."""
+
+    min: Angle | None = None
+    max: Angle | None = None
+
+
+class ElevationRange(_Keys):
+    """Bounds on an elevation [degrees]."""
+
+    min: Annotated[float, Field(ge=-90, le=90)] | None = None
+    max: Annotated[float, Field(ge=-90, le=90)] | None = None
+
+
+class FieldRange(_Keys):
+    """Bounds on a full angle of view [degrees]."""
+
+    min: Annotated[float, Field(ge=0, le=360)] | None = None
+    max: Annotated[float, Field(ge=SHORTEST_M, le=360)] | None = None
+
+
+class SpreadLimit(_Keys):
+    """The largest standard deviation of the origin, along any or along its thinnest direction [m]."""
+
+    max: Positive | None = None
+
+
+class ExcludedBox(_Keys):
+    """A box in whose interior no sensor may be [m]; one without volume excludes nothing."""
+
+    low_m: Vector
+    high_m: Vector
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ExcludedBox:
+        for axis, low, high in zip("xyz", self.low_m, self.high_m, strict=True):
+            if low > high:
+                raise ValueError(f"low_m is above high_m along {axis}")
+        return self
+
+
+class Origin(_Keys):
+    """Where a sensor may sit [m]."""
+
+    low_m: Vector | None = None
+    high_m: Vector | None = None
+    fixed_m: Vector | None = None
+    spread_m: SpreadLimit = SpreadLimit()
+    thickness_m: SpreadLimit = SpreadLimit()
+    mounts_m: Annotated[list[Vector], Field(min_length=1)] | None = None
+    exclude: Annotated[list[ExcludedBox], Field(max_length=MOST_EXCLUDED)] | None = None
+
+    @model_validator(mode="after")
+    def _distinct_mounts(self) -> Origin:
+        if len({tuple(mount) for mount in self.mounts_m or []}) < len(self.mounts_m or []):
+            raise ValueError("the mounts must differ")
+        return self
+
+
+class Boresight(_Keys):
+    """Where it may point."""
+
+    azimuth_deg: AngleRange = AngleRange()
+    elevation_deg: ElevationRange = ElevationRange()
+
+
+class FieldOfView(_Keys):
+    """How wide it may see, horizontally and vertically in its own frame."""
+
+    horizontal_deg: FieldRange = FieldRange()
+    vertical_deg: FieldRange = FieldRange()
+
+
+class Gate(_Keys):
+    """When it may listen, as one-way distances [m]."""
+
+    start_m: DistanceRange = DistanceRange()
+    end_m: DistanceRange = DistanceRange()
+    width_m: DistanceRange = DistanceRange()
+
+
+class Budget(_Keys):
+    """Rays per frame and the read-out of the whole design."""
+
+    rays: Annotated[int, Field(ge=1, le=MOST_RAYS)] | None = None
+    bandwidth_mbps: Positive | None = None
+    # wider than any part's; beyond them products under- and overflow
+    bin_ps: Annotated[float, Field(ge=0.001, le=1e9)] = 100.0
+    bits_per_bin: Annotated[float, Field(ge=0.001, le=1e9)] = 40.0
+    rate_hz: Annotated[float, Field(ge=0.001, le=1e12)] = 10.0
+
+
+class MostOfPart(_Keys):
+    """`{max: 1}`: how many of a part a design has at most."""
+
+    max: Count
+
+
+class Parts(_Keys):
+    """Real parts that the design is made of, chosen with their poses.
+
+    Arguments:
+        names: Names, `NAME:MODE`, or paths of part files and folders; `catalog` is all that are shipped.
+        count: How many parts; `--sensors` goes before.
+        each: By the name of a part how many of it there may be.
+        power_w: What all of them may consume [W]; parts of which no source says it are left out.
+    """
+
+    names: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | Literal["catalog"] = "catalog"
+    count: Count | None = None
+    each: dict[str, MostOfPart] = {}
+    power_w: Positive | None = None
+
+
+class SensorConstraints(_Keys):
+    """The keys that may also stand under `each`."""
+
+    origin: Origin = Origin()
+    boresight: Boresight = Boresight()
+    field_of_view: FieldOfView = FieldOfView()
+    gate: Gate = Gate()
+
+
+@dataclass(frozen=True, eq=False)
+class SensorRules:
+    """What one sensor must keep, its entry of `each` laid over the common keys, and where the file says so.
+
+    Arguments:
+        origin, boresight, field_of_view, gate: The bounds.
+        index: The sensor's place in the design; of the last rules, that of the first sensor beyond `each`.
+        own_keys: The keys, as `gate.width_m.max`, that its own entry has.
+    """
+
+    origin: Origin
+    boresight: Boresight
+    field_of_view: FieldOfView
+    gate: Gate
+    index: int
+    own_keys: frozenset[str]
+
+    def path(self, key: str) -> str:
+        """Where the file has one of the keys, as `each[1].gate.width_m.max`."""
+        return f"each[{self.index}].{key}" if key in self.own_keys else key
+
+
+def rules_of(rules: Sequence[SensorRules], sensor: int) -> SensorRules:
+    """The rules of one sensor; all sensors beyond the entries of `each` have the last ones."""
+    return rules[min(sensor, len(rules) - 1)]
+
+
+class Constraints(SensorConstraints):
+    """What a design must satisfy: fields of view, gates, places, rays and bandwidth; every key is optional.
+
+    Keys and units are those of a constraint file (docs/constraints.md): for all sensors, or by sensor in `each`.
+
+    Example:
+        >>> narrow = Constraints.from_mapping({"gate": {"width_m": {"max": 0.1}}, "budget": {"rays": 64}})
+        >>> narrow.budget.rays
+        64
+        >>> narrow.as_document()["gate"]
+        {'width_m': {'max': 0.1}}
+    """
+
+    model_config = ConfigDict(json_schema_extra={"description": "A whole constraint file; every key is optional."})
+
+    sensors: SensorCount = SensorCount()
+    budget: Budget = Budget()
+    parts: Parts | None = None
+    each: list[SensorConstraints] = []
+
+    @classmethod
+    def from_mapping(
+        cls,
+        values: Mapping[str, Any] | None,
+        *,
+        where: str = "constraints",
+        locate: Callable[..., str] | None = None,
+    ) -> Constraints:
+        """Constraints of plain values, as read from YAML.
+
+        Arguments:
+            values: The mapping; None is an empty one.
+            where: Name of the file or option, for messages.
+            locate: The position `file:line:column` of a key path.
+
+        Raises:
+            ConfigError: Unknown keys, wrong types, numbers outside their physical range.
+        """
+        if values is not None and not isinstance(values, Mapping):
+            raise ConfigError(f"found one {type(values).__name__}", where=where, allowed="a mapping, as `gate: {...}`")
+
+        def named(path: tuple[str | int, ...], *, key: bool = False) -> str:
+            return where
+
+        values, locate = dict(values or {}), locate or named
+        for path, value in leaves(values):
+            if value is None:
+                name = ".".join(map(str, path))
+                raise ConfigError(f"{name} has no value", where=locate(path), allowed="a value", hint=UNSET_HINT)
+        return check_model(cls, values, locate)
+
+    @cached_property
+    def rules(self) -> tuple[SensorRules, ...]:
+        """What each sensor must keep: by its entry of `each`, and last what every further sensor must."""
+        common = self.model_dump(exclude_none=True, include=set(SensorConstraints.model_fields))
+        rules = []
+        for index, entry in enumerate([*self.each, SensorConstraints()]):
+            own = entry.model_dump(exclude_none=True)
+            resolved = SensorConstraints.model_validate(merged(common, own))
+            keys = frozenset(_key_paths(own)) if index < len(self.each) else frozenset()
+            rules.append(SensorRules(**dict(resolved), index=index, own_keys=keys))
+        return tuple(rules)
+
+    def as_document(self) -> dict[str, Any]:
+        """The plain values that were given, for the design file."""
+        return self.model_dump(exclude_none=True, exclude_unset=True)
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain values with others laid over them, key by key at every depth."""
+    result = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, Mapping) and isinstance(result.get(key), dict)
+        result[key] = merged(result[key], value) if both else value
+    return result
+
+
+def _key_paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """The keys of plain values at every depth, joined by dots."""
+    for key, value in values.items():
+        yield prefix + key
+        if isinstance(value, Mapping):
+            yield from _key_paths(value, f"{prefix}{key}.")

@@ -1,0 +1,134 @@
+"""How much room a design leaves under each of its constraints: what one would have to loosen to gain anything.
+
+Works on what the independent checker found; bounds that many sensors share are told once, by the closest sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from lidardesign.constraints.check import ConstraintCheck
+
+# A bound with this share of itself left is one that the design leans on.
+TIGHT_SHARE = 0.01
+# Bounds of the design space hold for every sensor, whatever was asked for.
+SPACE_MARK = "space."
+# Where the bandwidth is the only bound whose name says nothing of its side.
+UPPER_ENDS = (".max", ".high_m", "budget.bandwidth_mbps", "budget.power_w")
+LOWER_ENDS = (".min", ".low_m")
+FULL_TURN_DEG = 360.0
+
+
+@dataclass(frozen=True)
+class ConstraintSlack:
+    """One bound, over all sensors that it holds for.
+
+    Arguments:
+        name: The key in the constraint file, as `gate.width_m.max`; of the design space as `space.range_m`.
+        bound: What was asked for.
+        value: What the closest of the sensors has; of a bound that is broken, what the worst has.
+        sensor: The name of that sensor; empty where the bound is on the whole design.
+        room: How far that is from the bound, in the bound's unit; negative where it is broken, None where a bound is
+            kept or not, without a distance.
+        share: The same as a share of the bound, of an interval of its width; None with no distance, or a bound of 0.
+        sensors: How many sensors have this bound.
+        tight: How many of them are within 1 % of it.
+        broken: How many of them break it.
+    """
+
+    name: str
+    bound: Any
+    value: Any
+    sensor: str
+    room: float | None
+    share: float | None
+    sensors: int
+    tight: int
+    broken: int
+
+    @property
+    def word(self) -> str:
+        """`broken`, `at the bound`, or `kept`."""
+        return "broken" if self.broken else "at the bound" if self.tight else "kept"
+
+
+class Room(NamedTuple):
+    """How far a value is inside its bound; both are None without a distance.
+
+    Arguments:
+        room: In the bound's unit; negative beyond the bound.
+        share: As a share of the bound, of an interval of its width; None of a bound of 0.
+    """
+
+    room: float | None
+    share: float | None
+
+    @property
+    def is_tight(self) -> bool:
+        """Whether next to nothing of the bound is left."""
+        return self.room is not None and (self.room <= 0 if self.share is None else self.share <= TIGHT_SHARE)
+
+
+def constraint_slack(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) -> list[ConstraintSlack]:
+    """How tight each bound is, in the order in which the checker comes to them.
+
+    Arguments:
+        checks: What the checker found on a design.
+        sensors: The names of the design's sensors.
+    """
+    groups: dict[tuple[str, str], list[tuple[str, ConstraintCheck, Room]]] = {}
+    for check in checks:
+        owner, key = split_name(check.name, sensors)
+        groups.setdefault((key, repr(check.bound)), []).append((owner, check, room_of(check)))
+    rows = []
+    for (key, _), group in groups.items():
+        # the first broken one that is furthest beyond, else the closest
+        order = [(check.satisfied, math.inf if room.room is None else room.room) for _, check, room in group]
+        owner, check, (room, share) = group[order.index(min(order))]
+        tight = sum(check.satisfied and room.is_tight for _, check, room in group)
+        broken = sum(not check.satisfied for _, check, _ in group)
+        rows.append(ConstraintSlack(key, check.bound, check.value, owner, room, share, len(group), tight, broken))
+    return rows
+
+
+def split_name(name: str, sensors: Sequence[str]) -> tuple[str, str]:
+    """The sensor that a check is of, empty where it is of the whole design, and the key of its bound."""
+    # one sensor's name may begin with another's
+    owners = [sensor for sensor in sensors if name.startswith(f"{sensor}.")]
+    owner = max(owners, key=len, default="")
+    return owner, name.removeprefix(f"{owner}.") if owner else name
+
+
+def room_of(check: ConstraintCheck) -> Room:
+    """How far the value of a check is inside its bound."""
+    bound, value = _numbers(check.bound), _numbers(check.value)
+    # room and what it is a share of, at every end
+    ends: list[tuple[float, float]] = []
+    if check.name.endswith(UPPER_ENDS) and len(bound) == len(value):
+        ends = [(limit - found, abs(limit)) for limit, found in zip(bound, value, strict=True)]
+    elif check.name.endswith(LOWER_ENDS) and len(bound) == len(value):
+        ends = [(found - limit, abs(limit)) for limit, found in zip(bound, value, strict=True)]
+    elif check.name.endswith(".boresight.azimuth_deg") and bound and value:
+        low, high = bound
+        width = high - low if high - low >= FULL_TURN_DEG else (high - low) % FULL_TURN_DEG
+        past = (value[0] - low) % FULL_TURN_DEG
+        inside = min(past, width - past)
+        # outside, the nearer end counts
+        ends = [(inside if inside >= 0 else -min(past - width, FULL_TURN_DEG - past), width)]
+    elif f".{SPACE_MARK}" in check.name and len(bound) == 2 and value:
+        low, high = bound
+        ends = [(value[0] - low, high - low), (high - value[-1], high - low)]
+    if not ends:
+        return Room(None, None)
+    room, scale = min(ends)
+    return Room(room, room / scale if scale else None)
+
+
+def _numbers(value: Any) -> list[float]:
+    """A number, or a list of them, as a list; empty for anything else."""
+    values = value if isinstance(value, list | tuple) else [value]
+    plain = all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
+    return [float(one) for one in values] if plain and all(math.isfinite(one) for one in values) else []

@@ -1,0 +1,294 @@
+"""Laws of the task contract, the task that they are tried on, and what became of each of them."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from lidardesign.config import RunConfig
+from lidardesign.contract.fingerprint import fingerprint
+from lidardesign.contract.probing import rays_at_targets
+from lidardesign.errors import LidardesignError, PluginError
+from lidardesign.registry import AUTHOR_HINT, plugin_guard
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Rays, Returns
+from lidardesign.scenes.scene import Scene
+from lidardesign.scoring.scenes.scene_scores import checked_score
+from lidardesign.simulate.returns import build_casters, simulate
+from lidardesign.task import Metric, Score, Split, Task, conditions_of, metric_of, scenes_of
+
+PACKAGE = Path(__file__).parents[1]
+# Libraries that tasks call, and that errors are raised in when they are called wrongly.
+LIBRARIES = ("numpy", "scipy", "trimesh", "pydantic", "mujoco")
+Outcome = Literal["pass", "fail", "skip"]
+# What comes before all laws: name, group and statement.
+LOADS = (
+    "plugin loads",
+    "interface",
+    "it is imported, has all members of the interface, and its configuration resolves",
+)
+
+
+# One call of a task's code may take so long, where nothing else is asked for.
+CALL_SECONDS = 60.0
+
+
+class BrokenLawError(PluginError):
+    """A law of the contract that a task does not keep; the message says how, with figures (exit 6)."""
+
+
+class LawHolds(NamedTuple):
+    """A law that holds: what was measured, in words, and the same as numbers by name with their unit."""
+
+    words: str
+    figures: Mapping[str, float] = {}
+
+
+class NotApplicable(NamedTuple):
+    """A law that says nothing about this task, and why."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Law:
+    """One law of the contract.
+
+    Arguments:
+        name: Short and unique, for tables and test names.
+        group: The part of the contract that it belongs to.
+        statement: What a task keeps to, in one sentence.
+        check: Tries it on a task; raises BrokenLawError where it does not hold.
+        needs: Names of laws without which it cannot be tried.
+        after: Names of laws that are tried before it, whatever comes of them: it looks at what they did.
+    """
+
+    name: str
+    group: str
+    statement: str
+    check: Callable[[Subject], LawHolds | NotApplicable]
+    needs: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What became of a law.
+
+    Arguments:
+        law: Its name.
+        group: Its group.
+        statement: What it says.
+        outcome: Whether it holds.
+        detail: What was measured where it holds; else why it does not, or was not tried.
+        seconds: How long that took [s].
+        figures: Numbers by name.
+    """
+
+    law: str
+    group: str
+    statement: str
+    outcome: Outcome
+    detail: str
+    seconds: float = 0.0
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The form that it has in JSON."""
+        return {
+            "law": self.law,
+            "group": self.group,
+            "statement": self.statement,
+            "outcome": self.outcome,
+            "detail": self.detail,
+            "seconds": round(self.seconds, 3),
+            "figures": {name: float(value) for name, value in self.figures.items()},
+        }
+
+
+def error_words(error: LidardesignError) -> str:
+    """A finding's words for an error: what was found, what is allowed, what to do."""
+    parts = [error.message]
+    if error.allowed:
+        parts.append(f"allowed: {error.allowed}")
+    # whoever checks a plugin is its author
+    if error.hint and AUTHOR_HINT not in error.hint:
+        parts.append(f"try: {error.hint}")
+    return "; ".join(parts)
+
+
+def place_of(error: BaseException) -> str:
+    """Where in other code than this package's an error comes from, as " (task.py:52)"; empty where that is unknown.
+
+    Of several places the last one counts that is in no installed library, unless there is none but in libraries.
+    """
+    while error.__cause__ is not None:
+        error = error.__cause__
+    frames = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not (frame.filename.startswith("<") or Path(frame.filename).is_relative_to(PACKAGE))
+    ]
+    own = [
+        frame
+        for frame in frames
+        if not any(name in Path(frame.filename).parts for name in (*LIBRARIES, "importlib", "contextlib.py"))
+    ] or frames
+    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
+
+
+@contextlib.contextmanager
+def restore_random_states(drawn: list[str], what: str) -> Iterator[None]:
+    """Put global random states back as they were before, and note those that had changed.
+
+    Arguments:
+        drawn: Gets the states that changed, in words.
+        what: What runs meanwhile.
+    """
+    before = _random_states()
+    try:
+        yield
+    finally:
+        now = _random_states()
+        changed = [f"{name} in {what}" for name in before if fingerprint(now[name]) != fingerprint(before[name])]
+        drawn += [note for note in changed if note not in drawn]
+        random.setstate(before["Python's random"])
+        np.random.set_state(before["numpy's random"])  # noqa: NPY002 - it is this state that must not change
+        if "torch's random" in before:
+            sys.modules["torch"].set_rng_state(before["torch's random"])
+
+
+def _random_states() -> dict[str, Any]:
+    """The global random states by the words for them; torch's only where torch is loaded."""
+    found: dict[str, Any] = {
+        "Python's random": random.getstate(),
+        "numpy's random": np.random.get_state(),  # noqa: NPY002
+    }
+    torch = sys.modules.get("torch")
+    return found if torch is None else found | {"torch's random": torch.get_rng_state()}
+
+
+# The geometry and the scores of so many training scenes are looked at.
+LOOKED_AT = 3
+
+
+@dataclass(eq=False)
+class Subject:
+    """A task with a configuration, tried by the laws.
+
+    Arguments:
+        task: The plugin.
+        config: Its resolved configuration.
+        limit_s: What one call of its code may take [s].
+        drawn: Global random states that its code drew from or seeded, and when.
+        on_call: Called with what is called before every call of its code, and "" after it.
+    """
+
+    task: Task
+    config: RunConfig
+    limit_s: float = CALL_SECONDS
+    drawn: list[str] = field(default_factory=list)
+    on_call: Callable[[str], None] = lambda what: None
+
+    def __post_init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._scenes: dict[tuple[Split, int], list[Scene]] = {}
+        self._as_made: list[str] = []
+        self._casters: dict[int, list[SceneCaster]] = {}
+        self._rays: dict[tuple[int, int], list[Rays]] = {}
+
+    @contextlib.contextmanager
+    def calling(self, what: str) -> Iterator[None]:
+        """Run the task's code: what it raises breaks the law that is tried, and the longest time is kept.
+
+        Raises:
+            BrokenLawError: Whatever it raised.
+        """
+        self.on_call(what)
+        started = time.perf_counter()
+        try:
+            with restore_random_states(self.drawn, what), plugin_guard(self.task.name):
+                yield
+        except LidardesignError as error:
+            told = error.message if error.message.startswith((what, "scoring")) else f"{what} failed: {error.message}"
+            raise BrokenLawError(f"{told}{place_of(error)}", allowed=error.allowed) from error
+        finally:
+            self.seconds[what] = max(self.seconds.get(what, 0.0), time.perf_counter() - started)
+            self.on_call("")
+
+    def new_scenes(self, split: Split, seed: int) -> list[Scene]:
+        """The scenes of a split, made anew."""
+        with self.calling("scenes"):
+            return list(scenes_of(self.task, self.config.task, split, seed, self.config.space))
+
+    def scenes(self, split: Split, seed: int | None = None) -> list[Scene]:
+        """The scenes of a split, made once."""
+        key = (split, self.config.seed if seed is None else seed)
+        if key not in self._scenes:
+            self._scenes[key] = self.new_scenes(*key)
+        return self._scenes[key]
+
+    @property
+    def looked_at(self) -> list[Scene]:
+        """The first training scenes."""
+        scenes = self.scenes("train")[:LOOKED_AT]
+        if not self._as_made:
+            self._as_made = [fingerprint(scene) for scene in scenes]
+        return scenes
+
+    def touched(self) -> list[str]:
+        """The names of scenes that are looked at and are not as they were made."""
+        return [
+            scene.name for scene, made in zip(self.looked_at, self._as_made, strict=True) if fingerprint(scene) != made
+        ]
+
+    @cached_property
+    def metric(self) -> Metric:
+        """What scores mean."""
+        if not hasattr(self.task, "metric_of"):
+            return self.task.metric
+        with self.calling("metric_of"):
+            return metric_of(self.task, self.config.task)
+
+    @cached_property
+    def conditions(self) -> list[dict[str, float]]:
+        """The condition values that designs are evaluated at; one empty mapping where there are no conditions."""
+        if not self.config.space.conditioned:
+            return [{}]
+        with self.calling("conditions"):
+            return conditions_of(self.task, self.config.task, self.config.space)
+
+    def casters(self, number: int) -> list[SceneCaster]:
+        """One caster per frame of a scene that is looked at, by its number."""
+        if number not in self._casters:
+            self._casters[number] = build_casters(self.looked_at[number])
+        return self._casters[number]
+
+    def rays(self, number: int, count: int) -> list[Rays]:
+        """Up to so many rays at what can be seen of a scene's targets, for each condition value."""
+        if (number, count) not in self._rays:
+            scene, casters, space = self.looked_at[number], self.casters(number), self.config.space
+            self._rays[number, count] = [
+                rays_at_targets(scene, space.at(condition), casters, count) for condition in self.conditions
+            ]
+        return self._rays[number, count]
+
+    def returns(self, number: int, lists: Sequence[Rays]) -> list[Returns]:
+        """What rays give in a scene that is looked at: for each condition value all frames, as `score` gets them."""
+        scene, casters = self.looked_at[number], self.casters(number)
+        return [frame for rays in lists for frame in simulate(scene, rays, casters=casters)]
+
+    def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
+        """The checked score of returns."""
+        with self.calling("score"):
+            return checked_score(self.task, self.metric, scene, returns)

@@ -1,0 +1,216 @@
+"""The contract tried in a process of its own: a plugin that hangs or crashes harms nobody.
+
+The process says by lines of JSON when it calls the task's code and what it found; whoever asks waits for each line no
+longer than a call may take. It works in an empty folder and has temporary files of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from lidardesign import registry
+from lidardesign.config import resolve
+from lidardesign.contract.law import CALL_SECONDS, LOADS, Finding, Law, error_words, place_of, restore_random_states
+from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.run.child import START_SECONDS, Child, ChildError, write_line
+
+if TYPE_CHECKING:
+    from lidardesign.config import RunConfig
+    from lidardesign.contract.contract import Contract
+    from lidardesign.task import Task
+
+# A call that takes longer than it may ends within this many times as long, so that it can be told how long it took.
+OVERTIME = 3
+# The key of a line that says what is called now; empty once the call has ended.
+CALLED = "called"
+FINDING_KEYS = {"law", "group", "statement", "outcome", "detail", "seconds", "figures"}
+REFUSALS = {"config": ConfigError, "data": DataError}
+
+
+@dataclass(frozen=True)
+class CheckRequest:
+    """What to check.
+
+    Arguments:
+        name: The task, as `learn` takes it.
+        config_file: A YAML file of its configuration.
+        overrides: `KEY=VALUE` as `--set` takes it.
+        seed: Root of all chance.
+        limit_s: What one call of the task's code may take [s].
+    """
+
+    name: str
+    config_file: Path | None = None
+    overrides: Sequence[str] = ()
+    seed: int | None = None
+    limit_s: float = CALL_SECONDS
+
+
+def check_in_process(request: CheckRequest) -> Iterator[Finding]:
+    """What became of each law, as it is found; the first is that the plugin loads.
+
+    Raises:
+        ConfigError, DataError: There is no such task, or its configuration is refused.
+    """
+    try:
+        offer = registry.offer_of(request.name)
+    except registry.PluginError as error:
+        yield from _all_lost(0, error_words(error))
+        return
+    with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
+        document = {
+            "folder": folder,
+            "name": offer.name,
+            "value": offer.value,
+            "config_file": str(request.config_file) if request.config_file else None,
+            "overrides": list(request.overrides),
+            "seed": request.seed,
+            "seconds": request.limit_s,
+        }
+        child = Child(f"{__name__}:answer_check", document, {registry.PROBING: "1"})
+        try:
+            yield from _read_findings(child, request.limit_s)
+        finally:
+            child.end()
+
+
+def _read_findings(child: Child, seconds: float) -> Iterator[Finding]:
+    """Findings as they come; where the process is lost, the law that it tried does not hold."""
+    for number in range(len(_laws()) + 1):
+        found = _next_finding(child, seconds, loading=number == 0)
+        if isinstance(found, str):
+            yield from _all_lost(number, found)
+            return
+        finding = _finding(found)
+        yield finding
+        if number == 0 and finding.outcome == "fail":
+            yield from _not_reached(1)
+            return
+
+
+def _next_finding(child: Child, seconds: float, *, loading: bool) -> dict[str, Any] | str:
+    """The next line that is a finding, or how the process was lost; every call of the task's code has time of its own.
+
+    Arguments:
+        child: The process.
+        seconds: How long a call may take.
+        loading: Whether it loads the plugin, which is one call.
+    """
+    # between calls libraries are loaded, fields built and other processes waited for
+    allowed = seconds if loading else START_SECONDS + OVERTIME * seconds
+    called = ""
+    while True:
+        try:
+            found = child.answer(allowed, "while this is tried")
+        except ChildError as lost:
+            return f"{called} did not end within {allowed:g} s".lstrip() if lost.reason == "late" else str(lost)
+        if "refused" in found or set(found) == FINDING_KEYS:
+            return found
+        if set(found) != {CALLED}:
+            return "writes to a stream that is not its own while this is tried"
+        called = str(found[CALLED])
+        allowed = OVERTIME * seconds if called else START_SECONDS + OVERTIME * seconds
+
+
+def _finding(found: dict[str, Any]) -> Finding:
+    """What a line says; where the configuration was refused, the error that it was refused with."""
+    if "refused" not in found:
+        return Finding(**found)
+    told = found["refused"]
+    raise REFUSALS.get(told["kind"], ConfigError)(
+        told["message"], **{key: told.get(key) for key in ("where", "allowed", "hint")}
+    )
+
+
+def _all_lost(number: int, reason: str) -> Iterator[Finding]:
+    """The law that was tried does not hold, and those behind it are not reached; number 0 is that it loads."""
+    name, group, statement = LOADS if number == 0 else _named(number)
+    yield Finding(name, group, statement, "fail", reason)
+    yield from _not_reached(number + 1)
+
+
+def _not_reached(number: int) -> Iterator[Finding]:
+    for later in range(number, len(_laws()) + 1):
+        yield Finding(*_named(later), "skip", "not reached")
+
+
+def _laws() -> Sequence[Law]:
+    from lidardesign.contract.contract import LAWS
+
+    return LAWS
+
+
+def _named(number: int) -> tuple[str, str, str]:
+    law = _laws()[number - 1]
+    return law.name, law.group, law.statement
+
+
+def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
+    """In that process: try all laws and say what was found."""
+    _settle(request)
+    contract = _begin(request, result)
+    if contract is None:
+        return {}
+    os.chdir(_make_folder(request, "work"))
+    for finding in contract.findings():
+        write_line(result, finding.as_dict())
+    return {}
+
+
+def _settle(request: dict[str, Any]) -> None:
+    """Provide a place for temporary files, and write no compiled Python beside the plugin's sources."""
+    tempfile.tempdir = os.environ["TMPDIR"] = _make_folder(request, "temporary")
+    os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
+
+
+def _make_folder(request: dict[str, Any], name: str) -> str:
+    path = Path(request["folder"]) / name
+    path.mkdir()
+    return str(path)
+
+
+def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
+    """Import the plugin and resolve its configuration; None where that is the end of it, which is told."""
+    drawn: list[str] = []
+    started = time.perf_counter()
+    try:
+        task, config = _loaded(request, drawn)
+    except registry.PluginError as error:
+        write_line(result, Finding(*LOADS, "fail", f"{error_words(error)}{place_of(error)}").as_dict())
+        return None
+    except LidardesignError as error:
+        if str(error.where).startswith("defaults of task"):
+            write_line(result, Finding(*LOADS, "fail", f"{error.where}: {error_words(error)}").as_dict())
+        else:
+            write_line(result, {"refused": error.as_dict()})
+        return None
+    except BaseException as error:
+        write_line(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}").as_dict())
+        return None
+    # not before: a plugin that fails to load is named without the libraries that the laws need
+    from lidardesign.contract.contract import Contract
+    from lidardesign.contract.law import Subject
+
+    version = f"version {task.api_version} of the task interface"
+    loaded = Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started)
+    write_line(result, loaded.as_dict())
+    return Contract(Subject(task, config, request["seconds"], drawn, lambda what: write_line(result, {CALLED: what})))
+
+
+def _loaded(request: dict[str, Any], drawn: list[str]) -> tuple[Task, RunConfig]:
+    offer = EntryPoint(request["name"], request["value"], registry.GROUP)
+    with restore_random_states(drawn, "import"):
+        task = registry.import_task(offer, request["seconds"])
+    config_file = Path(request["config_file"]) if request["config_file"] else None
+    with restore_random_states(drawn, "space"):
+        return task, resolve(
+            task, preset="draft", config_file=config_file, overrides=request["overrides"], seed=request["seed"]
+        )

@@ -1,0 +1,188 @@
+"""Laws of a task's scenes: made again they are the same, splits share none, and they travel to other processes."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pickle
+from importlib.util import find_spec
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+from lidardesign.contract.fingerprint import fingerprint, geometry_fingerprint
+from lidardesign.contract.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
+from lidardesign.errors import LidardesignError
+from lidardesign.rays.information import informs_rays
+from lidardesign.registry import plugin_guard
+from lidardesign.run.child import ChildError, ask
+from lidardesign.space import DesignSpace
+from lidardesign.task import Split, scenes_of
+
+if TYPE_CHECKING:
+    from lidardesign.config import RunConfig
+
+# Training scenes are drawn with other seeds where rays are chosen; so many further seeds are tried.
+FURTHER_SEEDS = 2
+SPLITS: tuple[Split, ...] = ("train", "test")
+# Any number but 0, which would be no chance at all, and not the one of the process that asks.
+HASH_SEEDS = ("20251", "20252")
+
+
+def check_scenes(subject: Subject) -> LawHolds:
+    """Both splits have scenes, and their bodies are within the program's bounds."""
+    counts = {split: len(subject.scenes(split)) for split in SPLITS}
+    for split, count in counts.items():
+        if not count:
+            raise BrokenLawError(f"the split {split} has no scenes", allowed="1 or more")
+    frames = max(scene.frames for split in SPLITS for scene in subject.scenes(split))
+    moving = f", up to {frames} frames" if frames > 1 else ""
+    return LawHolds(f"{counts['train']} to train on, {counts['test']} held out{moving}", {**counts, "frames": frames})
+
+
+def check_repeatable(subject: Subject) -> LawHolds:
+    """The same configuration, split and seed give the same scenes, to the bit."""
+    for split in SPLITS:
+        first, again = subject.scenes(split), subject.new_scenes(split, subject.config.seed)
+        if len(first) != len(again):
+            raise BrokenLawError(f"the second time the split {split} has {len(again)} scenes, not {len(first)}")
+        for number, (one, other) in enumerate(zip(first, again, strict=True)):
+            if fingerprint(one) != fingerprint(other):
+                raise BrokenLawError(
+                    f"the second time the split {split} has a different scene {number} ({one.name!r})",
+                    hint="draw all random numbers from lidardesign.task.random_generator(seed, ...)",
+                )
+    return LawHolds("made twice, the same to the bit")
+
+
+def check_seeds(subject: Subject) -> LawHolds | NotApplicable:
+    """Another seed gives other training scenes: rays are chosen on further ones, by a task with `informs`."""
+    first = {geometry_fingerprint(scene) for scene in subject.scenes("train")}
+    other = {geometry_fingerprint(scene) for scene in subject.scenes("train", subject.config.seed + 1)}
+    shared = len(first & other)
+    if shared == len(first):
+        same = "another seed gives the same training scenes"
+        if not informs_rays(subject.task):
+            return NotApplicable(f"{same}; without informs, no further ones are drawn")
+        raise BrokenLawError(f"{same}, but rays are chosen on further ones", hint="draw random numbers from the seed")
+    return LawHolds(f"{shared} of {len(first)} training scenes are the same with another seed", {"shared": shared})
+
+
+def check_disjoint(subject: Subject) -> LawHolds:
+    """No held-out scene is trained on, whatever the seed of the training scenes."""
+    held_out = {geometry_fingerprint(scene): scene.name for scene in subject.scenes("test")}
+    seeds = range(subject.config.seed, subject.config.seed + FURTHER_SEEDS + 1)
+    for seed in seeds:
+        for scene in subject.scenes("train", seed):
+            name = held_out.get(geometry_fingerprint(scene))
+            if name is not None:
+                raise BrokenLawError(
+                    f"the training scene {scene.name!r} of seed {seed} is the held-out scene {name!r}",
+                    hint="name the split where random numbers are drawn: random_generator(seed, name, split, ...)",
+                )
+    return LawHolds(f"{len(held_out)} held out, none trained on with {len(seeds)} seeds", {"seeds": len(seeds)})
+
+
+def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
+    """A worker process makes the same scenes: nothing hangs on the order of sets or on what ran before."""
+    kind = type(subject.task)
+    if kind.__module__ == "__main__" or "<locals>" in kind.__qualname__ or find_spec(kind.__module__) is None:
+        return NotApplicable("the task's class cannot be imported in another process")
+    found = fingerprints_in_process(subject.config, kind, subject.limit_s)
+    for split in SPLITS:
+        mine = [fingerprint(scene) for scene in subject.scenes(split)]
+        if found[split] != mine:
+            number = next((i for i, (a, b) in enumerate(zip(mine, found[split], strict=False)) if a != b), len(mine))
+            raise BrokenLawError(
+                f"another process makes a different scene {number} of the split {split}",
+                hint="do not use hash(), the order of sets, the time or the process in scenes",
+            )
+    return LawHolds("another process makes them the same to the bit")
+
+
+def fingerprints_in_process(config: RunConfig, kind: type, seconds: float) -> dict[str, list[str]]:
+    """Fingerprints of all scenes by split, made in a process of its own.
+
+    Arguments:
+        config: Whose scenes.
+        kind: The task's class; it must be importable.
+        seconds: How long the scenes of one split may take there.
+
+    Raises:
+        BrokenLawError: It failed there, or took longer.
+    """
+    request = {
+        "module": kind.__module__,
+        "name": kind.__qualname__,
+        "task": config.task.model_dump(mode="json"),
+        "space": config.space.as_dict(),
+        "seed": config.seed,
+    }
+    hash_seed = next(seed for seed in HASH_SEEDS if seed != os.environ.get("PYTHONHASHSEED"))
+    try:
+        limit_s, work = len(SPLITS) * seconds, f"{__name__}:answer_fingerprints"
+        found = ask(work, request, limit_s, "there", {"PYTHONHASHSEED": hash_seed})
+    except ChildError as lost:
+        raise BrokenLawError(f"scenes failed in another process, which {lost}") from None
+    if "error" in found:
+        raise BrokenLawError(f"scenes failed in another process: {found['error']}")
+    return found
+
+
+def answer_fingerprints(request: dict[str, Any], _: object) -> dict[str, Any]:
+    """In that process: make the scenes, and say their fingerprints or what went wrong."""
+    try:
+        with plugin_guard(request["name"]):
+            task = attrgetter(request["name"])(importlib.import_module(request["module"]))()
+            config, space = task.Config(**request["task"]), DesignSpace.from_dict(request["space"])
+            return {
+                split: [fingerprint(scene) for scene in scenes_of(task, config, split, request["seed"], space)]
+                for split in SPLITS
+            }
+    except LidardesignError as error:
+        return {"error": error.message}
+
+
+def check_picklable(subject: Subject) -> LawHolds:
+    """Scenes and the configuration survive pickling, which any engine of workers may do with them."""
+    size = 0
+    for scene in (*subject.looked_at, subject.config.task):
+        try:
+            content = pickle.dumps(scene)
+            again = pickle.loads(content)
+        except LidardesignError:
+            raise
+        except Exception as error:
+            what = getattr(scene, "name", "the configuration")
+            raise BrokenLawError(f"{what!r} cannot be pickled: {type(error).__name__}: {error}") from error
+        if fingerprint(again) != fingerprint(scene):
+            raise BrokenLawError(f"{scene!r:.80} is different after pickling")
+        size = max(size, len(content))
+    return LawHolds(f"{size / 1000:.3g} kB at most", {"bytes": size})
+
+
+LAWS = (
+    Law("scenes are made", "scenes", "both splits have scenes", check_scenes, needs=("space is fixed",)),
+    Law(
+        "scenes repeat",
+        "scenes",
+        "the same configuration, split and seed give the same scenes",
+        check_repeatable,
+        needs=("scenes are made",),
+    ),
+    Law(
+        "scenes repeat elsewhere",
+        "scenes",
+        "another process makes the same scenes",
+        check_elsewhere,
+        needs=("scenes repeat",),
+    ),
+    Law("seeds differ", "scenes", "another seed gives other training scenes", check_seeds, needs=("scenes are made",)),
+    Law(
+        "splits are disjoint",
+        "scenes",
+        "no held-out scene is trained on, whatever the seed",
+        check_disjoint,
+        needs=("scenes are made",),
+    ),
+    Law("scenes are picklable", "scenes", "scenes survive pickling", check_picklable, needs=("scenes are made",)),
+)

@@ -1,0 +1,223 @@
+"""The target density p*(d): how often, over the scenes of a task, a design point sees a surface (paper, eq. 3 to 5).
+
+log p*(d) = logsumexp_i [ log w_i(s) - SDF_i(s)^2 / (2 sigma^2) + log T_i(d) ], s = M(d); one term per column, that is
+per scene, or per frame of a moving scene. w_i is the column's own weight, 1 / frames, times the importance of the
+surface next to s, where there is one (`fields.importance`). Only columns whose surface term is within
+`surface_tolerance_nats` (t) of the best one at a point are looked at further; the others are left out, which changes p*
+by less than columns * exp(-t) of the largest surface term there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields.bodies import collect_bodies
+from lidardesign.density.fields.distance import TableField, build_field, scene_columns
+from lidardesign.density.fields.importance import BodyWeights, build_log_weights, is_weighted, weigh
+from lidardesign.density.objective.quadrature import Quadrature
+from lidardesign.density.objective.surfaces import MovingFrames, SceneTable, Surfaces
+from lidardesign.density.objective.visibility import (
+    BistaticVisibility,
+    NoVisibility,
+    Optics,
+    RayBatch,
+    Visibility,
+    common_receiver,
+)
+from lidardesign.errors import ConfigError, NumericalError
+from lidardesign.numerics import SLACK
+from lidardesign.run.clock import phase
+from lidardesign.scenes.scene import Mesh, Scene
+from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, observed_point
+
+PADDING_SIGMAS = 4.0
+MOST_QUADRATURE_BODIES = 2000
+# d direction / d sin(elevation) grows without bound at the poles; it is capped at this cosine of the elevation.
+MINIMUM_POLE_COSINE = 1e-4
+# Cells per axis are 2 to this power: finer than the points of a batch lie apart.
+LEVELS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """The unnormalised target density of a set of scenes.
+
+    Arguments:
+        scenes: What it is the density of, one column per scene and frame.
+        surfaces: The targets of the columns, and how much they count.
+        visibility: How occlusion is computed.
+        optics: The final sigma and what goes with it.
+        space: The design space; it fixes the chart that gradients are given in.
+        surface_tolerance_nats: See the module docstring.
+    """
+
+    scenes: tuple[Scene, ...]
+    surfaces: Surfaces
+    visibility: Visibility
+    optics: Optics
+    space: DesignSpace
+    surface_tolerance_nats: float = 16.0
+
+    @property
+    def columns(self) -> int:
+        """The number of scenes and frames."""
+        return len(self.surfaces.log_column_weights)
+
+    @property
+    def rows_at_once(self) -> int:
+        """How many points keep the memory bounded."""
+        return min(self.surfaces.rows_at_once, self.visibility.rows_at_once)
+
+    def with_visibility(self, way: Visibility) -> Target:
+        """The same seen in another way, and heard in that way by the receiver of the scenes, where they have one."""
+        receiver = common_receiver(self.scenes)
+        return replace(self, visibility=way if receiver is None else BistaticVisibility(way, receiver))
+
+    def drawn(self, columns: np.ndarray) -> Target:
+        """An estimate of p* from some columns alone, weighted to stand for all; the others need no visibility."""
+        return replace(self, surfaces=self.surfaces.drawn(columns), visibility=self.visibility.take(columns))
+
+    def log_proximity(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
+        """log of the sum of surface terms at the scene points that design points (N, 6) observe, shape (N,)."""
+        sigma_m = self.optics.sigma_m if sigma_m is None else sigma_m
+        observed, values = observed_point(points), np.empty(len(points))
+        for start in range(0, len(points), self.rows_at_once):
+            rows = slice(start, start + self.rows_at_once)
+            values[rows] = self.surfaces.log_proximity(observed[rows], sigma_m, self.surface_tolerance_nats)
+        return values
+
+    def log_density(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
+        """log p* of design points, (N, 6) to (N,), at the final sigma unless a wider one is given."""
+        return self._in_chunks(points, sigma_m, gradient=False)[0]
+
+    def log_density_and_gradient(
+        self, points: np.ndarray, sigma_m: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """log p* and its gradient by the chart coordinates of `space`: (N, 6) to (N,) and (N, 6)."""
+        return self._in_chunks(points, sigma_m, gradient=True)
+
+    @phase("target")
+    def _in_chunks(self, points: np.ndarray, sigma_m: float | None, gradient: bool) -> tuple[np.ndarray, np.ndarray]:
+        points = np.asarray(points, dtype=np.float64)
+        if wrong := unusable(points):
+            raise NumericalError(wrong, where="target density")
+        optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
+        values, gradients = np.empty(len(points)), np.empty((len(points) if gradient else 0, 6))
+        size, order = self.rows_at_once, nearby_order(observed_point(points))
+        for start in range(0, len(points), size):
+            rows = order[start : start + size]
+            values[rows], by_chart = self._evaluate(points[rows], optics, gradient)
+            if gradient:
+                gradients[rows] = by_chart
+        return values, gradients
+
+    def _evaluate(self, points: np.ndarray, optics: Optics, gradient: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        """Apart from the loop over chunks, so that the arrays of one chunk are gone before the next one's."""
+        rays = RayBatch.of(points)
+        near = self.surfaces.near(rays.observed, optics.sigma_m, self.surface_tolerance_nats)
+        passed = self.visibility.transmittance(rays, near.columns, optics, differentiable=gradient)
+        values, shares = near.log_sums(passed.log_values)
+        if not gradient:
+            return values, None
+        by_point, by_ray = near.gradient(shares), passed.gradient(shares)
+        by_ray.add_by_point(by_point, rays)
+        sin_a, cos_a = np.sin(points[:, AZIMUTH]), np.cos(points[:, AZIMUTH])
+        sin_e, cos_e = np.sin(points[:, ELEVATION]), np.cos(points[:, ELEVATION])
+        by_elevation = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=1)
+        if self.space.measure == "solid_angle":
+            by_elevation /= np.maximum(cos_e, MINIMUM_POLE_COSINE)[:, None]
+        by_azimuth = np.stack([-cos_e * sin_a, cos_e * cos_a, np.zeros_like(sin_a)], axis=1)
+        by_chart = np.empty((len(points), 6))
+        by_chart[:, :3] = by_ray.origins
+        by_chart[:, AZIMUTH] = np.einsum("nk,nk->n", by_ray.directions, by_azimuth)
+        by_chart[:, ELEVATION] = np.einsum("nk,nk->n", by_ray.directions, by_elevation)
+        by_chart[:, RANGE] = by_ray.ranges
+        return values, by_chart
+
+
+def nearby_order(points: np.ndarray) -> np.ndarray:
+    """The order of points (N, 3) along a Z-shaped curve through their bounding box, shape (N,) (Morton 1966).
+
+    Neighbours in space follow each other and find each other's memory in the cache. Results do not depend on it, to the
+    last bit: every point is evaluated by itself.
+    """
+    if len(points) < 2:
+        return np.arange(len(points))
+    size = np.ptp(points, axis=0)
+    # points that share a coordinate have no extent there
+    shares = (points - points.min(axis=0)) / np.where(size > 0, size, 1.0)
+    cells = np.minimum((shares * 2**LEVELS).astype(np.int64), 2**LEVELS - 1)
+    keys = np.zeros(len(points), dtype=np.int64)
+    for level in range(LEVELS):
+        for axis in range(3):
+            keys |= ((cells[:, axis] >> level) & 1) << (3 * level + axis)
+    return np.argsort(keys, kind="stable")
+
+
+def unusable(points: np.ndarray) -> str | None:
+    """What makes design points (N, 6) none, by the name of the dimension; a range of 0 is one."""
+    if np.isfinite(points).all() and points[:, RANGE].min(initial=0.0) >= -SLACK:
+        return None
+    for name, values in zip(DIMENSIONS, points.T, strict=True):
+        if not np.isfinite(values).all():
+            return f"{int((~np.isfinite(values)).sum())} design points are not finite in {name}"
+    return f"range_m is {points[:, RANGE].min():g} m, which is negative"
+
+
+def build_target(
+    scenes: Sequence[Scene], space: DesignSpace, settings: DensitySettings, visibility: str, *, compiled: bool = True
+) -> Target:
+    """The target of scenes.
+
+    Arguments:
+        scenes: One term per scene and frame; where they have a fixed receiver, it must see the points too.
+        space: The design space.
+        settings: Its numbers.
+        visibility: raycast, quadrature or off; `prepare_target` decides auto.
+        compiled: False for a few evaluations without gradient, which are not worth loading the kernels.
+
+    Raises:
+        ConfigError: A quadrature over too many moving bodies, or scenes with different receivers.
+    """
+    scenes = tuple(scenes)
+    fields = {"resolution": settings.field_resolution, "padding_m": PADDING_SIGMAS * settings.sigma_m}
+    log_column_weights = -np.log(np.array([scenes[index].frames for index, _ in scene_columns(scenes)], np.float64))
+    # meshes at rest are best kept in the table that all scenes at rest share
+    at_rest = [body for scene in scenes if scene.frames == 1 for body in scene.bodies if body.is_target]
+    tabled = visibility == "quadrature" or any(isinstance(body.shape, Mesh) for body in at_rest)
+    if common_receiver(scenes) is None and not tabled:
+        bodies = collect_bodies(scenes, lambda body: body.is_target, **fields)
+        importance = None
+        if is_weighted(scenes):
+            entries = [body for scene in scenes for _ in range(scene.frames) for body in scene.bodies if body.is_target]
+            bodies = weigh(bodies, entries)
+            importance = BodyWeights(bodies)
+        surfaces: Surfaces = MovingFrames(bodies, log_column_weights, importance)
+    else:
+        moving = sum(scene.frames * len(scene.bodies) for scene in scenes if scene.frames > 1)
+        if visibility == "quadrature" and moving > MOST_QUADRATURE_BODIES:
+            # every body of thousands of frames would be evaluated at every midpoint
+            raise ConfigError(
+                f"a quadrature over {moving} bodies in all frames would take minutes per step",
+                where="density.visibility",
+                allowed=f"at most {MOST_QUADRATURE_BODIES}",
+                hint="density.visibility=raycast looks only at the frames that matter",
+            )
+        field = build_field(scenes, lambda body: body.is_target, **fields)
+        if isinstance(field, TableField):
+            field = replace(field, compiled=compiled)
+        surfaces = SceneTable(field, log_column_weights, build_log_weights(scenes, field))
+    if visibility == "off":
+        way: Visibility = NoVisibility()
+    elif visibility == "raycast":
+        way = surfaces.raycast(scenes)
+    else:
+        same = all(body.role == "both" for scene in scenes for body in scene.bodies)
+        occluders = field if same else build_field(scenes, lambda body: body.is_occluder, **fields)
+        way = Quadrature(occluders, settings.quadrature_points)
+    target = Target(scenes, surfaces, way, Optics.of(settings), space, settings.surface_tolerance_nats)
+    return target.with_visibility(way)

@@ -1,1 +1,0 @@
-"""Rigs that others made, read as designs."""

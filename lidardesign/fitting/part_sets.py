@@ -1,0 +1,220 @@
+"""A few candidates out of many, where every set is small: real parts at poses, not rays by the hundred.
+
+Sets are filled greedily, then one or two members leave and the best come in, until that gains nothing. The bound is
+that of `certificate`. It also says which candidates are in no better set: with thresholds t, a set that holds c has
+
+    F(S) <= sum_u w_u t_u + excess(c) + the largest excesses of the others.
+
+What is left is bounded anew and, once few sets are left, searched through: branches end where what is known and
+the largest gains together do no better than the best set (Nemhauser, Wolsey and Fisher 1978).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.numerics import SLACK
+from lidardesign.rays.certificate import ROUNDS, Tangents, Thresholds
+from lidardesign.rays.choice import Choice
+from lidardesign.rays.coverage import Coverage
+
+FEW_SETS = 100_000  # are searched through, whatever it takes
+MOST_WORK = 1e9  # entries of the table that a search of more sets may read: some seconds
+MOST_LEAVING = 2  # members of a set that are exchanged at once
+
+
+@dataclass(frozen=True, eq=False)
+class SetLimits:
+    """Which sets of candidates may be chosen.
+
+    Arguments:
+        count: How many candidates a set has at most.
+        kinds: Pairs of the kind of each candidate, (M,), and how many of each kind there may be, (K,).
+        budgets: Pairs of what each candidate costs, (M,), and what a set may cost.
+    """
+
+    count: int
+    kinds: Sequence[tuple[np.ndarray, np.ndarray]] = ()
+    budgets: Sequence[tuple[np.ndarray, float]] = ()
+
+    def may_join(self, chosen: Sequence[int], candidates: int) -> np.ndarray:
+        """Which of the candidates may be added to some, bool (M,)."""
+        members = np.array(chosen, dtype=np.intp)
+        may = np.full(candidates, len(members) < self.count)
+        may[members] = False
+        for kind, most in self.kinds:
+            may &= (np.bincount(kind[members], minlength=len(most)) < most)[kind]
+        for cost, limit in self.budgets:
+            may &= cost[members].sum() + cost <= limit * (1 + SLACK)
+        return may
+
+    def of(self, rows: np.ndarray) -> SetLimits:
+        """The same for some of the candidates."""
+        kinds = [(kind[rows], most) for kind, most in self.kinds]
+        return SetLimits(self.count, kinds, [(cost[rows], limit) for cost, limit in self.budgets])
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenSet:
+    """A set, and how far from the best it may be.
+
+    Arguments:
+        members: In the order in which they were taken.
+        value: F of the set.
+        bound: What no set exceeds.
+    """
+
+    members: tuple[int, ...]
+    value: float
+    bound: float
+
+
+def choose_set(coverage: Coverage, limits: SetLimits) -> ChosenSet:
+    """The best set found, with its bound; the best there is where few sets could be better.
+
+    Arguments:
+        coverage: What each candidate tells, through one gate.
+        limits: Which sets may be chosen.
+    """
+    rows = np.arange(coverage.shape[0])
+    best = _improved(coverage, limits)
+    value, bound = _value(coverage, best), np.inf
+    while len(rows):
+        left, allowed = _among(coverage, rows), limits.of(rows)
+        if math.comb(len(rows), min(limits.count, len(rows))) > FEW_SETS:
+            least, reached = _bounds(left, allowed, np.flatnonzero(np.isin(rows, best)), value)
+            bound = min(bound, max(least, value))
+            kept = reached > value * (1 + SLACK)
+            if kept.sum() < len(rows) / 2:
+                rows = rows[kept]
+                continue
+            rows, left, allowed = rows[kept], _among(left, np.flatnonzero(kept)), allowed.of(np.flatnonzero(kept))
+        found, is_complete = _searched(left, allowed, value)
+        if found:
+            best, value = tuple(int(row) for row in rows[list(found)]), _value(left, found)
+        return ChosenSet(best, value, value if is_complete else max(bound, value))
+    return ChosenSet(best, value, value)
+
+
+def _among(coverage: Coverage, rows: np.ndarray) -> Coverage:
+    """The table of some candidates."""
+    return coverage if len(rows) == coverage.shape[0] else coverage.grouped(rows[:, None])
+
+
+def _known(coverage: Coverage, chosen: Sequence[int]) -> np.ndarray:
+    gate = np.full(coverage.shape[0], -1)
+    gate[list(chosen)] = 0
+    return coverage.known(gate)
+
+
+def _value(coverage: Coverage, chosen: Sequence[int]) -> float:
+    return float(coverage.weight @ coverage.counted(_known(coverage, chosen)))
+
+
+def _filled(coverage: Coverage, limits: SetLimits, chosen: Sequence[int]) -> tuple[int, ...]:
+    """Some candidates and those that gain most beside them, one after the other; none that gains nothing."""
+    chosen = tuple(chosen)
+    while len(chosen) < limits.count:
+        gains = np.where(limits.may_join(chosen, coverage.shape[0]), coverage.gains(_known(coverage, chosen))[:, 0], 0)
+        best = int(gains.argmax())
+        if gains[best] <= 0:
+            break
+        chosen = (*chosen, best)
+    return chosen
+
+
+def _improved(coverage: Coverage, limits: SetLimits) -> tuple[int, ...]:
+    """The greedy set, members exchanged until no exchange gains."""
+    best = _filled(coverage, limits, ())
+    value, is_better = _value(coverage, best), True
+    while is_better:
+        is_better = False
+        for leaving in range(1, MOST_LEAVING + 1):
+            for rest in itertools.combinations(best, max(len(best) - leaving, 0)):
+                tried = _filled(coverage, limits, rest)
+                if (found := _value(coverage, tried)) > value * (1 + SLACK):
+                    best, value, is_better = tried, found, True
+                    break
+            if is_better:
+                break
+    return best
+
+
+class _Sets:
+    """What sets can sum to, for the steps of a certificate: within the count, and the narrowest kind alone."""
+
+    def __init__(self, limits: SetLimits, candidates: int) -> None:
+        self.count = limits.count
+        self.kinds = limits.kinds or [(np.zeros(candidates, dtype=np.intp), np.array([limits.count]))]
+        self.total = 0.0
+
+    def best(self, excess: np.ndarray) -> tuple[float, np.ndarray]:
+        """See `certificate`: the least of the largest sums, and the candidates of it, 0 or -1 each, (M,)."""
+        net = excess[:, 0]
+        order = np.argsort(-net, kind="stable")
+        order, sets = order[net[order] > 0], []
+        for kind, most in self.kinds:
+            own = kind[order]
+            by_kind = np.argsort(own, kind="stable")
+            place = np.empty(len(own), dtype=np.intp)  # of a candidate among those of its kind
+            place[by_kind] = np.arange(len(own)) - np.searchsorted(own[by_kind], own[by_kind])
+            sets.append(order[place < most[own]][: self.count])
+        kept = min(sets, key=lambda rows: net[rows].sum())
+        taken = np.full(len(net), -1)
+        taken[kept] = 0
+        self.total = float(net[kept].sum())
+        return self.total, taken
+
+
+def _bounds(coverage: Coverage, limits: SetLimits, chosen: np.ndarray, value: float) -> tuple[float, np.ndarray]:
+    """What no set exceeds, and what no set with each of the candidates does, (M,)."""
+    gate = np.full(coverage.shape[0], -1)
+    gate[chosen] = 0
+    sets = _Sets(limits, len(gate))
+    steps = Tangents if len(coverage.table) else Thresholds
+    search = steps(coverage, sets, Choice(gate, value, 0.0, 0.0, 0.0))
+    least, reached = np.inf, np.full(len(gate), np.inf)
+    for _ in range(ROUNDS):
+        bound = search.step(value)
+        excess = search.excess[:, 0]
+        others = np.sort(excess)[::-1][: limits.count - 1].sum()
+        reached = np.minimum(reached, bound - sets.total + excess + others)
+        least = min(least, bound)
+    return least, reached
+
+
+def _searched(coverage: Coverage, limits: SetLimits, value: float) -> tuple[tuple[int, ...], bool]:
+    """The best set of more than a value, none if there is none, and whether every set was looked at."""
+    candidates, best = coverage.shape[0], ()
+    few = math.comb(candidates, min(limits.count, candidates)) <= FEW_SETS
+    visits = FEW_SETS if few else MOST_WORK / max(len(coverage.item), 1)
+    open_sets: list[tuple[tuple[int, ...], int]] = [((), 0)]
+    order = np.argsort(-coverage.gains(np.zeros(len(coverage.weight)))[:, 0], kind="stable")
+    while open_sets:
+        chosen, first = open_sets.pop()
+        visits -= 1
+        if visits < 0:
+            return best, False
+        known = _known(coverage, chosen)
+        may = limits.may_join(chosen, candidates)
+        gains = np.where(may, coverage.gains(known)[:, 0], 0.0)[order]
+        gains[:first] = 0.0
+        reached, left = float(coverage.weight @ coverage.counted(known)), limits.count - len(chosen)
+        if reached > value * (1 + SLACK):
+            value, best = reached, chosen
+        if left == 1:
+            place = int(gains.argmax())
+            if gains[place] > 0 and reached + gains[place] > value * (1 + SLACK):
+                value, best = reached + float(gains[place]), (*chosen, int(order[place]))
+            continue
+        # the largest gains of those that may follow each candidate
+        for place in np.flatnonzero(gains)[::-1]:
+            further = np.sort(gains[place + 1 :])[::-1][: left - 1].sum()
+            if reached + gains[place] + further > value * (1 + SLACK):
+                open_sets.append(((*chosen, int(order[place])), int(place) + 1))
+    return best, True

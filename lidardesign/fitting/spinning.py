@@ -1,0 +1,278 @@
+"""Spinning sensors of which scenes choose where they stand, and the elevation of each channel: the layout `spinning`.
+
+A candidate is a ring: the rays of one turn from one place at one elevation. Sensors stand upright. What a ring tells is
+what its rays tell together (`Coverage.grouped`), so rings are chosen as rays are, and with the same certificate. Every
+set of places is tried, and at each of its places as many rings are chosen as a sensor has channels.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from time import perf_counter
+
+import numpy as np
+
+from lidardesign.constraints.document import Constraints
+from lidardesign.constraints.feasibility import check_feasible
+from lidardesign.constraints.origins import inside_excluded, mounts_of, origin_box
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.mixture.fit import FitResult
+from lidardesign.numerics import FULL_TURN
+from lidardesign.rays import information
+from lidardesign.rays.certificate import certificate_document, certify
+from lidardesign.rays.choice import Choice, RayCounts, choose
+from lidardesign.rays.coverage import Coverage, gather
+from lidardesign.rays.gates import CANDIDATES_PER_RAY, inform
+from lidardesign.run.clock import phase
+from lidardesign.samples import Samples
+from lidardesign.scenes.rays import Rays, Returns
+from lidardesign.scenes.scene import Scene
+from lidardesign.sensors.design_file import MOST_TABLE_RAYS
+from lidardesign.sensors.sensor import CERTIFICATES, DEFAULT_LEVEL, DesignSpec, Sensor, interval_factor
+from lidardesign.space import DesignSpace
+from lidardesign.task import Information
+
+CHANNELS = 16  # of a sensor, where nobody says how many
+POINTS_PER_TURN = 1800  # of a channel: every fifth of a degree, as scanners do at ten turns per second
+EVEN_SHARE = 0.25  # of the candidate elevations that are even; the others lie where even ones tell most
+FIRST_SHARE = 0.2  # of the scenes, that say where this is
+PLACES = np.array([(0.5, 0.5, 0.5), (0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 0)])  # in a box, no corners on one edge
+MOST_SETS, MOST_BOUNDED = 500, 20  # of places: that are tried, and that are bounded one by one
+
+
+@dataclass(frozen=True, eq=False)
+class RingCandidates:
+    """Candidate rings: every place with every elevation.
+
+    Arguments:
+        places_m: Where sensors may stand, (P, 3) [m].
+        elevation_rad: Ascending, (E,).
+        points: Rays of a ring.
+        range_m: From where to where they listen [m].
+    """
+
+    places_m: np.ndarray
+    elevation_rad: np.ndarray
+    points: int
+    range_m: tuple[float, float]
+
+    def __len__(self) -> int:
+        return len(self.places_m) * len(self.elevation_rad)
+
+    @cached_property
+    def place(self) -> np.ndarray:
+        """The place of each ring, (P E,)."""
+        return np.repeat(np.arange(len(self.places_m)), len(self.elevation_rad))
+
+    def rays(self, rings: np.ndarray, sensor: np.ndarray) -> Rays:
+        """The rays of some rings, each ring of a sensor; a sensor's fire column by column, as a head turns."""
+        turn = np.tile(FULL_TURN * ((np.arange(self.points) + 0.5) / self.points - 0.5), len(rings))
+        column, ring = np.tile(np.arange(self.points), len(rings)), np.repeat(rings, self.points)
+        order = np.lexsort((ring, column, np.repeat(sensor, self.points)))
+        ring = ring[order]
+        return Rays.from_angles(
+            self.places_m[self.place[ring]],
+            turn[order],
+            self.elevation_rad[ring % len(self.elevation_rad)],
+            np.tile(self.range_m, (len(ring), 1)),
+            np.repeat(sensor, self.points)[order],
+        )
+
+    def coverage(
+        self,
+        rings: np.ndarray,
+        scenes: Iterator[Scene],
+        informs: Callable[[Scene, Sequence[Returns]], Information],
+        share: float = 1.0,
+    ) -> tuple[Coverage, str]:
+        """What some rings tell about a share of the next few scenes, and the unit of that."""
+        rays = self.rays(rings, np.arange(len(rings)))
+        few = itertools.islice(scenes, round(share * information.FEW_SCENES))
+        informed = [inform(scene, rays, [slice(0, len(rays))], informs) for scene in few]
+        table = gather(informed, rays.gate_m[:, None], np.zeros((len(rays), 1)))
+        return table.grouped(np.arange(len(rays)).reshape(len(rings), self.points)), informed[0].unit
+
+
+def choose_rings(
+    samples: Samples,
+    constraints: Constraints,
+    *,
+    count: int,
+    channels: int,
+    rays: int | None,
+    informs: Callable[[Scene, Sequence[Returns]], Information],
+    scenes: Callable[[str], Iterator[Scene]],
+    name: str,
+) -> FitResult:
+    """The design of a few spinning sensors with the best channels at the best places.
+
+    Arguments:
+        samples: Of the density, whose design space says where rays may start and look.
+        constraints: Where sensors may stand, and what else the design keeps.
+        count: How many sensors.
+        channels: Rings of each.
+        rays: Of all sensors per turn; None fires `POINTS_PER_TURN` for each channel, or what a file holds.
+        informs: What a task says of a scene's returns.
+        scenes: Training scenes without end for a purpose, `choice` or `held back`.
+        name: The design's name.
+
+    Raises:
+        ConfigError: Rays that rings cannot share, more channels than elevations, more sets of places than can be
+            tried, or a density with conditions.
+        DataError: No ring tells anything about the scenes.
+        InfeasibleError: Constraints that contradict each other.
+    """
+    started, space, rings = perf_counter(), samples.space, count * max(channels, 1)
+    check_feasible(constraints, space, sensors=count, rays=rays)
+    even, points = ring_grid(space, rays, count, channels)
+    first = RingCandidates(places_of(constraints, space), even, points, (space.low[5], space.high[5]))
+    elevations = len(even)
+    every = np.arange(len(first))
+    with phase("what returns tell"), information.choosing(rings / len(first)):
+        told, _ = first.coverage(every, scenes("choice"), informs, FIRST_SHARE)
+        if not len(told.item):
+            raise DataError(f"none of {len(first)} rings tells anything about the training scenes", where=name)
+        gains = told.gains(np.zeros(len(told.weight)))[:, 0].reshape(-1, elevations).sum(axis=0)
+        candidates = replace(first, elevation_rad=finer(even, gains))
+        coverage, unit = candidates.coverage(every, scenes("choice"), informs)
+    with phase("choice"):
+        choice, loss, bound = chosen_rings(coverage, candidates.place, count, channels)
+    chosen = choice.rays
+    with phase("what returns tell"), information.choosing(1.0):
+        judged, _ = candidates.coverage(chosen, scenes("held back"), informs)
+    places, sensor = np.unique(candidates.place[chosen], return_inverse=True)
+    table = candidates.rays(chosen, sensor)
+    certificate = certificate_document(
+        rays=len(table),
+        value=loss,
+        bound=bound,
+        held_back_value=judged.loss_of(np.zeros(len(chosen), dtype=np.intp)),
+        candidates=len(candidates),
+        gates=1,
+        scenes=information.FEW_SCENES,
+        unit=unit,
+    )
+    reached = np.abs(candidates.elevation_rad[chosen % elevations])
+    design = DesignSpec(
+        name=name,
+        sensors=tuple(
+            replace(
+                _spinning(candidates, f"s{number}", candidates.places_m[place], reached[sensor == number].max()),
+                weight=1 / count,
+                rays=points * channels,
+            )
+            for number, place in enumerate(places)
+        ),
+        layout="spinning",
+        rays=len(table),
+        ray_table=table,
+        constraints=constraints.as_document(),
+        provenance={"channels": channels, CERTIFICATES: [certificate]},
+    )
+    return FitResult.of_choice(design, constraints, samples, perf_counter() - started)
+
+
+def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -> tuple[np.ndarray, int]:
+    """The even elevations of candidate rings, ascending [rad], and how many rays each ring has.
+
+    Raises:
+        ConfigError: So many rings cannot be chosen, or cannot share the rays.
+    """
+    rings = count * max(channels, 1)
+    points = min(POINTS_PER_TURN, MOST_TABLE_RAYS // rings) if rays is None else rays // rings
+    even = np.unique(np.linspace(space.low[4], space.high[4], CANDIDATES_PER_RAY * max(channels, 1)))
+    most = min(len(even), MOST_TABLE_RAYS // count)
+    faults = {
+        ("the density has conditions", "--layout spinning", "tasks whose sensors do not move"): space.conditioned,
+        (f"{channels} channels", "--channels", f"1 to {most}, of as many elevations and rays as there are"): not (
+            1 <= channels <= most
+        ),
+        (
+            f"{rays} rays of {count} sensors with {channels} channels",
+            "--rays",
+            f"a multiple of {rings}, at most {MOST_TABLE_RAYS}: as many for each channel",
+        ): points * rings != (rays or points * rings) or not 0 < points * rings <= MOST_TABLE_RAYS,
+    }
+    for (fault, where, allowed), is_found in faults.items():
+        if is_found:
+            raise ConfigError(fault, where=where, allowed=allowed)
+    return even, points
+
+
+def places_of(constraints: Constraints, space: DesignSpace) -> np.ndarray:
+    """Where spinning sensors may stand, (P, 3) [m]: all mounts, or the middle and corners of their box."""
+    rules = constraints.rules[-1]
+    if rules.origin.mounts_m:
+        return np.array(mounts_of(rules), dtype=np.float64).reshape(-1, 3)
+    low, high = origin_box(rules, space)
+    places = low + (high - low) * PLACES
+    return np.unique(places[~inside_excluded(places, rules)], axis=0)
+
+
+def finer(elevation_rad: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """As many elevations (E,) [rad]: some even ones, and others the denser the more even ones gain (E,)."""
+    count = len(elevation_rad)
+    even = math.ceil(EVEN_SHARE * count)
+    reached = np.cumsum(gains) / gains.sum()
+    wanted = (np.arange(count - even) + 0.5) / (count - even)
+    return np.sort(
+        np.append(np.linspace(elevation_rad[0], elevation_rad[-1], even), np.interp(wanted, reached, elevation_rad))
+    )
+
+
+def chosen_rings(coverage: Coverage, place: np.ndarray, count: int, channels: int) -> tuple[Choice, float, float]:
+    """The best rings found at as many places as there are sensors, what they lose, and what any others lose at least.
+
+    Arguments:
+        coverage: What the rings tell.
+        place: The place of each, (N,).
+        count: How many sensors.
+        channels: Rings of each.
+
+    Raises:
+        ConfigError: Fewer places than sensors, or too many sets of places.
+    """
+    places = int(place.max()) + 1
+    sets = [
+        RayCounts(place, np.where(np.isin(np.arange(places), chosen), channels, 0))
+        for chosen in itertools.islice(itertools.combinations(range(places), count), MOST_SETS + 1)
+    ]
+    if not 1 <= len(sets) <= MOST_SETS:
+        raise ConfigError(
+            f"{count} spinning sensors at {places} places", where="--sensors",
+            allowed=f"at most {places} sensors, and {MOST_SETS} sets of places", hint="fewer mounts, or fewer sensors",
+        )  # fmt: skip
+
+    def gained(counts: RayCounts) -> float:
+        found = choose(coverage, counts, passes=0)
+        return found.worth - found.harm
+
+    best = choose(coverage, max(sets, key=gained) if len(sets) > 1 else sets[0])
+    # all rings of all places together lose no more than those of the best places
+    bounded = sets if len(sets) <= MOST_BOUNDED else [RayCounts.of_one(len(place), count * channels)]
+    gain = max(certify(coverage, counts, best).bound for counts in bounded)
+    loss = coverage.complete - (best.worth - best.harm)
+    return best, loss, float(np.clip(coverage.complete - gain, 0.0, loss))
+
+
+def _spinning(rings: RingCandidates, name: str, place_m: np.ndarray, highest_rad: float) -> Sensor:
+    """A sensor that stands upright and looks along +x; its field is a full turn, as a part's (see `part_sensor`)."""
+    half, (near, far) = interval_factor(DEFAULT_LEVEL), rings.range_m
+    return Sensor(
+        name=name,
+        weight=1.0,
+        origin_m=place_m,
+        origin_covariance_m2=np.zeros((3, 3)),
+        azimuth_rad=0.0,
+        elevation_rad=0.0,
+        roll_rad=0.0,
+        spread_horizontal_rad=FULL_TURN / (2 * half),
+        # as far up as down: so its own upright axis is that of its rings
+        spread_vertical_rad=float(highest_rad) / half,
+        range_m=(near + far) / 2,
+        spread_range_m=(far - near) / (2 * half),
+    )

@@ -1,0 +1,305 @@
+"""Rays for a two-mirror scanner with a gated single-photon detector: mirror angles in the order of least travel.
+
+One row per ray, in the order in which the mirrors reach them. `lidardesign.formats.galvo_angles` says what the angles mean: x
+and y are optical, twice the mechanical ones. A scanner has one place, so rays that start elsewhere are the rows of
+another `position`, with its own origin, boresight and tour: the scanner is moved there, or another one stands there.
+A position's boresight is the middle of its rays.
+
+The order is a short round trip. Both mirrors turn at once, so a step takes as long as the one that turns further: the
+length of a step is the larger of its two angles. A frame follows the next, so the trip leads back to where it began.
+Tours start from the nearest neighbour and from the rays' own order, and are improved by turning stretches round (2-opt,
+Croes 1958) until that helps no more. Nothing in it is random.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.formats.galvo_angles import (
+    LIMIT_DEG,
+    degree_frame,
+    gate_m,
+    gate_ps,
+    middle_boresight_deg,
+    scan_angles_deg,
+    scan_directions,
+)
+from lidardesign.formats.ray_lists import LOST
+from lidardesign.numerics import ROUNDING, SLACK
+from lidardesign.run.arrays import csv_rows
+from lidardesign.run.files import write_atomic
+from lidardesign.run.inputs import RAY_TABLE, read_head
+from lidardesign.run.yaml import plain_number
+from lidardesign.scenes.rays import Rays, fire_times
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import DesignSpec
+
+NEIGHBOURS = 6
+# Nearest-neighbour tours cost time with the square of their stops; larger ones start from the rays' own order alone.
+MOST_NEAREST = 20_000
+# Rounds of improvement: 576 stops take 40, 5000 take 200; bounds the time of ever larger tours.
+MOST_ROUNDS = 500
+# Gains below this share of the tour's extent are rounding noise, and could be taken back and forth for ever.
+LEAST_GAIN = ROUNDING
+
+
+def short_tour(points: np.ndarray) -> np.ndarray:
+    """The order of stops (N, 2) along a short round trip, indices of shape (N,).
+
+    It begins behind the longest step, which the way back then is.
+    """
+    count = len(points)
+    if count < 4:
+        return np.arange(count)
+    # The nearest other stops of each, shape (N, K)
+    from scipy.spatial import cKDTree
+
+    found = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)), p=np.inf)[1]
+    # where many stops are at one place, a stop need not be the first of its own neighbours
+    own = found == np.arange(len(points))[:, None]
+    own[~own.any(axis=1), -1] = True
+    near = found[~own].reshape(len(points), -1)
+    starts = [np.arange(count), *([_nearest(points)] if count <= MOST_NEAREST else [])]
+    tours = [_improved(points, near, start) for start in starts]
+    best = min(tours, key=lambda tour: travel(points[tour]))
+    longest = int(_lengths(points[best], points[np.roll(best, -1)]).argmax())
+    return np.roll(best, -(longest + 1))
+
+
+def travel(stops: np.ndarray) -> float:
+    """The length of the round trip over stops (N, 2) in their order, with the way back to the first."""
+    return float(_lengths(stops, np.roll(stops, -1, axis=0)).sum())
+
+
+def _lengths(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return np.abs(first - second).max(axis=-1)
+
+
+def _nearest(points: np.ndarray) -> np.ndarray:
+    """From the lowest corner always on to the nearest stop that is left."""
+    left, here = np.arange(len(points)), int((points - points.min(axis=0)).sum(axis=1).argmin())
+    order = []
+    while len(left):
+        order.append(left[here])
+        place = points[left[here]]
+        left[here:-1] = left[here + 1 :]
+        left = left[:-1]
+        if len(left):
+            here = int(_lengths(points[left], place).argmin())
+    return np.array(order)
+
+
+def _improved(points: np.ndarray, near: np.ndarray, tour: np.ndarray) -> np.ndarray:
+    """The tour after all turns that shorten it, as far as `MOST_ROUNDS` go."""
+    least, rounds = LEAST_GAIN * float(np.ptp(points, axis=0).max()), 0
+    while rounds < MOST_ROUNDS and _turned(points, near, tour, least):
+        rounds += 1
+    return tour
+
+
+def _turned(points: np.ndarray, near: np.ndarray, tour: np.ndarray, least: float) -> bool:
+    """One round of 2-opt, in place: stretches that do not overlap are turned round, the best first."""
+    count, place = len(tour), np.argsort(tour)
+    here, there = np.repeat(place, near.shape[1]), place[near.ravel()]
+    # an edge is named by the place of its first end; a stop is the first end of one edge and the last of another
+    edges = np.concatenate([np.stack([here, there]), np.stack([here - 1, there - 1]) % count], axis=1)
+    first, last = edges.min(axis=0), edges.max(axis=0)
+    stops = points[tour]
+    a, b, c, d = stops[first], stops[(first + 1) % count], stops[last], stops[(last + 1) % count]
+    gain = _lengths(a, b) + _lengths(c, d) - _lengths(a, c) - _lengths(b, d)
+    helpful = np.flatnonzero((gain > least) & (last > first + 1))
+    free = np.ones(count + 1, dtype=bool)
+    for move in helpful[np.argsort(-gain[helpful], kind="stable")]:
+        low, high = int(first[move]), int(last[move])
+        if free[low] and free[high + 1] and free[low : high + 2].all():
+            free[low : high + 2] = False
+            tour[low + 1 : high + 1] = tour[low + 1 : high + 1][::-1].copy()
+    return bool(len(helpful))
+
+
+WHOLE = ("step", "position", "gate_start_ps", "gate_width_ps", "sensor", "ray")
+COLUMNS = (
+    "step", "position", "origin_x_m", "origin_y_m", "origin_z_m", "boresight_azimuth_deg", "boresight_elevation_deg",
+    "x_deg", "y_deg", "gate_start_ps", "gate_width_ps", "sensor", "ray",
+)  # fmt: skip
+LONGEST_SHOWN = 200
+# What spreadsheets put in front of UTF-8.
+BOM = b"\xef\xbb\xbf"
+# Angles at the limit come out of sines and cosines a few units in the last place off.
+ROUNDING_DEG = SLACK
+# Whole numbers up to here are exact as float64; light takes 104 days for so many picoseconds.
+MOST_WHOLE = 2**53
+
+
+@dataclass(frozen=True, eq=False)
+class Position:
+    """Where a scanner stands, and its rays in the order of their steps.
+
+    Arguments:
+        origin_m: Its place [m], shape (3,).
+        boresight_deg: Azimuth and elevation of where both mirrors are at zero [deg].
+        ray: Indices into the design's rays, shape (K,).
+        angles_deg: Optical scan angles x and y, shape (K, 2).
+        own_travel_deg: The length of the round trip in the design's own order [deg].
+    """
+
+    origin_m: np.ndarray
+    boresight_deg: tuple[float, float]
+    ray: np.ndarray
+    angles_deg: np.ndarray
+    own_travel_deg: float
+
+
+def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+    """Write the file, atomically; returns what it came to and notes of what the format cannot hold.
+
+    Raises:
+        ConfigError: Rays of one sensor start at several places, or look beyond what the mirrors reach.
+    """
+    positions = plan(design, rays)
+    gates = gate_ps(rays.gate_m)
+    lines = [",".join(COLUMNS)]
+    for number, one in enumerate(positions):
+        shared = [repr(float(value)) for value in (*one.origin_m, *one.boresight_deg)]
+        for ray, (x, y) in zip(one.ray.tolist(), one.angles_deg.tolist(), strict=True):
+            start, width = gates[ray].tolist()
+            row = (len(lines) - 1, number, *shared, repr(x), repr(y), start, width, int(rays.sensor[ray]), ray)
+            lines.append(",".join(map(str, row)))
+    write_atomic(path, "\n".join(lines) + "\n")
+    rounded = "gates are whole picoseconds (0.15 mm), opened outward; firing times follow from the order of the rows"
+    return [*_summary(positions), *LOST, rounded]
+
+
+def plan(design: DesignSpec, rays: Rays) -> list[Position]:
+    """The positions of a scanner that fires all rays, in the order of the rays that need them first.
+
+    Raises:
+        ConfigError: Rays of one sensor start at several places, or look beyond what the mirrors reach.
+    """
+    origins, first, place = np.unique(rays.origin_m, axis=0, return_index=True, return_inverse=True)
+    place = place.reshape(-1)
+    for index, sensor in enumerate(design.sensors):
+        places = len(np.unique(place[rays.sensor == index]))
+        if places > 1:
+            raise ConfigError(
+                f"the rays of sensor {sensor.name!r} start at {places} places, and a steering mirror stands at one",
+                where=design.name,
+                allowed="one origin per sensor",
+                hint="lidardesign constrain RUN --layout grid, or with origin.fixed_m in the constraints",
+            )
+    positions = []
+    for here in np.argsort(first):
+        chosen = np.flatnonzero(place == here)
+        boresight = middle_boresight_deg(rays.direction[chosen])
+        angles_deg = scan_angles_deg(degree_frame(*boresight), rays.direction[chosen])
+        order = short_tour(angles_deg)
+        positions.append(Position(origins[here], boresight, chosen[order], angles_deg[order], travel(angles_deg)))
+    _refuse_far_rays(design, rays, positions)
+    return positions
+
+
+def read_galvo(path: Path) -> Rays:
+    """The rays of a file that `write_galvo` made, in the design's own order.
+
+    They fire at the times of their steps, 10 frames a second. Directions come back to rounding, gates to the whole
+    picoseconds that hold them.
+
+    Raises:
+        DataError: The file is not there, no such table, or has values out of their range.
+    """
+    table = _columns(path)
+    count = len(table["ray"])
+    if sorted(table["ray"].tolist()) != list(range(count)) or sorted(table["step"].tolist()) != list(range(count)):
+        raise DataError(
+            "rays or steps are missing or given twice", where=str(path), allowed=f"each of 0 to {count - 1}"
+        )
+    directions = np.empty((count, 3))
+    boresights = np.stack([table["boresight_azimuth_deg"], table["boresight_elevation_deg"]], axis=1)
+    scan_deg = np.stack([table["x_deg"], table["y_deg"]], axis=1)
+    for boresight in np.unique(boresights, axis=0):
+        rows = (boresights == boresight).all(axis=1)
+        directions[rows] = scan_directions(degree_frame(*boresight), scan_deg[rows])
+    gates = gate_m(np.stack([table["gate_start_ps"], table["gate_width_ps"]], axis=1))
+    origins = np.stack([table[f"origin_{axis}_m"] for axis in "xyz"], axis=1)
+    times = fire_times(count, Bandwidth().rate_hz)[table["step"]]
+    return Rays(origins, directions, gates, table["sensor"], times).subset(np.argsort(table["ray"]))
+
+
+def is_galvo_file(path: Path) -> bool:
+    """Whether a file begins as `write_galvo` begins one."""
+    try:
+        return read_head(path, RAY_TABLE).removeprefix(BOM).startswith(",".join(COLUMNS).encode())
+    except DataError:
+        return False
+
+
+def _refuse_far_rays(design: DesignSpec, rays: Rays, positions: list[Position]) -> None:
+    ray = np.concatenate([one.ray for one in positions] or [np.zeros(0, dtype=np.int64)])
+    angles_deg = np.concatenate([one.angles_deg for one in positions] or [np.zeros((0, 2))])
+    beyond = np.abs(angles_deg).max(axis=1) > LIMIT_DEG + ROUNDING_DEG
+    if not beyond.any():
+        return
+    worst = int(np.abs(angles_deg).max(axis=1).argmax())
+    x, y = angles_deg[worst]
+    sensor = design.sensors[int(rays.sensor[ray[worst]])].name
+    raise ConfigError(
+        f"{int(beyond.sum())} of {len(ray)} rays are beyond the mirrors' reach, the farthest at x = {x:.2f}, "
+        f"y = {y:.2f} degrees from the middle of the rays (ray {ray[worst]}, sensor {sensor!r})",
+        where=design.name,
+        allowed=f"+-{LIMIT_DEG:g} degrees of optical scan angle per axis",
+        hint="constrain field_of_view and boresight, as boresight.elevation_deg.max=20, or fewer sensors apart",
+    )
+
+
+def _summary(positions: list[Position]) -> list[str]:
+    if not positions:
+        return []
+    after = sum(travel(one.angles_deg) for one in positions)
+    before = sum(one.own_travel_deg for one in positions)
+    widest = np.abs(np.concatenate([one.angles_deg for one in positions])).max(axis=0)
+    notes = [
+        f"the mirrors travel {after:.1f} degrees per frame, {before:.1f} in the design's own order",
+        f"optical angles (twice the mechanical ones) up to +-{widest[0]:.2f} in x and +-{widest[1]:.2f} degrees in y",
+    ]
+    if len(positions) > 1:
+        notes.append(f"the rays start at {len(positions)} places: one scanner each, or one that is moved there")
+    else:
+        azimuth, elevation = positions[0].boresight_deg
+        place = ", ".join(f"{value:g}" for value in positions[0].origin_m)
+        notes.append(f"scanner at ({place}) m, boresight at azimuth {azimuth:g}, elevation {elevation:g} degrees")
+    return notes
+
+
+def _columns(path: Path) -> dict[str, np.ndarray]:
+    where = str(path)
+    (_, header), *rows = csv_rows(path, RAY_TABLE) or [(1, [])]
+    if tuple(header) != COLUMNS:
+        raise DataError("is not a ray list of the galvo format", where=where, allowed=",".join(COLUMNS))
+    values = np.empty((len(rows), len(COLUMNS)))
+    for index, (line, row) in enumerate(rows):
+        values[index] = _numbers(row, f"{where}:{line}")
+    return {
+        name: column.astype(np.int64) if name in WHOLE else column
+        for name, column in zip(COLUMNS, values.T, strict=True)
+    }
+
+
+def _numbers(row: list[str], where: str) -> list[float]:
+    """The values of a row: finite, and whole and not negative where they count or time something."""
+    try:
+        found = [plain_number(cell) for cell in row]
+    except ValueError as error:
+        raise DataError(str(error)[:LONGEST_SHOWN], where=where, allowed="numbers") from error
+    if len(found) != len(COLUMNS) or not all(map(math.isfinite, found)):
+        raise DataError(f"holds {str(row)[:LONGEST_SHOWN]}", where=where, allowed=f"{len(COLUMNS)} finite numbers")
+    for name, value in zip(COLUMNS, found, strict=True):
+        if name in WHOLE and (value < 0 or value != int(value) or value > MOST_WHOLE):
+            raise DataError(f"{name} is {value:g}", where=where, allowed="whole numbers, 0 or more")
+        if name in ("x_deg", "y_deg") and abs(value) > LIMIT_DEG + ROUNDING_DEG:
+            raise DataError(f"{name} is {value:g}", where=where, allowed=f"+-{LIMIT_DEG:g} degrees")
+    return found

@@ -1,0 +1,167 @@
+"""Designs as PLY and STL files, for CloudCompare, Blender, MeshLab and CAD; metres in the task's own frame.
+
+`rays.ply` has a point per ray: where it starts, its direction as the normal, its gate, time and sensor as properties.
+`beams.ply` has the part of each ray inside its gate as an edge, `frusta.ply` the fields of view between start and end
+of their gates as surfaces. Numbers are float64, colours tell sensors apart.
+
+Mounting positions as STL: per sensor a small solid with its tip where the sensor stands, opening where it looks.
+
+STL has no units and CAD programs take its numbers as millimetres, so that is what is written. The solid is a pyramid
+of 20 mm along the boresight; its far face is 16 mm wide at the bottom and 8 mm at the top, so the roll can be seen.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.formats.names import identifier, numbers, write_folder
+from lidardesign.layouts.grid import field_on_sphere
+from lidardesign.numerics import unit_vectors
+from lidardesign.run.files import write_atomic
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.sensor import DesignSpec, Sensor, tangent_directions
+
+RAYS, BEAMS, FRUSTA = "rays.ply", "beams.ply", "frusta.ply"
+PLACE = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
+COLOUR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+NORMAL = [("nx", "<f8"), ("ny", "<f8"), ("nz", "<f8")]
+# CloudCompare reads properties of these names as scalar fields without being asked, and leaves their beginning out.
+RAY = [
+    (f"scalar_{name}", kind)
+    for name, kind in (("gate_start", "<f8"), ("gate_end", "<f8"), ("time", "<f8"), ("sensor", "<i4"))
+]
+FACE = [("corners", "u1"), ("vertex_indices", "<i4", (4,))]
+EDGE = [("vertex1", "<i4"), ("vertex2", "<i4")]
+TYPES = {"f8": "double", "u1": "uchar", "i4": "int"}
+# Told apart in every kind of colour vision (Okabe and Ito 2008).
+COLOURS = np.array(
+    [(0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0), (240, 228, 66)]
+)
+# Parts of each side of a shell: a field of 90 degrees bulges by 0.2 % of its range less than the sphere does.
+PARTS = 12
+# Common readers take lines of up to 1023 characters; a letter may be escaped to twelve.
+LONGEST_NAME = 60
+
+
+def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+    """Write the folder; returns notes of what the format cannot hold."""
+    comments = [
+        f"comment sensor {index} {json.dumps(one.name[:LONGEST_NAME])}" for index, one in enumerate(design.sensors)
+    ]
+    seen = [(index, one) for index, one in enumerate(design.sensors) if min(one.field_of_view_rad) > 0]
+    files = {RAYS: _file(comments, vertex=_ray_points(rays)), BEAMS: _beams(rays, comments)}
+    if seen:
+        files[FRUSTA] = _frusta(seen, comments)
+    notes = [*write_folder(path, files), "weights, spreads and origin covariances of the sensors are lost"]
+    if len(seen) < len(design.sensors):
+        notes.append(f"{len(design.sensors) - len(seen)} of {len(design.sensors)} sensors have no width, so no frustum")
+    moving = [length for length, _ in (sensor.travel_m for _, sensor in seen) if length > 0]
+    if moving:
+        notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: frusta stand in their middles")
+    return notes
+
+
+def _file(comments: list[str], **elements: np.ndarray) -> bytes:
+    header = ["ply", "format binary_little_endian 1.0", "comment lidardesign, metres, z up", *comments]
+    for name, table in elements.items():
+        header.append(f"element {name} {len(table)}")
+        header += _properties(table.dtype)
+    return "\n".join([*header, "end_header", ""]).encode("ascii") + b"".join(
+        table.tobytes() for table in elements.values()
+    )
+
+
+def _properties(kinds: np.dtype) -> list[str]:
+    if kinds == np.dtype(FACE):
+        return ["property list uchar int vertex_indices"]
+    return [f"property {TYPES[kinds[name].str[1:]]} {name}" for name in kinds.names or ()]
+
+
+def _points(places: np.ndarray, sensor: np.ndarray, kinds: list[tuple[str, str]]) -> np.ndarray:
+    """Points with the colours of their sensors, and room for more."""
+    table = np.zeros(len(places), dtype=kinds)
+    columns = (*places.T, *COLOURS[sensor % len(COLOURS)].T)
+    for (name, _), column in zip(PLACE + COLOUR, columns, strict=True):
+        table[name] = column
+    return table
+
+
+def _ray_points(rays: Rays) -> np.ndarray:
+    table = _points(rays.origin_m, rays.sensor, PLACE + NORMAL + COLOUR + RAY)
+    columns = (*rays.direction.T, *rays.gate_m.T, rays.time_s, rays.sensor)
+    for (name, _), column in zip(NORMAL + RAY, columns, strict=True):
+        table[name] = column
+    return table
+
+
+def _beams(rays: Rays, comments: list[str]) -> bytes:
+    """Two points per ray, where its gate starts and ends, and the edge between them."""
+    places = rays.origin_m[:, None] + rays.gate_m[:, :, None] * rays.direction[:, None]
+    edges = np.zeros(len(rays), dtype=EDGE)
+    edges["vertex1"], edges["vertex2"] = np.arange(2 * len(rays)).reshape(-1, 2).T
+    return _file(comments, vertex=_points(places.reshape(-1, 3), np.repeat(rays.sensor, 2), PLACE + COLOUR), edge=edges)
+
+
+def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
+    """Fields of view between the gates' ends: two shells and four sides each, as quadrilaterals."""
+    # Corners of the faces of `_frustum`, seen from outside against the clock, shape (F, 4)
+    side = PARTS + 1
+    near = np.arange(side * side).reshape(side, side)
+    far = near + side * side
+    inner = np.stack([near[:-1, :-1], near[1:, :-1], near[1:, 1:], near[:-1, 1:]], axis=-1).reshape(-1, 4)
+    outer = np.stack([far[:-1, :-1], far[:-1, 1:], far[1:, 1:], far[1:, :-1]], axis=-1).reshape(-1, 4)
+    rim = [near[0], near[:, -1], near[-1, ::-1], near[::-1, 0]]
+    walls = [np.stack([one[:-1], one[1:], one[1:] + side * side, one[:-1] + side * side], axis=-1) for one in rim]
+    corners = np.concatenate([inner, outer, *walls])
+    points, faces = [], []
+    for number, (index, sensor) in enumerate(sensors):
+        places = _frustum(sensor)
+        points.append(_points(places, np.full(len(places), index), PLACE + COLOUR))
+        faces.append(corners + number * len(places))
+    table = np.zeros(len(faces) * len(corners), dtype=FACE)
+    table["corners"], table["vertex_indices"] = 4, np.concatenate(faces)
+    return _file(comments, vertex=np.concatenate(points), face=table)
+
+
+def _frustum(sensor: Sensor) -> np.ndarray:
+    """Points of the shell at the gate's start, then of that at its end, row by row upwards: 2 (PARTS + 1)^2."""
+    across, up = (np.linspace(-extent / 2, extent / 2, PARTS + 1) for extent in field_on_sphere(sensor))
+    looking = tangent_directions(sensor.frame, np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2))
+    return np.concatenate([np.asarray(sensor.origin_m) + end * looking for end in sensor.gate_m])
+
+
+MM_PER_M = 1000.0
+# Forward, to the left and up from the tip [mm]: the tip, then the far face from its bottom right against the clock.
+CORNERS_MM = np.array([(0, 0, 0), (20, -8, -6), (20, -4, 6), (20, 4, 6), (20, 8, -6)], dtype=np.float64)
+# Seen from outside against the clock.
+FACETS = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (1, 4, 3), (1, 3, 2)])
+KEYWORDS = ("solid", "facet", "loop", "vertex")
+
+
+def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+    """Write the file, atomically; returns notes of what the format cannot hold."""
+    write_atomic(path, "".join(_solid(index, sensor) for index, sensor in enumerate(design.sensors)))
+    notes = [
+        "numbers are millimetres: STL has no units, and CAD programs take that one",
+        "sensors only: rays, fields of view, gates, weights and spreads are lost",
+    ]
+    moving = [length for length, _ in (sensor.travel_m for sensor in design.sensors) if length > 0]
+    if moving:
+        notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: solids stand in their middles")
+    return notes
+
+
+def _solid(index: int, sensor: Sensor) -> str:
+    # A name that no reader takes for a word of the format
+    word = identifier(sensor.name)
+    name = f"sensor_{index}" if any(key in word.lower() for key in KEYWORDS) else f"sensor_{index}_{word}"
+    corners = MM_PER_M * np.asarray(sensor.origin_m) + CORNERS_MM @ sensor.frame
+    facets = []
+    for triangle in corners[FACETS]:
+        normal = unit_vectors(np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0]))
+        vertices = "".join(f"   vertex {numbers(corner)}\n" for corner in triangle)
+        facets.append(f" facet normal {numbers(normal)}\n  outer loop\n{vertices}  endloop\n endfacet\n")
+    return f"solid {name}\n{''.join(facets)}endsolid {name}\n"

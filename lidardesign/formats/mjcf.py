@@ -1,0 +1,272 @@
+"""The rangefinders of a MuJoCo model (MJCF): each is one ray along the +z axis of its site.
+
+Rangefinders of one body that start at one place are one sensor, and so are those of a body that carries the sensor's
+name and whose sites are its rays, NAME_r0, NAME_r1, ..., as `export --format mjcf` writes them; these keep the starts
+of their gates in the rangefinders' user data. Rays stand where the model's bodies do when a simulation begins.
+
+MuJoCo compiles only what says where rangefinders are, as a model of its own that reads nothing from disk and runs
+nothing: bodies, frames, sites and their defaults are kept; shapes, joints, meshes, actuators and plugins are left out.
+Without joints bodies stand where the model puts them, which is where they are when a simulation begins.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.errors import DataError
+from lidardesign.formats.rig import Rig, RigSensor
+from lidardesign.run.xml import DEEPEST, Element, read_xml
+from lidardesign.space import FARTHEST_M, angles
+
+ALLOWED = "an MJCF model"
+PLACE = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
+KEPT = {
+    "compiler": ("angle", "eulerseq"),
+    "default": ("class",),
+    "worldbody": ("childclass",),
+    "body": ("name", "childclass", *PLACE),
+    "frame": ("name", "childclass", *PLACE),
+    "replicate": ("count", "sep", "offset", "euler"),
+    "site": ("name", "class", "size", "type", "fromto", *PLACE),
+    "sensor": (),
+    "rangefinder": ("name", "site", "cutoff", "user"),
+}
+MOST_INCLUDES = 100
+# MuJoCo takes seconds for a thousand copies with sensors, and four times as long for twice as many.
+MOST_COPIES = 1000
+# It takes ten seconds for so many sites and sensors, and four times as long for twice as many.
+MOST_KEPT = 120_000
+
+
+def stripped_model(path: Path) -> ElementTree.Element:
+    """The model of a file as it is left, with what it includes from its own folder.
+
+    Raises:
+        DataError: A file is not XML, lies outside the model's folder, or the model is one that cannot be read so.
+    """
+    root = read_xml(path, ALLOWED)
+    model = ElementTree.Element("mujoco", {"model": "rig"})
+    _Copier([path.resolve()]).copy_children(root, model, path, depth=1)
+    return model
+
+
+@dataclass
+class _Copier:
+    """Copies what is kept of a model and of what it includes.
+
+    Arguments:
+        seen: The files that were read, the model's own first.
+        copies: How many elements `replicate` makes.
+        kept: How many elements are kept.
+    """
+
+    seen: list[Path]
+    copies: int = 0
+    kept: int = 0
+
+    def copy_children(
+        self, source: ElementTree.Element, target: ElementTree.Element, path: Path, *, depth: int, times: int = 1
+    ) -> None:
+        """Append what is kept of an element's children; `times` is how often it is replicated."""
+        for child in source:
+            where = f"{path}:{child.line if isinstance(child, Element) else 1}"
+            if depth >= DEEPEST:
+                raise DataError("is nested too deep, with what it includes", where=where, allowed=f"{DEEPEST} levels")
+            if child.tag == "include":
+                file = self.included_file(child.attrib.get("file", ""), where)
+                self.copy_children(read_xml(file, ALLOWED), target, file, depth=depth + 1, times=times)
+                continue
+            if child.tag == "attach":
+                raise DataError("attaches another model", where=where, allowed="one model, or <include>")
+            if child.tag == "rangefinder" and "camera" in child.attrib:
+                raise DataError(
+                    "has a rangefinder on a camera", where=where, allowed="rangefinders on sites: one ray each"
+                )
+            if child.tag not in KEPT:
+                continue
+            self.kept += 1
+            if self.kept > MOST_KEPT:
+                raise DataError("has too many bodies, sites and sensors", where=where, allowed=f"at most {MOST_KEPT}")
+            kept = {name: child.attrib[name] for name in KEPT[child.tag] if name in child.attrib}
+            inner = times
+            if child.tag == "replicate":
+                count = child.attrib.get("count", "")
+                if not count.strip().isdecimal() or len(count) > len(str(MOST_COPIES)):
+                    raise DataError(
+                        f"count is {count[:40]!r}", where=where, allowed=f"a whole number up to {MOST_COPIES}"
+                    )
+                inner *= int(count)
+            self.copies += inner if inner > 1 else 0
+            if self.copies > MOST_COPIES:
+                raise DataError("replicates too much", where=where, allowed=f"at most {MOST_COPIES} copies")
+            self.copy_children(
+                child, ElementTree.SubElement(target, child.tag, kept), path, depth=depth + 1, times=inner
+            )
+
+    def included_file(self, name: str, where: str) -> Path:
+        """An included file, which lies in the first file's folder, links followed, and is included once."""
+        folder = self.seen[0].parent
+        file = (folder / name).resolve()
+        if not name or not file.is_relative_to(folder):
+            raise DataError(
+                f"includes {name!r}, which is outside the model's folder", where=where,
+                hint="copy the file into the model's folder and name it from there",
+            )  # fmt: skip
+        if file in self.seen or len(self.seen) > MOST_INCLUDES:
+            raise DataError(f"includes {name!r} again", where=where, allowed=f"each file once, at most {MOST_INCLUDES}")
+        self.seen.append(file)
+        return file
+
+
+# Rays of one sensor that were written with few digits start within this of one another [m].
+SAME_PLACE_M = 1e-4
+# What is left of a sensor's name when its rays are counted: `front_r12` and `front_r13` are of `front`.
+EXPORTED = re.compile(r"_r\d+")
+COUNTED = re.compile(r"[\s_.-]+(r|ray)?[\s_.-]*\d*$|\d+$")
+
+
+@dataclass(frozen=True)
+class _Ray:
+    """One rangefinder of the compiled model, in the world's frame.
+
+    Arguments:
+        name: Its own, or its site's.
+        site_name: Its site's.
+        body: The body that it is on; 0 is the world.
+        body_name: That body's name.
+        origin_m, direction: Shape (3,).
+        cutoff_m: How far it is heard; infinite where that is not said.
+        user: Its user data.
+    """
+
+    name: str
+    site_name: str
+    body: int
+    body_name: str
+    origin_m: np.ndarray
+    direction: np.ndarray
+    cutoff_m: float
+    user: tuple[float, ...]
+
+    @property
+    def is_exported(self) -> bool:
+        """Whether it is named as a ray that was exported of the sensor that its body is."""
+        named = self.body > 0 and self.body_name and self.site_name.startswith(self.body_name)
+        return bool(named) and EXPORTED.fullmatch(self.site_name, len(self.body_name)) is not None
+
+    @property
+    def start_m(self) -> float | None:
+        """The start of its gate, where its export left it beside the end."""
+        start, end = (*self.user, 0.0, 0.0)[:2]
+        return start if self.is_exported and 0 <= start <= end == self.cutoff_m else None
+
+
+def read_mjcf(path: Path) -> Rig:
+    """The sensors of a model.
+
+    Raises:
+        DataError: The file is no model, MuJoCo refuses it, or it has no rangefinder.
+    """
+    rays = _rays(stripped_model(path), path)
+    if not rays:
+        raise DataError(
+            "has no rangefinder", where=str(path), allowed="<sensor> with <rangefinder site=...>, one per ray"
+        )
+    for ray in rays:
+        if not (np.abs(ray.origin_m) <= FARTHEST_M).all():
+            raise DataError(
+                f"the rangefinder {ray.name!r} has the place {np.abs(ray.origin_m).max():g} m",
+                where=str(path),
+                allowed=f"at most {FARTHEST_M:g} m along each axis",
+            )
+    groups = _groups(rays)
+    notes = []
+    if any(ray.start_m is None for ray in rays):
+        notes.append("the file does not say where gates start: rangefinders listen from 0 m on")
+    sensors_of_body = Counter(rays[group[0]].body for group in groups)
+    sensors = []
+    for group in groups:
+        own = [rays[index] for index in group]
+        azimuth, elevation = angles(np.array([ray.direction for ray in own]))
+        gates = np.array([[ray.start_m or 0.0, ray.cutoff_m] for ray in own])
+        name = _name(own, alone=sensors_of_body[own[0].body] == 1)
+        origin = np.array([ray.origin_m for ray in own])
+        sensors.append(RigSensor(name, origin, azimuth, elevation, gates, order=np.array(group)))
+    return Rig("MuJoCo model", sensors, notes, "give the rangefinders a cutoff")
+
+
+def _rays(stripped: ElementTree.Element, path: Path) -> list[_Ray]:
+    from lidardesign.scenes.mujoco_models import import_mujoco, mujoco_warnings
+
+    mujoco = import_mujoco()
+    try:
+        with mujoco_warnings():
+            model = mujoco.MjModel.from_xml_string(ElementTree.tostring(stripped, encoding="unicode"))
+            data = mujoco.MjData(model)
+            mujoco.mj_kinematics(model, data)
+    except ValueError as error:
+        reason = " ".join(str(error).split()) or "no reason given"
+        raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from None
+    rays = []
+    for index in np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_RANGEFINDER)):
+        site = int(model.sensor_objid[index])
+        body = int(model.site_bodyid[site])
+        rays.append(
+            _Ray(
+                name=model.sensor(int(index)).name or model.site(site).name,
+                site_name=model.site(site).name,
+                body=body,
+                body_name=model.body(body).name,
+                origin_m=np.array(data.site_xpos[site]),
+                direction=np.array(data.site_xmat[site]).reshape(3, 3)[:, 2],
+                cutoff_m=float(model.sensor_cutoff[index]) or np.inf,
+                user=tuple(float(value) for value in model.sensor_user[index]),
+            )
+        )
+    return rays
+
+
+def _groups(rays: Sequence[_Ray]) -> list[list[int]]:
+    """The rays of each sensor, by body and place, in order of appearance."""
+    groups: list[list[int]] = []
+    # groups by the body and the cell of their first ray
+    near: dict[tuple[int, ...], list[list[int]]] = {}
+    exported: dict[int, list[int]] = {}
+    for index, ray in enumerate(rays):
+        if ray.is_exported and ray.body in exported:
+            exported[ray.body].append(index)
+            continue
+        cell = np.floor(ray.origin_m / SAME_PLACE_M).astype(np.int64)
+        around = [(ray.body, *(cell + np.array(step) - 1).tolist()) for step in np.ndindex(3, 3, 3)]
+        candidates = (group for key in around for group in near.get(key, []))
+        same = (group for group in candidates if np.linalg.norm(rays[group[0]].origin_m - ray.origin_m) <= SAME_PLACE_M)
+        group = next(same, None)
+        if group is not None:
+            group.append(index)
+            continue
+        groups.append([index])
+        if ray.is_exported:
+            exported[ray.body] = groups[-1]
+        near.setdefault((ray.body, *cell.tolist()), []).append(groups[-1])
+    return groups
+
+
+def _name(own: Sequence[_Ray], *, alone: bool) -> str:
+    """What the names of a sensor's rays have in common, or the name of the body that has no other sensor."""
+    if own[0].is_exported:
+        return own[0].body_name
+    if len(own) == 1 and own[0].name:
+        return own[0].name
+    names = [ray.name for ray in own]
+    # what the first and the last in order share, all share
+    pairs = takewhile(lambda letters: letters[0] == letters[1], zip(min(names), max(names), strict=False))
+    common = COUNTED.sub("", "".join(letter for letter, _ in pairs))
+    return common or (own[0].body_name if alone and own[0].body else "")

@@ -1,0 +1,338 @@
+"""Sensors and rays as other programs hold them: at mounting poses, or by the places where rays start.
+
+A mount has the sensor's place and boresight frame: x forward, y to the left (growing azimuth), z up. By fixed axes
+(URDF, SDF) its rotation is roll = the sensor's roll, pitch = -elevation, yaw = azimuth. The rays are given in that
+frame. What formats lose becomes notes (`*_losses`).
+
+Simulators of scanning sensors fire even grids of azimuth and elevation in the sensor's frame: rays of any layout are
+replaced by the grid of about as many rays that is nearest to them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidardesign.errors import DataError
+from lidardesign.formats.names import distinct, identifier
+from lidardesign.numerics import COARSE_SLACK, SLACK
+from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays
+from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.space import angles, direction
+
+
+def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Angles between unit vectors (N, 3) [rad], exact for the smallest too: 2 arcsin(|a - b| / 2), shape (N,)."""
+    return 2 * np.arcsin(np.minimum(np.linalg.norm(first - second, axis=1) / 2, 1.0))
+
+
+# Origins and gates closer than this are the same.
+SAME_M = SLACK
+
+
+@dataclass(frozen=True, eq=False)
+class Mount:
+    """One sensor where it is mounted, and what it fires.
+
+    Arguments:
+        name: An identifier, unique in the design.
+        sensor: What is mounted.
+        origin_m: The mean of where its rays start, shape (3,).
+        ray: Indices of its rays, shape (N,), N >= 1.
+        azimuth_rad, elevation_rad: Of its rays in its frame, azimuths from -pi to pi, shape (N,).
+        gate_m: The narrowest gate that holds those of all its rays, start and end.
+        spread_m: How far from its place its rays start at most.
+        gate_excess_m: How much wider than a ray's own gate `gate_m` is at most.
+    """
+
+    name: str
+    sensor: Sensor
+    origin_m: np.ndarray
+    ray: np.ndarray
+    azimuth_rad: np.ndarray
+    elevation_rad: np.ndarray
+    gate_m: tuple[float, float]
+    spread_m: float
+    gate_excess_m: float
+
+    @property
+    def roll_pitch_yaw_rad(self) -> tuple[float, float, float]:
+        """About the fixed axes x, y, z, in this order."""
+        return self.sensor.roll_rad, -self.sensor.elevation_rad, self.sensor.azimuth_rad
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """The rotation from its frame to the world as (w, x, y, z)."""
+        return quaternion(*self.roll_pitch_yaw_rad)
+
+
+def mounts(design: DesignSpec, rays: Rays) -> list[Mount]:
+    """The sensors of a design that fire rays, in their order."""
+    names = distinct([identifier(sensor.name) for sensor in design.sensors], "_")
+    order = np.argsort(rays.sensor, kind="stable")
+    edges = np.searchsorted(rays.sensor[order], np.arange(len(design.sensors) + 1))
+    return [
+        _mount(name, sensor, rays, order[edges[index] : edges[index + 1]])
+        for index, (name, sensor) in enumerate(zip(names, design.sensors, strict=True))
+        if edges[index] < edges[index + 1]
+    ]
+
+
+def _mount(name: str, sensor: Sensor, rays: Rays, ray: np.ndarray) -> Mount:
+    starts = rays.origin_m[ray]
+    # a mean of equal numbers need not be that number
+    origin = starts[0] if (starts == starts[0]).all() else starts.mean(axis=0)
+    azimuth, elevation = angles(rays.direction[ray] @ sensor.frame.T)
+    gate = rays.gate_m[ray]
+    start, end = float(gate[:, 0].min()), float(gate[:, 1].max())
+    return Mount(
+        name,
+        sensor,
+        origin,
+        ray,
+        np.where(azimuth > np.pi, azimuth - 2 * np.pi, azimuth),
+        elevation,
+        (start, end),
+        float(np.linalg.norm(starts - origin, axis=1).max()),
+        float(np.maximum(gate[:, 0] - start, end - gate[:, 1]).max()),
+    )
+
+
+def quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> tuple[float, float, float, float]:
+    """The unit quaternion (w, x, y, z) of rotations about the fixed axes x, y, z, in this order."""
+    cos_r, sin_r = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
+    cos_p, sin_p = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+    cos_y, sin_y = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return (
+        cos_r * cos_p * cos_y + sin_r * sin_p * sin_y,
+        sin_r * cos_p * cos_y - cos_r * sin_p * sin_y,
+        cos_r * sin_p * cos_y + sin_r * cos_p * sin_y,
+        cos_r * cos_p * sin_y - sin_r * sin_p * cos_y,
+    )
+
+
+def fire_times_s(rays: Rays, rate_hz: float) -> np.ndarray:
+    """When rays fire in a frame of another rate than they were laid out for [s]."""
+    return rays.time_s * (DEFAULT_RATE_HZ / rate_hz)
+
+
+def design_losses(design: DesignSpec, mounted: Sequence[Mount]) -> list[str]:
+    """What no format of mounted sensors holds of a design, and sensors that fire nothing."""
+    notes = ["weights, spreads and origin covariances of the sensors are lost"]
+    silent = len(design.sensors) - len(mounted)
+    if silent:
+        notes.append(f"{silent} of {len(design.sensors)} sensors fire no ray and are left out")
+    return notes
+
+
+def origin_losses(mounted: Sequence[Mount]) -> list[str]:
+    """What formats lose in which all rays of a sensor start at one place."""
+    spread = [one for one in mounted if one.spread_m > SAME_M]
+    if not spread:
+        return []
+    rays, worst = sum(len(one.ray) for one in spread), max(one.spread_m for one in spread)
+    return [
+        f"{rays} rays of {len(spread)} sensors start all over them: they start at their middle, up to {worst:.3g} m off"
+    ]
+
+
+def gate_losses(mounted: Sequence[Mount]) -> list[str]:
+    """What formats lose in which all rays of a sensor have one gate."""
+    wider = [one for one in mounted if one.gate_excess_m > SAME_M]
+    if not wider:
+        return []
+    worst = max(one.gate_excess_m for one in wider)
+    return [
+        f"the rays of {len(wider)} of {len(mounted)} sensors have gates of their own: the sensor's is the narrowest "
+        f"that holds them all, up to {worst:.3g} m wider"
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Rays of one sensor that start at one place.
+
+    Arguments:
+        name: An identifier, unique in the design: that of the sensor, numbered where it has several places.
+        mount: The sensor.
+        origin_m: The place [m], shape (3,).
+        ray: Indices of its rays in their order, shape (K,).
+    """
+
+    name: str
+    mount: Mount
+    origin_m: np.ndarray
+    ray: np.ndarray
+
+
+def places(mounted: Sequence[Mount], rays: Rays) -> list[Place]:
+    """The places of all sensors, by sensor and then in the order in which they first fire."""
+    found = []
+    for mount in mounted:
+        origins, first, place = np.unique(rays.origin_m[mount.ray], axis=0, return_index=True, return_inverse=True)
+        place = place.reshape(-1)
+        members = np.split(mount.ray[np.argsort(place, kind="stable")], np.cumsum(np.bincount(place))[:-1])
+        for number, here in enumerate(np.argsort(first)):
+            name = mount.name if len(origins) == 1 else f"{mount.name}_place_{number}"
+            found.append(Place(name, mount, origins[here], members[here]))
+    return found
+
+
+def require_rays(design: DesignSpec, rays: Rays, what: str) -> None:
+    """Refuse a design without rays, for a format that is made of them.
+
+    Raises:
+        DataError: There are none.
+    """
+    if not len(rays):
+        raise DataError(f"has no rays, and {what} holds nothing else", where=design.name, hint="give --rays N")
+
+
+# Rays nearer to a grid than this are on it: files hold some seven digits.
+ON_GRID_RAD = COARSE_SLACK
+# A grid has up to a tenth more or fewer rays than what it stands for.
+MOST_CHANGED = 10
+# Numbers of rows around that of square cells that are tried.
+TRIED_ROWS = 24
+
+
+@dataclass(frozen=True)
+class EvenGrid:
+    """Rows at even elevations, each with the same even azimuths; first and last rays are on the bounds.
+
+    Arguments:
+        columns, rows: How many azimuths and elevations.
+        azimuth_rad: The first and the last azimuth.
+        elevation_rad: The lowest and the highest elevation.
+    """
+
+    columns: int
+    rows: int
+    azimuth_rad: tuple[float, float]
+    elevation_rad: tuple[float, float]
+
+    def __len__(self) -> int:
+        return self.columns * self.rows
+
+    def directions(self) -> np.ndarray:
+        """Unit vectors row by row upwards, each row by growing azimuth, shape (rows * columns, 3)."""
+        azimuth = np.linspace(*self.azimuth_rad, self.columns)
+        elevation = np.linspace(*self.elevation_rad, self.rows)
+        return direction(np.tile(azimuth, self.rows), np.repeat(elevation, self.columns))
+
+    def distance_rad(self, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> np.ndarray:
+        """How far rays are from the grid's ray in whose cell they lie, shape (N,)."""
+        nearest = direction(
+            _nearest(cut_behind(azimuth_rad), self.azimuth_rad, self.columns),
+            _nearest(elevation_rad, self.elevation_rad, self.rows),
+        )
+        return angles_between(nearest, direction(azimuth_rad, elevation_rad))
+
+
+def nearest_grid(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> EvenGrid:
+    """The grid of about as many rays that is nearest to given ones in the mean square; at least one ray."""
+    azimuth_rad = cut_behind(azimuth_rad)
+    count = len(azimuth_rad)
+    shapes = [(rows, max(round(count / rows), 1)) for rows in _row_counts(azimuth_rad, elevation_rad)]
+    most = max(count // MOST_CHANGED, 1)
+    grids = [
+        EvenGrid(columns, rows, _fitted(azimuth_rad, columns), _fitted(elevation_rad, rows))
+        for rows, columns in shapes
+        if abs(rows * columns - count) <= most
+    ]
+
+    def misfit(grid: EvenGrid) -> float:
+        square = float(np.square(grid.distance_rad(azimuth_rad, elevation_rad)).mean())
+        # rounding is no reason for another number of rays
+        return square + ON_GRID_RAD**2 * abs(len(grid) - count)
+
+    return min(grids, key=misfit)
+
+
+def cut_behind(azimuth_rad: np.ndarray) -> np.ndarray:
+    """Azimuths from -pi up to below pi; what is straight behind to rounding is at -pi."""
+    start = -np.pi - ON_GRID_RAD
+    there = (azimuth_rad >= start) & (azimuth_rad < start + 2 * np.pi)
+    # what already exists stays as it is, to the last bit
+    return np.where(there, azimuth_rad, np.mod(azimuth_rad - start, 2 * np.pi) + start)
+
+
+def _row_counts(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> list[int]:
+    """Numbers of rows that are tried: around square cells, and as many as there are distinct elevations."""
+    count = len(azimuth_rad)
+    width = float(np.ptp(azimuth_rad) * np.cos(np.mean(elevation_rad)))
+    square = math.sqrt(count * float(np.ptp(elevation_rad)) / width) if width > 0 else float(count)
+    low = max(min(max(round(square), 1), count) - TRIED_ROWS // 2, 1)
+    tried = set(range(low, min(low + TRIED_ROWS, count) + 1))
+    azimuths, elevations = (
+        len(np.unique(np.round(values / ON_GRID_RAD / 2))) for values in (azimuth_rad, elevation_rad)
+    )
+    return sorted({1, *tried, elevations, max(round(count / max(azimuths, 1)), 1)})
+
+
+def _fitted(values: np.ndarray, count: int) -> tuple[float, float]:
+    """The first and last of `count` even values that are nearest to given ones in the mean square."""
+    low, high = float(values.min()), float(values.max())
+    if count == 1 or low == high:
+        middle = float(values.mean())
+        return middle, middle
+    index = np.rint((values - low) / (high - low) * (count - 1))
+    spread = index - index.mean()
+    step = float(spread @ (values - values.mean()) / (spread @ spread))
+    first = float(values.mean() - step * index.mean())
+    return first, first + step * (count - 1)
+
+
+def _nearest(values: np.ndarray, bounds: tuple[float, float], count: int) -> np.ndarray:
+    low, high = bounds
+    if count == 1 or low == high:
+        return np.full(len(values), low)
+    index = np.clip(np.rint((values - low) / (high - low) * (count - 1)), 0, count - 1)
+    return low + index * ((high - low) / (count - 1))
+
+
+def grid_of(mount: Mount) -> EvenGrid:
+    """The even grid that stands for the rays of a mount."""
+    return nearest_grid(mount.azimuth_rad, mount.elevation_rad)
+
+
+def channel_mounts(design: DesignSpec, rays: Rays) -> tuple[DesignSpec, Rays, list[Mount]]:
+    """A design with its mounts; one of sensors that spin has a sensor for each channel, whose ring is an even grid."""
+    if design.layout != "spinning":
+        return design, rays, mounts(design, rays)
+    rings = np.column_stack([rays.sensor, rays.elevation_rad])
+    found, channel = np.unique(rings, axis=0, return_inverse=True)
+    owners = [design.sensors[int(owner)] for owner in found[:, 0]]
+    sensors = tuple(replace(one, name=f"{one.name} channel {number}") for number, one in enumerate(owners))
+    design, rays = replace(design, sensors=sensors), replace(rays, sensor=channel.reshape(-1))
+    return design, rays, mounts(design, rays)
+
+
+def grid_sensor_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+    """Notes of what sensors with one place, one gate and an even grid of rays cannot hold."""
+    notes = [
+        *design_losses(design, mounted),
+        *grid_losses(mounted, rays),
+        *origin_losses(mounted),
+        *gate_losses(mounted),
+    ]
+    if design.layout == "spinning":
+        notes.append("every channel is a sensor of its own: an even ring")
+    return [*notes, "firing times are lost"]
+
+
+def grid_losses(mounted: Sequence[Mount], rays: Rays) -> list[str]:
+    """Notes of rays that are not on an even grid: how many, what replaces them, and how far off that is."""
+    pairs = [(mount, grid_of(mount)) for mount in mounted]
+    off = np.array([one for mount, grid in pairs for one in grid.distance_rad(mount.azimuth_rad, mount.elevation_rad)])
+    count, fired = int((off > ON_GRID_RAD).sum()), sum(len(grid) for _, grid in pairs)
+    if not count and all(len(grid) == len(mount.ray) for mount, grid in pairs):
+        return []
+    total = "" if fired == len(rays) else f", {fired} rays in all"
+    return [
+        f"{count} of {len(rays)} rays are not on an even grid of azimuth and elevation; replaced by even grids{total}: "
+        f"off by at most {math.degrees(off.max()):.2g} deg"
+    ]

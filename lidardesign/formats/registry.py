@@ -1,0 +1,260 @@
+"""The export formats by name; the code of a format is imported when it is used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from lidardesign.errors import ConfigError
+from lidardesign.scenes.mujoco_models import RobotFile
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import DesignSpec
+
+# A frame of a quarter of an hour, and one of a microsecond.
+SLOWEST_HZ, FASTEST_HZ = 0.001, 1e6
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """One export format.
+
+    Arguments:
+        name: As `export --format` takes it.
+        suffix: Of the file that it writes, with the dot; of the folder where it writes several.
+        summary: One line for `export --list`.
+        module: The module of its function.
+        function: The name of the function that writes it, `(design, rays, path) -> list[str]`.
+        reader: The program that reads it.
+        checked: How the tests show that this program takes what is written.
+        folder: Whether it writes a folder of files.
+        rated: Whether it holds the frame rate, so that `write` takes `rate_hz` too.
+        robotic: Whether it can hold a robot's model with the sensors in it, so that `write` takes `robot` too.
+    """
+
+    name: str
+    suffix: str
+    summary: str
+    module: str
+    function: str
+    reader: str
+    checked: str
+    folder: bool = False
+    rated: bool = False
+    robotic: bool = False
+
+    def write(
+        self,
+        design: DesignSpec,
+        rays: Rays,
+        path: Path,
+        rate_hz: float | None = None,
+        robot: RobotFile | None = None,
+    ) -> list[str]:
+        """Write the file, atomically; returns notes of what the format cannot hold.
+
+        Arguments:
+            design: The design.
+            rays: Its rays.
+            path: The file or folder.
+            rate_hz: Frames per second [Hz]; that of the read-out model by default.
+            robot: A model that the sensors are put into; None: they are written alone.
+
+        Raises:
+            ConfigError: A frame rate or a robot for a format that holds none, or a rate that no sensor has.
+            DataError: The file cannot be written, or the format cannot hold such a design at all.
+        """
+        write = getattr(import_module(self.module), self.function)
+        self.check_rate(rate_hz)
+        if robot is not None and not self.robotic:
+            raise ConfigError(f"{self.name} cannot hold a robot", where="--robot", allowed="with mjcf")
+        options: dict[str, Any] = {} if robot is None else {"robot": robot}
+        if self.rated:
+            options["rate_hz"] = Bandwidth().rate_hz if rate_hz is None else rate_hz
+        notes = write(design, rays, Path(path), **options)
+        if design.constraints:
+            notes.append("the constraints of the design are lost")
+        if design.mount is not None and robot is None:
+            hint = "; --robot MODEL puts the sensors on it" if self.robotic else ""
+            notes.append(f"places and directions are in the frame of the robot's body {design.mount!r}{hint}")
+        return notes
+
+    def check_rate(self, rate_hz: float | None) -> None:
+        """Refuse a frame rate [Hz] that no sensor has, or that the format cannot hold.
+
+        Raises:
+            ConfigError: It is such a one.
+        """
+        if rate_hz is not None and not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
+            raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")
+        if rate_hz is not None and not self.rated:
+            rated = ", ".join(name for name, exporter in EXPORTERS.items() if exporter.rated)
+            raise ConfigError(
+                f"{self.name} cannot hold a frame rate", where="--rate-hz", allowed=f"with {rated}" if rated else "none"
+            )
+
+
+EXPORTERS: dict[str, Exporter] = {
+    exporter.name: exporter
+    for exporter in (
+        Exporter(
+            "csv",
+            ".csv",
+            "one ray per row: origin, direction, angles, gate, time",
+            "lidardesign.formats.ray_lists",
+            "write_csv",
+            reader="anything that reads CSV; `evaluate` and `fit` too",
+            checked="read by numpy",
+        ),
+        Exporter(
+            "npz",
+            ".npz",
+            "the same columns as numpy arrays",
+            "lidardesign.formats.ray_lists",
+            "write_npz",
+            reader="numpy",
+            checked="read by numpy",
+        ),
+        Exporter(
+            "sensors-csv",
+            ".sensors.csv",
+            "one sensor per row, the 16 columns of the research code",
+            "lidardesign.formats.ray_lists",
+            "write_sensors_csv",
+            reader="the research code of the paper",
+            checked="read as a design; the columns are those of its own files",
+        ),
+        Exporter(
+            "galvo",
+            ".galvo.csv",
+            "mirror angles in the order of least travel, gates in ps: +-20 degrees per axis",
+            "lidardesign.formats.galvo",
+            "write_galvo",
+            reader="a script that drives two mirrors and a gated detector",
+            checked="read by `capture`",
+        ),
+        Exporter(
+            "mjcf",
+            ".mjcf.xml",
+            "a rangefinder site per ray",
+            "lidardesign.formats.robots",
+            "write_mjcf",
+            robotic=True,
+            reader="MuJoCo",
+            checked="loaded and run in MuJoCo: its distances agree with ours",
+        ),
+        Exporter(
+            "sdf",
+            ".sdf",
+            "a gpu_lidar per sensor, on even grids",
+            "lidardesign.formats.robots",
+            "write_sdf",
+            reader="Gazebo",
+            checked="parsed by libsdformat without a warning, all values compared; its pixels in a twin",
+            rated=True,
+        ),
+        Exporter(
+            "urdf",
+            ".urdf",
+            "a fixed link per sensor, with Gazebo's gpu_lidar",
+            "lidardesign.formats.robots",
+            "write_urdf",
+            reader="ROS, robot_state_publisher",
+            checked="parsed by check_urdf; sensors by libsdformat",
+            rated=True,
+        ),
+        Exporter(
+            "xacro",
+            ".urdf.xacro",
+            "the same as a macro that mounts it on a robot",
+            "lidardesign.formats.robots",
+            "write_xacro",
+            reader="ROS, xacro",
+            checked="expanded by xacro and parsed by check_urdf",
+            rated=True,
+        ),
+        Exporter(
+            "carla",
+            ".carla.json",
+            "attributes and transform of a ray_cast lidar per sensor",
+            "lidardesign.formats.simulators",
+            "write_carla",
+            reader="a script that sets blueprint attributes",
+            checked="names and types against CARLA's documented ones; its sweep in a twin",
+            rated=True,
+        ),
+        Exporter(
+            "isaac-usd",
+            ".usda",
+            "an OmniLidar per sensor, gates per ray",
+            "lidardesign.formats.simulators",
+            "write_isaac_usd",
+            reader="Isaac Sim from 5 on",
+            checked="opened with OpenUSD; types, tokens and lengths as its schema has them",
+            rated=True,
+        ),
+        Exporter(
+            "helios",
+            ".helios",
+            "a scanner per sensor with a channel per ray, and surveys of one frame each",
+            "lidardesign.formats.ray_tracers",
+            "write_helios",
+            reader="HELIOS++",
+            checked="valid by schemas of its fields; a twin of HELIOS++ fires the rays and finds their echoes",
+            folder=True,
+            rated=True,
+        ),
+        Exporter(
+            "osi",
+            ".osi.json",
+            "a lidar configuration per sensor: mounting position, unit vectors, microseconds",
+            "lidardesign.formats.simulators",
+            "write_osi",
+            reader="sensor models and simulators of ASAM OSI",
+            checked="parsed by protobuf, with ASAM's own bindings where they are",
+            rated=True,
+        ),
+        Exporter(
+            "rgl",
+            ".rgl",
+            "a pattern of float32 ray poses per sensor, and the model with the plugin",
+            "lidardesign.formats.ray_tracers",
+            "write_rgl",
+            reader="Robotec GPU Lidar and its Gazebo plugin",
+            checked="parsed by libsdformat; a twin reads patterns as the plugin does",
+            folder=True,
+            rated=True,
+        ),
+        Exporter(
+            "mitsuba",
+            ".mitsuba",
+            "a scene per sensor: gated film, rays as radiancemeters, a flash beside them",
+            "lidardesign.formats.ray_tracers",
+            "write_mitsuba",
+            reader="Mitsuba 3 with mitransient",
+            checked="rendered by them: light comes back in the bin of its range",
+            folder=True,
+        ),
+        Exporter(
+            "ply",
+            ".ply.d",
+            "rays as points, beams as edges, fields of view as surfaces",
+            "lidardesign.formats.meshes",
+            "write_ply",
+            reader="CloudCompare, Blender, MeshLab",
+            checked="loaded by trimesh; names as CloudCompare and Blender know them",
+            folder=True,
+        ),
+        Exporter(
+            "stl",
+            ".stl",
+            "mounting positions as small solids, in millimetres",
+            "lidardesign.formats.meshes",
+            "write_stl",
+            reader="CAD programs",
+            checked="loaded by trimesh as closed solids",
+        ),
+    )
+}

@@ -1,0 +1,301 @@
+"""Robots and their simulators as XML: MuJoCo, Gazebo and ROS.
+
+MuJoCo: a body per sensor, a site per ray whose +z looks along it, and a rangefinder on each.
+
+`sensordata` has the rays in their own order: the distance [m], negative where nothing is hit, the gate's end where what
+is hit lies beyond (`cutoff`). The start of the gate, the sensor's number and the firing time stand in the rangefinder's
+user data, which MuJoCo keeps (`model.sensor_user`) and does not use. The file is a model of its own and may be
+included in another one, or a copy of a robot's with the sensors on one of its bodies. Rangefinders see neither geoms of
+their own body, of which those of sensors have none, nor ones that are fully transparent.
+
+Gazebo and ROS: a gpu_lidar per sensor, in SDF 1.9, in a URDF, or in a xacro macro.
+
+A gpu_lidar fires an even grid of azimuth and elevation, the first and the last ray on the bounds, and has one range for
+all of them. In SDF they are in one link of a static model. Gazebo draws the six faces of a cube around the sensor and
+takes each range from the pixel in which the ray lies, that is, along the ray of its middle.
+
+For ROS there is a link per sensor with Gazebo's gpu_lidar on it. Links follow REP 103: x forward, y to the left, z up,
+in metres and radians. In the URDF they are fixed to a base link, which is fixed to `world` and has a nominal mass:
+Gazebo leaves out links without one, with all that is fixed to them. The macro mounts them on a robot's own link,
+`<xacro:include filename="FILE"/>` and `<xacro:NAME parent="base_link" prefix=""/>` in the robot's description; poses
+are relative to the parent.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, fromstring
+
+import numpy as np
+
+from lidardesign.errors import DataError
+from lidardesign.formats.mounts import (
+    Mount,
+    channel_mounts,
+    design_losses,
+    grid_of,
+    grid_sensor_losses,
+    mounts,
+)
+from lidardesign.formats.names import (
+    distinct,
+    document,
+    element,
+    identifier,
+    number,
+    numbers,
+    renamed_note,
+    xml_text,
+)
+from lidardesign.numerics import SLACK
+from lidardesign.run.files import write_atomic
+from lidardesign.scenes.mujoco_models import RobotFile, load_model, mujoco_warnings, seen_geoms
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import DesignSpec
+
+WORLD = "world"
+# Half of what a site of one ray is drawn as [m].
+SITE_SIZE_M = 0.002
+UNSEEN = "lidardesign_unseen"
+USER_VALUES = 4  # of a rangefinder: gate start and end, sensor, time
+
+
+def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | None = None) -> list[str]:
+    """Write the model, atomically; returns notes of what the format cannot hold.
+
+    Arguments:
+        design: The design; with a robot its sensors are on the body that it is mounted on, else in the world.
+        rays: Its rays.
+        path: The file.
+        robot: A MuJoCo model, MJCF or URDF, of which the file is a copy with the sensors in it.
+
+    Raises:
+        DataError: The robot's model cannot be read, or has no such body.
+    """
+    mounted = mounts(design, rays)
+    place, sensors, notes = element("worldbody"), element("sensor"), design_losses(design, mounted)
+    model, taken = element("mujoco", {"model": design.name}, [place, sensors]), [WORLD]
+    if robot is not None:
+        model, place, sensors = _robot_with(design.mount, robot, path)
+        taken += [body.get("name", "") for body in model.iter("body")]
+        notes.append(
+            "geoms of the robot that are not shown are transparent, since MuJoCo's rays pass through no others"
+        )
+    bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=taken)
+    site = np.empty(len(rays), dtype=object)
+    for mount, name in zip(mounted, bodies, strict=True):
+        site[mount.ray] = [f"{name}_r{number}" for number in range(len(mount.ray))]
+        place.append(_body(mount, name, rays, site[mount.ray]))
+    sensors.extend(_rangefinder(str(site[ray]), rays, ray) for ray in range(len(rays)))
+    write_atomic(path, document(model))
+    late = rays.gate_m[rays.gate_m[:, 0] > 0, 0]
+    if len(late):
+        notes.append(
+            f"MuJoCo has no gate start: {len(late)} of {len(rays)} rays also see what is nearer than theirs, of "
+            f"{late.min():.3g} to {late.max():.3g} m; it stands in the rangefinders' user data"
+        )
+    return [*notes, "a reading equal to the cutoff is a hit at or beyond the end of the gate; a negative one is no hit"]
+
+
+def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Element, Element, Element]:
+    """A robot's model as MuJoCo writes it, for a file at a path, its body that sensors go into, and its sensors."""
+    specifications: list[Any] = []
+    model, _ = load_model(robot.path, folder=robot.folder, edit=specifications.append)
+    seen = set(seen_geoms(model, robot.groups)[0].tolist())
+    # the class of a geom may have a material, whose transparency counts more than the geom's own colour
+    if all(material.name != UNSEEN for material in specifications[0].materials):
+        specifications[0].add_material(name=UNSEEN, rgba=(0.5, 0.5, 0.5, 0.0))
+    for geom in specifications[0].geoms:
+        if geom.id not in seen:
+            geom.material = UNSEEN
+    with mujoco_warnings(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        root = fromstring(specifications[0].to_xml())
+    for tag in ("compiler", "sensor", "size"):
+        if root.find(tag) is None:
+            root.append(element(tag))
+    compiler, sensors, size = (next(root.iter(tag)) for tag in ("compiler", "sensor", "size"))
+    for name in ("meshdir", "texturedir"):
+        folder = robot.path.resolve().parent / compiler.get(name, "")
+        compiler.set(name, os.path.relpath(folder, path.resolve().parent))
+    size.set("nuser_sensor", str(max(USER_VALUES, int(size.get("nuser_sensor", "0")))))
+    bodies = {body.get("name", ""): body for body in root.iter("body")}
+    place = next(root.iter("worldbody")) if mount is None else bodies.get(mount)
+    if place is None:
+        close = ", ".join(get_close_matches(str(mount), bodies, 3, 0.0))
+        raise DataError(f"has no body {mount!r}, which the design is mounted on", where=str(robot.path), allowed=close)
+    return root, place, sensors
+
+
+def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:
+    frame = mount.sensor.frame
+    places = (rays.origin_m[mount.ray] - mount.origin_m) @ frame.T
+    # The shortest rotations of +z to unit vectors (N, 3), as quaternions (w, x, y, z), shape (N, 4)
+    x, y, z = (rays.direction[mount.ray] @ frame.T).T
+    across = np.hypot(x, y)
+    half = np.arctan2(across, z) / 2
+    # straight down any axis across will do
+    along = np.where(across > 0, across, 1.0)
+    axis_x, axis_y = np.where(across > 0, -y / along, 1.0), x / along
+    turns = np.stack([np.cos(half), np.sin(half) * axis_x, np.sin(half) * axis_y, np.zeros(len(x))], axis=1)
+    made = [
+        element(
+            "site",
+            {"name": str(site), "pos": numbers(place), "quat": numbers(turn), "size": number(SITE_SIZE_M)},
+        )
+        for site, place, turn in zip(sites, places, turns, strict=True)
+    ]
+    return element("body", {"name": name, "pos": numbers(mount.origin_m), "quat": numbers(mount.quaternion)}, made)
+
+
+def _rangefinder(site: str, rays: Rays, ray: int) -> Element:
+    start, end = rays.gate_m[ray]
+    user = numbers([start, end, rays.sensor[ray], rays.time_s[ray]])
+    # a cutoff of 0 would be none
+    return element("rangefinder", {"name": site, "site": site, "cutoff": number(max(end, SLACK)), "user": user})
+
+
+LINK = "lidar"
+# Half the diagonal of a pixel of a face's picture, whose sides have 128 or more.
+BESIDE_DEG = 0.64
+# Gazebo renders depth images, whose near plane must be in front of the camera.
+NEAREST_M = 0.001
+
+
+def write_sdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the model, atomically; returns notes of what the format cannot hold."""
+    design, rays, mounted = channel_mounts(design, rays)
+    link = element("link", {"name": LINK}, [sensor_element(one, rate_hz, posed=True) for one in mounted])
+    model = element("model", {"name": identifier(design.name)}, [element("static", text="true"), link])
+    write_atomic(path, document(element("sdf", {"version": "1.9"}, [model])))
+    return sdf_losses(design, mounted, rays)
+
+
+def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+    """Notes of what gpu_lidar sensors cannot hold."""
+    near = [one for one in mounted if one.gate_m[0] < NEAREST_M]
+    late = [one.gate_m[0] for one in mounted if one.gate_m[0] >= NEAREST_M]
+    notes = grid_sensor_losses(design, mounted, rays)
+    if late:
+        notes.append(
+            f"Gazebo does not draw what is nearer than a gate's start: {len(late)} of {len(mounted)} sensors look "
+            f"through it, up to {max(late):.3g} m away, where this design's are blind behind it"
+        )
+    if near:
+        notes.append(
+            f"gates of {len(near)} of {len(mounted)} sensors start below {NEAREST_M:g} m, where Gazebo's depth camera "
+            f"cannot: they start at {NEAREST_M:g} m"
+        )
+    if mounted:
+        notes.append(f"Gazebo measures along the pixels of a picture: up to {BESIDE_DEG} deg beside the rays")
+    names = [design.name, *(one.sensor.name for one in mounted)]
+    return [*notes, *renamed_note(names, [identifier(design.name), *(one.name for one in mounted)])]
+
+
+def sensor_element(mount: Mount, rate_hz: float, *, posed: bool, name: str | None = None) -> Element:
+    """The <sensor> of a mount: at its pose, or at that of the link that holds it."""
+    grid = grid_of(mount)
+    start, end = max(mount.gate_m[0], NEAREST_M), max(mount.gate_m[1], NEAREST_M)
+    axes = [_axis("horizontal", grid.columns, grid.azimuth_rad), _axis("vertical", grid.rows, grid.elevation_rad)]
+    interval = [element("min", text=number(start)), element("max", text=number(end))]
+    lidar = element("lidar", children=[element("scan", children=axes), element("range", children=interval)])
+    return element(
+        "sensor",
+        {"name": name or mount.name, "type": "gpu_lidar"},
+        [
+            *([element("pose", text=numbers([*mount.origin_m, *mount.roll_pitch_yaw_rad]))] if posed else []),
+            element("topic", text=f"/{name or mount.name}"),
+            element("update_rate", text=number(rate_hz)),
+            element("always_on", text="true"),
+            element("visualize", text="true"),
+            lidar,
+        ],
+    )
+
+
+def _axis(name: str, samples: int, bounds_rad: tuple[float, float]) -> Element:
+    return element(
+        name,
+        children=[
+            element("samples", text=str(samples)),
+            element("resolution", text="1"),
+            element("min_angle", text=number(bounds_rad[0])),
+            element("max_angle", text=number(bounds_rad[1])),
+        ],
+    )
+
+
+# No sensor's link is called so: those end in _link. Nor its joint, for none has the name of the world.
+BASE = "lidar_base"
+BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
+
+
+def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the description, atomically; returns notes of what the format cannot hold."""
+    design, rays, mounted = channel_mounts(design, rays)
+    parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
+    write_atomic(path, document(element("robot", {"name": identifier(design.name)}, [*_base(), *parts])))
+    mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave out the sensors"
+    return [*urdf_losses(design, mounted, rays), mass]
+
+
+def urdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+    """Notes of what a description of links and Gazebo sensors cannot hold."""
+    return [
+        *sdf_losses(design, mounted, rays),
+        "URDF has no sensors of its own: rays, gates and rates stand in <gazebo> extensions, which Gazebo reads",
+    ]
+
+
+def _base() -> list[Element]:
+    """The base link, which has a mass, and what fixes it to the world."""
+    moments = {
+        name: numbers([BASE_INERTIA_KG_M2 * (name[1] == name[2])])
+        for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    }
+    inertial = element(
+        "inertial", children=[element("mass", {"value": numbers([BASE_MASS_KG])}), element("inertia", moments)]
+    )
+    ends = [element("parent", {"link": WORLD}), element("child", {"link": BASE})]
+    joint = element("joint", {"name": f"{WORLD}_joint", "type": "fixed"}, ends)
+    return [element("link", {"name": WORLD}), element("link", {"name": BASE}, [inertial]), joint]
+
+
+def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = "") -> list[Element]:
+    """The link of a sensor, the joint that fixes it to a parent, and what Gazebo simulates on it."""
+    name = f"{prefix}{mount.name}_link"
+    joint = element(
+        "joint",
+        {"name": f"{prefix}{mount.name}_joint", "type": "fixed"},
+        [
+            element("parent", {"link": parent}),
+            element("child", {"link": name}),
+            element("origin", {"xyz": numbers(mount.origin_m), "rpy": numbers(mount.roll_pitch_yaw_rad)}),
+        ],
+    )
+    sensor = sensor_element(mount, rate_hz, posed=False, name=f"{prefix}{mount.name}")
+    # what Gazebo publishes is then in the frame of the link, whose name ROS knows
+    sensor.append(element("gz_frame_id", text=name))
+    return [element("link", {"name": name}), joint, element("gazebo", {"reference": name}, [sensor])]
+
+
+MACRO = "xacro:macro"
+
+
+def write_xacro(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the macro, atomically; returns how to use it and notes of what the format cannot hold."""
+    design, rays, mounted = channel_mounts(design, rays)
+    name = identifier(design.name)
+    parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent="${parent}", prefix="${prefix}")]
+    macro = element(MACRO, {"name": name, "params": "parent prefix:=''"}, parts)
+    write_atomic(
+        path, document(element("robot", {"xmlns:xacro": "http://www.ros.org/wiki/xacro", "name": name}, [macro]))
+    )
+    usage = f'include it and call <xacro:{name} parent="base_link"/>: poses are relative to the parent'
+    return [usage, *urdf_losses(design, mounted, rays)]

@@ -1,1 +1,0 @@
-"""Rays, bodies, and where they meet."""

@@ -1,0 +1,90 @@
+"""Even layouts: a cell-centred grid of any number of rays in a field of view, and points that fill a cube evenly."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lidardesign.sensors.sensor import Sensor
+
+RECURRENCE_AXES = 2
+PRIMES = (2, 3, 5, 7, 11, 13)
+
+
+def grid_rows(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:
+    """Rays per row of an even grid, int64 (rows,), summing to `count`.
+
+    The number of rows makes the cells as square as whole numbers allow; the rays are spread over the rows as
+    evenly as possible, so a budget of k * k in a square field is the regular k by k grid.
+    """
+    if count == 0:
+        return np.zeros(0, dtype=np.int64)
+    rows = _row_count(horizontal_rad, vertical_rad, count)
+    # floor((2 i n + rows) / (2 rows)) rounds i n / rows half up in whole numbers, without a rounding error
+    return np.diff((2 * np.arange(rows + 1, dtype=np.int64) * count + rows) // (2 * rows))
+
+
+def _row_count(horizontal_rad: float, vertical_rad: float, count: int) -> int:
+    """The number of rows whose cells are closest to square by ratio; a field without height is one row."""
+    if vertical_rad <= 0:
+        return 1
+    if horizontal_rad <= 0:
+        return count
+    ideal = math.sqrt(count * (vertical_rad / horizontal_rad))
+    if ideal >= count:
+        return count
+    fewer = max(math.floor(ideal), 1)
+    return fewer if ideal**2 <= fewer * (fewer + 1) else min(fewer + 1, count)
+
+
+def grid_tangent(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:
+    """Angles of an even grid in a field of view, row by row upwards, shape (count, 2) [rad].
+
+    Cell-centred: ray i of n in a row stands at -FoV/2 + FoV * (i + 1/2) / n, never on the field's edge.
+    """
+    rows = grid_rows(horizontal_rad, vertical_rad, count)
+    if not rows.size:
+        return np.zeros((0, 2))
+    across = np.concatenate([(np.arange(n) + 0.5) / n - 0.5 for n in rows])
+    up = np.repeat((np.arange(len(rows)) + 0.5) / len(rows) - 0.5, rows)
+    return np.stack([horizontal_rad * across, vertical_rad * up], axis=1)
+
+
+def low_discrepancy(count: int, axes: int) -> np.ndarray:
+    """Points that fill the unit cube evenly, shape (count, axes), axes <= 6.
+
+    Up to two axes the additive recurrence R_k (M. Roberts 2018): its generators are the powers of 1 / phi, with phi
+    the root of phi^(k+1) = phi + 1 above 1. Beyond, small multiples of two generators nearly add up to a whole number,
+    and points lie on a few lines of that pair of axes (of four axes the first and the third: 1000 points leave 30
+    of 100 cells of their square empty); there J. Halton's sequence (1960) in the first primes. The smallest ones are
+    the most even: they go to the last axes, which are those of directions.
+    """
+    if axes > RECURRENCE_AXES:
+        return np.stack([_radical_inverse(count, base) for base in PRIMES[axes - 1 :: -1]], axis=1)
+    phi = 1.5
+    for _ in range(64):  # a contraction by at least 3: 64 steps are far below rounding
+        phi = (1.0 + phi) ** (1.0 / (axes + 1))
+    generators = phi ** -np.arange(1.0, axes + 1)
+    return np.mod(0.5 + np.arange(1, count + 1)[:, None] * generators, 1.0)
+
+
+def _radical_inverse(count: int, base: int) -> np.ndarray:
+    """The digits of 1 to `count` in a base, mirrored at the point, shape (count,), inside (0, 1)."""
+    left, place, total = np.arange(1, count + 1), 1.0, np.zeros(count)
+    while left.any():
+        place /= base
+        left, digit = np.divmod(left, base)
+        total += place * digit
+    return total
+
+
+def field_on_sphere(sensor: Sensor) -> tuple[float, float]:
+    """The field of view, shrunk in proportion where its corner would lie beyond the antipode [rad].
+
+    Past the angle pi the tangent plane covers the sphere a second time, so rays there would point elsewhere.
+    """
+    horizontal, vertical = sensor.field_of_view_rad
+    corner = math.hypot(horizontal, vertical) / 2
+    scale = math.pi / corner if corner > math.pi else 1.0
+    return scale * horizontal, scale * vertical

@@ -1,0 +1,265 @@
+r"""Mixtures of sensors on the sphere: density, responsibilities and sufficient statistics in one pass.
+
+A component is $q(d) = N(x)\, N_2(u)\, \frac{t}{\sin t}\, N(r)$: origin with its full covariance, tangent
+coordinates u of the direction at the angle t = |u| from the boresight, range. With unit axes f, h, v of the
+boresight and $g(t) = t / \sin t$ the coordinates are $u = g\,(h \cdot d, v \cdot d)$, so one matrix product
+per block of samples gives all cosines, and g multiplies after the exponential: no logarithm of it is needed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidardesign.mixture.features import Axes, Features
+from lidardesign.numerics import ROUNDING, wrap_angle
+
+# Samples per block: arrays of 10 components then stay inside a core's second-level cache (measured).
+BLOCK = 2048
+# Cosines are kept this far from +-1: at +1 t / sin t differs from its limit 1 by 3e-13, and at the antipode,
+# where it diverges, it stays finite.
+COSINE_MARGIN = ROUNDING
+# A component without samples keeps this weight, so that its logarithm stays finite.
+SMALLEST_WEIGHT = ROUNDING
+LOG_TWO_PI = math.log(2 * math.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Parameters of K components, one row each.
+
+    Arguments:
+        weights: Shares, summing to 1, shape (K,).
+        origin_m: Mean origins, shape (K, 3).
+        origin_covariance_m2: Shape (K, 3, 3); only its free axes are read.
+        azimuth_rad, elevation_rad, roll_rad: Internal boresights (see `features`), shape (K,).
+        spread_rad: Horizontal and vertical standard deviations, internal angles, shape (K, 2).
+        range_m, spread_range_m: Mean and standard deviation of the range, shape (K,).
+    """
+
+    weights: np.ndarray
+    origin_m: np.ndarray
+    origin_covariance_m2: np.ndarray
+    azimuth_rad: np.ndarray
+    elevation_rad: np.ndarray
+    roll_rad: np.ndarray
+    spread_rad: np.ndarray
+    range_m: np.ndarray
+    spread_range_m: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    @property
+    def frames(self) -> np.ndarray:
+        """Rows forward, horizontal, vertical of each boresight, roll included, shape (K, 3, 3)."""
+        return frames(self.azimuth_rad, self.elevation_rad, self.roll_rad)
+
+    def take(self, order: np.ndarray) -> Mixture:
+        """The components at indices, their weights scaled to sum to 1."""
+        rows = {name: getattr(self, name)[order] for name in self.__dataclass_fields__}
+        rows["weights"] = rows["weights"] / rows["weights"].sum()
+        return Mixture(**rows)
+
+    def with_weights(self, weights: np.ndarray) -> Mixture:
+        """The same components with other shares."""
+        return replace(self, weights=weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """What one pass over the samples leaves for the M-step, per component.
+
+    Arguments:
+        log_likelihood: Weighted mean log density of the samples.
+        mass: Expected share of the samples, shape (K,).
+        phi: Expected sums of the linear features, shape (K, F).
+        tangent: Expected sums of 1, u_h, u_v times u_h, u_v: shape (K, 2, 3) [rad, rad^2], in rolled axes.
+    """
+
+    log_likelihood: float
+    mass: np.ndarray
+    phi: np.ndarray
+    tangent: np.ndarray
+
+
+def frames(azimuth_rad: np.ndarray, elevation_rad: np.ndarray, roll_rad: np.ndarray) -> np.ndarray:
+    """`sensor.boresight_frame` for many boresights at once: (K,) each to (K, 3, 3)."""
+    sin_a, cos_a = np.sin(azimuth_rad), np.cos(azimuth_rad)
+    sin_e, cos_e = np.sin(elevation_rad), np.cos(elevation_rad)
+    sin_r, cos_r = np.sin(roll_rad)[:, None], np.cos(roll_rad)[:, None]
+    forward = np.stack([cos_e * cos_a, cos_e * sin_a, sin_e], axis=-1)
+    horizontal = np.stack([-sin_a, cos_a, np.zeros_like(sin_a)], axis=-1)
+    vertical = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=-1)
+    return np.stack([forward, cos_r * horizontal + sin_r * vertical, cos_r * vertical - sin_r * horizontal], axis=1)
+
+
+def angle_ratio(cosine: np.ndarray, out: np.ndarray, work: np.ndarray) -> np.ndarray:
+    """t / sin t of cos t, into `out`; overwrites `cosine` and `work`, all of one shape."""
+    np.clip(cosine, COSINE_MARGIN - 1.0, 1.0 - COSINE_MARGIN, out=cosine)
+    np.arccos(cosine, out=out)
+    # (1 - c)(1 + c) keeps the digits that 1 - c^2 loses near the boresight
+    np.subtract(1.0, cosine, out=work)
+    cosine += 1.0
+    work *= cosine
+    np.sqrt(work, out=work)
+    out /= work
+    return out
+
+
+def linear_coefficients(mixture: Mixture, features: Features) -> np.ndarray:
+    """Rows that turn the features Phi into log weight + log N(x) + log N(r) + angular constants, (K, F)."""
+    axes, count = features.axes, len(features.axes.origin)
+    constant = np.log(np.maximum(mixture.weights, SMALLEST_WEIGHT)) - 0.5 * LOG_TWO_PI * (axes.linear + axes.angular)
+    linear = np.zeros((len(mixture), axes.linear))
+    quadratic = np.zeros((len(mixture), len(features.pairs)))
+    if count:
+        constant = constant + _origin_coefficients(mixture, features, linear, quadratic)
+    if axes.range:
+        mean = (mixture.range_m - features.centre[-1]) / features.scale[-1]
+        precision = np.square(features.scale[-1] / mixture.spread_range_m)
+        linear[:, -1], quadratic[:, -1] = precision * mean, -0.5 * precision
+        constant = constant - 0.5 * precision * np.square(mean) - np.log(mixture.spread_range_m)
+    for axis, used in enumerate((axes.horizontal, axes.vertical)):
+        if used:
+            constant = constant - np.log(mixture.spread_rad[:, axis])
+    return np.concatenate([constant[:, None], linear, quadratic], axis=1)
+
+
+def _origin_coefficients(mixture: Mixture, features: Features, linear: np.ndarray, quadratic: np.ndarray) -> np.ndarray:
+    axes = list(features.axes.origin)
+    count = len(axes)
+    scale = features.scale[:count]
+    mean = (mixture.origin_m[:, axes] - features.centre[:count]) / scale
+    covariance = mixture.origin_covariance_m2[:, axes][:, :, axes]
+    precision = np.linalg.inv(covariance / (scale[:, None] * scale))
+    weighted = np.einsum("kij,kj->ki", precision, mean)
+    linear[:, :count] = weighted
+    for column, (i, j) in enumerate(features.pairs[: count * (count + 1) // 2]):
+        quadratic[:, column] = -0.5 * precision[:, i, j] * (1 if i == j else 2)
+    return -0.5 * np.einsum("ki,ki->k", weighted, mean) - 0.5 * np.linalg.slogdet(covariance)[1]
+
+
+def angular_rows(mixture: Mixture, axes: Axes) -> np.ndarray:
+    """Rows forward, horizontal / (sqrt 2 sigma_h), vertical / (sqrt 2 sigma_v), (3, K, 3); 0 where fixed."""
+    rows = np.ascontiguousarray(np.moveaxis(mixture.frames, 1, 0))
+    for axis, used in enumerate((axes.horizontal, axes.vertical)):
+        rows[axis + 1] *= (1.0 / (math.sqrt(2.0) * mixture.spread_rad[:, axis]))[:, None] if used else 0.0
+    return rows
+
+
+class _Block:
+    """Log joint densities of one block of samples, (K, n), with the angular arrays that led to them."""
+
+    def __init__(self, mixture: Mixture, features: Features) -> None:
+        self.features, self.axes, self.count = features, features.axes, len(mixture)
+        self.coefficients = linear_coefficients(mixture, features)
+        self.rows = angular_rows(mixture, features.axes).reshape(3 * self.count, 3)
+        size = min(BLOCK, len(features))
+        self.buffers = np.empty((6, self.count * size))
+
+    def evaluate(self, part: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Exponents without t / sin t, that ratio, and scaled tangent coordinates h, v, each (K, n)."""
+        n = part.stop - part.start
+        shape = (self.count, n)
+        views = self.buffers[:, : self.count * n]
+        exponent, ratio, work = (views[i].reshape(shape) for i in (3, 4, 5))
+        np.matmul(self.coefficients, self.features.phi[:, part], out=exponent)
+        if not self.axes.angular:
+            return exponent, ratio, ratio, ratio
+        cosines = self.buffers.reshape(-1)[: 3 * self.count * n].reshape(3 * self.count, n)
+        np.matmul(self.rows, self.features.directions[:, part], out=cosines)
+        forward, horizontal, vertical = cosines.reshape(3, *shape)
+        angle_ratio(forward, ratio, work)
+        for tangent in (horizontal, vertical):
+            tangent *= ratio
+            np.multiply(tangent, tangent, out=work)
+            exponent -= work
+        return exponent, ratio, horizontal, vertical
+
+
+def _blocks(count: int) -> list[slice]:
+    return [slice(start, min(start + BLOCK, count)) for start in range(0, count, BLOCK)]
+
+
+def expect(mixture: Mixture, features: Features) -> Statistics:
+    """The E-step: log-likelihood and expected sufficient statistics of weighted samples, in log space."""
+    block, count, axes = _Block(mixture, features), len(mixture), features.axes
+    phi = np.zeros((count, len(features.phi)))
+    tangent = np.zeros((count, 2, 3))
+    total = 0.0
+    for part in _blocks(len(features)):
+        exponent, ratio, horizontal, vertical = block.evaluate(part)
+        peak = exponent.max(axis=0)
+        exponent -= peak
+        np.exp(exponent, out=exponent)
+        if axes.angular == 2:
+            exponent *= ratio
+        norm = exponent.sum(axis=0)
+        weights = features.weights[part]
+        total += float(weights @ (np.log(norm) + peak))
+        exponent *= weights / norm
+        phi += exponent @ features.phi[:, part].T
+        if axes.angular:
+            # first and second moments of the scaled tangent coordinates
+            np.multiply(exponent, horizontal, out=ratio)
+            tangent[:, 0, 0] += ratio.sum(axis=1)
+            tangent[:, 0, 1] += np.einsum("kn,kn->k", ratio, horizontal)
+            tangent[:, 0, 2] += np.einsum("kn,kn->k", ratio, vertical)
+            np.multiply(exponent, vertical, out=ratio)
+            tangent[:, 1, 0] += ratio.sum(axis=1)
+            tangent[:, 1, 2] += np.einsum("kn,kn->k", ratio, vertical)
+    tangent[:, 1, 1] = tangent[:, 0, 2]
+    unit = math.sqrt(2.0) * mixture.spread_rad
+    tangent = tangent * unit[:, :, None] * np.concatenate([np.ones((count, 1)), unit], axis=1)[:, None, :]
+    return Statistics(total, phi[:, 0], phi, tangent)
+
+
+def log_density(mixture: Mixture, features: Features) -> np.ndarray:
+    """log q of each sample, shape (N,)."""
+    block, axes = _Block(mixture, features), features.axes
+    result = np.empty(len(features))
+    for part in _blocks(len(features)):
+        exponent, ratio, _, _ = block.evaluate(part)
+        peak = exponent.max(axis=0)
+        terms = np.exp(exponent - peak)
+        result[part] = np.log((terms * ratio if axes.angular == 2 else terms).sum(axis=0)) + peak
+    return result
+
+
+def responsibilities(mixture: Mixture, features: Features) -> np.ndarray:
+    """Posterior shares of the components for each sample, shape (N, K), rows summing to 1."""
+    block, axes = _Block(mixture, features), features.axes
+    result = np.empty((len(features), len(mixture)))
+    for part in _blocks(len(features)):
+        exponent, ratio, _, _ = block.evaluate(part)
+        terms = np.exp(exponent - exponent.max(axis=0))
+        terms = terms * ratio if axes.angular == 2 else terms
+        result[part] = (terms / terms.sum(axis=0)).T
+    return result
+
+
+def label_statistics(mixture: Mixture, features: Features, labels: np.ndarray) -> Statistics:
+    """Statistics of a hard assignment, each sample to one component: O(N) for any number of components."""
+    count = len(mixture)
+    scattered = [np.bincount(labels, features.weights * row, minlength=count) for row in features.phi]
+    local = np.einsum("nij,jn->in", mixture.frames[labels], features.directions)
+    ratio = angle_ratio(local[0], np.empty(len(labels)), np.empty(len(labels)))
+    u = local[1:] * ratio
+    used = (features.axes.horizontal, features.axes.vertical)
+    rows = [u[i] if used[i] else np.zeros(len(labels)) for i in range(2)]
+    tangent = [
+        [np.bincount(labels, features.weights * a * b, minlength=count) for b in (np.ones(len(labels)), *rows)]
+        for a in rows
+    ]
+    return Statistics(float("nan"), scattered[0], np.stack(scattered, 1), np.moveaxis(np.array(tangent), 2, 0))
+
+
+def mean_directions(features: Features, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth and elevation of the mean unit vector of each cell, shape (K,) each [rad]."""
+    sums = np.stack([np.bincount(labels, features.weights * row, minlength=count) for row in features.directions])
+    azimuth = np.arctan2(sums[1], sums[0]) if features.axes.horizontal else np.zeros(count)
+    elevation = np.arctan2(sums[2], np.hypot(sums[0], sums[1])) if features.axes.vertical else np.zeros(count)
+    return np.asarray(wrap_angle(azimuth)), elevation

@@ -1,0 +1,241 @@
+"""Expectation maximisation with restarts: the loop, its seeds, and components that lose their samples."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lidardesign.constraints.origins import nearest_in_boxes
+from lidardesign.errors import BackgroundNote, NumericalError
+from lidardesign.mixture.bounds import Bounds, Floors, clip_azimuth
+from lidardesign.mixture.components import (
+    Mixture,
+    Statistics,
+    expect,
+    label_statistics,
+    mean_directions,
+    responsibilities,
+)
+from lidardesign.mixture.features import Features
+from lidardesign.mixture.m_step import SMALLEST_MASS, maximise
+from lidardesign.mixture.quantise import lloyd
+from lidardesign.numerics import ROUNDING, TINY, effective_count, wrap_angle
+
+# Iterations stop when the mean log-likelihood gains less than this per iteration [nats].
+CONVERGENCE_NATS = 1e-5
+MOST_ITERATIONS = 200
+RESTART_ITERATIONS = 12
+# Seeds are first compared on so many samples, and the best few of them on all.
+SCREEN_SAMPLES = 5000
+FINALISTS = 3
+# Falls below this are rounding of a sum over the samples [nats].
+ROUNDING_NATS = ROUNDING
+SEED_SAMPLES = 2000
+SEED_LLOYD_ITERATIONS = 4
+# A component that explains less than this many effective samples has died.
+DEAD_SAMPLES = 2.0
+MOST_REVIVALS = 3
+# So many samples usually tell that there are more different ones than components.
+FEW_SAMPLES = 256
+# Shorter boresight steps than this share are as good as none.
+SMALLEST_STEP = 0.02
+# Mass that stands for an empty cell, so that its mean is finite.
+SMALLEST_CELL = TINY
+
+
+@dataclass(frozen=True, eq=False)
+class EMResult:
+    """What one run of the loop did.
+
+    Arguments:
+        mixture: The last parameters.
+        log_likelihood: Weighted mean log density [nats].
+        history: Log-likelihood after every accepted step; it never decreases.
+        notes: What happened to components, one line each.
+        values: The log density of each sample [nats], shape (N,), where it is at hand.
+    """
+
+    mixture: Mixture
+    log_likelihood: float
+    history: tuple[float, ...]
+    notes: tuple[str, ...] = field(default=())
+    values: np.ndarray | None = None
+
+
+def run_em(
+    mixture: Mixture,
+    features: Features,
+    bounds: Bounds,
+    *,
+    iterations: int = MOST_ITERATIONS,
+    tolerance_nats: float = CONVERGENCE_NATS,
+) -> EMResult:
+    """Iterate from admissible parameters; a step that would lower the log-likelihood is replaced.
+
+    The replacement keeps the boresights, for which the M-step is exact and so cannot lose; the share of the
+    boresights' step that is tried next is halved.
+    """
+    floors = Floors.of(features)
+    statistics = expect(mixture, features)
+    history = [_finite(statistics)]
+    step = 1.0
+    for _ in range(iterations):
+        proposal = maximise(mixture, statistics, features, bounds, floors, step)
+        outcome = expect(proposal, features)
+        if not outcome.log_likelihood >= history[-1]:
+            proposal = maximise(mixture, statistics, features, bounds, floors, 0.0)
+            outcome = expect(proposal, features)
+            step /= 2
+        else:
+            step = min(2 * step, 1.0)
+        gain = outcome.log_likelihood - history[-1]
+        if not gain >= -ROUNDING_NATS * (1 + abs(history[-1])):
+            break
+        mixture, statistics = proposal, outcome
+        history.append(max(_finite(statistics), history[-1]))
+        # a shortened boresight step may gain little and the next one more
+        if gain < tolerance_nats and (step >= 1.0 or step < SMALLEST_STEP):
+            break
+    return EMResult(mixture, history[-1], tuple(history))
+
+
+def _finite(statistics: Statistics) -> float:
+    if not math.isfinite(statistics.log_likelihood):
+        raise NumericalError(
+            "the log-likelihood of the sensors is not finite",
+            where="fit",
+            hint="check the run's samples: learn it again, or widen the constraints",
+        )
+    return statistics.log_likelihood
+
+
+def mixture_of_labels(features: Features, labels: np.ndarray, bounds: Bounds) -> Mixture:
+    """Admissible components of a hard assignment, in two passes: boresights, then moments about them.
+
+    A cell whose samples weigh next to nothing repeats the heaviest one.
+    """
+    count, axes = len(bounds), features.axes
+    mass = np.bincount(labels, features.weights, minlength=count)
+    source = np.where(mass > SMALLEST_MASS, np.arange(count), mass.argmax())
+    azimuth, elevation = mean_directions(features, labels, count)
+    placed = Mixture(
+        weights=mass[source] / mass[source].sum(),
+        origin_m=np.tile(features.points[0, :3], (count, 1)),
+        origin_covariance_m2=np.zeros((count, 3, 3)),
+        azimuth_rad=azimuth[source],
+        elevation_rad=elevation[source],
+        roll_rad=np.zeros(count),
+        spread_rad=np.full((count, 2), features.angular_scale),
+        range_m=np.full(count, features.points[0, 5]),
+        spread_range_m=np.zeros(count),
+    )
+    floors = Floors.of(features)
+    for step in (1.0, 0.0) if axes.angular else (0.0,):
+        statistics = label_statistics(placed, features, labels)
+        rows = Statistics(statistics.log_likelihood, mass[source], statistics.phi[source], statistics.tangent[source])
+        placed = maximise(placed, rows, features, bounds, floors, step)
+    return placed
+
+
+def seed_mixture(features: Features, bounds: Bounds, generator: np.random.Generator) -> Mixture:
+    """k-means++ seeds, a few Lloyd steps, and components from the cells, each where its bounds admit it."""
+    chosen = generator.choice(len(features), min(SEED_SAMPLES, len(features)), replace=False)
+    part = features.subset(np.sort(chosen)) if len(chosen) < len(features) else features
+    seeds = np.ascontiguousarray(part.embedding)
+    _, labels = lloyd(seeds, part.weights, len(bounds), generator, iterations=SEED_LLOYD_ITERATIONS)
+    return mixture_of_labels(part, _match_cells(part, labels, bounds), bounds)
+
+
+def _match_cells(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarray:
+    """Labels renumbered so that each cell has the component whose bounds it violates least."""
+    count, unit = len(bounds), features.scale.max() if len(features.scale) else 1.0
+    cost = np.zeros((count, count))
+    azimuth, elevation = mean_directions(features, labels, count)
+    mass = np.maximum(np.bincount(labels, features.weights, minlength=count), SMALLEST_CELL)
+    sums = [np.bincount(labels, features.weights * column, minlength=count) for column in features.points.T]
+    means = (np.stack(sums) / mass).T
+    for component in range(count):
+        one = bounds.take(np.full(count, component))
+        turned = wrap_angle(clip_azimuth(azimuth, one) - azimuth) / features.angular_scale
+        tilted = (np.clip(elevation, one.elevation_low, one.elevation_high) - elevation) / features.angular_scale
+        low = np.maximum(bounds.origin_low[component], bounds.free_low[component])
+        high = np.maximum(np.minimum(bounds.origin_high[component], bounds.free_high[component]), low)
+        moved = nearest_in_boxes(means[:, :3], low, high) - means[:, :3]
+        reach = np.clip(means[:, 5], one.start_low, one.end_high) - means[:, 5]
+        cost[component] = np.square(turned) + np.square(tilted) + (np.square(moved).sum(1) + np.square(reach)) / unit**2
+    if not cost.any() or (cost == cost[0]).all():
+        return labels
+    # loaded here because most designs have one set of bounds for all sensors
+    from scipy.optimize import linear_sum_assignment
+
+    component, cell = linear_sum_assignment(cost)
+    renumbered = np.empty(count, dtype=np.int64)
+    renumbered[cell] = component
+    return renumbered[labels]
+
+
+def fit_mixture(
+    features: Features,
+    bounds: Bounds,
+    generator: np.random.Generator,
+    *,
+    restarts: int = 12,
+    start: Mixture | None = None,
+) -> EMResult:
+    """The best of several short runs, continued until it converges.
+
+    Arguments:
+        features: Weighted samples.
+        bounds: One row per component.
+        generator: Source of the seeds.
+        restarts: Number of seeds that are tried.
+        start: Admissible parameters to continue from instead of seeds.
+    """
+    if start is None:
+        start = _best_seed(features, bounds, generator, 1 if len(bounds) == 1 else max(restarts, 1))
+    result = _revive_dead(run_em(start, features, bounds), features, bounds, generator)
+    for part in (features.points[: max(len(bounds), FEW_SAMPLES)], features.points):
+        different = len(np.unique(part, axis=0))
+        if different >= len(bounds):
+            return result
+    shared = f"fewer different samples ({different}) than sensors ({len(bounds)}): some sensors share a sample"
+    return replace(result, notes=(shared, *result.notes))
+
+
+def _best_seed(features: Features, bounds: Bounds, generator: np.random.Generator, restarts: int) -> Mixture:
+    """The most promising of several seeds: short runs on a part of the samples, then of a few on all."""
+    seeds = [seed_mixture(features, bounds, generator) for _ in range(restarts)]
+    if restarts == 1:
+        return seeds[0]
+    part = features
+    if len(features) > SCREEN_SAMPLES:
+        part = features.subset(np.sort(generator.choice(len(features), SCREEN_SAMPLES, replace=False)))
+    runs = [run_em(seed, part, bounds, iterations=RESTART_ITERATIONS) for seed in seeds]
+    finalists = sorted(runs, key=lambda run: -run.log_likelihood)[:FINALISTS]
+    runs = [run_em(run.mixture, features, bounds, iterations=RESTART_ITERATIONS) for run in finalists]
+    return max(runs, key=lambda run: run.log_likelihood).mixture
+
+
+def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
+    """Give dead components half of the heaviest one's samples and go on, where the likelihood gains."""
+    notes: list[str] = []
+    fewest = min(DEAD_SAMPLES, len(features) / len(bounds))
+    for _ in range(MOST_REVIVALS):
+        dead = np.flatnonzero(result.mixture.weights * effective_count(features.weights) < fewest)
+        if not len(dead):
+            break
+        labels = responsibilities(result.mixture, features).argmax(axis=1)
+        for component in dead:
+            inside = np.flatnonzero(labels == np.bincount(labels, features.weights).argmax())
+            part = features.subset(inside)
+            _, halves = lloyd(np.ascontiguousarray(part.embedding), part.weights, 2, generator, iterations=2)
+            labels[inside[halves == 1]] = component
+        again = run_em(mixture_of_labels(features, labels, bounds), features, bounds)
+        if again.log_likelihood < result.log_likelihood:
+            notes.append(f"{len(dead)} of {len(bounds)} sensors explain almost no samples")
+            break
+        notes.append(BackgroundNote(f"restarted {len(dead)} of {len(bounds)} sensors that had lost all their samples"))
+        result = again
+    return replace(result, notes=tuple(notes))

@@ -1,0 +1,342 @@
+r"""Groups of sensors, each with its own samples, fitted as one design's mixture; and the mounts that sensors take.
+
+A mount is a pinned origin. How much of the density sensors at several mounts see together is, per sample, the
+most that any of them sees of its scene point (re-aimed and reweighted as in `support`), summed over samples
+drawn from the density. Mounts are taken one after the other, each time the one that newly sees most: this sum
+is submodular, so the greedy choice sees at least 1 - 1/e of what the best choice sees (G. Nemhauser, L. Wolsey
+and M. Fisher 1978). Sensors with constraints of their own are placed together with their mount.
+
+How a ray follows from where it starts: the regressions that a product component leaves out.
+
+A component is a product N(x) N(u) N(r). Its samples, weighted by responsibility, still hold how the angles u
+follow from the origin x and the range from both. Their weighted least squares slopes are kept beside it:
+$E[u \mid x] = D\,(x - \bar x)$ and $E[r \mid x, u] = \bar r + a \cdot (x - \bar x) + b \cdot u$, about the sensor's
+own means. What the regressions leave are the residual spreads. The marginal spreads stay those of the
+constrained fit, so fields of view and gates keep their constraints whatever the slopes are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidardesign.constraints.document import SensorRules, rules_of
+from lidardesign.constraints.origins import Mount, fix_origin, fix_origins, mounts_of, mounts_suffice
+from lidardesign.errors import InfeasibleError
+from lidardesign.mixture.bounds import Bounds, Floors, Group, pins_of
+from lidardesign.mixture.components import Mixture, expect, responsibilities
+from lidardesign.mixture.em import EMResult, fit_mixture, run_em
+from lidardesign.mixture.features import Axes, Features
+from lidardesign.mixture.m_step import maximise
+from lidardesign.mixture.support import Retarget, reaim_samples
+from lidardesign.numerics import SLACK, effective_count, systematic_draw, wrap_angle, wrap_turn
+from lidardesign.run.clock import phase
+from lidardesign.samples import Samples
+from lidardesign.sensors.sensor import Coupling, Sensor, tangent_coordinates
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
+from lidardesign.task import random_generator
+
+# So many samples tell apart mounts whose shares differ by a hundredth.
+MOUNT_SAMPLES = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class GroupSamples:
+    """One group of sensors with its samples and bounds.
+
+    Arguments:
+        group: Which sensors, and where they are pinned.
+        share: The group's share of the density, all groups summing to 1.
+        features: Weighted samples.
+        bounds: One row per sensor of the group.
+    """
+
+    group: Group
+    share: float
+    features: Features
+    bounds: Bounds
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """Fitted parts.
+
+    Arguments:
+        parts: What was fitted.
+        results: One per part.
+    """
+
+    parts: tuple[GroupSamples, ...]
+    results: tuple[EMResult, ...]
+
+    @property
+    def log_likelihood(self) -> float:
+        """Weighted mean log density of the samples, given their group [nats]."""
+        return float(sum(p.share * t.log_likelihood for p, t in zip(self.parts, self.results, strict=True)))
+
+    @property
+    def order(self) -> np.ndarray:
+        """The sensor that each component of all parts, one after the other, stands for."""
+        return np.concatenate([np.array(part.group.sensors) for part in self.parts])
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Shares of the rays in the order of the sensors, summing to 1."""
+        pairs = zip(self.parts, self.results, strict=True)
+        weights = self._in_order([part.share * result.mixture.weights for part, result in pairs])
+        return weights / weights.sum()
+
+    @property
+    def widths_m(self) -> np.ndarray:
+        """Gate widths in the order of the sensors [m]."""
+        pairs = zip(self.parts, self.results, strict=True)
+        return self._in_order([2 * part.bounds.interval * result.mixture.spread_range_m for part, result in pairs])
+
+    def _in_order(self, values: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate(values)[np.argsort(self.order)]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What happened to components."""
+        return tuple(note for result in self.results for note in result.notes)
+
+    def narrowed(self, width_m: float) -> Ensemble:
+        """The fit continued with gates no wider than a cap [m]."""
+        results = []
+        for part, result in zip(self.parts, self.results, strict=True):
+            bounds = part.bounds.narrowed(width_m)
+            start = admitted_mixture(result.mixture, part.features, bounds)
+            results.append(replace(run_em(start, part.features, bounds), notes=result.notes))
+        return Ensemble(self.parts, tuple(results))
+
+
+@phase("mixture")
+def fit_groups(parts: Sequence[GroupSamples], seed: int, restarts: int) -> Ensemble:
+    """Fit every group."""
+    results = [
+        fit_mixture(part.features, part.bounds, random_generator(seed, "sensors", index), restarts=restarts)
+        for index, part in enumerate(parts)
+    ]
+    return Ensemble(tuple(parts), tuple(results))
+
+
+def admitted_mixture(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
+    """The nearest parameters of a fit inside other bounds: one M-step from its own statistics."""
+    return maximise(mixture, expect(mixture, features), features, bounds, Floors.of(features), 0.0)
+
+
+def sensors_of(ensemble: Ensemble, space: DesignSpace, level: float) -> tuple[Sensor, ...]:
+    """The fitted components as sensors s0, s1, ... in the order of the constraint file."""
+    rows = [
+        _sensor(part, result.mixture, row, space, level)
+        for part, result in zip(ensemble.parts, ensemble.results, strict=True)
+        for row in range(len(part.bounds))
+    ]
+    order = np.argsort(ensemble.order, kind="stable")
+    return _named([replace(rows[i], weight=float(w)) for i, w in zip(order, ensemble.weights, strict=True)])
+
+
+def heaviest_first(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    """Sensors by weight, named s0, s1, ... in that order."""
+    return _named(sorted(sensors, key=lambda s: (-round(s.weight, 9), s.azimuth_rad, s.elevation_rad, s.range_m)))
+
+
+def _named(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    return tuple(replace(sensor, name=f"s{index}") for index, sensor in enumerate(sensors))
+
+
+def _sensor(part: GroupSamples, mixture: Mixture, row: int, space: DesignSpace, level: float) -> Sensor:
+    axes: Axes = part.features.axes
+    fixed = [low if pin is None else pin for low, pin in zip(space.low[:3], part.group.pins, strict=True)]
+    origin, free = np.array(fixed, dtype=np.float64), list(axes.origin)
+    origin[free] = mixture.origin_m[row, free]
+    covariance = np.zeros((3, 3))
+    covariance[np.ix_(free, free)] = mixture.origin_covariance_m2[row][np.ix_(free, free)]
+    horizontal, vertical = mixture.spread_rad[row]
+    return Sensor(
+        name="",
+        weight=float(mixture.weights[row]),
+        origin_m=origin,
+        origin_covariance_m2=covariance,
+        azimuth_rad=float(wrap_turn(wrap_angle(mixture.azimuth_rad[row]))) if axes.horizontal else axes.azimuth_rad,
+        elevation_rad=float(mixture.elevation_rad[row]) if axes.vertical else axes.elevation_rad,
+        roll_rad=float(mixture.roll_rad[row]),
+        spread_horizontal_rad=float(horizontal * axes.angle_scale) if axes.horizontal else 0.0,
+        spread_vertical_rad=float(vertical) if axes.vertical else 0.0,
+        range_m=float(mixture.range_m[row]),
+        spread_range_m=float(mixture.spread_range_m[row]) if axes.range else 0.0,
+        level=level,
+    )
+
+
+def choose_mounts(
+    rules: Sequence[SensorRules], samples: Samples, count: int, retarget: Retarget | None, seed: int
+) -> tuple[SensorRules, ...]:
+    """The rules with every mounted sensor fixed at the mount chosen for it.
+
+    Arguments:
+        rules: Feasible rules of all sensors.
+        samples: Samples of the density.
+        count: Number of sensors.
+        retarget: log p* of design points, (N, 6) to (N,).
+        seed: Root of the draw of samples.
+
+    Raises:
+        ConfigError: There is a choice, but no way to evaluate the target density.
+        InfeasibleError: No mount sees any of the density.
+    """
+    entries = len(rules) - 1
+    count = count if mounts_of(rules[-1]) else entries
+    options = [mounts_of(rules_of(rules, sensor)) for sensor in range(count)]
+    if not entries and len(options[0]) == len(options):
+        # alike sensors at all the mounts, in the file's order
+        chosen = dict(enumerate(options[0]))
+    else:
+        chosen = _greedy(_views(rules, samples, options, retarget, seed), options)
+    return fix_origins(rules, [chosen.get(sensor) for sensor in range(count)])
+
+
+def _views(
+    rules: Sequence[SensorRules],
+    samples: Samples,
+    options: list[list[Mount]],
+    retarget: Retarget | None,
+    seed: int,
+) -> dict[tuple[int, Mount], np.ndarray]:
+    """What each sensor would see of each drawn sample's scene point from each of its mounts, (N,) each."""
+    drawn = systematic_draw(samples.weights, MOUNT_SAMPLES, random_generator(seed, "mounts"))
+    last = len(rules) - 1
+    views: dict[tuple[int, Mount], np.ndarray] = {}
+    for sensor, mounts in enumerate(options):
+        for mount in mounts:
+            # sensors beyond the entries of `each` are alike
+            view = views.get((last, mount)) if sensor > last else None
+            if view is None:
+                fixed = fix_origin(rules_of(rules, sensor), mount)
+                group = Group(pins_of(fixed, samples.space), (0,))
+                view = reaim_samples(samples, drawn, (fixed,), group, retarget)[1]
+            views[sensor, mount] = view
+    if not any(view.any() for view in views.values()):
+        names = [rules[0].path("origin.mounts_m")]
+        raise InfeasibleError(
+            "no mount sees any part of the density", conflicts=names, hint="add mounts in other places"
+        )
+    return views
+
+
+def _greedy(views: dict[tuple[int, Mount], np.ndarray], options: list[list[Mount]]) -> dict[int, Mount]:
+    """The mount of each mounted sensor, of those that see most of the density together."""
+    seen = np.zeros(len(next(iter(views.values()))))
+    left = {sensor: list(mounts) for sensor, mounts in enumerate(options) if mounts}
+    chosen: dict[int, Mount] = {}
+    while left:
+        gains = {
+            (sensor, mount): float(np.maximum(seen, views[sensor, mount]).sum())
+            for sensor, mounts in left.items()
+            for mount in mounts
+            if mounts_suffice([[m for m in others if m != mount] for other, others in left.items() if other != sensor])
+        }
+        sensor, mount = max(gains, key=lambda pair: gains[pair])
+        chosen[sensor] = mount
+        seen = np.maximum(seen, views[sensor, mount])
+        del left[sensor]
+        left = {other: [m for m in mounts if m != mount] for other, mounts in left.items()}
+    return chosen
+
+
+# A regression on five covariates means nothing from fewer effective samples.
+LEAST_EFFECTIVE_SAMPLES = 30.0
+# Directions of the standardised covariates with less of their variance than this share carry rounding only.
+SMALLEST_VARIANCE_SHARE = SLACK
+
+
+def add_couplings(ensemble: Ensemble, sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+    """The sensors of an ensemble, in its own order of sensors, with their couplings."""
+    coupled = list(sensors)
+    for part, trace in zip(ensemble.parts, ensemble.results, strict=True):
+        if not part.features.axes.origin:
+            continue
+        share = responsibilities(trace.mixture, part.features) * part.features.weights[:, None]
+        for column, index in enumerate(part.group.sensors):
+            coupling = coupling_of(sensors[index], part.features.points, share[:, column])
+            coupled[index] = replace(sensors[index], coupling=coupling)
+    return tuple(coupled)
+
+
+def coupling_of(sensor: Sensor, points: np.ndarray, weights: np.ndarray) -> Coupling | None:
+    """The coupling of a sensor's weighted samples; None where its origin is fixed or they are too few.
+
+    Slopes are zero along what does not vary. Residual spreads never exceed the sensor's marginal ones.
+
+    Arguments:
+        sensor: Its means, frame and marginal spreads.
+        points: Design points, shape (N, 6).
+        weights: Non-negative, shape (N,).
+    """
+    if not np.any(sensor.origin_covariance_m2) or effective_count(weights) < LEAST_EFFECTIVE_SAMPLES:
+        return None
+    origin, tangent, range_m = relative(sensor, points)
+    free = np.diag(sensor.origin_covariance_m2) > 0
+    angular = np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad])
+    direction_per_m, spread_rad = np.zeros((2, 3)), angular.copy()
+    for axis in np.flatnonzero(angular > 0):
+        slopes, spread = _regression(origin[:, free], tangent[:, axis], weights)
+        direction_per_m[axis, free] = slopes
+        spread_rad[axis] = min(spread, angular[axis])
+    range_per_m, range_per_rad, spread_m = np.zeros(3), np.zeros(2), sensor.spread_range_m
+    if sensor.spread_range_m > 0:
+        covariates = np.concatenate([origin[:, free], tangent[:, angular > 0]], axis=1)
+        slopes, spread = _regression(covariates, range_m, weights)
+        range_per_m[free], range_per_rad[angular > 0] = np.split(slopes, [int(free.sum())])
+        spread_m = min(spread, sensor.spread_range_m)
+    return Coupling(direction_per_m, range_per_m, range_per_rad, spread_rad, float(spread_m))
+
+
+def relative(sensor: Sensor, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Origins (N, 3) [m], tangent angles (N, 2) [rad] and ranges (N,) [m] about a sensor's means.
+
+    Angles along which the sensor has no spread are 0.
+    """
+    tangent = tangent_coordinates(sensor.frame, direction(points[:, AZIMUTH], points[:, ELEVATION]))
+    tangent[:, np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad]) == 0] = 0.0
+    return points[:, :3] - sensor.origin_m, tangent, points[:, RANGE] - sensor.range_m
+
+
+def conditional_means(sensor: Sensor, origin: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """E[u | x] (N, 2) [rad] and E[range | x, u] (N,) [m] at origins (N, 3) and angles (N, 2) about the means."""
+    coupling = sensor.coupling
+    if coupling is None:
+        return np.zeros((len(origin), 2)), np.full(len(origin), sensor.range_m)
+    return (
+        origin @ coupling.direction_per_m.T,
+        sensor.range_m + origin @ coupling.range_per_m + tangent @ coupling.range_per_rad,
+    )
+
+
+def conditional_spreads(sensor: Sensor) -> tuple[np.ndarray, float]:
+    """Standard deviations of the angles given the origin (2,) [rad], and of the range given both [m]."""
+    if sensor.coupling is None:
+        return np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad]), sensor.spread_range_m
+    return sensor.coupling.spread_rad, sensor.coupling.spread_m
+
+
+def _regression(covariates: np.ndarray, values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
+    """Weighted least squares slopes (C,) and the residual standard deviation.
+
+    In standardised covariates through the eigenvectors of their correlation matrix, so that covariates which
+    do not vary, or vary together only, get the smallest slopes that do as well.
+    """
+    share = weights / weights.sum()
+    centred = covariates - share @ covariates
+    deviation = values - share @ values
+    scale = np.sqrt(share @ np.square(centred))
+    unit = np.where(scale > 0, scale, 1.0)
+    standard = centred / unit
+    variances, axes = np.linalg.eigh(standard.T @ (share[:, None] * standard))
+    carried = variances > SMALLEST_VARIANCE_SHARE * max(variances[-1], 0.0)
+    inverse = np.where(carried, 1.0 / np.where(carried, variances, 1.0), 0.0)
+    slopes = axes @ (inverse * (axes.T @ (standard.T @ (share * deviation))))
+    left = deviation - standard @ slopes
+    return np.where(scale > 0, slopes / unit, 0.0), float(np.sqrt(share @ np.square(left)))

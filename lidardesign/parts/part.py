@@ -1,0 +1,340 @@
+"""A real part in one of its modes, as designs use it: its figures, and where its rays go in its own frame.
+
+That frame has x forward, y to the left (growing azimuth), z up. What the two angles of a field of view mean depends on
+the part: equal angles from the forward axis (`tangent`: zones behind a wide lens, rosettes), azimuth and elevation
+(`sphere`: whatever turns or steps), or angles in the horizontal and the vertical plane (`plane`: a camera whose pixels
+are even on its focal plane).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.layouts.grid import grid_rows, low_discrepancy
+from lidardesign.numerics import COARSE_SLACK, sphere_exp, sphere_log
+from lidardesign.parts.statements import (
+    Even,
+    PartFieldOfView,
+    PartFile,
+    Pixels,
+    Rings,
+    Rosette,
+    Source,
+    Statement,
+    Zones,
+    ray_count,
+)
+from lidardesign.space import direction
+
+Projection = Literal["tangent", "sphere", "plane"]
+FULL_TURN_DEG = 360.0
+BITS_PER_MEGABIT = 1e6
+BITS_PER_BYTE = 8
+CONDITIONS = ("reflectance_percent", "illuminance_klux", "detection_percent", "at")
+
+
+def projection_of(pattern: Any, view: PartFieldOfView) -> Projection:
+    """What the two angles of a part's field of view are."""
+    if isinstance(pattern, Pixels):
+        return "plane"
+    if isinstance(pattern, Zones | Rosette) or (isinstance(pattern, Even) and view.shape == "ellipse"):
+        return "tangent"
+    return "sphere"
+
+
+def to_angles(projection: Projection, directions: np.ndarray) -> np.ndarray:
+    """The two angles of unit vectors in the part's frame: (N, 3) to (N, 2) [rad]."""
+    if projection == "tangent":
+        return sphere_log(directions)
+    x, y, z = directions.T
+    if projection == "sphere":
+        return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=1)
+    # what is behind a camera has angles beyond a right one, which no field of it has
+    return np.stack([np.arctan2(y, x), np.arctan2(z, x)], axis=1)
+
+
+def to_directions(projection: Projection, angles: np.ndarray) -> np.ndarray:
+    """Unit vectors in the part's frame at two angles: (N, 2) [rad] to (N, 3)."""
+    if projection == "tangent":
+        return sphere_exp(angles)
+    if projection == "sphere":
+        return direction(angles[:, 0], angles[:, 1])
+    plane = np.concatenate([np.ones((len(angles), 1)), np.tan(angles)], axis=1)
+    return plane / np.linalg.norm(plane, axis=1, keepdims=True)
+
+
+def pattern_directions(pattern: Any, view: PartFieldOfView, rate_hz: float) -> np.ndarray:
+    """The unit vectors of a frame in the part's frame, in the order in which they fire, shape (M, 3)."""
+    (left, right), (bottom, top) = view.azimuth, view.elevation
+    if isinstance(pattern, Rosette):
+        # thin prisms: each adds a fixed deflection in the direction in which it stands (first order in the wedge)
+        time_s = np.arange(ray_count(pattern, rate_hz)) / pattern.points_per_s
+        angles_deg = np.zeros((len(time_s), 2))
+        for turns_hz, deflection_deg in zip(pattern.rotor_hz, pattern.deflection_deg, strict=True):
+            phase = 2 * np.pi * turns_hz * time_s
+            angles_deg += deflection_deg * np.stack([np.cos(phase), np.sin(phase)], axis=1)
+    elif isinstance(pattern, Even):
+        angles_deg = _even_angles(pattern.rays, view)
+    elif isinstance(pattern, Rings):
+        # column by column, as a head turns; all beams of a column fire at about the same time
+        elevations = pattern.elevations_deg or _ends_included(bottom, top, pattern.rings or 1)
+        spaced = _cell_centres if right - left >= FULL_TURN_DEG - COARSE_SLACK else _ends_included
+        across = spaced(left, right, pattern.columns)
+        angles_deg = np.stack([np.repeat(across, len(elevations)), np.tile(elevations, pattern.columns)], axis=1)
+    else:
+        # row by row; pixels are even on a plane
+        spaced = _plane_centres if isinstance(pattern, Pixels) else _cell_centres
+        across, up = spaced(left, right, pattern.columns), spaced(bottom, top, pattern.rows)
+        angles_deg = np.stack([np.tile(across, len(up)), np.repeat(up, len(across))], axis=1)
+    return to_directions(projection_of(pattern, view), np.radians(angles_deg))
+
+
+def _cell_centres(low: float, high: float, count: int) -> np.ndarray:
+    """Centres of equal cells of an interval: never on its ends, shape (count,)."""
+    return low + (high - low) * (np.arange(count) + 0.5) / count
+
+
+def _plane_centres(low_deg: float, high_deg: float, count: int) -> np.ndarray:
+    """Angles of pixels that are even on a plane, shape (count,) [degrees]."""
+    low, high = math.tan(math.radians(low_deg)), math.tan(math.radians(high_deg))
+    return np.degrees(np.arctan(_cell_centres(low, high, count)))
+
+
+def _ends_included(low: float, high: float, count: int) -> np.ndarray:
+    return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
+
+
+def _even_angles(count: int, view: PartFieldOfView) -> np.ndarray:
+    """Points that fill the field evenly per solid angle (a disc in its tangent plane), shape (count, 2) [degrees]."""
+    unit = low_discrepancy(count, 2)
+    (left, right), (bottom, top) = view.azimuth, view.elevation
+    if view.shape == "ellipse":
+        radius, turn = np.sqrt(unit[:, 0]), 2 * np.pi * unit[:, 1]
+        middle = np.array([left + right, bottom + top]) / 2
+        half = np.array([right - left, top - bottom]) / 2
+        return middle + half * radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    low, high = math.sin(math.radians(bottom)), math.sin(math.radians(top))
+    up = np.degrees(np.arcsin(np.clip(low + (high - low) * unit[:, 1], -1.0, 1.0)))
+    return np.stack([left + (right - left) * unit[:, 0], up], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One mode of one part.
+
+    Arguments:
+        name: Its name in the catalogue, with `:MODE` behind it where that is not the first.
+        product: Maker and product.
+        kind: `multi-zone`, `spinning`, ...
+        summary: One line for people.
+        mode: The mode's name; None where the part has one only.
+        modes: All modes' names.
+        figures: The statements of every field, the one that counts first.
+        sources: By the key that statements name.
+        origin: Where the part file is: `lidardesign`, or a path.
+    """
+
+    name: str
+    product: str
+    kind: str
+    summary: str
+    mode: str | None
+    modes: tuple[str, ...]
+    figures: Mapping[str, Sequence[Any]]
+    sources: Mapping[str, Source] = field(default_factory=dict)
+    origin: str = "lidardesign"
+
+    @classmethod
+    def of_file(cls, stem: str, file: PartFile, mode: str | None, origin: str) -> Part:
+        """One mode of a part file; None is its first."""
+        modes = tuple(file.modes)
+        first = modes[0] if modes else None
+        mode = mode or first
+        return cls(
+            name=stem if mode == first else f"{stem}:{mode}",
+            product=f"{file.maker} {file.product}",
+            kind=file.kind,
+            summary=file.summary,
+            mode=mode,
+            modes=modes,
+            figures=file.figures(mode),
+            sources=file.sources,
+            origin=origin,
+        )
+
+    def value(self, name: str) -> float | None:
+        """The figure of a field that counts; None where no source gives one."""
+        statements = self.figures.get(name)
+        return None if statements is None else statements[0].value
+
+    @property
+    def pattern(self) -> Any:
+        """Where its rays go."""
+        return self.figures["pattern"][0]
+
+    @property
+    def view(self) -> PartFieldOfView:
+        """Its field of view, in degrees from its forward axis."""
+        return self.figures["field_of_view_deg"][0]
+
+    @property
+    def projection(self) -> Projection:
+        """What the two angles of its field of view are."""
+        return projection_of(self.pattern, self.view)
+
+    @property
+    def field_of_view_rad(self) -> tuple[float, float]:
+        """Full horizontal and vertical angles."""
+        horizontal, vertical = (math.radians(high - low) for low, high in (self.view.azimuth, self.view.elevation))
+        return horizontal, vertical
+
+    @property
+    def centre_rad(self) -> tuple[float, float]:
+        """Azimuth and elevation of its field's centre in its own frame."""
+        azimuth, elevation = (math.radians(low + high) / 2 for low, high in (self.view.azimuth, self.view.elevation))
+        return azimuth, elevation
+
+    @cached_property
+    def directions(self) -> np.ndarray:
+        """The unit vectors of one frame in its own frame, in the order in which they fire, shape (rays, 3)."""
+        return pattern_directions(self.pattern, self.view, self.rate_hz)
+
+    @property
+    def rays(self) -> int:
+        """Rays per frame."""
+        return ray_count(self.pattern, self.rate_hz)
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Columns and rows of its pattern; of one that has none, those of as many rays in square cells."""
+        pattern = self.pattern
+        if hasattr(pattern, "rows"):
+            return pattern.columns, pattern.rows
+        if hasattr(pattern, "columns"):
+            return pattern.columns, self.rays // pattern.columns
+        rows = len(grid_rows(*self.field_of_view_rad, self.rays))
+        return -(-self.rays // rows), rows
+
+    @property
+    def range_m(self) -> tuple[float, float]:
+        """From where to where it measures, under the conditions of the first statements; from 0 where none says."""
+        return self.value("near_m") or 0.0, self.figures["far_m"][0].value
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second."""
+        return self.figures["rate_hz"][0].value
+
+    @property
+    def histogram_mbps(self) -> float | None:
+        """What its histograms cost to read: their number x bins x bits x rate [Mbit/s]; None where it gives none."""
+        bins, bits = self.value("bins"), self.value("bits_per_bin")
+        if bins is None or bits is None:
+            return None
+        return (self.value("histograms") or self.rays) * bins * bits * self.rate_hz / BITS_PER_MEGABIT
+
+    @property
+    def processed_mbps(self) -> float | None:
+        """What its own results cost to read [Mbit/s]; None where no source says how long a frame is."""
+        frame = self.value("frame_bytes")
+        return None if frame is None else frame * BITS_PER_BYTE * self.rate_hz / BITS_PER_MEGABIT
+
+    def under(self, *, reflectance_percent: float | None = None, illuminance_klux: float | None = None) -> Part:
+        """The same part with the range that its sources vouch for under conditions.
+
+        A statement vouches for targets at least as bright and light at most as strong as its own; of those that do,
+        the farthest counts. One that states no such condition says nothing about it.
+
+        Raises:
+            ConfigError: No source states a range under such conditions.
+        """
+        fits = [
+            one
+            for one in self.figures["far_m"]
+            if (
+                reflectance_percent is None
+                or (one.reflectance_percent is not None and one.reflectance_percent <= reflectance_percent)
+            )
+            and (
+                illuminance_klux is None
+                or (one.illuminance_klux is not None and one.illuminance_klux >= illuminance_klux)
+            )
+        ]
+        if not fits:
+            asked = _conditions(reflectance_percent, illuminance_klux)
+            raise ConfigError(
+                f"no source of {self.name} states a range at {asked}",
+                where="catalog",
+                allowed="; ".join(sorted({conditions_of(one) or "no conditions" for one in self.figures["far_m"]})),
+            )
+        best = max(fits, key=lambda one: one.value)
+        others = [one for one in self.figures["far_m"] if one is not best]
+        return replace(self, figures={**self.figures, "far_m": [best, *others]})
+
+
+def _conditions(reflectance_percent: float | None, illuminance_klux: float | None) -> str:
+    parts = [] if reflectance_percent is None else [f"{reflectance_percent:g} % reflectance"]
+    if illuminance_klux is not None:
+        parts.append("darkness" if illuminance_klux == 0 else f"{illuminance_klux:g} klux")
+    return ", ".join(parts)
+
+
+def conditions_of(statement: Statement) -> str:
+    """The conditions of a statement, for people; empty where it states none."""
+    parts = [statement.at, _conditions(statement.reflectance_percent, statement.illuminance_klux)]
+    if statement.detection_percent is not None:
+        parts.append(f"{statement.detection_percent:g} % detected")
+    return ", ".join(part for part in parts if part)
+
+
+def disagreements(part: Part) -> list[str]:
+    """Fields of which two sources give different figures for the same conditions."""
+    names = []
+    for name, statements in part.figures.items():
+        # source and figure of the statements under the same conditions
+        same: dict[tuple[Any, ...], list[tuple[str, Any]]] = {}
+        for statement in statements:
+            figure = statement.model_dump(exclude={"note"})
+            same.setdefault(tuple(figure.pop(key) for key in CONDITIONS), []).append((figure.pop("source"), figure))
+        pairs = (pair for found in same.values() for pair in itertools.combinations(found, 2))
+        if any(first[0] != second[0] and first[1] != second[1] for first, second in pairs):
+            names.append(name)
+    return names
+
+
+def even_subset(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices, ascending, of `count` of the points that lie evenly among them: (M, K) to int64 (count,).
+
+    The points are halved along their longest extent until as many groups as wanted are left, each with the same
+    number of points but for one; of each the point nearest to its centre stays. Deterministic, and O(M log M).
+
+    Raises:
+        ConfigError: More are wanted than there are.
+    """
+    if not 0 <= count <= len(points):
+        raise ConfigError(f"{count} of {len(points)} rays", where="rays", allowed=f"0 to {len(points)}")
+    if count == len(points):
+        return np.arange(count)
+    kept: list[int] = []
+    groups = [(np.arange(len(points)), count)] if count else []
+    while groups:
+        members, wanted = groups.pop()
+        inside = points[members]
+        if wanted == 1:
+            kept.append(int(members[np.square(inside - inside.mean(axis=0)).sum(axis=1).argmin()]))
+            continue
+        # to so many digits, so that rounding does not choose among equal extents and positions
+        axis = np.round(np.ptp(inside, axis=0), 9).argmax()
+        order = members[np.argsort(np.round(inside[:, axis], 9), kind="stable")]
+        first = wanted // 2
+        cut = int(np.clip(round(len(order) * first / wanted), first, len(order) - (wanted - first)))
+        groups += [(order[:cut], first), (order[cut:], wanted - first)]
+    return np.sort(np.array(kept, dtype=np.int64))

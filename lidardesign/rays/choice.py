@@ -1,0 +1,209 @@
+"""Rays and gates chosen out of many: greedily, then by swaps, within a count per sensor and a bandwidth.
+
+Greedy on F - price * bits - harm takes the ray and gate that add most (Nemhauser, Wolsey and Fisher 1978). What every
+gate would add is kept true as rays come and go: few items change what is known of them, and few rays tell of an item.
+Then one ray at a time leaves and the best that is left comes in, until no swap gains. No constant is promised:
+`certificate` bounds what is lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.numerics import SLACK
+from lidardesign.rays import kernels
+from lidardesign.rays.coverage import Coverage
+
+SMALLEST_GAIN = SLACK  # of F, relative: what a swap must gain, so that rounding cannot make two rays take turns
+BISECTIONS = 12  # of the price of bandwidth
+NEAR_BUDGET = 0.98  # what spends this share of a budget is near enough: swaps within the budget spend the rest
+MOST_PASSES = 10  # of swaps
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Which rays fire, and through which gate.
+
+    Arguments:
+        gate: The gate of each candidate ray, -1 for those that do not fire, (N,).
+        worth: F of the choice.
+        bits: What reading it out costs [Mbit/s].
+        harm: What it spoils, in the unit of worth.
+        price: What one Mbit/s was weighed with.
+    """
+
+    gate: np.ndarray
+    worth: float
+    bits: float
+    harm: float
+    price: float
+
+    @property
+    def rays(self) -> np.ndarray:
+        """Which candidates fire, in their order."""
+        return np.flatnonzero(self.gate >= 0)
+
+
+@dataclass(frozen=True, eq=False)
+class RayCounts:
+    """How many rays each sensor fires.
+
+    Arguments:
+        sensor: The sensor of each candidate ray, (N,).
+        most: The number of rays of each sensor, (S,).
+    """
+
+    sensor: np.ndarray
+    most: np.ndarray
+
+    @staticmethod
+    def of_one(rays: int, count: int) -> RayCounts:
+        """One sensor that fires `count` of all rays."""
+        return RayCounts(np.zeros(rays, dtype=np.intp), np.array([count]))
+
+
+class _Search:
+    """A choice under way: what it knows, what each ray would add, and what is left of each sensor's count."""
+
+    def __init__(self, coverage: Coverage, counts: RayCounts) -> None:
+        self.coverage, self.sensor, self.left = coverage, counts.sensor, counts.most.copy()
+        self.cost = coverage.harm
+        self.limit_mbps, self.spent_mbps = np.inf, 0.0
+        self.gate = np.full(coverage.shape[0], -1)
+        self.known = np.zeros(len(coverage.weight))
+        self.gains = coverage.first_gains.copy()
+
+    def improve(self, price: float, limit_mbps: float, *, full: bool, passes: int) -> None:
+        """Takes rays at a price and within a bandwidth, then swaps them."""
+        coverage = self.coverage
+        self.cost = coverage.harm + price * np.where(np.isfinite(coverage.bits), coverage.bits, 0.0)
+        self.limit_mbps = limit_mbps
+        self.fill(full)
+        for _ in range(passes):
+            worth = float(coverage.weight @ coverage.counted(self.known))
+            changed = self.swap(full, SMALLEST_GAIN * worth)
+            self.fill(full)
+            if not changed:
+                return
+
+    def choice(self, price: float) -> Choice:
+        """What was chosen so far."""
+        return Choice(self.gate.copy(), self.coverage.value_of(self.gate), *self.coverage.charge(self.gate), price)
+
+    def best(self) -> tuple[int, int, float]:
+        """The ray and gate that add most now, and what they add; -inf where none may be taken."""
+        may_fire = (self.gate < 0) & (self.left[self.sensor] > 0)
+        room_mbps = self.limit_mbps - self.spent_mbps
+        return kernels.best_gate(self.gains, self.cost, self.coverage.bits, may_fire, room_mbps)
+
+    def take(self, ray: int, gate: int) -> None:
+        """Fires a ray through a gate."""
+        self._change(ray, gate, adding=True)
+        self._count(ray, gate)
+
+    def _count(self, ray: int, gate: int) -> None:
+        self.gate[ray] = gate
+        self.left[self.sensor[ray]] -= 1
+        self.spent_mbps += self.coverage.bits[ray, gate]
+
+    def drop(self, ray: int) -> None:
+        """Takes a ray out."""
+        gate = int(self.gate[ray])
+        self.gate[ray] = -1
+        self._change(ray, gate, adding=False)
+        self.left[self.sensor[ray]] += 1
+        self.spent_mbps -= self.coverage.bits[ray, gate]
+
+    def _change(self, ray: int, gate: int, *, adding: bool) -> None:
+        coverage = self.coverage
+        kernels.change_choice(ray, gate, adding, coverage.entries, coverage.by_item, self.gate, self.known, self.gains)
+
+    def fill(self, full: bool) -> None:
+        """Takes rays greedily until counts or bandwidth are used up or, unless `full`, none gains."""
+        while True:
+            ray, gate, net = self.best()
+            if net == -np.inf or (net <= 0 and not full):
+                return
+            self.take(ray, gate)
+
+    def swap(self, full: bool, smallest: float) -> bool:
+        """Every chosen ray leaves once and the best comes in, where that gains; says whether anything changed."""
+        changed, entries = False, self.coverage.entries
+        for ray in np.flatnonzero(self.gate >= 0):
+            gate = int(self.gate[ray])
+            items = entries.item[entries.start[ray] : entries.start[ray + 1]]
+            known, gains = self.known[items], self.gains.copy()
+            self.drop(int(ray))
+            own = float(self.gains[ray, gate] - self.cost[ray, gate])
+            other, new_gate, net = self.best()
+            if net > own + smallest:
+                self.take(other, new_gate)
+                changed = True
+            elif full or own >= 0:
+                self._count(int(ray), gate)
+                self.known[items], self.gains = known, gains
+            else:
+                changed = True
+        return changed
+
+
+def choose(
+    coverage: Coverage,
+    counts: RayCounts,
+    *,
+    price: float = 0.0,
+    full: bool = True,
+    passes: int = MOST_PASSES,
+) -> Choice:
+    """Rays and gates of large F - price * bits - harm.
+
+    Arguments:
+        coverage: What the candidates tell.
+        counts: How many rays each sensor fires.
+        price: What 1 Mbit/s costs, in the unit of worth.
+        full: Whether each sensor fires all its rays, also those that gain nothing.
+        passes: How often each ray may be swapped.
+    """
+    search = _Search(coverage, counts)
+    search.improve(price, np.inf, full=full, passes=passes)
+    return search.choice(price)
+
+
+def choose_within(
+    coverage: Coverage,
+    counts: RayCounts,
+    budget_mbps: float,
+    *,
+    full: bool = True,
+    passes: int = MOST_PASSES,
+) -> Choice:
+    """The best choice found that a bandwidth allows; as `choose`, with a budget [Mbit/s] for a price.
+
+    A price reaches only the convex hull of what choices cost and are worth. So the price is bisected, and what the
+    least price that keeps to the budget leaves over is spent at the next lower price, then at none.
+    """
+    budget_mbps *= 1 + SLACK  # the same bits added up in another order
+    free = choose(coverage, counts, full=full, passes=passes)
+    if free.bits <= budget_mbps:
+        return free
+    low, high = 0.0, (free.worth or 1.0) / free.bits  # a price has to rise from above 0
+    for _ in range(BISECTIONS):
+        tried = choose(coverage, counts, price=high, full=full, passes=0).bits
+        if tried <= budget_mbps:
+            break
+        low, high = high, 4 * high
+    for _ in range(BISECTIONS):
+        if tried >= NEAR_BUDGET * budget_mbps and tried <= budget_mbps:
+            break
+        middle = (low + high) / 2
+        bits = choose(coverage, counts, price=middle, full=full, passes=0).bits
+        if bits <= budget_mbps:
+            high, tried = middle, bits
+        else:
+            low = middle
+    search = _Search(coverage, counts)
+    for price in (high, low, 0.0):
+        search.improve(price, budget_mbps, full=full, passes=passes)
+    return search.choice(high)

@@ -1,0 +1,321 @@
+"""What every candidate ray tells about every item of many scenes, as one sparse table.
+
+A candidate is a ray with one of a few gates. Items are what scenes ask about: points of a visible surface, frames of
+a track, bodies. The worth of a choice S is F(S) = sum_u w_u phi_u(S), where phi is the largest worth of the returns
+that S hears of item u (facility location), or a concave table of their sum. Both are monotone and submodular
+(Nemhauser, Wolsey and Fisher 1978).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from lidardesign.errors import ConfigError, PluginError
+from lidardesign.numerics import SLACK
+from lidardesign.rays import kernels
+from lidardesign.rays.information import require_valid
+from lidardesign.scenes.rays import Returns
+from lidardesign.task import Information
+
+MOST_GATES = 8  # of a ray: an entry keeps one bit for each
+LARGEST = np.zeros(0)  # the table of items that count the largest worth
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """All candidates beside all items, with prices.
+
+    Arguments:
+        start: Where the entries of each ray begin, (N + 1,).
+        item: The item of each entry, (E,).
+        worth: Its worth, float32 (E,).
+        gates: One bit for each gate of the ray that lets the return through, uint8 (E,).
+        weight: What items count; they sum to 1, (U,).
+        bits: What reading a ray out through each gate costs [Mbit/s], inf for a gate that is not allowed, (N, G).
+        harm: What a ray spoils through each gate, in the unit of worth, (N, G).
+        table: The concave table of sums, 0 at 0, or `LARGEST`.
+        complete: F where nothing is left to know: the loss of a choice is what it lacks of that.
+    """
+
+    start: np.ndarray
+    item: np.ndarray
+    worth: np.ndarray
+    gates: np.ndarray
+    weight: np.ndarray
+    bits: np.ndarray
+    harm: np.ndarray
+    table: np.ndarray = field(default_factory=lambda: LARGEST)
+    complete: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Raises `PluginError` where the table of sums is not concave, nondecreasing and 0 at 0."""
+        rises = np.diff(self.table)
+        if len(self.table) and (self.table[0] != 0 or (rises < 0).any() or (np.diff(rises) > SLACK * rises[0]).any()):
+            raise PluginError(
+                f"the table of sums is {np.array2string(self.table)}",
+                where="informs",
+                allowed="0 at 0, never falling, and never rising faster than before",
+            )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """How many rays, and how many gates each has."""
+        return self.bits.shape
+
+    @cached_property
+    def ray(self) -> np.ndarray:
+        """The ray of each entry, (E,)."""
+        return np.repeat(np.arange(len(self.start) - 1, dtype=np.int32), np.diff(self.start))
+
+    @cached_property
+    def entries(self) -> kernels.ByRay:
+        """The table for compiled loops."""
+        return kernels.ByRay(self.start, self.item, self.worth, self.gates, self.weight, self.table)
+
+    @cached_property
+    def by_item(self) -> kernels.ByItem:
+        """The table in the order of items, each from what tells most of it."""
+        begin, order = self._order_by_item
+        return kernels.ByItem(begin, self.ray[order], self.worth[order], self.gates[order], self.weight, self.table)
+
+    @cached_property
+    def _order_by_item(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the entries of each item begin, and their order."""
+        begin = _begins(self.item, len(self.weight))
+        return begin, kernels.order_by_item(self.item, self.worth, begin)
+
+    def of_rays(self, rays: slice) -> Coverage:
+        """The table of some rays, one after the other."""
+        if rays == slice(0, len(self.bits)):
+            return self
+        first, last = self.start[rays.start], self.start[rays.stop]
+        return replace(
+            self,
+            start=self.start[rays.start : rays.stop + 1] - first,
+            item=self.item[first:last],
+            worth=self.worth[first:last],
+            gates=self.gates[first:last],
+            bits=self.bits[rays],
+            harm=self.harm[rays],
+        )
+
+    def through(self, gate: np.ndarray) -> Coverage:
+        """The table with one gate of each ray, (N,), and no other."""
+        rays = np.arange(len(gate))
+        narrowed = replace(
+            self,
+            gates=self.gates >> gate.astype(np.uint8)[self.ray] & 1,
+            bits=self.bits[rays, gate][:, None],
+            harm=self.harm[rays, gate][:, None],
+        )
+        vars(narrowed).update(ray=self.ray, _order_by_item=self._order_by_item)  # the same entries in the same order
+        return narrowed
+
+    def grouped(self, groups: Sequence[np.ndarray]) -> Coverage:
+        """The table whose candidates are groups of rays that fire together, each through the gate of the same number.
+
+        A group tells of an item what its rays tell together; what its rays cost and spoil adds up.
+
+        Arguments:
+            groups: The rays of each; a ray may be in several, and in one several times, where it counts so often.
+        """
+        first = np.cumsum([0, *map(len, groups)])
+        members = np.concatenate([np.zeros(0, dtype=np.intp), *groups]).astype(np.intp)
+        begin = np.zeros(len(first), dtype=np.int64)
+        kernels.group_entries(self.entries, first, members, self.shape[1], begin, False)
+        item, worth, gates = kernels.group_entries(self.entries, first, members, self.shape[1], begin, True)
+        bits, harm = (np.array([values[rays].sum(axis=0) for rays in groups]) for values in (self.bits, self.harm))
+        return replace(self, start=begin, item=item, worth=worth, gates=gates, bits=bits, harm=harm)
+
+    def known(self, gate: np.ndarray) -> np.ndarray:
+        """What a choice of one gate per ray, -1 for none, (N,), knows about each item, (U,)."""
+        known = np.empty(len(self.weight))
+        kernels.know(self.entries, gate, known)
+        return known
+
+    def gains(self, known: np.ndarray) -> np.ndarray:
+        """What each gate of every ray would add to F, (N, G)."""
+        gains = np.empty(self.shape)
+        kernels.gate_gains(self.by_item, known, gains)
+        return gains
+
+    @cached_property
+    def first_gains(self) -> np.ndarray:
+        """What each gate of every ray would add where nothing is known, (N, G)."""
+        return self.gains(np.zeros(len(self.weight)))
+
+    def value_of(self, gate: np.ndarray) -> float:
+        """F of a choice of one gate per ray, -1 for none, (N,)."""
+        return float(self.weight @ self.counted(self.known(gate)))
+
+    def loss_of(self, gate: np.ndarray) -> float:
+        """What F of a choice lacks of complete knowledge."""
+        return self.complete - self.value_of(gate)
+
+    def counted(self, known: np.ndarray) -> np.ndarray:
+        """What known worths count, any shape."""
+        return known if len(self.table) == 0 else np.interp(known, np.arange(len(self.table)), self.table)
+
+    def charge(self, gate: np.ndarray) -> tuple[float, float]:
+        """Bits [Mbit/s] and harm of a choice of one gate per ray, -1 for none, (N,)."""
+        rays = np.flatnonzero(gate >= 0)
+        return float(self.bits[rays, gate[rays]].sum()), float(self.harm[rays, gate[rays]].sum())
+
+
+@dataclass(frozen=True, eq=False)
+class InformedScene:
+    """What a task says of a scene's returns, with the ranges that say through which gates they are heard.
+
+    Arguments:
+        ray, item: Of each pair, int32 (E,).
+        worth: Above 0, float32 (E,).
+        range_m: The range of its return, (E,) [m].
+        weight: What items count, (U,); they sum to 1.
+        spoiling: Rays whose returns spoil something, one entry per return, (H,).
+        harm, harm_range_m: What each of these spoils, and its range [m], (H,).
+        sums: The table of sums, or `LARGEST`.
+        complete: What an item counts of which nothing is left to know.
+        is_repeated: Whether a ray may tell of an item by several frames, of which the largest worth counts.
+        unit: Of worth.
+    """
+
+    ray: np.ndarray
+    item: np.ndarray
+    worth: np.ndarray
+    range_m: np.ndarray
+    weight: np.ndarray
+    spoiling: np.ndarray
+    harm: np.ndarray
+    harm_range_m: np.ndarray
+    sums: np.ndarray
+    complete: float
+    is_repeated: bool
+    unit: str
+
+    @classmethod
+    def of(cls, information: Information, returns: Sequence[Returns]) -> InformedScene:
+        """What is kept of the returns of all candidate rays, through open gates.
+
+        Raises:
+            PluginError: Pairs, weights or harm that cannot be.
+        """
+        range_m = np.stack([frame.range_m for frame in returns])
+        require_valid(information, range_m.shape[1], len(returns))
+        tells = np.flatnonzero(information.worth > 0)
+        ray, item = information.ray[tells], information.item[tells]
+        count = len(information.frame)
+        weight = np.ones(count) if information.weight is None else np.asarray(information.weight, dtype=np.float64)
+        harm = np.zeros_like(range_m) if information.harm is None else np.asarray(information.harm)
+        spoiling = np.nonzero(harm)
+        return cls(
+            ray=ray.astype(np.int32),
+            item=item.astype(np.int32),
+            worth=information.worth[tells].astype(np.float32),
+            range_m=range_m[information.source[tells], ray],
+            weight=weight / weight.sum(),
+            spoiling=spoiling[1],
+            harm=harm[spoiling],
+            harm_range_m=range_m[spoiling],
+            sums=LARGEST if information.sums is None else np.asarray(information.sums, dtype=np.float64),
+            complete=information.complete,
+            is_repeated=information.seen_in is not None,
+            unit=information.unit,
+        )
+
+    @cached_property
+    def telling_returns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Every return that tells something: its ray (K,) and range (K,) [m]."""
+        # a return tells of several items
+        order = np.lexsort((self.range_m, self.ray))
+        ray, range_m = self.ray[order], self.range_m[order]
+        is_first = np.append(True, (np.diff(ray) > 0) | (np.diff(range_m) > 0))[: len(ray)]
+        return ray[is_first].astype(np.intp), range_m[is_first]
+
+
+def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndarray) -> Coverage:
+    """The table over scenes, each of which counts as much as any other; its items are in an order of its own.
+
+    Arguments:
+        informed: What a task says of each scene.
+        gates_m: The gates of each ray, each from a start to before an end, shape (N, G, 2).
+        bits: What reading a ray out through each gate costs, inf for gates that are not allowed, (N, G) [Mbit/s].
+
+    Raises:
+        ConfigError: No scene, or more gates than an entry has bits.
+    """
+    rays, gates = bits.shape
+    if gates > MOST_GATES:
+        raise ConfigError(f"{gates} gates per ray", where="selection", allowed=f"at most {MOST_GATES}")
+    columns: tuple[list[np.ndarray], ...] = ([], [], [], [])
+    weights, items, sums = [], 0, LARGEST
+    harm, complete = np.zeros((rays, gates)), 0.0
+    small = np.uint16 if rays <= np.iinfo(np.uint16).max else np.int32
+    for scene in informed:
+        passes = _passes(scene.range_m, scene.ray, gates_m)
+        if scene.is_repeated:
+            passes = _largest_alone(scene, passes, gates)
+        heard = passes > 0
+        # few bytes each, as there are many; small integers are sorted fast
+        found = (scene.ray.astype(small), np.int32(items) + scene.item, scene.worth, passes)
+        for column, values in zip(columns, found, strict=True):
+            column.append(values[heard])
+        spoils = _passes(scene.harm_range_m, scene.spoiling, gates_m)
+        for gate in range(gates):
+            harm[:, gate] += np.bincount(scene.spoiling, np.where(spoils >> gate & 1, scene.harm, 0.0), rays)
+        weights.append(scene.weight)
+        items, complete, sums = items + len(scene.weight), complete + scene.complete, scene.sums
+    if not weights:
+        raise ConfigError("no scene", where="selection", allowed="at least one training scene")
+    ray = _joined(columns[0])
+    order = np.argsort(ray, kind="stable")
+    item, worth, opens = (_joined(column)[order] for column in columns[1:])
+    start, best = _begins(ray, rays), np.empty(items, dtype=np.int32)
+    # items that one ray tells most of are numbered in a row: what follows rays to items finds them side by side
+    kernels.best_rays(start, item, worth, best)
+    by_ray, number = np.argsort(best, kind="stable"), np.empty(items, dtype=np.int32)
+    number[by_ray] = np.arange(items)
+    return Coverage(
+        start=start,
+        item=number[item],
+        worth=worth,
+        gates=opens,
+        weight=np.concatenate(weights)[by_ray] / len(weights),
+        bits=bits,
+        harm=harm / len(weights),
+        table=sums,
+        complete=complete / len(weights),
+    )
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """Parts as one array; they are let go."""
+    joined = np.concatenate(parts)
+    parts.clear()
+    return joined
+
+
+def _begins(labels: np.ndarray, count: int) -> np.ndarray:
+    """Where each of `count` labels begins, and the last ends, once they are sorted, (count + 1,)."""
+    return np.concatenate([[0], np.cumsum(np.bincount(labels, minlength=count))])
+
+
+def _passes(range_m: np.ndarray, ray: np.ndarray, gates_m: np.ndarray) -> np.ndarray:
+    """One bit for each gate of the rays (N, G, 2) that lets the return of a ray (K,) at a range (K,) through, uint8."""
+    passed = np.empty(len(range_m), dtype=np.uint8)
+    kernels.gates_passed(range_m, ray, gates_m, passed)
+    return passed
+
+
+def _largest_alone(scene: InformedScene, passes: np.ndarray, gates: int) -> np.ndarray:
+    """The gates (E,) without those through which a ray tells more about the same item in another frame."""
+    pair = scene.ray.astype(np.int64) * len(scene.weight) + scene.item
+    order = np.lexsort((-scene.worth, pair))
+    kept = np.zeros_like(passes)
+    for gate in range(gates):
+        through = order[passes[order] >> gate & 1 > 0]
+        kept[through[np.unique(pair[through], return_index=True)[1]]] |= 1 << gate
+    return kept

@@ -1,0 +1,180 @@
+"""What returns tell about surfaces: the `informs` of tasks that reconstruct one, and the check of what tasks answer.
+
+A return tells about all points of the surface that are near it, and the more the nearer they are: to choose the rays
+with the largest mean worth is to choose those whose returns are nearest to the points of the surface, as facilities are
+located near their clients.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import numpy as np
+
+from lidardesign.errors import PluginError
+from lidardesign.numerics import SLACK
+from lidardesign.registry import plugin_guard
+from lidardesign.scenes.rays import Returns
+from lidardesign.scenes.scene import Scene
+from lidardesign.task import Information, Task
+
+# On so many scenes rays are chosen at first, and at most; as many as at first are held back.
+FEW_SCENES, MOST_SCENES = 50, 400
+# Rays: what candidates of more tell of scenes takes long, and gigabytes.
+MOST_SELECTED = 5000
+# Of the candidates' returns so many are chosen, or about so many: lengths follow from it, and they are no thresholds.
+CHOSEN_SHARE = 0.2
+# A return tells about what is nearer than so many mean spacings of the chosen ones: sqrt(5), so that on a surface it is
+# five of the candidates' spacings. Few places of a surface are further than this from all chosen returns.
+REACH_SPACINGS = math.sqrt(5.0)
+
+
+_chosen_share = ContextVar("chosen share", default=CHOSEN_SHARE)
+
+
+@contextmanager
+def choosing(share: float) -> Iterator[None]:
+    """What returns tell is asked for choices of another share of the candidates."""
+    token = _chosen_share.set(share)
+    try:
+        yield
+    finally:
+        _chosen_share.reset(token)
+
+
+def informs_rays(task: Task) -> bool:
+    """Whether a task says what returns tell about a scene, so that its rays can be chosen."""
+    return callable(getattr(task, "informs", None))
+
+
+def checked_information(task: Task, scene: Scene, returns: Sequence[Returns]) -> Information:
+    """What the returns of all candidate rays tell about a scene, by a task that says so.
+
+    Raises:
+        PluginError: The task's code raised, or returned something else, or what cannot be.
+    """
+    where = f"task {task.name}, informs, scene {scene.name}"
+    try:
+        with plugin_guard(task.name):
+            answer = task.informs(scene, returns)
+    except PluginError as error:
+        raise PluginError(f"informs failed: {error.message}", where=where, hint=error.hint) from error
+    if not isinstance(answer, Information):
+        allowed = "lidardesign.task.Information"
+        raise PluginError(f"informs returned {type(answer).__name__}", where=where, allowed=allowed)
+    require_valid(answer, len(returns[0].rays) if len(returns) else 0, len(returns), where)
+    return answer
+
+
+def require_valid(information: Information, rays: int, frames: int, where: str = "task") -> None:
+    """Raises `PluginError` for pairs of rays and items that there are not, and for numbers that cannot be."""
+    pairs, items = len(information.ray), len(information.frame)
+    weight = np.ones(items) if information.weight is None else np.asarray(information.weight)
+    harm = np.zeros((frames, rays)) if information.harm is None else np.asarray(information.harm)
+    most = 0.0 if information.sums is None else float(np.max(information.sums, initial=0.0))
+    seen_in = np.zeros(0, dtype=int) if information.seen_in is None else information.seen_in
+    faults = {
+        "ray, item and worth of different lengths": not len(information.item) == len(information.worth) == pairs,
+        "seen_in and item of different lengths": information.seen_in is not None and len(seen_in) != pairs,
+        "weight and frame of different lengths": weight.shape != (items,),
+        f"harm of shape {harm.shape}, not {(frames, rays)}": harm.shape != (frames, rays),
+        "a unit that is not text": not isinstance(information.unit, str),
+        "weights that are all zero": not weight.sum() > 0,
+        f"sums up to {most:g}, above complete, {information.complete:g}": most > (1 + SLACK) * information.complete,
+    }
+    for name, index, count in (
+        ("ray", information.ray, rays),
+        ("item", information.item, items),
+        ("frame", information.frame, frames),
+        ("seen_in", seen_in, frames),
+    ):
+        faults[f"{name} outside 0 to {count - 1}"] = bool(((index < 0) | (index >= count)).any())
+    for name, values in (("worth", information.worth), ("weight", weight), ("harm", harm)):
+        faults[f"{name} that is negative or not a number"] = not (np.isfinite(values) & (values >= 0)).all()
+    for fault, found in faults.items():
+        if found:
+            raise PluginError(f"informs gave {fault}", where=where, allowed="see lidardesign.task.Information")
+
+
+def surface_information(
+    points_m: Sequence[np.ndarray],
+    returns: Sequence[Returns],
+    is_target: Sequence[bool],
+    size: float,
+    *,
+    weight: Sequence[np.ndarray] | None = None,
+    dimensions: int = 2,
+) -> Information:
+    """What returns tell about a surface: max(0, D - distance) of each of its points, D the reach of a return.
+
+    A return of something else is taken for the surface, and spoils its share of all candidates' returns by its distance
+    from the surface, at most D. That is enough to choose gates that leave it out. Its share of the chosen returns would
+    be more than it spoils: others beside it meet the same thing, and a place without any ray is no better known.
+
+    Arguments:
+        points_m: Even points of the surface that each of the returns should show, (U, 3) [m]; few are enough. None at
+            all where nothing is to be seen.
+        returns: Of all candidate rays, through open gates.
+        is_target: Which bodies of the scene are of the surface.
+        size: The area of the surface [m^2], the length of a curve [m]; over all of the returns.
+        weight: How much each of the points counts, (U,) each; None: all alike.
+        dimensions: 2 for a surface, 1 for a curve.
+    """
+    from scipy.spatial import cKDTree
+
+    targets = np.append(np.asarray(is_target, dtype=bool), False)  # a body of -1 is none
+    hits = [one.returned & targets[one.body] for one in returns]
+    reach_m = return_reach_m(size, sum(int(hit.sum()) for hit in hits), dimensions)
+    count = sum(int(one.returned.sum()) for one in returns)
+    rays, items, worths, frames, known = [], [], [], [], 0
+    harm = np.zeros((len(returns), len(returns[0].rays)))
+    for frame, (one, hit, points) in enumerate(zip(returns, hits, points_m, strict=True)):
+        frames.append(np.full(len(points), frame))
+        first, known = known, known + len(points)
+        if not len(points) or not one.returned.any():
+            continue
+        tree, places = cKDTree(points), one.points_m
+        on_target = hit[one.returned]
+        pairs = cKDTree(places[on_target]).sparse_distance_matrix(tree, reach_m, output_type="ndarray")
+        rays.append(np.flatnonzero(hit)[pairs["i"]])
+        items.append(first + pairs["j"])
+        worths.append(reach_m - pairs["v"])
+        away_m = np.minimum(tree.query(places[~on_target], distance_upper_bound=reach_m)[0], reach_m)
+        harm[frame, one.returned & ~hit] = away_m / count
+    return Information(
+        np.concatenate([np.zeros(0, dtype=np.int64), *rays]),
+        np.concatenate([np.zeros(0, dtype=np.int64), *items]),
+        np.concatenate([np.zeros(0), *worths]),
+        np.concatenate(frames),
+        weight=None if weight is None else np.concatenate(weight),
+        harm=harm,
+        complete=reach_m,
+        unit="m",
+    )
+
+
+def return_reach_m(size: float, count: int, dimensions: int = 2) -> float:
+    """How far a return tells: `REACH_SPACINGS` of the mean spacing that a choice's returns have; 0 without returns.
+
+    Arguments:
+        size: The area of the surface [m^2], the length of a curve [m].
+        count: How many of the candidates' returns lie on it; `CHOSEN_SHARE` of them, or as `choosing` says, are chosen.
+        dimensions: 2 for a surface, 1 for a curve.
+    """
+    return REACH_SPACINGS * (size / (_chosen_share.get() * count)) ** (1 / dimensions) if count else 0.0
+
+
+def scattered_area_m2(points_m: np.ndarray) -> float:
+    """The area that random points (K, 3) [m] are spread over evenly, 0 for less than two.
+
+    Of n points per area the nearest neighbour is 0.5 / sqrt(n) away in the mean.
+    """
+    from scipy.spatial import cKDTree
+
+    points = np.unique(points_m, axis=0)
+    if len(points) < 2:
+        return 0.0
+    return len(points) * float(2 * cKDTree(points).query(points, k=2)[0][:, 1].mean()) ** 2

@@ -1,0 +1,262 @@
+"""The curves of scores and the learned density as plain plotly documents, for the report and for notebooks.
+
+plotly reads a little HTML in names, so every name is escaped here. Legends are in the page itself, where they can be
+switched from the keyboard too.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lidardesign.errors import check_choice
+from lidardesign.report.density_views import Marginal, PlaneDensity
+from lidardesign.report.drawing import frustum_lines
+from lidardesign.report.series import Against, Series, axis_titles, log_ticks, logarithmic, position, series
+from lidardesign.report.view import encoded
+from lidardesign.scenes.rays import Rays
+from lidardesign.scoring.evaluation.results import Evaluation
+from lidardesign.sensors.sensor import DesignSpec
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
+
+FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
+
+FAR_SHARE = 0.5  # of the worst design's score: rivals that are always worse by more are hidden at first
+
+
+def far_rivals(evaluation: Evaluation) -> set[str]:
+    """Rivals so much worse than all designs, at every number of rays, that they only take room in a plot."""
+    sign, rival = (1.0 if evaluation.metric.better == "lower" else -1.0), evaluation.strongest_rival
+    worst: dict[int, float] = {}
+    for row in evaluation.rows:
+        if not row.baseline:
+            worst[row.rays] = max(sign * row.value, worst.get(row.rays, -math.inf))
+    rivals = [row for row in evaluation.rows if row.baseline and row.rays in worst]
+    near = {row.design for row in rivals if sign * row.value - worst[row.rays] <= FAR_SHARE * abs(worst[row.rays])}
+    return {row.design for row in rivals} - near - {rival.name if rival is not None else ""}
+
+
+def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[str] = ()) -> dict[str, Any]:
+    """Score against rays or bandwidth: a line and an interval band per name, some of them hidden at first."""
+    curves = series(evaluation)
+    across, up = axis_titles(evaluation, against)
+    rows = [row for curve in curves for row in curve.rows]
+    places = [position(row, against) for row in rows]
+    ends = [end for curve in curves if curve.name not in hidden for row in curve.rows for end in row.drawn_interval]
+    ticks = {"tickvals": sorted(set(places))} if against == "rays" else {}
+    axis = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside"}
+    layout = {
+        "font": FONT,
+        "paper_bgcolor": "#ffffff",
+        "plot_bgcolor": "#ffffff",
+        "margin": {"l": 74, "r": 16, "t": 12, "b": 56},
+        "xaxis": {**axis, **_scale(places), **ticks, "tickformat": "~g", "title": {"text": across}},
+        "yaxis": {
+            **axis,
+            **_scale([row.value for row in rows], ends),
+            "tickformat": "~g",
+            "automargin": True,
+            "title": {"text": html.escape(up).replace(", ", "<br>"), "font": {"size": 13}},
+        },
+        "showlegend": False,
+        "hovermode": "closest",
+    }
+    traces = [
+        {**trace, "visible": curve.name not in hidden} for curve in curves for trace in _curve_traces(curve, against)
+    ]
+    return {"data": traces, "layout": layout}
+
+
+def _scale(values: Sequence[float], shown: Sequence[float] = ()) -> dict[str, Any]:
+    """The scale of an axis that holds some values; as many ticks as are needed among those that are shown at first."""
+    if not logarithmic(values):
+        return {"type": "linear"}
+    positive = [value for value in shown if value > 0]
+    return {"type": "log", "tickvals": sorted({*log_ticks(values), *(log_ticks(positive) if positive else ())})}
+
+
+def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
+    across = [position(row, against) for row in curve.rows]
+    name = html.escape(curve.name)
+    red, green, blue = (int(curve.colour[i : i + 2], 16) for i in (1, 3, 5))
+    values = [row.value for row in curve.rows]
+    low, high = zip(*(row.drawn_interval for row in curve.rows), strict=True)
+    band = {
+        "type": "scatter",
+        "x": [*across, *across[::-1]],
+        "y": [*high, *low[::-1]],
+        "fill": "toself",
+        "fillcolor": f"rgba({red},{green},{blue},0.13)",
+        "line": {"width": 0},
+        "mode": "lines",
+        "hoverinfo": "skip",
+        "showlegend": False,
+        "legendgroup": name,
+    }
+    line = {
+        "type": "scatter",
+        "x": across,
+        "y": values,
+        # a single point has no band
+        "error_y": {
+            "type": "data",
+            "symmetric": False,
+            "array": [end - value for end, value in zip(high, values, strict=True)],
+            "arrayminus": [value - end for end, value in zip(low, values, strict=True)],
+            "visible": len(values) == 1,
+        },
+        "name": name,
+        "legendgroup": name,
+        "mode": "lines+markers",
+        "line": {
+            "color": curve.colour,
+            "width": 1.5 if curve.baseline else 2.5,
+            "dash": curve.dash,
+        },
+        "marker": {
+            "symbol": curve.marker,
+            "size": 8,
+            "color": curve.colour,
+            "line": {"color": curve.colour, "width": 1.5},
+        },
+        "text": [f"{row.rays} rays, {row.bandwidth_mbps:.3g} Mbit/s, {row.failures} failures" for row in curve.rows],
+        "hovertemplate": "%{y:.4g}<br>%{text}<extra>%{fullData.name}</extra>",
+    }
+    return [band, line]
+
+
+# One hue from light to dark: it reads the same without colour vision and on paper.
+SCALE = [[0.0, "#ffffff"], [0.2, "#d6e6f4"], [0.45, "#6baed6"], [0.7, "#2171b5"], [1.0, "#08306b"]]
+FILL, INK, QUIET = "#b8c1cb", "#1f2933", "#7b8794"
+MOST_DESIGNS = 6  # drawn beside a marginal
+AXIS = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside", "tickformat": "~g"}
+LAYOUT = {
+    "font": {**FONT, "size": 12},
+    "paper_bgcolor": "#ffffff",
+    "plot_bgcolor": "#ffffff",
+    "margin": {"l": 58, "r": 12, "t": 10, "b": 46},
+    "showlegend": False,
+}
+
+
+def marginal_figure(marginal: Marginal, looks: Mapping[str, Series]) -> dict[str, Any]:
+    """One marginal as a filled outline, those of designs as lines."""
+    density = {
+        **_steps(marginal.edges, marginal.heights),
+        "fill": "tozeroy",
+        "fillcolor": FILL,
+        "line": {"color": QUIET, "width": 1},
+        "hoverinfo": "skip",
+    }
+    lines = [
+        {
+            **_steps(marginal.edges, heights),
+            "line": {"color": looks[name].colour, "width": 2, "dash": looks[name].dash},
+            "name": html.escape(name),
+            "hovertemplate": "%{y:.3g}<extra>%{fullData.name}</extra>",
+        }
+        for name, heights in list(marginal.designs.items())[:MOST_DESIGNS]
+        if name in looks
+    ]
+    layout = {
+        **LAYOUT,
+        "xaxis": {**AXIS, "title": {"text": marginal.label}, "range": [marginal.edges[0], marginal.edges[-1]]},
+        "yaxis": {**AXIS, "title": {"text": marginal.unit}, "range": [0, marginal.top]},
+        "hovermode": "closest",
+    }
+    return {"data": [density, *lines], "layout": layout}
+
+
+def plane_figure(plane: PlaneDensity) -> dict[str, Any]:
+    """The field of a plane as shades, and the outlines of what stands in it."""
+    across, up = ((edges[:-1] + edges[1:]) / 2 for edges in plane.edges)
+    heat = {
+        "type": "heatmap",
+        "x": across.tolist(),
+        "y": up.tolist(),
+        "z": _array(plane.heights),
+        "colorscale": SCALE,
+        "zmin": 0,
+        "colorbar": {"title": {"text": plane.unit}, "thickness": 12, "tickformat": "~g", "len": 0.9},
+        "hovertemplate": f"%{{x:.3f}}, %{{y:.3f}} m: %{{z:.3g}} {html.escape(plane.unit)}<extra></extra>",
+    }
+    outlines = [
+        _outline(across, up, covered, dash)
+        for covered, dash in ((plane.targets, "solid"), (plane.others, "dot"))
+        if covered.any() and not covered.all()
+    ]
+    layout = {
+        **LAYOUT,
+        "xaxis": {**AXIS, "title": {"text": plane.labels[0]}, "constrain": "domain", "showgrid": False},
+        "yaxis": {
+            **AXIS, "title": {"text": plane.labels[1]}, "constrain": "domain", "showgrid": False, "scaleanchor": "x"
+        },
+    }  # fmt: skip
+    return {"data": [heat, *outlines], "layout": layout}
+
+
+def _outline(across: np.ndarray, up: np.ndarray, covered: np.ndarray, dash: str) -> dict[str, Any]:
+    return {
+        "type": "contour",
+        "x": across.tolist(),
+        "y": up.tolist(),
+        "z": _array(covered),
+        "contours": {"start": 0.5, "end": 0.5, "size": 1, "coloring": "none"},
+        "line": {"color": INK, "width": 1.2, "dash": dash},
+        "showscale": False,
+        "hoverinfo": "skip",
+    }
+
+
+def _array(values: np.ndarray) -> dict[str, str]:
+    """A matrix as plotly's own short form."""
+    rows, columns = values.shape
+    return {"dtype": "f4", "bdata": encoded(values, "<f4"), "shape": f"{rows}, {columns}"}
+
+
+def _steps(edges: np.ndarray, heights: np.ndarray) -> dict[str, Any]:
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "x": np.repeat(edges, 2).tolist(),
+        "y": [0.0, *np.repeat(heights, 2).tolist(), 0.0],
+    }
+
+
+# More lines are no picture.
+MOST_DRAWN_RAYS = 2000
+
+
+def design_figure(design: DesignSpec, rays: Rays | None = None) -> Figure:
+    """The sensors of a design with their fields of view and gates; rays are drawn inside their gates."""
+    from plotly.graph_objects import Figure
+
+    figure = Figure()
+    for sensor in design.sensors:
+        _add_lines(figure, frustum_lines(sensor), sensor.name)
+    if rays is not None:
+        chosen = np.unique(np.linspace(0, len(rays) - 1, min(len(rays), MOST_DRAWN_RAYS)).astype(int))
+        ends = rays.origin_m[chosen, None] + rays.gate_m[chosen, :, None] * rays.direction[chosen, None]
+        gaps = np.full((len(chosen), 1, 3), np.nan)
+        _add_lines(figure, np.concatenate([ends, gaps], axis=1).reshape(-1, 3), "gates of rays")
+    axes = {f"{name}axis": {"title": {"text": f"{name} [m]"}} for name in "xyz"}
+    return figure.update_layout(title={"text": design.name}, scene={"aspectmode": "data", **axes})
+
+
+def scores_figure(evaluation: Evaluation, against: str = "rays") -> Figure:
+    """Scores with their intervals against numbers of rays, or against bandwidth."""
+    from plotly.graph_objects import Figure
+
+    check_choice(against, "against", ("rays", "bandwidth"))
+    return Figure(curve_figure(evaluation, against)).update_layout(showlegend=True)
+
+
+def _add_lines(figure: Figure, points_m: np.ndarray, name: str) -> None:
+    x, y, z = points_m.T
+    figure.add_scatter3d(x=x, y=y, z=z, mode="lines", name=name)

@@ -1,0 +1,1 @@
+"""Scenes, their bodies, and where rays meet them."""

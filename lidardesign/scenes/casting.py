@@ -1,0 +1,330 @@
+"""First hits and all crossings of rays with a scene: Embree for meshes, closed forms for primitives.
+
+Meshes at rest are one Embree scene; a mesh that moves has one in its own frame, built once, and rays are brought into
+that frame where they pass the mesh's ball. First hits are asked for twice where a ray may have slipped through a
+mesh (see `triangles`), and how often it had is counted. `trace` and `trace_each`, of which learning asks many more
+rays, cast once: vertices have no share of a density.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from typing import Literal
+from weakref import WeakKeyDictionary, WeakValueDictionary
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.numerics import COARSE_SLACK, SQUARABLE, unit_vectors
+from lidardesign.scenes.primitives import BALL_SLACK, KINDS, SIZES, bounding_radius_m
+from lidardesign.scenes.rays import Crossings, Hits
+from lidardesign.scenes.scene import Body, Mesh, Scene, inverse_rigid
+from lidardesign.scenes.triangles import FARTHEST_M, SecondCasts, Triangles, advances_m, mesh_caster
+
+# After a triangle the next one is looked for this share of the scene's reach further on.
+STEP_SHARE = COARSE_SLACK
+MAXIMUM_LAYERS = 16
+CROSSINGS_PER_RAY = 2  # of primitives, that there is room for at first
+
+Only = Literal["all", "targets", "occluders"]
+
+
+class SceneCaster:
+    """Casts rays into one frame of a scene.
+
+    Arguments:
+        scene: The scene.
+        frame: The time frame.
+        only: Which bodies rays can hit.
+    """
+
+    def __init__(self, scene: Scene, frame: int = 0, *, only: Only = "all") -> None:
+        chosen = _chosen(scene, only)
+        self.second_casts = SecondCasts()
+        meshes = [(i, body) for i, body in chosen if isinstance(body.shape, Mesh)]
+        resting = [(i, body) for i, body in meshes if body.poses.ndim == 2]
+        moving = [(i, body) for i, body in meshes if body.poses.ndim == 3]
+        self._resting = _shared_at_rest(resting) if resting else None
+        self._moving = _Moving(moving, frame) if moving else None
+        primitives = [(i, body) for i, body in chosen if not isinstance(body.shape, Mesh)]
+        self._primitives = Primitives(primitives, frame) if primitives else None
+
+    @property
+    def resting(self) -> _AtRest | None:
+        """Its meshes at rest, where it casts at nothing else."""
+        return None if self._primitives or self._moving else self._resting
+
+    def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
+        """The nearest hit of every ray, shapes (N, 3) and (N, 3); directions are normalised here.
+
+        A ray that starts inside a solid hits its way out.
+
+        Raises:
+            ConfigError: An origin or direction that is not finite, or a direction of zero length.
+        """
+        return self.first_hit_of_checked(*checked_rays(origins, directions))
+
+    def first_hit_of_checked(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
+        """As `first_hit`, of what `checked_rays` returned: rays that are fired in many frames are checked once."""
+        self.second_casts.rays += len(origins)
+        return self._traced(origins, directions, np.full(len(origins), np.inf), self.second_casts)
+
+    def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
+        """First hits of finite float64 rays of unit length, cast once; from its limit (N,) on, a hit is a miss."""
+        return self._traced(origins, directions, limit_m, None)
+
+    def _traced(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
+    ) -> Hits:
+        hits = self._traced_meshes(origins, directions, limit_m, twice)
+        if self._primitives:
+            self._primitives.keep_nearer(hits, origins, directions, limit_m)
+        rows = np.flatnonzero(hits.body >= 0)
+        hits.normal[rows] = _facing(hits.normal[rows], directions[rows])
+        return hits
+
+    def crossings(
+        self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
+    ) -> Crossings:
+        """Every surface that rays as in `trace` pass from a start (N,) up to a limit (N,), hidden ones too.
+
+        Up to `MAXIMUM_LAYERS` triangles per ray are found; triangles closer than the step between them count once.
+        """
+        parts = [Crossings(np.empty(0, int), np.empty(0), np.empty(0))]
+        meshes = [part for part in (self._resting, self._moving) if part]
+        if meshes:
+            reach_m = float(limit_m[np.isfinite(limit_m)].max(initial=0.0))
+            step_m = STEP_SHARE * max(reach_m, *(part.radius_m for part in meshes))
+            alive, start = np.arange(len(origins)), start_m.copy()
+            for _ in range(MAXIMUM_LAYERS):
+                ahead, toward = start[alive], directions[alive]
+                places, left_m = origins[alive] + ahead[:, None] * toward, limit_m[alive] - ahead
+                hits = self._traced_meshes(places, toward, left_m, None)
+                hit = hits.body >= 0
+                alive = alive[hit]
+                if not len(alive):
+                    break
+                reached = ahead[hit] + hits.range_m[hit]
+                cosine = np.abs(np.einsum("nk,nk->n", hits.normal[hit], toward[hit]))
+                parts.append(Crossings(alive, reached, cosine))
+                start[alive] = reached + step_m
+        if self._primitives:
+            parts.append(self._primitives.crossings(origins, directions, start_m, limit_m))
+        return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def _traced_meshes(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
+    ) -> Hits:
+        hits = self._resting.trace(origins, directions, limit_m, twice) if self._resting else Hits.none(len(origins))
+        if self._moving:
+            self._moving.keep_nearer(hits, origins, directions, limit_m, twice)
+        return hits
+
+
+def trace_each(
+    casters: Sequence[SceneCaster],
+    starts: np.ndarray,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    limit_m: np.ndarray,
+) -> Hits:
+    """First hits of many casters' rays at once: caster c traces the rays from starts[c] to starts[c + 1].
+
+    Rays are as those of `SceneCaster.trace`, and so are hits. Casters of meshes at rest, of which there are many in
+    learning, only share Embree's own calls out.
+    """
+    resting = [caster.resting for caster in casters]
+    if any(meshes is None for meshes in resting):
+        parts = [
+            caster.trace(origins[begin:end], directions[begin:end], limit_m[begin:end])
+            for caster, begin, end in zip(casters, starts[:-1], starts[1:], strict=True)
+        ]
+        return Hits.joined(parts)
+    # for meshes at rest everything but Embree's calls is done for all rays together
+    counts = np.diff(starts)
+    local = origins - np.repeat([meshes.triangles.centre_m for meshes in resting], counts, axis=0)
+    advance_m = advances_m(local, directions, np.repeat([meshes.radius_m for meshes in resting], counts))
+    local = (local + advance_m[:, None] * directions).astype(np.float32)
+    toward, limit = directions.astype(np.float32), np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32)
+    hits = Hits.none(len(origins))
+    rows, ranges, normals = [], [], []
+    for meshes, begin, end in zip(resting, starts[:-1], starts[1:], strict=True):
+        if begin == end:
+            continue
+        found = meshes.triangles.run(local[begin:end], toward[begin:end], limit[begin:end])
+        hit = np.flatnonzero(found["primID"] >= 0)
+        rows.append(begin + hit)
+        ranges.append(found["tfar"][hit])
+        normals.append(found["Ng"][hit])
+        hits.body[begin + hit] = meshes.body_of_geometry[found["geomID"][hit]]
+    if rows:
+        hit = np.concatenate(rows)
+        hits.range_m[hit] = np.concatenate(ranges) + advance_m[hit]
+        hits.normal[hit] = _facing(unit_vectors(np.concatenate(normals).astype(np.float64)), directions[hit])
+    beyond = hits.range_m >= limit_m
+    hits.range_m[beyond], hits.body[beyond], hits.normal[beyond] = np.inf, -1, 0.0
+    return hits
+
+
+def _chosen(scene: Scene, only: Only) -> list[tuple[int, Body]]:
+    keep = {"all": lambda body: True, "targets": lambda body: body.is_target, "occluders": lambda b: b.is_occluder}
+    return [(i, body) for i, body in enumerate(scene.bodies) if keep[only](body)]
+
+
+_casters: WeakKeyDictionary[Scene, dict[tuple[int, ...], SceneCaster]] = WeakKeyDictionary()
+
+
+def shared_caster(scene: Scene, frame: int = 0, *, only: Only = "all") -> SceneCaster:
+    """The one caster of a scene's frame and bodies, built at first use and kept as long as the scene."""
+    known = _casters.setdefault(scene, {})
+    key = (frame, *(i for i, _ in _chosen(scene, only)))
+    if key not in known:
+        known[key] = SceneCaster(scene, frame, only=only)
+    return known[key]
+
+
+def checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of unit length, float64, shape (N, 3) each.
+
+    Raises:
+        ConfigError: One that is not finite, or a direction of zero length.
+    """
+    directions = np.asarray(directions, dtype=np.float64)
+    if directions.ndim != 2 or directions.shape[1] != 3:
+        raise ConfigError(f"directions have shape {directions.shape}", where="rays", allowed="(N, 3)")
+    origins = np.ascontiguousarray(np.broadcast_to(origins, directions.shape), dtype=np.float64)
+    largest = np.abs(directions).max(axis=1, initial=0.0)
+    if not (np.isfinite(origins).all() and np.isfinite(largest).all()) or (len(largest) and largest.min() == 0):
+        raise ConfigError("an origin or direction is not finite, or a direction has zero length", where="rays")
+    extreme = (largest < SQUARABLE) | (largest > 1 / SQUARABLE)
+    if extreme.any():
+        directions = np.where(extreme[:, None], directions / largest[:, None], directions)
+    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+class Primitives:
+    """The primitives of a frame.
+
+    Arguments:
+        members: Their numbers among all bodies, and the bodies; at least one.
+        frame: The time frame.
+    """
+
+    def __init__(self, members: Sequence[tuple[int, Body]], frame: int) -> None:
+        shapes, poses = [body.shape for _, body in members], np.stack([body.pose(frame) for _, body in members])
+        radii_m = np.array([bounding_radius_m(shape) for shape in shapes])
+        self.radius_m = float(radii_m.max())  # of a ball around a member's origin that holds any of them
+        self._shapes = (
+            np.array([KINDS[type(shape)] for shape in shapes]),
+            np.array([SIZES[type(shape)](shape) for shape in shapes], dtype=np.float64),
+            np.ascontiguousarray(inverse_rigid(poses)[:, :3]),
+            np.ascontiguousarray(poses[:, :3, 3]),
+            radii_m,
+            np.array([number for number, _ in members]),
+        )
+
+    def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> None:
+        """Enter the hits that are nearer than what `hits` holds, with outward normals."""
+        from lidardesign.scenes import primitive_kernels
+
+        primitive_kernels.keep_nearer(self._shapes, origins, directions, limit_m, hits.range_m, hits.body, hits.normal)
+
+    def crossings(
+        self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
+    ) -> Crossings:
+        """See `SceneCaster.crossings`."""
+        from lidardesign.scenes import primitive_kernels
+
+        room = CROSSINGS_PER_RAY * len(origins)
+        while True:
+            found = np.empty(room, dtype=np.int64), np.empty(room), np.empty(room)
+            count = primitive_kernels.crossings(self._shapes, origins, directions, start_m, limit_m, *found)
+            if count <= room:
+                return Crossings(*(column[:count] for column in found))
+            room = count
+
+
+class _AtRest:
+    def __init__(self, bodies: Sequence[tuple[int, Body]]) -> None:
+        self.body_of_geometry = np.array([index for index, _ in bodies], dtype=np.int64)
+        self._meshes = [body.shape for _, body in bodies]  # as long as they live, nothing else has their identities
+        self.triangles = Triangles([body.shape.transformed(body.poses) for _, body in bodies])
+        self.radius_m = self.triangles.radius_m
+
+    def trace(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
+    ) -> Hits:
+        hits = Hits.none(len(origins))
+        if len(origins):
+            rows, range_m, geometry, normal = self.triangles.trace(origins, directions, limit_m, twice)
+            hits.range_m[rows], hits.body[rows], hits.normal[rows] = range_m, self.body_of_geometry[geometry], normal
+        return hits
+
+
+# By the first of its bodies and by geometry: what was built of them.
+_at_rest: WeakKeyDictionary[Body, dict[Hashable, _AtRest]] = WeakKeyDictionary()
+_by_geometry: WeakValueDictionary[Hashable, _AtRest] = WeakValueDictionary()
+
+
+def _shared_at_rest(bodies: Sequence[tuple[int, Body]]) -> _AtRest:
+    """What does not move is built once for all frames of a scene, and for scenes of the same meshes in their places."""
+    geometry = tuple((index, id(body.shape), body.poses.tobytes()) for index, body in bodies)
+    known = _at_rest.setdefault(bodies[0][1], {})
+    if geometry not in known:
+        known[geometry] = _by_geometry.get(geometry) or _AtRest(bodies)
+        _by_geometry[geometry] = known[geometry]
+    return known[geometry]
+
+
+class _Moving:
+    def __init__(self, bodies: Sequence[tuple[int, Body]], frame: int) -> None:
+        self._body = [index for index, _ in bodies]
+        self._casters = [mesh_caster(body.shape) for _, body in bodies]
+        poses = np.stack([body.pose(frame) for _, body in bodies])
+        self._rotation, self._translation = poses[:, :3, :3], poses[:, :3, 3]
+        centres = np.stack([caster.centre_m for caster in self._casters])
+        self._centres = np.einsum("bij,bj->bi", self._rotation, centres) + self._translation
+        self._radii_m = np.array([caster.radius_m for caster in self._casters])
+        self.radius_m = float(self._radii_m.max())
+
+    def keep_nearer(
+        self,
+        hits: Hits,
+        origins: np.ndarray,
+        directions: np.ndarray,
+        limit_m: np.ndarray,
+        twice: SecondCasts | None,
+    ) -> None:
+        """Enter the hits that are nearer than what `hits` holds."""
+        for number, caster in enumerate(self._casters):
+            bound = np.minimum(hits.range_m, limit_m)
+            # Which rays pass a mesh's ball before their limit, shape (N,)
+            offset = self._centres[number] - origins
+            along = np.einsum("nk,nk->n", offset, directions)
+            squared = np.einsum("nk,nk->n", offset, offset)
+            slack = BALL_SLACK * squared
+            radius_m = self._radii_m[number]
+            reach = radius_m + np.sqrt(slack)
+            rows = np.flatnonzero(
+                (squared - along**2 <= radius_m**2 + slack) & (along >= -reach) & (along - reach <= bound)
+            )
+            if not len(rows):
+                continue
+            rotation = self._rotation[number]
+            local = _turned(origins[rows] - self._translation[number], rotation.T)
+            range_m, normal = caster.first_hits(local, _turned(directions[rows], rotation.T), bound[rows], twice)
+            hit = np.isfinite(range_m)
+            won = rows[hit]
+            hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
+            hits.normal[won] = _turned(normal[hit], rotation)
+
+
+def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Rotated vectors (N, 3); unlike a matrix product, to the same bits in whatever batch."""
+    x, y, z = (vectors[:, [axis]] * rotation[:, axis] for axis in range(3))
+    return x + y + z
+
+
+def _facing(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Normals (N, 3) turned against the directions (N, 3) of the rays that hit there."""
+    return np.where((np.einsum("nk,nk->n", normals, directions) > 0)[:, None], -normals, normals)

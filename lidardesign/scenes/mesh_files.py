@@ -1,0 +1,496 @@
+"""Mesh files, read through trimesh and checked: refused or mended with a note, never silently wrong.
+
+Whether faces run around a mesh the same way is found from edges alone. Weights that someone painted on a mesh are a
+number per vertex, or the brightness of vertex colours.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from lidardesign.errors import BackgroundNote, DataError, LidardesignError
+from lidardesign.numerics import ROUNDING
+from lidardesign.run.inputs import MESH, check_bytes, read_file
+from lidardesign.scenes.mesh_formats import check_gltf, check_ply, check_triangles, read_obj, read_off, read_stl
+from lidardesign.scenes.scene import LARGEST_WEIGHT, Mesh, Sign
+from lidardesign.space import FARTHEST_M
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where each distinct row (N, K) stands first, in their order, and which of these each row is, (U,) and (N,).
+
+    As `numpy.unique` along an axis, which takes minutes for the faces of a large scan.
+    """
+    order = np.lexsort(rows.T[::-1])
+    is_new = np.ones(len(rows), dtype=bool)
+    is_new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    group = np.empty(len(rows), dtype=np.int64)
+    group[order] = np.cumsum(is_new) - 1
+    return order[is_new], group
+
+
+def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which edge each side of faces (F, 3) is and whether it runs upwards, (3 F,), and the faces per edge (E,)."""
+    start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1).astype(np.int64)
+    # one number per edge: pairs of int32 fit into an int64
+    number = np.minimum(start, end) * (int(faces.max(initial=0)) + 1) + np.maximum(start, end)
+    _, edge, count = np.unique(number, return_inverse=True, return_counts=True)
+    return edge.reshape(-1), start < end, count
+
+
+def edge_defects(faces: np.ndarray) -> tuple[int, int]:
+    """How many edges are open, and how many join faces that run along them the same way.
+
+    An edge is open when an odd number of faces meets there. Where closed parts touch, four faces share an
+    edge, two in each direction: that is no defect.
+    """
+    edge, upwards, count = _edges(faces)
+    balance = np.bincount(edge, weights=np.where(upwards, 1.0, -1.0))
+    is_open = count % 2 == 1
+    return int(is_open.sum()), int((~is_open & (balance != 0)).sum())
+
+
+def turned_to_agree(faces: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, int]:
+    """Faces (F, 3) of which those that disagree with their neighbours are turned, and how many those are.
+
+    Two faces that alone share an edge agree when they run along it in opposite directions. Within a part that such
+    edges hold together, the orientation of the larger area stays; a part that has none, as a Moebius strip, stays as
+    it is.
+
+    Arguments:
+        faces: Vertex indices, shape (F, 3).
+        areas: Of the faces, in any unit, shape (F,).
+    """
+    # Pairs of faces that alone share an edge, and whether they run along it in opposite directions, (P,) each
+    edge, upwards, count = _edges(faces)
+    order = np.argsort(edge, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(count)[:-1]])[count == 2]
+    one, other = order[starts], order[starts + 1]
+    side = _sides(len(faces), one // 3, other // 3, upwards[one] != upwards[other])
+    if side is None:
+        return faces, 0
+    part, flipped = side
+    # the sheet of less area is turned
+    share = np.bincount(part, weights=np.where(flipped, areas, -areas))
+    turn = flipped ^ (share[part] > 0)
+    return np.where(turn[:, None], faces[:, ::-1], faces), int(turn.sum())
+
+
+def _sides(
+    count: int, first: np.ndarray, second: np.ndarray, agree: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The part of each face and whether it lies on the other side than the part's first face; None if none turns.
+
+    Every face stands twice in a graph, once as it is and once turned (the orientation double cover): a part whose
+    two copies hang together cannot be oriented, and keeps its faces.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if agree.all():
+        return None
+    across = np.where(agree, 0, count)
+    rows = np.concatenate([first, first + count])
+    columns = np.concatenate([second + across, (second + count) - across])
+    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(2 * count, 2 * count))
+    sheet = connected_components(graph, directed=False)[1]
+    part = np.minimum(sheet[:count], sheet[count:])
+    one_sided = sheet[:count] == sheet[count:]
+    return part, (sheet[:count] != part) & ~one_sided
+
+
+COLOURS = "colours"
+# luma of red, green and blue as they are stored (ITU-R BT.709)
+LUMA = np.array([0.2126, 0.7152, 0.0722])
+POSITIONS = ("x", "y", "z", "nx", "ny", "nz")
+
+
+@dataclass(frozen=True)
+class Painted:
+    """Where a file has its weights.
+
+    Arguments:
+        attribute: The name of a property of the vertices whose values are the weights, or `colours`.
+        contrast: How many times as much white counts as black; a brightness b between them counts contrast^b.
+    """
+
+    attribute: str
+    contrast: float = 10.0
+
+
+def painted_weights(part: trimesh.Trimesh, painted: Painted, where: str) -> np.ndarray:
+    """The weight of each vertex of a mesh as it was loaded, unprocessed, shape (V,).
+
+    Raises:
+        DataError: It has no such property or no colours, or a weight is not a positive number.
+    """
+    if painted.attribute == COLOURS:
+        return painted.contrast ** brightness(part, where)
+    named = vertex_properties(part)
+    if painted.attribute not in named:
+        raise DataError(
+            f"has no vertex property {painted.attribute!r}",
+            where=where,
+            allowed=", ".join([*sorted(named), COLOURS]),
+            hint="PLY and glTF files keep properties of vertices; name one of these",
+        )
+    values = named[painted.attribute]
+    if len(values) != len(part.vertices):
+        raise DataError(
+            f"has {len(values)} values of {painted.attribute!r} for {len(part.vertices)} vertices",
+            where=where,
+            hint="export the mesh without texture coordinates",
+        )
+    if values.ndim != 1 or values.dtype.kind not in "iuf":
+        raise DataError(f"vertex property {painted.attribute!r} is not one number per vertex", where=where)
+    weights = values.astype(np.float64)
+    wrong = ~((weights >= 1 / LARGEST_WEIGHT) & (weights <= LARGEST_WEIGHT))
+    if wrong.any():
+        raise DataError(
+            f"{painted.attribute} of {int(wrong.sum())} vertices is not a usable weight, such as {weights[wrong][0]:g}",
+            where=where,
+            allowed=f"{1 / LARGEST_WEIGHT:g} to {LARGEST_WEIGHT:g}",
+            hint="give a part that hardly matters a small weight, not 0",
+        )
+    return weights
+
+
+def brightness(part: trimesh.Trimesh, where: str) -> np.ndarray:
+    """How bright the colour of each vertex is, 0 for black to 1 for white, shape (V,).
+
+    Raises:
+        DataError: The mesh has no vertex colours.
+    """
+    if part.visual.kind != "vertex":
+        found = {"face": "colours of faces", "texture": "a texture"}.get(part.visual.kind or "", "no colours")
+        raise DataError(
+            f"has {found}, but none of vertices",
+            where=where,
+            allowed="vertex colours, as PLY, OBJ and glTF files have them",
+            hint="paint vertices, or transfer the colours to them, and export these",
+        )
+    return part.visual.vertex_colors[:, :3] @ LUMA / 255.0
+
+
+def vertex_properties(part: trimesh.Trimesh) -> dict[str, np.ndarray]:
+    """The properties of a mesh's vertices by name, besides positions, normals and colours."""
+    found = {name: _alone(values) for name, values in part.vertex_attributes.items()}
+    data = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    names = getattr(getattr(data, "dtype", None), "names", None) or (data if isinstance(data, dict) else ())
+    return found | {name: _alone(data[name]) for name in names if name not in POSITIONS}
+
+
+def _alone(values: np.ndarray) -> np.ndarray:
+    values = np.asarray(values)
+    return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+READERS = {".obj": read_obj, ".off": read_off, ".stl": read_stl}
+# a triangle whose double area is a smaller share of its longest edge squared has a normal of rounding noise
+FLATTEST_TRIANGLE = ROUNDING
+
+
+def list_mesh_files(folder: str | Path) -> list[Path]:
+    """The mesh files directly inside a folder, sorted by name.
+
+    Raises:
+        DataError: No such folder, or no mesh file in it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError("is not a folder", where=str(folder), hint="name a folder that holds mesh files")
+    entries = sorted(folder.iterdir())
+    files = [p for p in entries if p.suffix.lower() in SUFFIXES and not (p.is_dir() or p.name.startswith("."))]
+    if not files:
+        raise DataError("holds no mesh file", where=str(folder), allowed=", ".join(SUFFIXES))
+    return files
+
+
+def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, painted: Painted | None = None) -> Mesh:
+    """A checked mesh from a file; all geometry in it becomes one mesh.
+
+    Arguments:
+        path: A file of one of the formats `SUFFIXES`.
+        sign: How the inside is told from the outside, see `check_mesh`.
+        scale: Factor from the file's unit to metres (0.001 for millimetres).
+        painted: Where the file has the importance of the surface; None: it counts 1 everywhere.
+
+    Raises:
+        DataError: The file is missing, unreadable, empty, or its mesh cannot be used, or it has no such importance; the
+            message names it.
+    """
+    path = Path(path)
+    if not (np.isfinite(scale) and scale > 0):
+        raise DataError(f"the scale {scale} is not a factor to metres", where=str(path), allowed="a positive number")
+    vertices, faces, importance = _read(path, painted)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is too large is refused below
+        vertices = vertices * scale
+    return check_mesh(vertices, faces, sign=sign, where=str(path), importance=importance)
+
+
+def check_mesh(
+    vertices: Any, faces: Any, *, sign: Sign = "auto", where: str = "mesh", importance: np.ndarray | None = None
+) -> Mesh:
+    """A mesh without degenerate, duplicate or dangling parts, with a sign rule that it can bear.
+
+    `auto` takes `solid` for a closed mesh, after turning faces that disagree with their neighbours, and `unsigned` for
+    an open one or one that has no outside (a Klein bottle), each with a note. Only an explicit `solid` refuses. A mesh
+    that is inside out is turned, with a note.
+
+    Arguments:
+        vertices: Positions [m], shape (V, 3).
+        faces: Vertex indices, shape (F, 3).
+        sign: How the inside is told from the outside.
+        where: The file or object that messages name.
+        importance: How much the surface counts at each vertex, shape (V,). Where vertices become one, it is their
+            geometric mean.
+
+    Raises:
+        DataError: Nothing usable is left, values are not finite, indices are wrong, or `sign` does not fit.
+    """
+    try:
+        vertices = np.asarray(vertices, dtype=np.float64)
+        faces = np.asarray(faces)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"vertices or faces are not numbers ({error})", where=where) from error
+    _refuse_unusable(vertices, faces, where)
+    if importance is not None and np.shape(importance) != vertices.shape[:1]:
+        raise DataError(f"has {np.shape(importance)} weights for {len(vertices)} vertices", where=where)
+    notes: list[str] = []
+    # vertices at exactly the same place become one, as formats without shared vertices (STL) need; -0.0 is 0.0
+    first, place = unique_rows(vertices + 0.0)
+    vertices = vertices[first] + 0.0
+    faces = usable_faces(vertices, place[faces.astype(np.int64)], notes)
+    if not len(faces):
+        raise DataError(f"no usable face is left ({'; '.join(notes)})", where=where)
+    used, faces = np.unique(faces, return_inverse=True)
+    if importance is not None:
+        log_sums = np.bincount(place, np.log(importance), minlength=len(vertices))
+        importance = np.exp(log_sums / np.bincount(place, minlength=len(vertices)))[used]
+    vertices, faces = vertices[used], faces.reshape(-1, 3)
+    faces, rule = _oriented(vertices, faces, sign, notes, where)
+    return Mesh(vertices, faces, rule, tuple(notes), importance)
+
+
+def _refuse_unusable(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
+    if vertices.size == 0 or faces.size == 0:
+        raise DataError("has no faces (an empty or unreadable mesh)", where=where, hint="open it in a mesh viewer")
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise DataError(
+            f"vertices and faces have shapes {vertices.shape} and {faces.shape}",
+            where=where,
+            allowed="(V, 3) and (F, 3)",
+        )
+    if not np.issubdtype(faces.dtype, np.integer):
+        raise DataError(f"faces are of type {faces.dtype}", where=where, allowed="integer vertex indices")
+    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
+    if bad:
+        raise DataError(
+            f"{bad} of {len(vertices)} vertices are NaN or infinite",
+            where=where,
+            hint="export the mesh again",
+        )
+    farthest = float(np.abs(vertices).max())
+    if farthest > FARTHEST_M:
+        raise DataError(
+            f"reaches {farthest:.3g} m",
+            where=where,
+            allowed=f"within {FARTHEST_M:g} m of the origin",
+            hint="is the scale right?",
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        wrong = int(((faces < 0) | (faces >= len(vertices))).any(axis=1).sum())
+        raise DataError(
+            f"{wrong} faces name vertices that do not exist", where=where, allowed=f"0 to {len(vertices) - 1}"
+        )
+
+
+def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
+    """The faces that have an area and are no duplicate of another; what was dropped is added to `notes`."""
+    edges = np.roll(vertices[faces], -1, axis=1) - vertices[faces]
+    longest = np.einsum("fek,fek->fe", edges, edges).max(axis=1)
+    degenerate = _double_areas(vertices, faces) <= FLATTEST_TRIANGLE * longest
+    if degenerate.any():
+        notes.append(BackgroundNote(f"dropped {int(degenerate.sum())} degenerate faces (without area)"))
+        faces = faces[~degenerate]
+    first, _ = unique_rows(np.sort(faces, axis=1))
+    if len(first) < len(faces):
+        notes.append(BackgroundNote(f"dropped {len(faces) - len(first)} duplicate faces"))
+    return faces[np.sort(first)]
+
+
+def _double_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _oriented(
+    vertices: np.ndarray, faces: np.ndarray, sign: Sign, notes: list[str], where: str
+) -> tuple[np.ndarray, Literal["solid", "winding", "unsigned"]]:
+    open_edges, mixed_edges = edge_defects(faces)
+    if mixed_edges and sign in ("auto", "winding"):
+        faces, turned = turned_to_agree(faces, _double_areas(vertices, faces))
+        mixed_edges = edge_defects(faces)[1]
+        if turned:
+            notes.append(BackgroundNote(f"flipped {turned} faces that were wound against their neighbours"))
+    if not open_edges and not mixed_edges and signed_volume_m3(vertices, faces) < 0:
+        faces = faces[:, ::-1]
+        notes.append(BackgroundNote("the mesh was inside out: all faces were flipped"))
+    defects = [f"{open_edges} open edges"] * bool(open_edges)
+    defects += [f"{mixed_edges} edges between faces of opposite winding"] * bool(mixed_edges)
+    found = " and ".join(defects)
+    if sign == "solid" and found:
+        raise DataError(
+            f"is not a solid: it has {found}",
+            where=where,
+            allowed="a closed, consistently wound mesh",
+            hint="sign: auto, winding or unsigned, or close the mesh",
+        )
+    if sign != "auto":
+        return faces, sign
+    if not found:
+        return faces, "solid"
+    closed = f"closed mesh with {found}: it has no outside: unsigned distances"
+    notes.append(BackgroundNote(f"open mesh ({found}): unsigned distances, no inside" if open_edges else closed))
+    return faces, "unsigned"
+
+
+def signed_volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """The enclosed volume of a closed mesh [m^3]; negative when its normals point inwards."""
+    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
+    return float(np.einsum("fk,fk->f", a, np.cross(b, c)).sum() / 6)
+
+
+def _read(path: Path, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Vertices, faces and weights of everything in a file, with every way to fail turned into a `DataError`."""
+    where = str(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise DataError(f"has the suffix {path.suffix!r}", where=where, allowed=", ".join(SUFFIXES))
+    data = read_file(path, MESH, hint="check the path")
+    if not data.strip():
+        raise DataError("is an empty file", where=where)
+    try:
+        with _quiet_trimesh():
+            return _geometry(path, data, painted)
+    except LidardesignError:
+        raise
+    # loaders raise anything on garbage: IndexError, KeyError, ModuleNotFoundError, struct.error
+    except Exception as error:
+        raise DataError(
+            f"cannot be read as a mesh ({_reason(error)})",
+            where=where,
+            allowed=", ".join(SUFFIXES),
+            hint="open it in a mesh viewer and export it again",
+        ) from error
+
+
+def _reason(error: Exception) -> str:
+    """One line for people; trimesh asks an optional package about text that is not UTF-8."""
+    if isinstance(error, ModuleNotFoundError):
+        return "it is not UTF-8 text" if error.name == "charset_normalizer" else f"needs {error.name}"
+    return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
+
+
+def _geometry(path: Path, data: bytes, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """All triangles of a file as one mesh, each part at its place in the file's scene; weights where asked for."""
+    vertices, faces, weights, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0)], 0
+    for part, transform in _parts(path, data):
+        own = np.asarray(part.faces, dtype=np.int64)
+        wrong = ((own < 0) | (own >= len(part.vertices))).any(axis=1)
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            raise DataError(
+                f"triangle {first} of {len(own)} names the vertices {', '.join(map(str, own[first]))}",
+                where=str(path),
+                allowed=f"0 to {len(part.vertices) - 1}",
+            )
+        vertices.append(part.vertices @ transform[:3, :3].T + transform[:3, 3])
+        faces.append(own + count)
+        count += len(part.vertices)
+        if painted is not None:
+            weights.append(painted_weights(part, painted, str(path)))
+    check_triangles(sum(map(len, faces)), str(path))
+    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(weights) if painted else None
+
+
+def _parts(path: Path, data: bytes) -> Iterator[tuple[trimesh.Trimesh, np.ndarray]]:
+    """The meshes of a file and where each stands, a transform of shape (4, 4)."""
+    import trimesh
+
+    suffix = path.suffix.lower()
+    if suffix in READERS:
+        vertices, faces, colours = READERS[suffix](data, str(path))
+        yield trimesh.Trimesh(vertices, faces, process=False, vertex_colors=colours), np.eye(4)
+        return
+    if suffix == ".ply":
+        check_ply(data, str(path))
+        options = {"skip_materials": True, "fix_texture": False}
+    else:
+        check_gltf(data, str(path))
+        options = {"skip_materials": True}
+    resolver = _SameFolder(path)
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=resolver, process=False, **options)
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        part = scene.geometry[name]
+        if isinstance(part, trimesh.Trimesh):
+            _check_polygons(part, str(path))
+            yield part, transform
+
+
+def _check_polygons(part: trimesh.Trimesh, where: str) -> None:
+    """Refuse a binary PLY whose faces have other numbers of corners than its first: their indices would be misread."""
+    faces = part.metadata.get("_ply_raw", {}).get("face", {}).get("data")
+    for name in getattr(getattr(faces, "dtype", None), "names", None) or ():
+        sizes = faces[name]["f0"] if faces[name].dtype.names else np.zeros(0)
+        if sizes.size and (sizes != sizes[0]).any():
+            raise DataError("has faces of several sizes", where=where, allowed="one size", hint="export triangles")
+
+
+class _SameFolder:
+    """Gives loaders the files beside a mesh file (the .bin buffers of a .gltf), nothing from elsewhere."""
+
+    def __init__(self, path: Path) -> None:
+        self._folder = path.resolve().parent
+        self._bytes = 0
+
+    def get(self, name: str) -> bytes:
+        """The content of a file of the same folder."""
+        path = (self._folder / name).resolve()
+        if path.parent != self._folder:
+            raise DataError(f"refers to {name!r}, which is outside its folder", where=str(self._folder))
+        content = read_file(path, MESH)
+        self._bytes += len(content)
+        check_bytes(self._bytes, MESH, str(path))
+        return content
+
+    __getitem__ = get
+
+
+@contextmanager
+def _quiet_trimesh() -> Iterator[None]:
+    """Loaders speak through the errors raised here, not through log lines and warnings of their own."""
+    log = logging.getLogger("trimesh")
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # what is no number ends the reading of numbers: the rest would be left out in silence
+            warnings.filterwarnings("error", "string or file could not be read")
+            yield
+    finally:
+        log.setLevel(level)

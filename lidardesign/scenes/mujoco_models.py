@@ -1,0 +1,470 @@
+"""MuJoCo models as bodies: MJCF and URDF files are read safely, and every visible geom becomes a `Body`.
+
+MuJoCo is imported when a model is read. A model may only read files of its own folder.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lidardesign.errors import BackgroundNote, ConfigError, DataError
+from lidardesign.run.inputs import ROBOT_FILES, check_bytes, check_file, read_head
+from lidardesign.run.xml import read_xml
+from lidardesign.scenes.mesh_files import check_mesh
+from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Role, Shape, Sphere, rigid
+from lidardesign.scenes.surface import grid_faces
+from lidardesign.space import FARTHEST_M
+
+if TYPE_CHECKING:
+    import mujoco
+
+DIRECTORIES = ("meshdir", "texturedir", "assetdir")
+MAX_INCLUDES = MAX_DIRECTORIES = 100
+# What MuJoCo would make of a few words: elements, copies of them, pixels, places of terrain, room for keyframes.
+# Its time grows with the square of the elements, and faster with copies.
+MOST_ELEMENTS, MOST_COPIES = 20_000, 2000
+MOST_PIXELS, MOST_PLACES = 1 << 27, 1 << 21
+MOST_NUMBERS = 10_000
+REPEATING = ("replicate", "composite", "flexcomp")
+PNG_BEGINNING = b"\x89PNG\r\n\x1a\n"
+MESH_ENDINGS = (".obj", ".stl", ".msh")  # what MuJoCo reads
+# What MuJoCo's viewer shows unless told otherwise; Menagerie keeps what is seen in group 2, what collides in group 3.
+SHOWN_GROUPS = (0, 1, 2)
+PRIMITIVES: dict[str, Callable[[float, float, float], Shape]] = {
+    "sphere": lambda radius_m, *_: Sphere(radius_m),
+    "box": lambda *half_extents_m: Box(half_extents_m),
+    "capsule": lambda radius_m, half_length_m, _: Capsule(radius_m, half_length_m),
+    "cylinder": lambda radius_m, half_length_m, _: Cylinder(radius_m, half_length_m),
+    "ellipsoid": lambda *semi_axes_m: Ellipsoid(semi_axes_m),
+}
+ALLOWED = "an MJCF or URDF model that MuJoCo can load"
+
+FileState = tuple[str, int, int]
+
+
+@dataclass(frozen=True)
+class RobotFile:
+    """The file of a model, the folder that holds all its files (None: its own), and the groups of geoms to be seen."""
+
+    path: Path
+    folder: Path | None = None
+    groups: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ModelGeom:
+    """One visible piece of a model: a geom, or all meshes without a name of one of its bodies.
+
+    Arguments:
+        name: Of the body, with the geom's name or a number where the body has several pieces.
+        body_name: Of its MuJoCo body, `world` for what stands still.
+        geom_name: Of the geom, empty where it has none.
+        body: The number of its MuJoCo body.
+        shape: Its geometry; keep it between scenes, since what is cached about a mesh hangs on it.
+        pose: Of the shape in the body's frame, shape (4, 4).
+    """
+
+    name: str
+    body_name: str
+    geom_name: str
+    body: int
+    shape: Shape
+    pose: np.ndarray
+
+    def at(self, poses: np.ndarray, role: Role = "both") -> Body:
+        """The piece as a body, at rest where it never moves; `poses` (F, nbody, 4, 4) are those of `body_poses`."""
+        own = poses[:, self.body] @ self.pose
+        return Body(self.shape, self.name, role, own[0] if (own == own[0]).all() else own)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelBody:
+    """A body of a scene, and which MuJoCo body and geom it is."""
+
+    body: Body
+    body_name: str
+    geom_name: str
+
+
+def import_mujoco() -> Any:
+    """MuJoCo, the physics engine; raises ConfigError where it is missing."""
+    try:
+        return import_module("mujoco")
+    except ImportError as error:
+        raise ConfigError(
+            f"MuJoCo models need mujoco, which cannot be imported ({error})", hint="pip install mujoco"
+        ) from error
+
+
+@contextmanager
+def mujoco_warnings() -> Iterator[list[str]]:
+    """Collects MuJoCo's warnings, which would otherwise be written to MUJOCO_LOG.TXT in the working folder."""
+    mujoco = import_mujoco()
+    before, collected = mujoco.get_mju_user_warning(), []
+    mujoco.set_mju_user_warning(collected.append)
+    try:
+        yield collected
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def load_model(
+    path: str | Path, *, folder: Path | None = None, edit: Callable[[mujoco.MjSpec], None] | None = None
+) -> tuple[mujoco.MjModel, tuple[str, ...]]:
+    """The model of an MJCF or URDF file, and MuJoCo's warnings, one line each.
+
+    Arguments:
+        path: The file.
+        folder: All that it reads must lie here; None: in the file's own folder.
+        edit: What changes its specification before it is compiled.
+
+    Raises:
+        DataError: A file is missing, unreadable, too large, outside the model's folder, or no model.
+        ConfigError: MuJoCo is not installed.
+    """
+    path = Path(path)
+    root = _documents(path, folder)[1]
+    mujoco = import_mujoco()
+    with mujoco_warnings() as collected, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            if root.tag == "robot":
+                spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+                spec.modelfiledir = str(path.parent)
+            else:
+                spec = mujoco.MjSpec.from_file(str(path))
+            if edit is not None:
+                edit(spec)
+            model = spec.compile()
+        except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
+            reason = " ".join(str(error).split())
+            raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from error
+    _check_places(model, path)
+    if root.find("mujoco/compiler[@discardvisual='true']") is not None:
+        collected.append("visual shapes are discarded, so rays meet the collision shapes")
+    lines = dict.fromkeys(" ".join(str(line).split()) for line in (*collected, *(one.message for one in caught)))
+    return model, tuple(f"{path.name}: MuJoCo warns: {line}" for line in lines)
+
+
+def _check_places(model: mujoco.MjModel, path: Path) -> None:
+    """Refuse poses and sizes that are no numbers, or farther than anything is measured.
+
+    Raises:
+        DataError: So is one, with the body or geom.
+    """
+    kinds = {"body": ("body_pos", "body_quat"), "geom": ("geom_pos", "geom_quat", "geom_size"), "jnt": ("jnt_pos",)}
+    for kind, names in kinds.items():
+        for name in names:
+            rows = getattr(model, name)
+            wrong = ~(np.abs(rows) <= FARTHEST_M).all(axis=1)
+            if wrong.any():
+                number = int(np.argmax(wrong))
+                called = (model.joint if kind == "jnt" else getattr(model, kind))(number).name
+                found = f"{name} of {called or f'{kind} {number}'!r} is {' '.join(map(str, rows[number].tolist()))}"
+                raise DataError(found, where=str(path), allowed=f"numbers up to {FARTHEST_M:g}")
+    places = int((model.hfield_nrow * model.hfield_ncol).sum())
+    if places > MOST_PLACES:
+        raise DataError(f"has {places} places of height fields", where=str(path), allowed=f"at most {MOST_PLACES}")
+
+
+def bodies_from_mujoco(
+    model: mujoco.MjModel, qpos: np.ndarray, *, groups: Sequence[int] | None = None, clip_m: float | None = None
+) -> list[ModelBody]:
+    """Every visible geom of a model as a body that moves with its joints.
+
+    Arguments:
+        model: From `load_model` or from MuJoCo itself.
+        qpos: Joint configurations, one per frame, shape (F, nq), or one for a scene at rest, shape (nq,).
+        groups: Of the geoms that are seen; None: 0, 1 and 2, as MuJoCo shows them, without shapes that collide where
+            their body has others that are only seen.
+        clip_m: Planes reach at most so far from their middle [m]; None: as far as their own size.
+
+    Raises:
+        DataError: No geom is visible, or `qpos` does not fit the model.
+    """
+    poses = body_poses(model, qpos)
+    geoms, _ = visible_geoms(model, groups=groups, clip_m=clip_m)
+    return [ModelBody(geom.at(poses), geom.body_name, geom.geom_name) for geom in geoms]
+
+
+def body_poses(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """The poses of all bodies of a model, body to world, shape (F, nbody, 4, 4).
+
+    Arguments:
+        model: The MuJoCo model.
+        qpos: Joint configurations, shape (F, nq) or (nq,).
+
+    Raises:
+        DataError: `qpos` has another shape, or is not finite.
+    """
+    qpos = np.atleast_2d(np.asarray(qpos, dtype=np.float64))
+    if qpos.ndim != 2 or qpos.shape[1] != model.nq or not len(qpos) or not np.isfinite(qpos).all():
+        raise DataError(f"joint configurations of shape {qpos.shape}", allowed=f"(frames, {model.nq}), finite")
+    mujoco = import_mujoco()
+    data, poses = mujoco.MjData(model), np.tile(np.eye(4), (len(qpos), model.nbody, 1, 1))
+    for frame, configuration in enumerate(qpos):
+        data.qpos[:] = configuration
+        mujoco.mj_kinematics(model, data)
+        poses[frame, :, :3, :3] = data.xmat.reshape(-1, 3, 3)
+        poses[frame, :, :3, 3] = data.xpos
+    return poses
+
+
+def visible_geoms(
+    model: mujoco.MjModel, *, groups: Sequence[int] | None = None, clip_m: float | None = None
+) -> tuple[tuple[ModelGeom, ...], tuple[str, ...]]:
+    """The visible pieces of a model, body by body, and notes on what was mended or left out.
+
+    Arguments:
+        model, groups, clip_m: As of `bodies_from_mujoco`.
+
+    Raises:
+        DataError: No geom is visible, or the mesh of one cannot be used.
+    """
+    chosen, notes = seen_geoms(model, groups)
+    pieces: list[ModelGeom] = []
+    for body in np.unique(model.geom_bodyid[chosen]).tolist():
+        name = model.body(body).name or f"body {body}"
+        geoms = chosen[model.geom_bodyid[chosen] == body].tolist()
+        nameless = [geom for geom in geoms if _is_mesh(model, geom) and not model.geom(geom).name]
+        parts = [(geom, [geom]) for geom in geoms if geom not in nameless[1:]]
+        parts = [(geom, nameless if geom in nameless else own) for geom, own in parts]
+        for number, (geom, own) in enumerate(parts, 1):
+            label = model.geom(geom).name
+            full = name if len(parts) == 1 else f"{name} {label or number}"
+            shape, pose = _piece(model, full, own, clip_m)
+            pieces.append(ModelGeom(full, name, label, body, shape, pose))
+    meshes = ((piece.name, piece.shape) for piece in pieces if isinstance(piece.shape, Mesh))
+    notes += [type(note)(f"{name}: {note}") for name, mesh in meshes for note in mesh.notes]
+    if model.nflex or model.nskin:
+        notes.append(f"flexible bodies and skins are left out: {model.nflex + model.nskin}")
+    return tuple(pieces), tuple(notes)
+
+
+def seen_geoms(model: mujoco.MjModel, groups: Sequence[int] | None = None) -> tuple[np.ndarray, list[str]]:
+    """The numbers of the visible geoms of a model, ascending, and notes on what was left out.
+
+    Arguments:
+        model, groups: As of `bodies_from_mujoco`.
+
+    Raises:
+        DataError: There are none.
+    """
+    shown = np.isin(model.geom_group, SHOWN_GROUPS if groups is None else list(groups))
+    # MuJoCo's rays pass through what is fully transparent, too
+    alpha, coated = model.geom_rgba[:, 3].copy(), model.geom_matid >= 0
+    alpha[coated] = model.mat_rgba[model.geom_matid[coated], 3]
+    chosen = np.flatnonzero(shown & (alpha > 0))
+    notes = []
+    if groups is None:
+        # what collides is a coarse double where its body has shapes in another group that are only seen
+        bodies = model.geom_bodyid[chosen]
+        places = bodies * import_mujoco().mjNGROUP + model.geom_group[chosen]
+        collides = (model.geom_contype[chosen] != 0) | (model.geom_conaffinity[chosen] != 0)
+        double = collides & (bodies > 0) & np.isin(bodies, bodies[~collides]) & ~np.isin(places, places[~collides])
+        chosen = chosen[~double]
+        if double.any():
+            left_out = f"collision shapes are left out where their body has visual ones: {double.sum()}"
+            notes.append(BackgroundNote(left_out))
+    if not len(chosen):
+        used = ", ".join(str(group) for group in np.unique(model.geom_group)) or "none"
+        raise DataError("the model has no visible geoms", allowed=f"groups that it uses: {used}")
+    return chosen, notes
+
+
+def _kind(model: mujoco.MjModel, geom: int) -> str:
+    """The type of a geom, as "mesh" or "sphere"."""
+    return import_mujoco().mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
+
+
+def _is_mesh(model: mujoco.MjModel, geom: int) -> bool:
+    return _kind(model, geom) in ("mesh", "sdf")
+
+
+def _piece(model: mujoco.MjModel, name: str, geoms: list[int], clip_m: float | None) -> tuple[Shape, np.ndarray]:
+    """The shape of a geom, or of several meshes as one, and its pose in the body's frame."""
+    pose, kind, size = _geom_pose(model, geoms[0]), _kind(model, geoms[0]), model.geom_size[geoms[0]].tolist()
+    if _is_mesh(model, geoms[0]):
+        return _merged(model, name, geoms), np.eye(4)
+    if kind in PRIMITIVES:
+        return PRIMITIVES[kind](*size), pose
+    if kind == "hfield":
+        return _height_field(model, name, int(model.geom_dataid[geoms[0]])), pose
+    # a plane, endless where its size is 0
+    x, y = (min(half or np.inf, clip_m or np.inf) for half in size[:2])
+    if np.isinf(max(x, y)):
+        return Plane(), pose
+    return Mesh([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]], [[0, 1, 2], [0, 2, 3]], "unsigned"), pose
+
+
+def _geom_pose(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    matrix = np.zeros(9)
+    import_mujoco().mju_quat2Mat(matrix, model.geom_quat[geom])
+    return rigid(matrix.reshape(3, 3), model.geom_pos[geom])
+
+
+def _merged(model: mujoco.MjModel, name: str, geoms: list[int]) -> Mesh:
+    """Mesh geoms of a body as one mesh in the body's frame."""
+    vertices, faces, count = [], [], 0
+    for geom in geoms:
+        mesh, pose = int(model.geom_dataid[geom]), _geom_pose(model, geom)
+        first, number = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        first_face, face_number = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+        points = np.array(model.mesh_vert[first : first + number], dtype=np.float64)
+        vertices.append(points @ pose[:3, :3].T + pose[:3, 3])
+        faces.append(np.array(model.mesh_face[first_face : first_face + face_number], dtype=np.int64) + count)
+        count += len(points)
+    return check_mesh(np.concatenate(vertices), np.concatenate(faces), where=name)
+
+
+def _height_field(model: mujoco.MjModel, name: str, number: int) -> Mesh:
+    """Terrain as a closed mesh in the geom's frame: the triangles that MuJoCo sees, sides and a flat bottom."""
+    rows, columns, start = (int(column[number]) for column in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
+    x_m, y_m, highest_m, base_m = model.hfield_size[number].tolist()
+    height = highest_m * model.hfield_data[start : start + rows * columns]
+    x, y = np.meshgrid(np.linspace(-x_m, x_m, columns), np.linspace(-y_m, y_m, rows))
+    top = np.stack([x.ravel(), y.ravel(), height], axis=1)
+    index = np.arange(rows * columns).reshape(rows, columns)
+    # MuJoCo cuts its cells along the other diagonal than `grid_faces`
+    faces = [index[:, ::-1].ravel()[grid_faces(rows, columns)][:, ::-1]]
+    rim = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
+    foot, middle = np.arange(len(rim)) + rows * columns, np.full(len(rim), rows * columns + len(rim))
+    after, after_foot = np.roll(rim, -1), np.roll(foot, -1)
+    for corners in ((foot, after_foot, after), (foot, after, rim), (after_foot, foot, middle)):
+        faces.append(np.stack(corners, axis=1))
+    feet = np.concatenate([top[rim, :2], [[0.0, 0.0]]])
+    vertices = np.concatenate([top, np.column_stack([feet, np.full(len(feet), -base_m)])])
+    return check_mesh(vertices, np.concatenate(faces), where=name)
+
+
+def model_files(path: Path, folder: Path | None = None) -> tuple[FileState, ...]:
+    """Name, time of change [ns] and size of every file of an MJCF or URDF model, the XML files first.
+
+    Raises:
+        DataError: A file is missing, unreadable, no model, or lies outside the model's folder.
+    """
+    return _documents(path, folder)[0]
+
+
+def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], ElementTree.Element]:
+    """The same, and the root of the first, a URDF's with its names settled."""
+    own, allowed_folder = path.resolve().parent, (folder or path.parent).resolve()
+    documents, assets, directories, roots = [path.resolve()], [], {""}, []
+    if folder is not None and not os.path.isdir(allowed_folder):
+        raise DataError("is not a folder", where=str(folder), hint="name the folder that holds all files of the model")
+
+    def inside(directory: str, name: str) -> Path:
+        """The file that the model names, links followed."""
+        found = (own / directory / name).resolve()
+        if not found.is_relative_to(allowed_folder):
+            what = f"reads {(Path(directory) / name).as_posix()!r}, which is outside the model's folder"
+            hint = "copy the file into the model's folder, or say which folder holds all its files"
+            raise DataError(what, where=str(path), hint=hint)
+        return found
+
+    for document in documents:  # grows while included files are found
+        if len(documents) > MAX_INCLUDES:
+            raise DataError(f"includes more than {MAX_INCLUDES} files", where=str(path))
+        root = read_xml(document, ALLOWED, most_elements=MOST_ELEMENTS)
+        if document == documents[0] and root.tag not in ("mujoco", "robot"):
+            allowed = "<mujoco>, an MJCF model, or <robot>, a URDF model"
+            raise DataError(f"its root element is <{root.tag}>", where=str(path), allowed=allowed)
+        roots.append(root)
+        if root.tag == "robot":
+            _settle_urdf(root, own, allowed_folder)
+        for element in root.iter():
+            directories |= {element.get(name, "") for name in DIRECTORIES if element.tag == "compiler"}
+            names = [value for key, value in element.attrib.items() if key == "file" or key.startswith("file")]
+            if element.tag in ("include", "model"):
+                documents += [found for name in names if (found := inside("", name)) not in documents]
+            else:
+                assets += [name for name in names if name]
+    if len(directories) > MAX_DIRECTORIES:
+        raise DataError(f"names {len(directories)} folders", where=str(path), allowed=f"at most {MAX_DIRECTORIES}")
+    found = {inside(directory, name) for directory in directories for name in ["", *assets]}
+    states = tuple(_state(file) for file in [*documents, *sorted(found)] if file.exists() and not file.is_dir())
+    check_bytes(sum(size for _, _, size in states), ROBOT_FILES, str(path))
+    _check_growth(roots, {Path(name) for name, _, _ in states}, path)
+    return states, roots[0]
+
+
+def _check_growth(roots: Sequence[ElementTree.Element], files: Collection[Path], path: Path) -> None:
+    """Refuse a model that is small as text, and beyond measure once MuJoCo has read it.
+
+    Raises:
+        DataError: So it is, with what grows.
+    """
+    pixels = {file.name: _pixels(file) for file in files if file.suffix.lower() == ".png"}
+    elements = [element for root in roots for element in root.iter()]
+    copies = sum(map(_expanded, roots)) - len(elements)
+    grown = {"elements": len(elements), "copies": copies, "pixels of textures": 0, "places of height fields": 0}
+    for element in elements:
+        drawn = sum(pixels.get(Path(name).name, 0) for key, name in element.attrib.items() if key.startswith("file"))
+        if element.tag == "texture":
+            width, height = _whole(element, "width"), _whole(element, "height")
+            grown["pixels of textures"] += drawn + (width * height if element.get("type") == "2d" else 6 * width**2)
+        elif element.tag == "hfield":
+            grown["places of height fields"] += drawn + _whole(element, "nrow") * _whole(element, "ncol")
+        elif element.tag == "size":
+            for name in element.attrib:
+                count = _whole(element, name)
+                if (name == "nkey" or name.startswith("nuser_")) and count > MOST_NUMBERS:
+                    raise DataError(f"{name} is {count}", where=str(path), allowed=f"at most {MOST_NUMBERS}")
+    for (what, count), most in zip(grown.items(), (MOST_ELEMENTS, MOST_COPIES, MOST_PIXELS, MOST_PLACES), strict=True):
+        if count > most:
+            raise DataError(f"has {count:.4g} {what}", where=str(path), allowed=f"at most {most} in all")
+
+
+def _expanded(element: ElementTree.Element) -> int:
+    """How many elements one becomes: itself and those inside, as often as it repeats them."""
+    times = 1
+    for count in element.get("count", "1").split() if element.tag in REPEATING else ():
+        times *= max(int(count), 1) if count.isdecimal() and len(count) < 12 else 1
+    return times * (1 + sum(map(_expanded, element)))
+
+
+def _whole(element: ElementTree.Element, name: str) -> int:
+    text = element.get(name, "0").strip()
+    return int(text) if text.isdecimal() and len(text) < 12 else 0
+
+
+def _pixels(path: Path) -> int:
+    """How many pixels a PNG file says that it has; 0 where it is none."""
+    head = read_head(path, ROBOT_FILES)
+    width, height = (int.from_bytes(head[begin : begin + 4], "big") for begin in (16, 20))
+    return width * height if head.startswith(PNG_BEGINNING) else 0
+
+
+def _settle_urdf(root: ElementTree.Element, own: Path, folder: Path) -> None:
+    """Keep the visual shapes and all links of a URDF, and name the meshes of its package from its own folder."""
+    extension = root.find("mujoco")
+    extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
+    compiler = extension.find("compiler")
+    compiler = ElementTree.SubElement(extension, "compiler") if compiler is None else compiler
+    names = [mesh.get("filename", "") for mesh in root.iterfind("link/visual/geometry/mesh")]
+    readable = all(name.lower().endswith(MESH_ENDINGS) for name in names)
+    for name, value in (("discardvisual", not readable), ("fusestatic", False), ("strippath", False)):
+        compiler.attrib.setdefault(name, str(value).lower())
+    for mesh in root.iter("mesh"):
+        _, package, name = mesh.get("filename", "").partition("package://")
+        bases = [base for base in (own, *own.parents) if base.is_relative_to(folder)]
+        places = [base / name.partition("/")[2] for base in bases] if package else []
+        found = next((place for place in places if place.is_file()), None)
+        if found is not None:
+            mesh.set("filename", os.path.relpath(found, own))
+
+
+def _state(path: Path) -> FileState:
+    check_file(path, ROBOT_FILES)
+    state = path.stat()
+    return str(path), state.st_mtime_ns, state.st_size

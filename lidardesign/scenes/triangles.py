@@ -1,0 +1,154 @@
+"""Rays at the triangles of meshes in one frame, by Embree; the one module that knows its interface.
+
+Meshes are recentred in float64 before they become Embree's float32, and rays that start far away are advanced to their
+neighbourhood first, which keeps sub-micrometre accuracy far from the origin.
+
+Embree runs in its robust mode, without which a quarter of the rays aimed at vertices slip through. With it one in a
+hundred still does: to nowhere, or from outside to the back of a closed mesh. So rays that hit nothing, or a triangle's
+back, can be cast a second time from a place beside; what that finds nearer counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary, WeakValueDictionary
+
+import numpy as np
+
+from lidardesign.numerics import COARSE_SLACK, unit_vectors
+from lidardesign.scenes.scene import Mesh
+
+FARTHEST_M = 1e30  # what Embree takes for an unlimited ray
+# Rays that start further than this many radii from the meshes' ball are advanced to it in float64.
+FAR_RADII = 4.0
+# Rays are cast a second time from this share of the meshes' radius beside: some ten roundings of Embree's float32, and
+# no more than its ranges are off by anyway.
+BESIDE_SHARE = COARSE_SLACK
+# The second hit counts where it is nearer by more than this share of the range or radius, and so is another surface.
+NEARER_SHARE = 1e-4
+# From each of two axes across a ray unlike shares are taken: a mesh's planes of symmetry hold many of its vertices.
+BESIDE_SLANT = 0.618
+
+
+@dataclass
+class SecondCasts:
+    """How often the triangles of meshes were asked twice.
+
+    Arguments:
+        rays: Rays whose first hit was asked for.
+        cast: How often one was cast at meshes a second time.
+        found: How often it had slipped through a nearer surface the first time.
+    """
+
+    rays: int = 0
+    cast: int = 0
+    found: int = 0
+
+    def __add__(self, other: SecondCasts) -> SecondCasts:
+        return SecondCasts(self.rays + other.rays, self.cast + other.cast, self.found + other.found)
+
+
+class Triangles:
+    """Meshes in one Embree scene, recentred; `centre_m` (3,) and `radius_m` are those of a ball around them."""
+
+    def __init__(self, meshes: Sequence[Mesh]) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        corners = np.concatenate([mesh.bounds_m for mesh in meshes])
+        self.centre_m = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        self.radius_m = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
+        self._scene = EmbreeScene()
+        self._geometries = [
+            TriangleMesh(self._scene, (mesh.vertices - self.centre_m).astype(np.float32), mesh.faces) for mesh in meshes
+        ]
+
+    def trace(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """First hits of finite float64 rays of unit length: rows (K,), ranges (K,), meshes (K,) and normals (K, 3).
+
+        From its limit (N,) on, a hit counts as a miss. Normals are wound as the faces are. Where hits are asked for
+        twice, what is cast again is counted there.
+        """
+        local = origins - self.centre_m
+        advance_m = advances_m(local, directions, self.radius_m)
+        near = local + advance_m[:, None] * directions
+        limit = np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32)
+        found = self.run(near.astype(np.float32), directions.astype(np.float32), limit)
+        if twice is not None:
+            self._cast_again(found, near, directions, limit, twice)
+        range_m = found["tfar"] + advance_m
+        rows = np.flatnonzero((found["primID"] >= 0) & (range_m < limit_m))
+        return rows, range_m[rows], found["geomID"][rows], unit_vectors(found["Ng"][rows].astype(np.float64))
+
+    def _cast_again(
+        self,
+        found: dict[str, np.ndarray],
+        near: np.ndarray,
+        directions: np.ndarray,
+        limit_m: np.ndarray,
+        counted: SecondCasts,
+    ) -> None:
+        """Enter what rays that hit nothing, or a triangle's back, meet before that from a place beside."""
+        missed = found["primID"] < 0
+        doubtful = np.flatnonzero(missed | (np.einsum("nk,nk->n", found["Ng"], directions) > 0))
+        counted.cast += len(doubtful)
+        if not len(doubtful):
+            return
+        toward, first_m = directions[doubtful], found["tfar"][doubtful]
+        behind_m = first_m - NEARER_SHARE * np.maximum(first_m, self.radius_m)
+        until = np.where(missed[doubtful], limit_m[doubtful], np.maximum(behind_m, 0.0)).astype(np.float32)
+        # A vector of about unit length across each direction, (N, 3) to (N, 3)
+        x, y, z = toward.T
+        sign = np.copysign(1.0, z)
+        share = -1.0 / (sign + z)
+        mixed = x * y * share
+        across = np.empty_like(toward)
+        across[:, 0] = 1.0 + sign * x * x * share + BESIDE_SLANT * mixed
+        across[:, 1] = sign * mixed + BESIDE_SLANT * (sign + y * y * share)
+        across[:, 2] = -sign * x - BESIDE_SLANT * y
+        beside = near[doubtful] + BESIDE_SHARE * self.radius_m * across
+        again = self.run(beside.astype(np.float32), toward.astype(np.float32), until)
+        nearer = again["primID"] >= 0
+        counted.found += int(nearer.sum())
+        for name in ("primID", "geomID", "tfar", "Ng"):
+            found[name][doubtful[nearer]] = again[name][nearer]
+
+    def first_hits(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Ranges (N,) [m], infinite on a miss, and normals (N, 3), zero there, of rays as in `trace`."""
+        range_m, normal = np.full(len(origins), np.inf), np.zeros((len(origins), 3))
+        if len(origins):
+            rows, reached_m, _, found = self.trace(origins, directions, limit_m, twice)
+            range_m[rows], normal[rows] = reached_m, found
+        return range_m, normal
+
+    def run(self, local: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> dict[str, np.ndarray]:
+        """Embree's own answer for float32 rays."""
+        return self._scene.run(local, directions, dists=limit_m, output=True)
+
+
+def advances_m(local: np.ndarray, directions: np.ndarray, radius_m: np.ndarray | float) -> np.ndarray:
+    """How far starts are moved towards meshes around 0 where float32 could not tell them apart, shape (N,)."""
+    far = np.einsum("nk,nk->n", local, local) > (FAR_RADII * radius_m) ** 2
+    if not far.any():
+        return np.zeros(len(local))
+    closest = -np.einsum("nk,nk->n", local, directions)
+    return np.where(far, np.maximum(closest - 2 * radius_m, 0.0), 0.0)
+
+
+_mesh_casters: WeakKeyDictionary[Mesh, Triangles] = WeakKeyDictionary()
+_casters_by_content: WeakValueDictionary[str, Triangles] = WeakValueDictionary()
+
+
+def mesh_caster(mesh: Mesh) -> Triangles:
+    """The one caster of a mesh in its own frame, kept as long as the mesh; meshes of equal content share it."""
+    if mesh not in _mesh_casters:
+        known = _casters_by_content.get(mesh.content_hash)
+        if known is None:
+            known = _casters_by_content[mesh.content_hash] = Triangles([mesh])
+        _mesh_casters[mesh] = known
+    return _mesh_casters[mesh]

@@ -1,0 +1,1 @@
+"""Scores of designs on held-out scenes, beside those of baselines."""

@@ -1,0 +1,246 @@
+"""Accuracy and cost of distance fields of meshes by their grid points along the longest side.
+
+Bodies that are primitives have exact distances at any cost and need no field.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields.bodies import place_bodies
+from lidardesign.density.fields.distance import BodyField, Field, TableField, scene_columns
+from lidardesign.density.fields.grids import distance_grid, grid_around
+from lidardesign.density.fields.importance import build_log_weights
+from lidardesign.density.objective.surfaces import SceneTable
+from lidardesign.density.objective.target import PADDING_SIGMAS, Target
+from lidardesign.density.objective.visibility import (
+    NoVisibility,
+    Optics,
+    RayBatch,
+)
+from lidardesign.numerics import logsumexp
+from lidardesign.scenes.scene import Body, Mesh, Scene, inverse_rigid
+from lidardesign.scoring.accuracy.probes import (
+    AccuracyRequest,
+    Probes,
+    density_sweep,
+    draw_probes,
+    few_columns,
+)
+from lidardesign.scoring.accuracy.settings import Measurement, Sweep
+from lidardesign.space import DesignSpace
+
+
+class ExactField:
+    """The exact distances of the chosen bodies of all scenes: to meshes by libigl, triangle by triangle.
+
+    Arguments:
+        scenes: One column per scene and frame.
+        chosen: Which bodies count.
+    """
+
+    def __init__(self, scenes: Sequence[Scene], chosen: Callable[[Body], bool]) -> None:
+        entries = [
+            (column, body, frame)
+            for column, (index, frame) in enumerate(scene_columns(scenes))
+            for body in filter(chosen, scenes[index].bodies)
+        ]
+        self.columns = len(scene_columns(scenes))
+        self._meshes = [entry for entry in entries if isinstance(entry[1].shape, Mesh)]
+        others = [entry for entry in entries if not isinstance(entry[1].shape, Mesh)]
+        self._others = BodyField(place_bodies(others, self.columns, _no_grid)) if others else None
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """Distances at points: (N, 3) to (N, columns) [m]."""
+        out = np.full((len(points), self.columns), np.inf)
+        if self._others is not None:
+            out = self._others.distances(points)
+        for column, body, frame in self._meshes:
+            to_body = inverse_rigid(body.pose(frame))
+            local = points @ to_body[:3, :3].T + to_body[:3, 3]
+            out[:, column] = np.minimum(out[:, column], mesh_distances(body.shape, local))
+        return out
+
+
+def _no_grid(mesh: Mesh) -> tuple:
+    raise AssertionError("meshes are asked exactly")
+
+
+def mesh_distances(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """The exact distances of points (N, 3) from a mesh in its own frame, negative inside where it has one, (N,)."""
+    import igl
+
+    # relative to the mesh's corner: squares of coordinates far from the origin would lose every digit
+    corner = mesh.bounds_m[0]
+    points, vertices, faces = points - corner, mesh.vertices - corner, mesh.faces.astype(np.int64)
+    distance = igl.signed_distance(points, vertices, faces, sign_type=igl.SIGNED_DISTANCE_TYPE_UNSIGNED)[0]
+    if mesh.sign == "unsigned":
+        return distance
+    return np.where(np.abs(igl.fast_winding_number(vertices, faces, points)) > 0.5, -distance, distance)
+
+
+def fresh_table(scenes: Sequence[Scene], around: Sequence[Scene], resolution: int, padding_m: float) -> TableField:
+    """The table of scenes whose targets are meshes at rest, built anew whatever is cached.
+
+    Arguments:
+        scenes: One column each.
+        around: All scenes that the run's grid holds.
+        resolution, padding_m: See `fields.build_field`.
+    """
+    bounds = np.concatenate([mesh.bounds_m for scene in around for mesh in target_meshes(scene)])
+    grid = grid_around(np.stack([bounds.min(axis=0), bounds.max(axis=0)]), resolution, padding_m)
+    columns = [np.min([distance_grid(mesh, grid) for mesh in target_meshes(scene)], axis=0) for scene in scenes]
+    unsigned = [any(mesh.sign == "unsigned" for mesh in target_meshes(scene)) for scene in scenes]
+    return TableField(np.stack(columns, axis=1), grid, np.where(unsigned, grid.step, 0.0))
+
+
+def target_meshes(scene: Scene) -> list[Mesh]:
+    """The target meshes of a scene at rest, in the world."""
+    return [b.shape.transformed(b.pose()) for b in scene.bodies if b.is_target and isinstance(b.shape, Mesh)]
+
+
+RESOLUTIONS = (16, 24, 32, 48, 64, 96, 128)
+# The more scenes, the more their errors average out; so many can be built anew at every resolution.
+COLUMNS = 12
+PROBES = 16_384
+# Resolutions beyond the run's own are measured where building them for all these scenes takes at most so long.
+LONGEST_SECONDS = 20.0
+# A coarse field has its surfaces elsewhere: probes must meet them there too.
+WIDENING = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class FieldCase:
+    """A few scenes of meshes, and what their fields are compared by.
+
+    Arguments:
+        few: These scenes.
+        scenes: All scenes that share a grid with them.
+        settings: Of the density.
+        target: Their p* with the run's own field.
+        probes: Around their surfaces.
+        observed: The scene points of these, shape (N, 3).
+        log_transmittance: Their log T, shape (N, columns).
+        exact: Their exact distances, shape (N, columns) [m].
+    """
+
+    few: list[Scene]
+    scenes: list[Scene]
+    settings: DensitySettings
+    target: Target
+    probes: Probes
+    observed: np.ndarray
+    log_transmittance: np.ndarray
+    exact: np.ndarray
+
+    @classmethod
+    def of(
+        cls, scenes: list[Scene], space: DesignSpace, settings: DensitySettings, seed: int, visibility: str
+    ) -> FieldCase | None:
+        """A case of training scenes; None where no probe reaches a surface."""
+        few = few_columns(scenes, COLUMNS)
+        frames = np.array([few[index].frames for index, _ in scene_columns(few)], dtype=np.float64)
+        field = fresh(few, scenes, settings.field_resolution, settings)
+        surfaces = SceneTable(field, -np.log(frames), build_log_weights(few, field))
+        way = NoVisibility() if visibility == "off" else surfaces.raycast(few)
+        target = Target(
+            tuple(few), surfaces, way, Optics.of(settings), space, settings.surface_tolerance_nats
+        ).with_visibility(way)
+        probes = draw_probes(target, PROBES, seed, "fields", widening=WIDENING)
+        if not len(probes.points):
+            return None
+        rays = RayBatch.of(probes.points)
+        everywhere = np.ones((len(probes.points), len(frames)), dtype=bool)
+        passed = target.visibility.transmittance(rays, everywhere, target.optics, differentiable=False)
+        exact = ExactField(few, lambda body: body.is_target).distances(rays.observed)
+        return cls(few, scenes, settings, target, probes, rays.observed, passed.log_values, exact)
+
+    def log_density(self, distances: np.ndarray) -> np.ndarray:
+        """log p* at the probes from their distances (N, columns)."""
+        terms = self.target.surfaces.terms(self.observed, distances, self.target.optics.sigma_m)
+        return logsumexp(terms + self.log_transmittance, axis=1)
+
+    def errors(self, field: Field) -> tuple[float, float, dict[str, float]]:
+        """The share of mass in the wrong place, its standard error, and the error of distances near surfaces."""
+        distances = np.asarray(field.distances(self.observed), dtype=np.float64)
+        near = np.abs(self.exact) < 2.0 * self.target.optics.sigma_m
+        apart_m = math.sqrt(np.square((distances - self.exact)[near]).mean()) if near.any() else 0.0
+        return (
+            *self.probes.misplaced(self.log_density(distances), self.log_density(self.exact)),
+            {"distance_error_mm": 1e3 * apart_m},
+        )
+
+
+def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
+    """One sweep; empty where no target is a mesh, or no ray meets one."""
+    scenes, config = list(request.request.train), request.config
+    if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
+        return []
+    visibility = request.decided_visibility or config.density.visibility
+    case = FieldCase.of(scenes, config.space, config.density, config.seed, visibility)
+    return [] if case is None else [resolution_sweep(case)]
+
+
+def resolution_sweep(case: FieldCase) -> Sweep:
+    """Grid points along the longest side of a field, against exact distances."""
+    own, measurements, left_out = case.settings.field_resolution, [], ""
+    for count in sorted({*RESOLUTIONS, own}):
+        # the time grows like the volume
+        if count > own:
+            last = measurements[-1]
+            if last.seconds * (count / int(last.setting)) ** 3 * len(case.few) > LONGEST_SECONDS:
+                left_out = f"; {count} and more points would take long to measure"
+                break
+        started = time.perf_counter()
+        field = fresh(case.few, case.scenes, count, case.settings)
+        seconds = (time.perf_counter() - started) / len(case.few)
+        error, uncertainty, values = case.errors(field)
+        of_all = _bytes(field, case)
+        measurements.append(Measurement(str(count), error, uncertainty, seconds, of_all, count == own, values=values))
+    return density_sweep(
+        knob="density.field_resolution",
+        against="exact distances to the triangles",
+        work="building the field of one scene",
+        measurements=measurements,
+        note=f"measured on {len(case.few)} of {len(case.scenes)} training scenes; memory is that of all scenes' "
+        f"fields{left_out}",
+    )
+
+
+def _bytes(field: Field, case: FieldCase) -> int:
+    """The memory of the fields of all scenes; moving meshes have one each, however many scenes they are in."""
+    if isinstance(field, TableField):
+        return field.table.nbytes // field.columns * len(scene_columns(case.scenes))
+    return field.bodies.grids.values.nbytes * _meshes(case.scenes) // max(_meshes(case.few), 1)
+
+
+def _meshes(scenes: list[Scene]) -> int:
+    bodies = [body for scene in scenes for body in scene.bodies if body.is_target]
+    return len({body.shape.content_hash for body in bodies if isinstance(body.shape, Mesh)})
+
+
+def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: DensitySettings) -> Field:
+    """The field of a few scenes as the run would build it, whatever is cached."""
+    padding_m = PADDING_SIGMAS * settings.sigma_m
+    bodies = [(scene, body) for scene in scenes for body in scene.bodies if body.is_target]
+    if all(isinstance(body.shape, Mesh) and scene.frames == 1 for scene, body in bodies):
+        return fresh_table(few, scenes, resolution, padding_m)
+
+    def build(mesh: Mesh) -> tuple:
+        grid = grid_around(mesh.bounds_m, resolution, padding_m)
+        return grid, distance_grid(mesh, grid)
+
+    columns = scene_columns(few)
+    entries = [
+        (column, body, frame)
+        for column, (index, frame) in enumerate(columns)
+        for body in few[index].bodies
+        if body.is_target
+    ]
+    return BodyField(place_bodies(entries, len(columns), build))

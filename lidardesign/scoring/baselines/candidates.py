@@ -1,0 +1,196 @@
+"""What a baseline may take: layouts of any number of rays, with one gate or a gate per ray, in a bandwidth.
+
+A design has one list of rays. Where a task's scenes are seen from several condition values (a robot's positions), it
+has one list per value; all have the same number of rays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, NamedTuple, Protocol
+
+import numpy as np
+
+from lidardesign.numerics import EPSILON
+from lidardesign.scenes.rays import Rays, fire_times
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import MOST_RAYS
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
+
+# A gate without width hears nothing, since gates are open at their end. Ranges that never vary get the width
+# of the default 100 ps bin around them.
+SMALLEST_GATE_M = 0.015
+
+
+def rays_at(points: np.ndarray, gate_m: np.ndarray) -> Rays:
+    """Rays of one sensor at (x, y, z, azimuth, elevation), shape (N, 5 or 6), with one gate (2,) or each its own [m].
+
+    They fire one after another over a frame, as a design's do.
+    """
+    return Rays(
+        origin_m=points[:, :3],
+        direction=direction(points[:, AZIMUTH], points[:, ELEVATION]),
+        gate_m=np.broadcast_to(gate_m, (len(points), 2)).copy(),
+        sensor=np.zeros(len(points)),
+        time_s=fire_times(len(points), Bandwidth().rate_hz),
+    )
+
+
+def opened_gate(start_m: float | np.ndarray, end_m: float | np.ndarray) -> np.ndarray:
+    """Gates that hear both their ends, shape (..., 2) [m]; those without width get `SMALLEST_GATE_M`."""
+    start, end = np.asarray(start_m, dtype=np.float64), np.asarray(end_m, dtype=np.float64)
+    around = np.maximum(0.0, start - SMALLEST_GATE_M / 2)
+    wide = end > start
+    return np.stack(
+        [np.where(wide, start, around), np.where(wide, np.nextafter(end, np.inf), around + SMALLEST_GATE_M)], axis=-1
+    )
+
+
+class LayoutSite(NamedTuple):
+    """Where and for which scene rays are laid out.
+
+    Arguments:
+        space: The design space at a condition value.
+        number: Which of the values it is.
+        scene: The held-out scene, for what is drawn anew in each.
+    """
+
+    space: DesignSpace
+    number: int = 0
+    scene: int = 0
+
+
+class Candidate(Protocol):
+    """One layout that a baseline may take; `drawn_anew` says whether it differs from scene to scene."""
+
+    name: str
+    drawn_anew: bool
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+        """Exactly `count` rays in each of the spaces."""
+
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition | None:
+        """As many rays as fit in a bandwidth [Mbit/s], the same number in each space; none where not one fits.
+
+        None where more fit than any sensor fires.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class BaselineLayout:
+    """A layout whose rays all have one gate.
+
+    Arguments:
+        name: For messages.
+        place: Even or random points (x, y, z, azimuth, elevation) of any number, (count, site) to (count, 5).
+        gate_m: The gate of all its rays, shape (2,).
+        drawn_anew: Whether the points differ from scene to scene.
+    """
+
+    name: str
+    place: Callable[[int, LayoutSite], np.ndarray]
+    gate_m: np.ndarray
+    drawn_anew: bool = False
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+        """See `Candidate`."""
+        sites = (LayoutSite(space, number, scene) for number, space in enumerate(spaces))
+        return tuple(rays_at(self.place(count, site), self.gate_m) for site in sites)
+
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition | None:
+        """See `Candidate`."""
+        count = rays_within(limit_mbps, bandwidth, self.gate_m)
+        return self.positions(spaces, count) if count <= MOST_RAYS else None
+
+
+@dataclass(frozen=True, eq=False)
+class GatedLayout:
+    """A layout whose rays have gates of their own, or those of their site.
+
+    Arguments:
+        name: For messages.
+        lay_out: Points (x, y, z, azimuth, elevation) of any number and their gates [m]:
+            (count, site) to (count, 5) and (count, 2).
+    """
+
+    name: str
+    lay_out: Callable[[int, LayoutSite], tuple[np.ndarray, np.ndarray]]
+    drawn_anew: ClassVar[bool] = False
+    _known: dict[tuple[DesignSpace, int], Rays] = field(default_factory=dict, repr=False)
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+        """See `Candidate`."""
+        for number, space in enumerate(spaces):
+            if (space, count) not in self._known:
+                self._known[space, count] = rays_at(*self.lay_out(count, LayoutSite(space, number)))
+        return tuple(self._known[space, count] for space in spaces)
+
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition | None:
+        """See `Candidate`."""
+        return most_within(lambda count: self.positions(spaces, count), limit_mbps, bandwidth, FIRST_GUESS)
+
+
+FIRST_GUESS = 64
+# Bandwidth grows almost in proportion to the number of rays: a few steps find the largest number that fits.
+MOST_STEPS = 8
+
+
+def most_within(
+    lay_out: Callable[[int], RaysPerCondition],
+    limit_mbps: float,
+    bandwidth: Bandwidth,
+    count: int,
+    *,
+    close_enough: float = 1.0,
+) -> RaysPerCondition | None:
+    """The most rays that a few steps in proportion to the bandwidth find; never more than fit.
+
+    None where they are more than any sensor fires.
+
+    Arguments:
+        lay_out: The rays of any number.
+        limit_mbps: The bandwidth [Mbit/s].
+        bandwidth: The read-out model.
+        count: The number to begin with.
+        close_enough: The share of the bandwidth that ends the search.
+    """
+    low, high = 0, math.inf
+    for _ in range(MOST_STEPS):
+        cost = mean_mbps(lay_out(count), bandwidth)
+        low, high = (count, high) if cost <= limit_mbps else (low, count)
+        if high - low <= 1 or close_enough * limit_mbps <= cost <= limit_mbps:
+            break
+        guess = math.floor(count * limit_mbps / cost) if cost > 0 else 2 * count
+        if guess > MOST_RAYS:
+            return None
+        count = int(min(max(guess, low + 1), high - 1))
+    return lay_out(low)
+
+
+def rays_within(limit_mbps: float, bandwidth: Bandwidth, gate_m: np.ndarray) -> int:
+    """The number of rays with one gate (2,) [m] that fit in a bandwidth [Mbit/s], however many."""
+    width_m = np.diff(gate_m)
+    # the ratio of two multiples of one bin may lie an ulp below a whole number
+    count = math.floor(limit_mbps / bandwidth.mbps_of_widths(width_m) * (1 + EPSILON))
+    while count and bandwidth.mbps_of_widths(width_m, count) > limit_mbps:
+        count -= 1
+    return count
+
+
+def mean_mbps(positions: RaysPerCondition, bandwidth: Bandwidth) -> float:
+    """What reading rays out costs, averaged over condition values [Mbit/s]."""
+    return math.fsum(bandwidth.mbps(rays) for rays in positions) / len(positions)
+
+
+def whole_range(space: DesignSpace) -> np.ndarray:
+    """The gate that hears all of a space's range, shape (2,) [m]."""
+    return opened_gate(space.low[RANGE], space.high[RANGE])

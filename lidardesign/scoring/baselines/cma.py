@@ -1,0 +1,311 @@
+"""The baseline `cma`: the first design with what direct optimisation makes of its sensors, by N. Hansen's `cma`.
+
+A vector holds, sensor by sensor, the shift of its origin, of its boresight (azimuth, elevation, roll) and of its gates,
+and the logarithms by which its field of view and its gates are wider, as far as they are free, in steps that change a
+score about equally. The design's own rays move with their sensors, so the vector 0 is the design, whatever its layout,
+and what is found is no worse than it on the scenes of the search. Constraints bound the vector and cut gates; rays that
+take more bandwidth than the design's rank behind all others.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidardesign.constraints.document import Constraints
+from lidardesign.constraints.feasibility import BandwidthBudget
+from lidardesign.constraints.origins import mounts_of
+from lidardesign.errors import BackgroundNote
+from lidardesign.layouts.gates import admitted_gates
+from lidardesign.layouts.rays import layout_of
+from lidardesign.mixture.bounds import bounds_of, clip_azimuth
+from lidardesign.mixture.features import Axes
+from lidardesign.numerics import SLACK, TINY, sphere_exp, sphere_log, wrap_angle
+from lidardesign.run.clock import phase
+from lidardesign.scenes.rays import Rays
+from lidardesign.scoring.baselines.candidates import mean_mbps
+from lidardesign.scoring.baselines.views import OutOfTimeError, TrainingObjective
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import DesignSpec, boresight_frame, interval_factor
+from lidardesign.space import DesignSpace, angles, direction
+from lidardesign.task import Metric, random_generator
+
+CMA = "cma"
+DEFAULT_SECONDS = 60.0
+# More scenes tell candidates no better apart, and cost the search its time.
+MOST_SCENES = 40
+STEP = 0.3  # the first standard deviation, in units of the vector
+# Beyond so many numbers a full covariance takes longer to learn than any search lasts: variances alone are adapted.
+MOST_CORRELATED = 250
+# Columns of a sensor's numbers.
+ORIGIN, AIM, AZIMUTH, ELEVATION, ROLL, FIELD, GATE = slice(0, 3), slice(3, 6), 3, 4, 5, slice(6, 8), slice(8, 10)
+# One unit: shares of the box of origins, of the field of view and of the gate, radians of roll, or nats.
+BOX_SHARE, FIELD_SHARE, ROLL_RAD, GATE_SHARE, LOG_STEP = 0.05, 0.15, 0.2, 0.1, 0.15
+NARROWEST_RAD, STEEPEST_COSINE = 1e-3, 0.1
+WIDEST_LOG = 5.0
+
+# Told what a search is for, the share of its time that is used up, and its best score so far.
+Show = Callable[[str, float, float], None]
+
+
+@dataclass(frozen=True)
+class CmaSettings:
+    """Limits of the search of the baseline `cma` at each number of rays; the first that is reached ends it.
+
+    Arguments:
+        seconds: Wall time [s].
+        evaluations: Scores of one candidate in one scene.
+        show: Told how each search stands.
+    """
+
+    seconds: float = DEFAULT_SECONDS
+    evaluations: float = math.inf
+    show: Show | None = None
+
+
+@dataclass(frozen=True)
+class SearchRecord:
+    """A search and what came of it.
+
+    Arguments:
+        rays: The number of rays.
+        sensors, parameters: How many sensors and how many numbers of them it varied.
+        seconds: Wall time [s].
+        candidates: How many were scored.
+        training_scenes: The scenes that each was scored in.
+        start_value, value: Mean scores of the design and of the best candidate there.
+    """
+
+    rays: int
+    sensors: int
+    parameters: int
+    seconds: float
+    candidates: int
+    training_scenes: int
+    start_value: float
+    value: float
+
+    def note(self, followed: str, metric: Metric) -> str:
+        """One line for people, of a search that began at a design of this name."""
+        return BackgroundNote(
+            f"{CMA} at {self.rays} rays: {self.parameters} numbers of the sensors of {followed} varied for "
+            f"{self.seconds:.0f} s, {self.candidates} candidates, {self.start_value:.4g} to {self.value:.4g} "
+            f"{metric.unit} on {self.training_scenes} training scenes"
+        )
+
+
+class MovableSensors:
+    """The sensors of a design, and its rays as they move with them.
+
+    Arguments:
+        design: Whose sensors and constraints.
+        start: Its rays, of which all sensors have some or none.
+        space: The design space at one condition value.
+        bandwidth: The read-out model of the comparison.
+
+    `vector_bounds` are the lowest and the highest vector, shape (2, M).
+    """
+
+    def __init__(self, design: DesignSpec, start: RaysPerCondition, space: DesignSpace, bandwidth: Bandwidth) -> None:
+        constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
+        every, self._single = Rays.joined(start), layout_of(design).one_sensor_per_ray
+        self.start, self.count, self._axes = start, int(every.sensor.max()) + 1, Axes.of(space)
+        self._rays_bounded = self._single or design.track is not None
+        self._bounds = bounds_of(constraints.rules, space, tuple(range(self.count)), interval_factor(design.level))
+        models = (bandwidth, BandwidthBudget.of(constraints, None).model)
+        self._limits = [(model, mean_mbps(start, model)) for model in models]
+        if self._single:
+            middle = np.zeros((self.count, 3))
+            np.add.at(middle, every.sensor, every.direction)
+            self._aim, spread = np.stack([*angles(middle), np.zeros(self.count)], axis=1), np.zeros((self.count, 2))
+        else:
+            sensors = design.sensors[: self.count]
+            self._aim = np.array([(one.azimuth_rad, one.elevation_rad, one.roll_rad) for one in sensors])
+            spread = np.array([(one.spread_horizontal_rad, one.spread_vertical_rad) for one in sensors])
+        self._frames = np.array([boresight_frame(*aim) for aim in self._aim])
+        sides = self._changes(every, spread)
+        if any(mounts_of(rules) or rules.origin.exclude for rules in constraints.rules):
+            sides[..., ORIGIN] = 0.0
+        parts = [index for index, sensor in enumerate(design.sensors[: self.count]) if sensor.part is not None]
+        sides[:, parts, FIELD.start :] = 0.0
+        sides[:, np.bincount(every.sensor) == 0] = 0.0
+        # a start at a bound may lie an ulp beyond it
+        self._low, self._high = np.minimum(sides[0], 0.0), np.maximum(sides[1], 0.0)
+        self._free = self._high - self._low > SLACK
+        self._unit = np.minimum(self._units(every, spread), np.where(self._free, self._high - self._low, 1.0))
+        self.vector_bounds = [(side / self._unit)[self._free] for side in (self._low, self._high)]
+
+    def _changes(self, every: Rays, spread: np.ndarray) -> np.ndarray:
+        """Largest fall and rise of each number, shape (2, G, 10); 0 where it is not free."""
+        axes, bounds, sides = self._axes, self._bounds, np.zeros((2, self.count, 10))
+        first, last = np.full((self.count, 3), np.inf), np.full((self.count, 3), -np.inf)
+        np.minimum.at(first, every.sensor, every.origin_m)
+        np.maximum.at(last, every.sensor, every.origin_m)
+        for axis in axes.origin:
+            sides[..., axis] = (bounds.origin_low - first)[:, axis], (bounds.origin_high - last)[:, axis]
+        if axes.horizontal:
+            offset = np.where(bounds.azimuth_half < math.pi, wrap_angle(self._aim[:, 0] - bounds.azimuth_centre), 0.0)
+            sides[..., AZIMUTH] = -bounds.azimuth_half - offset, bounds.azimuth_half - offset
+        if axes.vertical:
+            sides[..., ELEVATION] = bounds.elevation_low - self._aim[:, 1], bounds.elevation_high - self._aim[:, 1]
+        if axes.angular == 2 and not self._single:
+            sides[..., ROLL] = np.array([-math.pi, math.pi])[:, None]
+        wide = np.array([axes.horizontal, axes.vertical]) & (spread > 0)
+        widest = np.minimum(bounds.spread_high * [axes.angle_scale, 1.0], math.pi / 2 / bounds.interval)
+        ends = np.stack([bounds.spread_low * [axes.angle_scale, 1.0], widest]) / np.where(wide, spread, 1.0)
+        sides[..., FIELD] = np.where(wide, np.log(np.clip(ends, *np.exp([-WIDEST_LOG, WIDEST_LOG]))), 0.0)
+        if axes.range:
+            reach_m = np.ptp(every.gate_m)
+            sides[..., GATE] = np.array([(-reach_m, -WIDEST_LOG), (reach_m, WIDEST_LOG)])[:, None]
+        return sides
+
+    def _units(self, every: Rays, spread: np.ndarray) -> np.ndarray:
+        """One unit of each number, shape (G, 10)."""
+        unit = np.full((self.count, 10), LOG_STEP)
+        unit[:, ORIGIN] = np.maximum(BOX_SHARE * (self._bounds.origin_high - self._bounds.origin_low), TINY)
+        middle = every.direction.mean(axis=0)
+        away = (every.direction @ middle).min() / max(np.linalg.norm(middle), TINY)
+        even = 2 * math.acos(np.clip(away, -1.0, 1.0)) / self.count ** (1 / max(self._axes.angular, 1))
+        field = np.where(spread.max(axis=1) > 0, 2 * self._bounds.interval * spread.max(axis=1), even)
+        unit[:, ELEVATION] = FIELD_SHARE * np.maximum(field, NARROWEST_RAD)
+        unit[:, AZIMUTH] = unit[:, ELEVATION] / np.maximum(np.cos(self._aim[:, 1]), STEEPEST_COSINE)
+        unit[:, ROLL] = ROLL_RAD
+        unit[:, GATE.start] = GATE_SHARE * max(float(np.ptp(every.gate_m, axis=1).mean()), TINY)
+        return unit
+
+    def rays(self, vector: np.ndarray) -> RaysPerCondition:
+        """The rays of a vector (M,); of the vector 0 those of the design."""
+        if not vector.any():
+            return self.start
+        change = np.zeros(self._unit.shape)
+        change[self._free] = vector * self._unit[self._free]
+        change = np.clip(change, self._low, self._high)
+        return tuple(self._moved(rays, change) for rays in self.start)
+
+    def _moved(self, rays: Rays, change: np.ndarray) -> Rays:
+        sensor, own, rows = rays.sensor, change[rays.sensor], self._bounds.take(rays.sensor)
+        if self._axes.angular == 2:
+            local = np.einsum("nij,nj->ni", self._frames[sensor], rays.direction)
+            turned = np.array([boresight_frame(*aim) for aim in self._aim + change[:, AIM]])
+            local = sphere_exp(sphere_log(local) * np.exp(own[:, FIELD]))
+            azimuth, elevation = angles(np.einsum("nij,ni->nj", turned[sensor], local))
+        else:
+            # in the plane or on the cone that the design space holds all rays in
+            offset = np.stack(angles(rays.direction), axis=1) - self._aim[sensor, :2]
+            offset[:, 0] = wrap_angle(offset[:, 0])
+            azimuth, elevation = (self._aim[sensor, :2] + own[:, AIM][:, :2] + offset * np.exp(own[:, FIELD])).T
+        if self._rays_bounded:
+            azimuth = clip_azimuth(azimuth, rows)
+            elevation = np.clip(elevation, rows.elevation_low, rows.elevation_high)
+        middle, half = rays.gate_m.mean(axis=1) + own[:, 8], np.ptp(rays.gate_m, axis=1) / 2 * np.exp(own[:, 9])
+        gate_m = np.stack([middle - half, middle + half], axis=1)
+        varied = own[:, GATE].any(axis=1, keepdims=True)
+        gate_m = np.where(varied, admitted_gates(gate_m, rows), rays.gate_m) if varied.any() else rays.gate_m
+        return Rays(rays.origin_m + own[:, ORIGIN], direction(azimuth, elevation), gate_m, sensor, rays.time_s)
+
+    def excess(self, positions: RaysPerCondition) -> float:
+        """The share by which rays take more bandwidth than the design's; 0 where they do not."""
+        return max(max(mean_mbps(positions, model) / limit - 1 - SLACK, 0.0) for model, limit in self._limits)
+
+
+@dataclass(eq=False)
+class CmaCandidate:
+    """The layout of the baseline `cma`; every number of rays is a search of its own.
+
+    Arguments:
+        design: Whose sensors are moved.
+        starts: Its rays by their number.
+        space: The design space at one condition value.
+        objective: The metric on training scenes.
+        settings: How long each search takes.
+        seed: Root of the random numbers.
+        bandwidth: The read-out model.
+    """
+
+    design: DesignSpec
+    starts: Mapping[int, RaysPerCondition]
+    space: DesignSpace
+    objective: TrainingObjective
+    settings: CmaSettings
+    seed: int
+    bandwidth: Bandwidth
+    name: str = CMA
+    drawn_anew: bool = False
+    _known: dict[int, tuple[RaysPerCondition, SearchRecord]] = field(default_factory=dict)
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+        """See `lidardesign.scoring.baselines.candidates.Candidate`."""
+        if count not in self._known:
+            self._known[count] = self._searched(count)
+        return self._known[count][0]
+
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition:
+        """See `lidardesign.scoring.baselines.candidates.Candidate`: as many rays as the design of this bandwidth."""
+        of_limit = [n for n, start in self.starts.items() if mean_mbps(start, bandwidth) == limit_mbps]
+        return self.positions(spaces, max(of_limit))
+
+    def record_of(self, positions: RaysPerCondition) -> SearchRecord:
+        """The search that found these rays."""
+        return next(record for known, record in self._known.values() if known is positions)
+
+    @phase("cma")
+    def _searched(self, count: int) -> tuple[RaysPerCondition, SearchRecord]:
+        # loaded here: it takes a second, and few evaluations ask for it
+        import cma
+
+        began, objective, settings = time.perf_counter(), self.objective, self.settings
+        generator = random_generator(self.seed, CMA, count)
+        sensors = MovableSensors(self.design, self.starts[count], self.space, self.bandwidth)
+        low, high = sensors.vector_bounds
+        best = np.zeros(len(low))
+        value = start_value = float(objective.values([sensors.start]).mean())
+        candidates, scenes = 1, len(objective.scenes)
+
+        def share() -> float:
+            return max((time.perf_counter() - began) / settings.seconds, candidates * scenes / settings.evaluations)
+
+        options = {
+            "bounds": [low.tolist(), high.tolist()],
+            "maxstd_boundrange": math.inf,
+            "CMA_diagonal": len(best) > MOST_CORRELATED,
+            "seed": math.nan,  # the generator is the only source of random numbers
+            "randn": lambda *shape: generator.standard_normal(shape),
+            "verbose": -9,
+        }
+        strategy = None
+        while len(best) and share() < 1.0:
+            if strategy is None or strategy.stop():
+                # one that has converged begins anew at the best found so far
+                strategy = cma.CMAEvolutionStrategy(best, STEP, options)
+            asked = strategy.ask()
+            try:
+                values = self._values(sensors, asked, lambda: share() >= 1.0)
+            except OutOfTimeError:
+                break
+            strategy.tell(asked, values.tolist())
+            candidates += len(asked)
+            first = int(values.argmin())
+            if values[first] < value:
+                best, value = np.array(asked[first]), float(values[first])
+            if settings.show is not None:
+                settings.show(f"{CMA}, {count} rays", min(share(), 1.0), objective.sign * value)
+        values = objective.sign * start_value, objective.sign * value
+        seconds = time.perf_counter() - began
+        return sensors.rays(best), SearchRecord(count, sensors.count, len(best), seconds, candidates, scenes, *values)
+
+    def _values(self, sensors: MovableSensors, vectors: Sequence[np.ndarray], stop: Callable[[], bool]) -> np.ndarray:
+        """Scores of vectors, lower is better, shape (L,)."""
+        lists = [sensors.rays(vector) for vector in vectors]
+        excess = np.array([sensors.excess(positions) for positions in lists])
+        values = self.objective.sign * self.objective.metric.worst + excess
+        fits = np.flatnonzero(excess == 0)
+        if len(fits):
+            values[fits] = self.objective.values([lists[index] for index in fits], stop).mean(axis=0)
+        return values

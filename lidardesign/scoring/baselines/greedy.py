@@ -1,0 +1,226 @@
+"""The baseline `greedy`: rays and gates chosen on training scenes as a design's are, but without any density.
+
+Candidates are even over where training scenes return: on the lattice of `silhouette`, with free origins in the crops of
+`bounding`. Which of them fire, and through which gates, is chosen as by `fit --layout selected`: by what the task says
+that returns tell about scenes, of the same scenes, as many, and in the bandwidth of the design beside it. Where no
+design has gates per ray there is one gate, that of the crops, and at equal rays it costs what it costs.
+
+Where the density has conditions, rays are chosen at each of their values, all of them at once: the bandwidth is a mean
+over the values, and is spent at those where it tells most.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+import numpy as np
+
+from lidardesign.numerics import COARSE_SLACK
+from lidardesign.run.clock import phase
+from lidardesign.scenes.rays import Rays, fire_times
+from lidardesign.scenes.scene import Scene
+from lidardesign.scoring.baselines.bounding import Crop, crop_kinds
+from lidardesign.scoring.baselines.candidates import rays_at, rays_within, whole_range
+from lidardesign.scoring.baselines.even import even_placement
+from lidardesign.scoring.baselines.silhouette import LEAST_SHARE, lattice_rays, survey
+from lidardesign.scoring.baselines.views import RAY_AXES, TrainingViews
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.space import AZIMUTH, DesignSpace
+from lidardesign.task import Task
+
+if TYPE_CHECKING:
+    from lidardesign.rays.coverage import Coverage, InformedScene
+    from lidardesign.rays.selection import SelectionProblem
+
+GREEDY = "greedy"
+USUAL_SCENES = 200  # that rays are chosen on where no design says on how many it was
+# Rays over all values of a condition: choosing more would take longer than all else in an evaluation.
+MOST_CHOSEN = 2000
+SMALLEST_SHARE = 0.1  # of even rays that return: where fewer do, candidates are those that return most often
+
+
+class GreedySource(NamedTuple):
+    """What rays are chosen by, beside the task.
+
+    Arguments:
+        scenes: Training scenes without end for a purpose, as designs with chosen rays are chosen on.
+        margin_m: By how much gates that hold all of a ray's returns are longer at both ends.
+    """
+
+    scenes: Callable[[str], Iterator[Scene]]
+    margin_m: float
+
+
+def greedy_rays(task: Task, positions: int, counts: Iterable[int]) -> tuple[list[int], list[str]]:
+    """The numbers of rays that `greedy` can choose at so many condition values, and why not the others, for people."""
+    from lidardesign.rays.information import informs_rays
+
+    if not informs_rays(task):
+        return [], [f"{GREEDY} is left out: the task {task.name} has no method informs"]
+    most = MOST_CHOSEN // positions
+    beyond = any(count > most for count in counts)
+    notes = [f"{GREEDY} is left out above {most} rays: choosing them takes too long"] if beyond else []
+    return [count for count in counts if count <= most], notes
+
+
+class Fired(NamedTuple):
+    """What a design beside it fires: a number of rays in a bandwidth [Mbit/s]."""
+
+    rays: int
+    mbps: float
+
+
+class _Table(NamedTuple):
+    """What all candidates tell about the training scenes through each of their gates, (N, G, 2) [m]."""
+
+    problem: SelectionProblem
+    coverage: Coverage
+    gates_m: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class GreedyCandidate:
+    """Chosen rays as a baseline's layout.
+
+    Arguments:
+        task: Says what returns tell.
+        views: The training scenes, for where they return.
+        spaces: The design space at each of the condition values.
+        source: Scenes to choose on, and the margin of gates.
+        scenes: On how many scenes rays are chosen.
+        gates_per_ray: Whether each ray has a gate of its own.
+        candidates: How many rays are chosen from, at each of the values.
+        fired: What the designs beside it fire.
+        bandwidth: The read-out model.
+    """
+
+    name: ClassVar[str] = GREEDY
+    drawn_anew: ClassVar[bool] = False
+    task: Task
+    views: TrainingViews
+    spaces: Sequence[DesignSpace]
+    source: GreedySource
+    scenes: int
+    gates_per_ray: bool
+    candidates: int
+    fired: Sequence[Fired]
+    bandwidth: Bandwidth
+    _known: dict[tuple[int, float], RaysPerCondition] = field(default_factory=dict, repr=False)
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+        """See `Candidate`; in no more than the largest bandwidth of a design with so many rays."""
+        limits = [one.mbps for one in self.fired if one.rays == count] if self.gates_per_ray else []
+        return self._chosen(count, max(limits, default=np.inf))
+
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition:
+        """As many rays as the design of this bandwidth fires; with one gate as many as fit."""
+        if self.gates_per_ray:
+            return self._chosen(max(one.rays for one in self.fired if one.mbps == limit_mbps), limit_mbps)
+        gates_m = np.concatenate([rays.gate_m[:1] for rays in self._proposed])
+        fit = rays_within(limit_mbps * len(gates_m), bandwidth, gates_m)
+        most = min(MOST_CHOSEN // len(gates_m), *(len(rays) for rays in self._proposed))
+        return self._chosen(min(fit, most), np.inf)
+
+    def _chosen(self, count: int, limit_mbps: float) -> RaysPerCondition:
+        """The choice of so many rays at each value, in a bandwidth that is a mean over the values [Mbit/s]."""
+        if (count, limit_mbps) not in self._known:
+            self._known[count, limit_mbps] = self._choice(count, limit_mbps)
+        return self._known[count, limit_mbps]
+
+    def _choice(self, count: int, limit_mbps: float) -> RaysPerCondition:
+        from lidardesign.rays.choice import choose, choose_within
+
+        table, values = self._table, len(self.spaces)
+        counts = table.problem.counts(count)
+        with phase("choice"):
+            choice = choose_within(table.coverage, counts, limit_mbps * values)
+            if len(choice.rays) < count * values:
+                # no design spends less than one bin per ray
+                choice = choose(table.coverage, counts, price=1 / COARSE_SLACK)
+        gate_m = table.gates_m[choice.rays, choice.gate[choice.rays]]
+        fired = replace(table.problem.rays.subset(choice.rays), gate_m=gate_m)
+        time_s = fire_times(count, self.bandwidth.rate_hz)
+        # candidates are in the order of the values, and as many are chosen at each
+        places = np.arange(count * values).reshape(values, count)
+        return tuple(replace(fired.subset(place), time_s=time_s) for place in places)
+
+    @cached_property
+    def _proposed(self) -> list[Rays]:
+        """Candidates at each of the values, with the widest gates that they may have."""
+        return [self._candidates(space) for space in self.spaces]
+
+    def _candidates(self, space: DesignSpace) -> Rays:
+        """Even candidates at a value; where nothing returns there, by what returns at any of them."""
+        views = self.views
+        crops = self._crops(space) or self._crops(views.space)
+        found = None
+        if not any(axis < AZIMUTH for axis in space.free):
+            found = survey(views, space) or survey(views, views.space)
+        if found is not None:
+            points = lattice_rays(found, self.candidates)
+        else:
+            each = math.ceil(self.candidates / len(crops))
+            points = np.concatenate([self._returning(crop, each) for crop in crops])
+        for axis in (axis for axis in views.space.conditioned if axis < RAY_AXES):
+            points[:, axis] = np.clip(points[:, axis], space.low[axis], space.high[axis])
+        ends = np.array([crop.gate_m for crop in crops])
+        gate_m = np.array([ends[:, 0].min(), ends[:, 1].max()])
+        return rays_at(points, whole_range(space) if self.gates_per_ray else gate_m)
+
+    def _crops(self, space: DesignSpace) -> list[Crop]:
+        observed = self.views.observed(space)
+        crops = [crop_of(self.views, space, observed) for crop_of in crop_kinds(space).values() if len(observed.points)]
+        return [crop for crop in crops if crop is not None]
+
+    def _returning(self, crop: Crop, count: int) -> np.ndarray:
+        """At least so many even rays in a crop, those in whose place scenes return most often, (K, 5)."""
+        place = partial(even_placement, crop.low, crop.high, field=crop.directions)
+        share = float((self.views.returns(place(count)).share >= LEAST_SHARE).mean())
+        points = place(math.ceil(count / max(share, SMALLEST_SHARE)))
+        found = self.views.returns(points).share
+        often = max(count, int((found >= LEAST_SHARE).sum()))
+        return points[np.sort(np.argsort(-found, kind="stable")[:often])]
+
+    @cached_property
+    def _table(self) -> _Table:
+        from lidardesign.rays.information import checked_information
+        from lidardesign.rays.selection import SelectionProblem
+
+        ends = np.cumsum([0, *map(len, self._proposed)]).tolist()
+        problem = SelectionProblem(
+            rays=Rays.joined(self._proposed),
+            visits=[slice(*pair) for pair in itertools.pairwise(ends)],
+            shares=None,
+            gates=self._gates,
+            informs=partial(checked_information, self.task),
+            scenes=self.source.scenes,
+            bandwidth=self.bandwidth,
+            limit_mbps=np.inf,
+            one_gate=False,
+            most_scenes=self.scenes,
+            name=GREEDY,
+        )
+        informed = problem.inform(problem.scenes("choice"), self.scenes)
+        gates_m = problem.gates(problem.rays, problem.visits, informed)
+        return _Table(problem, problem.coverage(informed, gates_m), gates_m)
+
+    @phase("gates")
+    def _gates(self, rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene]) -> np.ndarray:
+        """The gates that candidates may have, (N, G, 2) [m]; the last is of one bin, so that any design's bits do."""
+        from lidardesign.rays.gates import gate_choices
+
+        own = rays.gate_m[:, None]
+        if not self.gates_per_ray:
+            return own
+        gates_m = gate_choices(rays, visits, informed, self.source.margin_m)
+        middle, half = gates_m[:, -1:].mean(axis=2), self.bandwidth.bin_m / 2
+        one_bin = np.stack([np.maximum(middle - half, 0.0), middle + half], axis=2)
+        return np.concatenate([gates_m, one_bin], axis=1)

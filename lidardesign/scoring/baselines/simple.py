@@ -1,0 +1,299 @@
+"""The baselines that stand beside every design, by name.
+
+Each is built for exactly N rays, alone from the design space and from the training scenes. A baseline is one or
+more candidate layouts; where there are several, the best on training scenes is taken at each number of rays.
+
+- `uniform`: rays even on the sphere over the whole design space, with the whole range as their gate. Free origin axes
+  join the layout: two free axes in all give a grid, more a low-discrepancy set.
+- `random`: rays uniform in the measure of the design space, with the whole range as their gate, drawn anew for
+  every scene.
+- `bounding`: one even layout over where the training returns are, see `lidardesign.scoring.baselines.bounding`.
+- `silhouette` and `lloyd`: rays and gates by what training scenes return, see
+  `lidardesign.scoring.baselines.silhouette`.
+- `greedy`: rays chosen on training scenes without a density, see `lidardesign.scoring.baselines.greedy`.
+- `occupancy`: see `lidardesign.scoring.baselines.occupancy`.
+- `no-visibility`: a design fitted anew to the density without its occlusion term; the number of sensors, the layout,
+  the constraints, the level and the seed stay. It is not weighted, even where the design is.
+- `cma`: see `lidardesign.scoring.baselines.cma`.
+
+Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.mixture.fit import fit_like
+from lidardesign.mixture.support import Retarget
+from lidardesign.run.clock import phase
+from lidardesign.samples import Samples
+from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.scene import Scene
+from lidardesign.scoring.baselines.bounding import bounding
+from lidardesign.scoring.baselines.candidates import BaselineLayout, Candidate, LayoutSite, most_within, whole_range
+from lidardesign.scoring.baselines.cma import CMA
+from lidardesign.scoring.baselines.even import even_placement
+from lidardesign.scoring.baselines.greedy import GREEDY
+from lidardesign.scoring.baselines.occupancy import occupancy
+from lidardesign.scoring.baselines.silhouette import lloyd, silhouette
+from lidardesign.scoring.baselines.views import RAY_AXES, TrainingViews
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.space import DesignSpace
+from lidardesign.task import random_generator
+
+Judge = Callable[[Sequence[RaysPerCondition]], Sequence[float]]
+NO_VISIBILITY = "no-visibility"
+CLOSE_ENOUGH = 0.98  # of the bandwidth: every further step may be another fit
+
+
+class Option(NamedTuple):
+    """A candidate at a number of rays."""
+
+    candidate: Candidate
+    positions: RaysPerCondition
+
+
+class Baselines:
+    """Builds baselines for one design space and one set of training scenes, which it traces once.
+
+    Arguments:
+        space: The design space.
+        train: Training scenes.
+        seed: Root of the baselines that are drawn.
+        judge: What lists of rays score on training scenes, lower is better; None counts missing returns.
+        conditions: The condition values that rays are laid out at.
+        gates_per_ray: Whether the rays of `bounding` may have gates of their own.
+        without_visibility: Makes the layout that stands for `no-visibility`; called when that is asked for.
+        optimised: Makes the layout that stands for `cma`; called when that is asked for.
+        chosen: Makes the layout that stands for `greedy`; called when that is asked for.
+    """
+
+    def __init__(
+        self,
+        space: DesignSpace,
+        train: Sequence[Scene],
+        seed: int,
+        judge: Judge | None = None,
+        *,
+        conditions: Sequence[Mapping[str, float]] = ({},),
+        gates_per_ray: bool = False,
+        without_visibility: Callable[[], Candidate] | None = None,
+        optimised: Callable[[], Candidate] | None = None,
+        chosen: Callable[[TrainingViews], Candidate] | None = None,
+    ) -> None:
+        self.space, self.train, self.seed = space, train, seed
+        self.spaces = [space.at(condition) for condition in conditions]
+        self.views = TrainingViews(space, train)
+        self.gates_per_ray = gates_per_ray
+        self.without_visibility, self.optimised, self.chosen = without_visibility, optimised, chosen
+        self._judge = judge or self.views.missing_returns
+        self._candidates: dict[str, list[Candidate]] = {}
+        self._scores: dict[tuple[str, str, int], float] = {}
+
+    def options(self, name: str, count: int) -> list[Option]:
+        """All candidates of a baseline at a number of rays."""
+        return [Option(one, one.positions(self.spaces, count)) for one in self.candidates(name)]
+
+    def options_within(self, name: str, limit_mbps: float, bandwidth: Bandwidth) -> list[Option]:
+        """All candidates of a baseline with as many rays as fit in a bandwidth [Mbit/s].
+
+        None where more fit than any sensor fires: without them the baseline would not be what it can be.
+        """
+        options = []
+        for one in self.candidates(name):
+            positions = one.positions_within(self.spaces, limit_mbps, bandwidth)
+            if positions is None:
+                return []
+            options.append(Option(one, positions))
+        return options
+
+    def candidates(self, name: str) -> list[Candidate]:
+        """The layouts that a baseline chooses from.
+
+        Raises:
+            ConfigError: There is no such baseline.
+        """
+        if name not in self._candidates:
+            check_baseline(name)
+            self._candidates[name] = BASELINES[name](self)
+        return self._candidates[name]
+
+    @phase("baselines")
+    def best(self, choices: Sequence[tuple[str, list[Option]]]) -> list[Option]:
+        """Of each baseline's options the one that scores best on training scenes, the first of equals.
+
+        All that still have to be judged are judged together.
+        """
+        unknown = {
+            key: option.positions
+            for name, options in choices
+            for key, option in _keyed(name, options)
+            if len(options) > 1 and key not in self._scores
+        }
+        if unknown:
+            self._scores.update(zip(unknown, self._judge(list(unknown.values())), strict=True))
+        return [
+            min(_keyed(name, options), key=lambda one: self._scores.get(one[0], 0.0))[1] for name, options in choices
+        ]
+
+
+def _keyed(name: str, options: Sequence[Option]) -> list[tuple[tuple[str, str, int], Option]]:
+    return [((name, one.candidate.name, len(one.positions[0])), one) for one in options]
+
+
+def _uniform(source: Baselines) -> list[Candidate]:
+    def place(count: int, site: LayoutSite) -> np.ndarray:
+        return even_placement(site.space.low[:RAY_AXES], site.space.high[:RAY_AXES], count)
+
+    return [BaselineLayout("even", place, whole_range(source.space))]
+
+
+def _random(source: Baselines) -> list[Candidate]:
+    def place(count: int, site: LayoutSite) -> np.ndarray:
+        # the first position draws what a space without conditions draws
+        later = [site.number] if site.number else []
+        return site.space.sample(count, random_generator(source.seed, "random baseline", count, site.scene, *later))
+
+    return [BaselineLayout("random", place, whole_range(source.space), drawn_anew=True)]
+
+
+def _bounding(source: Baselines) -> list[Candidate]:
+    return list(bounding(source.views, gates_per_ray=source.gates_per_ray)) or _uniform(source)
+
+
+def _silhouette(source: Baselines) -> list[Candidate]:
+    return list(silhouette(source.views)) or _uniform(source)
+
+
+def _lloyd(source: Baselines) -> list[Candidate]:
+    return list(lloyd(source.views)) or _uniform(source)
+
+
+def _greedy(source: Baselines) -> list[Candidate]:
+    if source.chosen is None or not len(source.views.observed(source.space).points):
+        return _uniform(source)
+    return [source.chosen(source.views)]
+
+
+def _occupancy(source: Baselines) -> list[Candidate]:
+    layout = occupancy(source.space, source.train, source.seed)
+    return _random(source) if layout is None else [layout]
+
+
+def _no_visibility(source: Baselines) -> list[Candidate]:
+    if source.without_visibility is None:
+        raise ConfigError(
+            "there is no design to refit without occlusion",
+            where=f"--baseline {NO_VISIBILITY}",
+            allowed="at least one design whose run can be found",
+            hint="evaluate the run, or a design in its folder",
+        )
+    return [source.without_visibility()]
+
+
+def _cma(source: Baselines) -> list[Candidate]:
+    if source.optimised is None:
+        raise ConfigError(
+            "there is no design whose sensors can be varied",
+            where=f"--baseline {CMA}",
+            allowed="at least one design",
+        )
+    return [source.optimised()]
+
+
+BASELINES: dict[str, Callable[[Baselines], list[Candidate]]] = {
+    "uniform": _uniform,
+    "random": _random,
+    "bounding": _bounding,
+    "silhouette": _silhouette,
+    "lloyd": _lloyd,
+    GREEDY: _greedy,
+    "occupancy": _occupancy,
+    NO_VISIBILITY: _no_visibility,
+    CMA: _cma,
+}
+
+
+# In the place of names: no baselines at all.
+NONE = "none"
+# What stands beside every design, asked for or not.
+ALWAYS = ("uniform", "random", "bounding", "silhouette", GREEDY)
+
+
+def check_baseline(name: str, *, where: str = "baselines") -> None:
+    """Refuse a name that is no baseline's.
+
+    Raises:
+        ConfigError: There is no such baseline.
+    """
+    if name not in BASELINES:
+        raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=", ".join(BASELINES))
+
+
+class LayOut(Protocol):
+    """Lays out so many rays of a design at a condition value."""
+
+    def __call__(
+        self, design: DesignSpec, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
+    ) -> Rays:
+        """As `lidardesign.mixture.fit.rays_at`."""
+
+
+def fitted_twin(design: DesignSpec, samples: Samples, *, name: str, retarget: Retarget | None = None) -> DesignSpec:
+    """A design fitted to other samples as a given one was fitted to its own.
+
+    Arguments:
+        design: The design whose sensors, layout, constraints, level and seed are taken.
+        samples: Samples of the other density.
+        name: Of the twin.
+        retarget: log p* of the other density, where the fit needs it.
+    """
+    seed = design.provenance.get("seed")
+    seed = seed if isinstance(seed, int) else 0
+    return fit_like(design, samples, rays=design.rays, seed=seed, name=name, retarget=retarget)
+
+
+class TwinCandidate:
+    """A design as a baseline's layout.
+
+    Arguments:
+        design: The design.
+        samples: What it is laid out by at other numbers of rays.
+        conditions: The condition values.
+        lay_out: How it becomes rays.
+    """
+
+    drawn_anew = False
+
+    def __init__(
+        self, design: DesignSpec, samples: Samples, conditions: Sequence[Mapping[str, float]], lay_out: LayOut
+    ) -> None:
+        self.name = design.name
+        self._design, self._samples, self._conditions, self._lay_out = design, samples, conditions, lay_out
+        self._known: dict[int, RaysPerCondition] = {}
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
+        """See `lidardesign.scoring.baselines.candidates.Candidate`."""
+        if count not in self._known:
+            self._known[count] = tuple(
+                self._lay_out(self._design, count, self._samples, at=condition) for condition in self._conditions
+            )
+        return self._known[count]
+
+    def positions_within(
+        self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
+    ) -> RaysPerCondition | None:
+        """See `lidardesign.scoring.baselines.candidates.Candidate`."""
+        return most_within(
+            lambda count: self.positions(spaces, count),
+            limit_mbps,
+            bandwidth,
+            self._design.rays or max(len(self._design.sensors), 1),
+            close_enough=CLOSE_ENOUGH,
+        )

@@ -1,0 +1,286 @@
+"""Training scenes as baselines see them: their returns, the gates that hold these, and the task's metric."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lidardesign.layouts.grid import low_discrepancy
+from lidardesign.numerics import wrap_turn
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.scene import Scene
+from lidardesign.scoring.baselines.candidates import opened_gate, whole_range
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_lists
+from lidardesign.simulate.detector.physics import Physics
+from lidardesign.simulate.plan import Planner
+from lidardesign.simulate.returns import build_casters
+from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, direction, observed_point
+from lidardesign.task import Metric, Task
+
+RAY_AXES = 5  # x, y, z, azimuth, elevation: everything but the range
+
+# Per scene and frame, over several axes or over one: the ends of the central 99 % then rest on a few rays in each.
+DENSE_RAYS, DENSE_RAYS_ON_A_LINE = 4096, 256
+MOST_VIEWS = 128  # scenes times frames that are looked at: evenly spread where there are more
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """What rays return on targets.
+
+    Arguments:
+        points: Design points with a return, the azimuth unrolled to one arc, shape (K, 6).
+        hits_m: Where they hit, shape (K, 3).
+    """
+
+    points: np.ndarray
+    hits_m: np.ndarray
+
+
+FLATTEST_COSINE = 0.1  # a surface counts as seen no more flatly
+
+
+class ReturnTable:
+    """What each of M rays returns on targets in each of V views.
+
+    Arguments:
+        space: The design space, whose range all gates keep to.
+        points: The rays (x, y, z, azimuth, elevation), shape (M, 5).
+        range_m: Ranges of their returns, NaN where there is none, shape (V, M).
+        cosine: Of the angle between a ray and the surface's normal, shape (V, M).
+    """
+
+    def __init__(self, space: DesignSpace, points: np.ndarray, range_m: np.ndarray, cosine: np.ndarray) -> None:
+        self.space, self.points, self.range_m, self.cosine = space, points, range_m, cosine
+        self.returned = np.isfinite(range_m)
+
+    @cached_property
+    def share(self) -> np.ndarray:
+        """The share of views in which each ray returns, shape (M,)."""
+        return self.returned.mean(axis=0)
+
+    @cached_property
+    def area_m2_sr(self) -> np.ndarray:
+        """The area of surface that a solid angle covers, averaged over a ray's returns; 0 without any, shape (M,)."""
+        area = np.where(self.returned, self.range_m**2 / np.maximum(self.cosine, FLATTEST_COSINE), 0.0)
+        return area.sum(axis=0) / np.maximum(self.returned.sum(axis=0), 1)
+
+    @cached_property
+    def sigma_m(self) -> float:
+        """How much ranges along one ray vary from view to view: the median standard deviation [m]."""
+        several = self.returned.sum(axis=0) > 1
+        return float(np.median(np.nanstd(self.range_m[:, several], axis=0, ddof=1))) if several.any() else 0.0
+
+    @cached_property
+    def _ascending(self) -> tuple[np.ndarray, np.ndarray]:
+        """All ranges in ascending order, and the rays that they are of."""
+        ray, range_m = np.nonzero(self.returned)[1], self.range_m[self.returned]
+        order = np.argsort(range_m, kind="stable")
+        return range_m[order], ray[order]
+
+    @cached_property
+    def _scale(self) -> tuple[float, float]:
+        return _scales(self.points)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(_features(self.points, self._scale))
+
+    def nearest(self, points: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
+        """The nearest of the table's rays, or of some (K,), to each of others (N, 5), shape (N,)."""
+        asked = _features(points, self._scale)
+        if among is None:
+            return self._tree.query(asked)[1]
+        return among[cKDTree(self._tree.data[among]).query(asked)[1]]
+
+    def gates(self, points: np.ndarray, tail: float, margin_m: float) -> np.ndarray:
+        """Gates that hold what the table's rays return that are nearer to each ray than to any other, (N, 5) to (N, 2).
+
+        Arguments:
+            points: The rays.
+            tail: The share of these returns that is left out at either end.
+            margin_m: How much further the gates reach at either end, inside the space's range [m].
+        """
+        if not len(points):
+            return np.zeros((0, 2))
+        cell = cKDTree(_features(points, self._scale)).query(self._tree.data)[1]
+        low, high = self._ends(cell, len(points), tail)
+        empty = np.isnan(low)
+        if empty.any():
+            own = self.nearest(points[empty], np.flatnonzero(self.share > 0))
+            low[empty], high[empty] = (end[own] for end in self._ends(np.arange(len(cell)), len(cell), tail))
+        lowest, highest = self.space.low[RANGE], self.space.high[RANGE]
+        return opened_gate(np.clip(low - margin_m, lowest, highest), np.clip(high + margin_m, lowest, highest))
+
+    def _ends(self, cell: np.ndarray, count: int, tail: float) -> tuple[np.ndarray, np.ndarray]:
+        """Quantiles of what the rays of each cell return, rounded outwards; NaN where they return nothing."""
+        range_m, ray = self._ascending
+        order = np.argsort(cell[ray], kind="stable")
+        returns = np.bincount(cell[ray], minlength=count)
+        first, last = np.cumsum(returns) - returns, returns - 1
+        some = returns > 0
+        low, high = np.full(count, np.nan), np.full(count, np.nan)
+        low[some] = range_m[order[(first + np.floor(tail * last).astype(np.int64))[some]]]
+        high[some] = range_m[order[(first + np.ceil((1.0 - tail) * last).astype(np.int64))[some]]]
+        return low, high
+
+
+def _scales(points: np.ndarray) -> tuple[float, float]:
+    """What directions and origins are divided by, so that both extend over about 1."""
+    looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
+    return tuple(float(np.ptp(part, axis=0).max()) or 1.0 for part in (looking, points[:, :3]))
+
+
+def _features(points: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
+    """Where rays are near each other, so are these, (N, 5) to (N, 6)."""
+    looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
+    return np.column_stack([looking / scale[0], points[:, :3] / scale[1]])
+
+
+class TrainingViews:
+    """The training scenes at up to `MOST_VIEWS` of their frames, evenly spread over scenes and time.
+
+    Arguments:
+        space: The design space.
+        train: The training scenes.
+    """
+
+    def __init__(self, space: DesignSpace, train: Sequence[Scene]) -> None:
+        self.space, self.train = space, train
+        self._observed: dict[DesignSpace, Observed] = {}
+
+    @cached_property
+    def casters(self) -> list[tuple[Scene, SceneCaster]]:
+        """A caster per scene and frame, built once."""
+        return [(self.train[i], SceneCaster(self.train[i], frame)) for i, frame in spread_frames(self.train)]
+
+    def observed(self, space: DesignSpace) -> Observed:
+        """What dense rays over a part of the design space return, traced once."""
+        if space not in self._observed:
+            self._observed[space] = self.hits(dense_points(space))
+        return self._observed[space]
+
+    def hits(self, points: np.ndarray) -> Observed:
+        """What rays at (N, 5 or 6) return on targets inside the space's range, over all views."""
+        table = self.returns(points)
+        view, ray = np.nonzero(table.returned)
+        design = np.column_stack([table.points[ray], table.range_m[view, ray]])
+        hits_m = observed_point(design)
+        if self.space.full_azimuth:
+            design[:, AZIMUTH] = unrolled(design[:, AZIMUTH])
+        return Observed(design, hits_m)
+
+    def returns(self, points: np.ndarray) -> ReturnTable:
+        """The same ray by ray and view by view."""
+        lowest, highest = whole_range(self.space)
+        looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
+        range_m = np.full((len(self.casters), len(points)), np.nan)
+        cosine = np.zeros(range_m.shape)
+        for view, (scene, caster) in enumerate(self.casters):
+            found = caster.first_hit(points[:, :3], looking)
+            target = np.array([*(body.is_target for body in scene.bodies), False])[found.body]
+            seen = target & (found.range_m >= lowest) & (found.range_m < highest)
+            range_m[view, seen] = found.range_m[seen]
+            cosine[view] = np.abs(np.einsum("nk,nk->n", found.normal, looking))
+        return ReturnTable(self.space, points[:, :RAY_AXES], range_m, cosine)
+
+    def missing_returns(self, lists: Sequence[RaysPerCondition]) -> list[float]:
+        """The share of rays without a return inside their gate, over all views."""
+        return [self._missing(positions) for positions in lists]
+
+    def _missing(self, positions: RaysPerCondition) -> float:
+        returned = fired = 0
+        for rays in positions:
+            for _, caster in self.casters:
+                range_m = caster.first_hit(rays.origin_m, rays.direction).range_m
+                returned += int(((range_m >= rays.gate_m[:, 0]) & (range_m < rays.gate_m[:, 1])).sum())
+                fired += len(rays)
+        return 1.0 - returned / max(fired, 1)
+
+
+def spread_frames(scenes: Sequence[Scene], most: int = MOST_VIEWS) -> list[tuple[int, int]]:
+    """All (scene, frame), or `most` of them evenly spread."""
+    every = [(index, frame) for index, scene in enumerate(scenes) for frame in range(scene.frames)]
+    if len(every) <= most:
+        return every
+    # the middles of equal shares: no scene's first frame is favoured
+    return [every[int((i + 0.5) * len(every) / most)] for i in range(most)]
+
+
+def dense_rays(axes: int) -> int:
+    """How many rays are dense over so many axes."""
+    return DENSE_RAYS if axes > 1 else DENSE_RAYS_ON_A_LINE
+
+
+def dense_points(space: DesignSpace) -> np.ndarray:
+    """Dense rays over the space, even in its own measure, shape (M, 6)."""
+    axes = [i for i, dimension in enumerate(space.free) if dimension != RANGE]
+    count = dense_rays(len(axes))
+    unit = np.full((count, len(space.free)), -1.0)
+    unit[:, axes] = 2 * low_discrepancy(count, len(axes)) - 1
+    return space.from_unit(unit)
+
+
+def unrolled(azimuth_rad: np.ndarray) -> np.ndarray:
+    """Azimuths moved by whole turns onto one arc that starts behind the widest gap, shape (K,)."""
+    if not len(azimuth_rad):
+        return azimuth_rad
+    turned = np.sort(wrap_turn(azimuth_rad))
+    gaps = np.diff(np.append(turned, turned[0] + FULL_TURN))
+    return wrap_turn(azimuth_rad, turned[(int(np.argmax(gaps)) + 1) % len(turned)])
+
+
+class OutOfTimeError(Exception):
+    """The time was up before all was scored."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingObjective:
+    """The task's metric on training scenes, turned so that lower is better.
+
+    Arguments:
+        task: Whose score is taken.
+        metric: What it means.
+        scenes: Training scenes.
+        planner: The detector, and how effects are chosen.
+        seed: Root of the effects' random streams.
+    """
+
+    task: Task
+    metric: Metric
+    scenes: Sequence[Scene]
+    planner: Planner
+    seed: int
+    _prepared: dict[int, tuple[list[SceneCaster], Physics | None]] = field(default_factory=dict, repr=False)
+
+    @property
+    def sign(self) -> float:
+        """1 where lower is better, else -1."""
+        return 1.0 if self.metric.better == "lower" else -1.0
+
+    def values(self, lists: Sequence[RaysPerCondition], stop: Callable[[], bool] = lambda: False) -> np.ndarray:
+        """The score of every set of rays in every scene, lower is better, shape (scenes, sets).
+
+        Arguments:
+            lists: The sets of rays; one without rays has the metric's worst value everywhere.
+            stop: Asked before every scene but the first whether the time is up.
+
+        Raises:
+            OutOfTimeError: It was.
+        """
+        found = np.empty((len(self.scenes), len(lists)))
+        for number, scene in enumerate(self.scenes):
+            if number and stop():
+                raise OutOfTimeError
+            if number not in self._prepared:
+                # the rays that are fired first say which effects a scene calls for
+                casters = build_casters(scene)
+                plan = self.planner.plan(scene, [rays for positions in lists for rays in positions], casters)
+                self._prepared[number] = casters, self.planner.physics(plan, self.seed)
+            scores = score_lists(self.task, self.metric, scene, lists, *self._prepared[number])
+            found[number] = [self.sign * score.value for score, _ in scores]
+        return found

@@ -1,0 +1,304 @@
+"""The rows of an evaluation: which rays every design and baseline fires, at equal rays and at equal bandwidth.
+
+Baselines are built from training scenes alone. The one to be held against is the strongest of them there.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.layouts.rays import gates_of, layout_of
+from lidardesign.layouts.track import travels
+from lidardesign.rays.gates import CANDIDATES_PER_RAY
+from lidardesign.registry import plugin_guard
+from lidardesign.run.clock import phase
+from lidardesign.scenes.scene import Scene
+from lidardesign.scoring.baselines import cma
+from lidardesign.scoring.baselines.candidates import Candidate, mean_mbps
+from lidardesign.scoring.baselines.greedy import GREEDY, USUAL_SCENES, Fired, GreedyCandidate, greedy_rays
+from lidardesign.scoring.baselines.simple import Baselines, Option, TwinCandidate
+from lidardesign.scoring.baselines.views import TrainingObjective, TrainingViews
+from lidardesign.scoring.evaluation.request import EvaluationRequest, fired_numbers, numbers_fired
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_here
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import CERTIFICATES, DesignSpec
+from lidardesign.task import conditions_of
+
+# Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
+# at a fraction of the held-out scenes' cost.
+JUDGED_SCENES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One row to be.
+
+    Arguments:
+        name: The design's or baseline's.
+        positions: The rays per condition value.
+        baseline: Whether it is a baseline.
+        redraw: Rays of a scene, for what is drawn anew in each.
+        matched_to, matched_rays: The design and its number of rays whose bandwidth this baseline was given.
+        search: How a direct search found its rays.
+    """
+
+    name: str
+    positions: RaysPerCondition
+    baseline: bool
+    redraw: Callable[[int], RaysPerCondition] | None = None
+    matched_to: str | None = None
+    matched_rays: int | None = None
+    search: cma.SearchRecord | None = None
+
+    @property
+    def rays(self) -> int:
+        """Rays per condition value."""
+        return len(self.positions[0])
+
+    def mbps(self, bandwidth: Bandwidth) -> float:
+        """The bandwidth of its rays, averaged over condition values [Mbit/s]."""
+        return mean_mbps(self.positions, bandwidth)
+
+    def drawn(self, scene: int) -> RaysPerCondition:
+        """The rays that it fires in a held-out scene."""
+        return self.positions if self.redraw is None else self.redraw(scene)
+
+    @cached_property
+    def key(self) -> tuple[Any, ...]:
+        """Equal for entries that fire the same rays."""
+        if not self.baseline:
+            return ("design", self.name, self.rays)
+        arrays = (array for rays in self.positions for array in (rays.origin_m, rays.direction, rays.gate_m))
+        return (self.name, *(array.tobytes() for array in arrays))
+
+
+@phase("rays")
+def entries_of(request: EvaluationRequest) -> list[Entry]:
+    """All rows to be: designs at the numbers of rays that they can fire, baselines, then those at each one's bandwidth.
+
+    Raises:
+        ConfigError: No design can fire any of the numbers of rays, or a track ends before where it is evaluated.
+    """
+    conditions = _conditions(request)
+    _check_tracks(request, conditions)
+    counts = fired_numbers(request.designs, request.rays)
+    designs = [
+        Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
+        for design in request.designs
+        for count in numbers_fired(design, counts, request.alone)
+    ]
+    shared = [count for count in counts if count not in request.alone]
+    choosable = [] if request.greedy is None else greedy_rays(request.task, len(conditions), shared)[0]
+    starts = {one.rays: one.positions for one in designs if one.name == request.designs[0].name}
+    baselines = Baselines(
+        request.space,
+        request.train,
+        request.seed,
+        partial(_judge, request),
+        conditions=conditions,
+        gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
+        without_visibility=partial(_twin, request, conditions) if request.without_visibility else None,
+        optimised=partial(_optimised, request, conditions, starts) if request.designs else None,
+        chosen=partial(_chosen, request, conditions, designs, max(choosable, default=0)),
+    )
+    wanted: list[tuple[str, list[Option], Entry | None]] = [
+        (name, baselines.options(name, count), None)
+        for name in request.baselines
+        for count in shared
+        if name != GREEDY or count in choosable
+        if name != cma.CMA or count in starts or not starts
+    ]
+    if request.equal_bandwidth:
+        wanted += [
+            (name, baselines.options_within(name, entry.mbps(request.bandwidth), request.bandwidth), entry)
+            for entry in designs
+            if entry.rays in shared
+            for name in request.baselines
+            if name != cma.CMA or entry.name == request.designs[0].name
+            if name != GREEDY or entry.rays in choosable
+        ]
+    wanted = [one for one in wanted if one[1]]
+    chosen = baselines.best([(name, options) for name, options, _ in wanted])
+    return designs + [
+        _entry(baselines, name, option, matched) for (name, _, matched), option in zip(wanted, chosen, strict=True)
+    ]
+
+
+def has_gates_per_ray(design: DesignSpec) -> bool:
+    """True for a design whose rays have gates of their own, be it that each is a sensor."""
+    return gates_of(design) == "ray" or layout_of(design).one_sensor_per_ray
+
+
+def _check_tracks(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> None:
+    for design in request.designs:
+        if design.track is None:
+            continue
+        name, (first, last) = design.track.dimension, travels(design.track)
+        beyond = [one[name] for one in conditions if name in one and not first <= one[name] <= last]
+        if beyond:
+            raise ConfigError(
+                f"its track goes from {name}={first:g} to {last:g}, but designs are evaluated at {beyond[0]:g} too",
+                where=f"design {design.name}",
+                hint="fit a track of the whole way: lidardesign fit RUN",
+            )
+
+
+def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | None) -> Entry:
+    candidate, count = option.candidate, len(option.positions[0])
+    searched = matched is None and isinstance(candidate, cma.CmaCandidate)
+    return Entry(
+        name,
+        option.positions,
+        baseline=True,
+        redraw=partial(candidate.positions, baselines.spaces, count) if candidate.drawn_anew else None,
+        matched_to=None if matched is None else matched.name,
+        matched_rays=None if matched is None else matched.rays,
+        search=candidate.record_of(option.positions) if searched else None,
+    )
+
+
+def _conditions(request: EvaluationRequest) -> list[dict[str, float]]:
+    with plugin_guard(request.task.name):
+        return conditions_of(request.task, request.config, request.space)
+
+
+def ordered_conditions(request: EvaluationRequest) -> list[dict[str, float]]:
+    """The condition values that are evaluated at, ascending; one empty entry without conditions."""
+    return sorted(_conditions(request), key=lambda condition: tuple(condition.values()))
+
+
+def _laid_out(
+    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], design: DesignSpec, count: int
+) -> RaysPerCondition:
+    samples = request.samples.get(design.name)
+    return tuple(request.lay_out(design, count, samples, at=condition) for condition in conditions)
+
+
+def _twin(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> Candidate:
+    return TwinCandidate(*request.without_visibility(), conditions, request.lay_out)
+
+
+def _optimised(
+    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], starts: Mapping[int, RaysPerCondition]
+) -> Candidate:
+    design, space, scenes = request.designs[0], request.space, request.train[: cma.MOST_SCENES]
+    middle = conditions[len(conditions) // 2]
+    return cma.CmaCandidate(
+        design=design,
+        starts=starts,
+        space=space.at({**middle, **design.at}) if space.conditioned else space,
+        objective=TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed),
+        settings=request.cma,
+        seed=request.seed,
+        bandwidth=request.bandwidth,
+    )
+
+
+def _chosen(
+    request: EvaluationRequest,
+    conditions: Sequence[Mapping[str, float]],
+    designs: Sequence[Entry],
+    most: int,
+    views: TrainingViews,
+) -> Candidate:
+    numbers = [one["scenes"] for design in request.designs for one in design.provenance.get(CERTIFICATES, ())]
+    return GreedyCandidate(
+        task=request.task,
+        views=views,
+        spaces=[request.space.at(condition) for condition in conditions],
+        source=request.greedy,
+        scenes=max(numbers, default=USUAL_SCENES),
+        gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
+        candidates=CANDIDATES_PER_RAY * most,
+        fired=[Fired(entry.rays, entry.mbps(request.bandwidth)) for entry in designs],
+        bandwidth=request.bandwidth,
+    )
+
+
+def _judge(request: EvaluationRequest, lists: Sequence[RaysPerCondition]) -> list[float]:
+    """The mean score of sets of rays on a few training scenes, turned so that lower is better."""
+    scenes = request.train[:JUDGED_SCENES]
+    objective = TrainingObjective(request.task, request.metric, scenes, request.planner, request.seed)
+    if not objective.scenes:
+        return [0.0] * len(lists)
+    return objective.values(lists).mean(axis=0).tolist()
+
+
+# The strongest baseline is found on training scenes that no baseline's rays were chosen on: whoever picks the best of
+# several by their scores on held-out scenes holds designs against a lucky one.
+MOST_RIVAL_SCENES = 20
+FEWEST_RIVAL_SCENES = 5
+LARGEST_RIVAL_SHARE = 0.1  # of the rays that an evaluation fires may be fired to find it
+
+
+@dataclass(frozen=True)
+class StrongestRival:
+    """The best of all baselines at one number of rays.
+
+    Arguments:
+        name: Its name.
+        rays: Rays per frame.
+        scenes: The number of training scenes that it was found on.
+        values: The mean score of every baseline on them.
+    """
+
+    name: str
+    rays: int
+    scenes: int
+    values: Mapping[str, float]
+
+    @classmethod
+    def best_of(cls, values: Mapping[str, float], better: str, rays: int, scenes: int) -> StrongestRival:
+        """The best of mean scores by name; the first of equal ones."""
+        choose = min if better == "lower" else max
+        return cls(choose(values, key=lambda name: values[name]), rays, scenes, dict(values))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {"name": self.name, "rays": self.rays, "scenes": self.scenes, "values": dict(self.values)}
+
+
+@phase("strongest rival")
+def strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: int) -> StrongestRival | None:
+    """The best of all baselines at a number of rays, under the effects of the evaluation; None without baselines.
+
+    Arguments:
+        request: The evaluation.
+        entries: All its rows to be.
+        rays: The number of rays.
+    """
+    rivals = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
+    if not rivals or not request.train:
+        return None
+    fired = sum(entry.rays for entry in entries) * len(request.test)
+    affordable = int(LARGEST_RIVAL_SHARE * fired / (rays * len(rivals)))
+    scenes = held_back_scenes(request, min(max(affordable, FEWEST_RIVAL_SCENES), MOST_RIVAL_SCENES))
+    scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in rivals], request.planner)
+    found = score_here(replace(scene_pass, scenes=scenes), None)
+    means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
+    values = dict(zip((entry.name for entry in rivals), means, strict=True))
+    return StrongestRival.best_of(values, request.metric.better, rays, len(scenes))
+
+
+def held_back_scenes(request: EvaluationRequest, count: int) -> list[Scene]:
+    """Training scenes that no rival's rays were chosen on; the first ones where a request has no others."""
+    scenes = iter(request.train) if request.greedy is None else request.greedy.scenes("held back")
+    return list(itertools.islice(scenes, count))
+
+
+def mean_rival(found: Iterable[StrongestRival | None], better: str) -> StrongestRival | None:
+    """The strongest rival of several seeds, by its mean score over them; None where one seed has none."""
+    each = list(found)
+    known = [one for one in each if one is not None]
+    if not known or len(known) < len(each):
+        return None
+    names = [name for name in known[0].values if all(name in one.values for one in known)]
+    values = {name: float(np.mean([one.values[name] for one in known])) for name in names}
+    return StrongestRival.best_of(values, better, known[0].rays, sum(one.scenes for one in known))

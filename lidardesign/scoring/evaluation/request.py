@@ -1,0 +1,221 @@
+"""What an evaluation is asked for.
+
+At which numbers of rays which designs are evaluated: a fixed pattern fires all its rays, or where only fewer are asked
+for an even subset of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from lidardesign.errors import ConfigError, PluginError
+from lidardesign.layouts.rays import layout_of
+from lidardesign.mixture.fit import rays_at
+from lidardesign.registry import plugin_guard
+from lidardesign.samples import Samples
+from lidardesign.scenes.scene import Scene
+from lidardesign.scoring.baselines.cma import CmaSettings
+from lidardesign.scoring.baselines.greedy import GreedySource
+from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, LayOut, check_baseline
+from lidardesign.scoring.evaluation.mounting import MountError
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, ScenePass, Scorer, score_here
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.simulate.plan import EffectPlan, Planner
+from lidardesign.space import DesignSpace
+from lidardesign.task import Metric, Task, metric_of, mount_of
+
+# Fixed patterns of more rays are scored without baselines, unless their number is asked for: scans have 100,000.
+MOST_SHARED = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluationRequest:
+    """What to evaluate.
+
+    Arguments:
+        task: The task whose score is taken.
+        config: The task's configuration; its condition values are evaluated at.
+        space: The design space that baselines fill.
+        seed: Root of the drawn baselines and the bootstrap.
+        designs: The designs, by distinct names that are no baseline's.
+        rays: Numbers of rays per frame; with conditions, per condition value. See `numbers_fired`.
+        baselines: Names of baselines.
+        bandwidth: The read-out model.
+        samples: Samples of the learned density by design name, for layouts that need them.
+        equal_bandwidth: Whether baselines are also given each design's bandwidth.
+        train, test: Training scenes (for baselines) and held-out scenes.
+        lay_out: How a design becomes a ray list of a given length.
+        without_visibility: The design that stands for the baseline `no-visibility`, and the samples that it was
+            fitted to; called when that is asked for.
+        density: Samples of what was learned, for figures; None where a run has none.
+        greedy: What the baseline `greedy` chooses by; None: it is left out.
+        cma: How long the baseline `cma` searches, and who is told how it stands.
+        planner: The detector, and how the effects that are simulated are chosen.
+        audit: Whether all rows are scored under all effects too.
+        mount_error: How carelessly sensors are mounted in rows beside the exact ones; None: there are none.
+        scorer: What scores the held-out scenes: this process, or workers (`evaluate.workers`) to the same numbers.
+        scenes_seed: Root of the held-out scenes; None: `seed`.
+        alone: Those numbers of rays at which fixed patterns are evaluated without baselines and other designs.
+    """
+
+    task: Task
+    config: Any
+    space: DesignSpace
+    seed: int
+    designs: Sequence[DesignSpec]
+    rays: Sequence[int]
+    baselines: Sequence[str] = ALWAYS
+    bandwidth: Bandwidth = field(default_factory=Bandwidth)
+    samples: Mapping[str, Samples] = field(default_factory=dict)
+    equal_bandwidth: bool = True
+    train: Sequence[Scene] = ()
+    test: Sequence[Scene] = ()
+    lay_out: LayOut = rays_at
+    without_visibility: Callable[[], tuple[DesignSpec, Samples]] | None = None
+    density: Callable[[], Samples | None] = lambda: None
+    greedy: GreedySource | None = None
+    cma: CmaSettings = field(default_factory=CmaSettings)
+    planner: Planner = field(default_factory=Planner)
+    audit: bool = False
+    mount_error: MountError | None = None
+    scorer: Scorer = score_here
+    scenes_seed: int | None = None
+    alone: Sequence[int] = ()
+
+    @property
+    def held_out_seed(self) -> int:
+        """Root of the held-out scenes."""
+        return self.seed if self.scenes_seed is None else self.scenes_seed
+
+    @cached_property
+    def metric(self) -> Metric:
+        """What scores mean."""
+        with plugin_guard(self.task.name):
+            return metric_of(self.task, self.config)
+
+    def check(self) -> None:
+        """Refuse what makes no sense.
+
+        Raises:
+            ConfigError: No scenes, designs of one name, an unknown baseline, or no rays.
+            PluginError: The metric's worst value is not finite.
+        """
+        where = f"task {self.task.name}"
+        if not self.test:
+            raise ConfigError("there are no held-out scenes", where=where, allowed="1 or more")
+        if not math.isfinite(self.metric.worst):
+            raise PluginError(f"the worst value is {self.metric.worst}", where=where, allowed="finite")
+        mount = mount_of(self.task, self.config)
+        for design in self.designs:
+            if design.mount not in (None, mount):
+                there = "in the world" if mount is None else f"on {mount!r}"
+                raise ConfigError(f"{design.name} is mounted on the body {design.mount!r}", where=where, allowed=there)
+        names = [design.name for design in self.designs]
+        for name in names:
+            if names.count(name) > 1 or name in BASELINES:
+                other = "a baseline" if name in BASELINES else "another design"
+                raise ConfigError(f"a design has the same name as {other}: {name!r}", hint="rename its file")
+        for name in self.baselines:
+            check_baseline(name, where="--baseline")
+        if any(count < 1 for count in self.rays):
+            raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
+
+    def scene_pass(
+        self, fired: Callable[[int], Sequence[RaysPerCondition]], planner: Planner, plans: Sequence[EffectPlan] = ()
+    ) -> ScenePass:
+        """Sets of rays in the held-out scenes: see `ScenePass`."""
+        return ScenePass(self.task, self.metric, self.seed, self.test, fired, planner, plans)
+
+
+def pattern_size(design: DesignSpec) -> int | None:
+    """The rays of a design's fixed pattern; None where a design can be laid out at any number."""
+    return layout_of(design).most_count(design)
+
+
+def numbers_fired(design: DesignSpec, asked: Iterable[int], alone: Sequence[int] = ()) -> list[int]:
+    """Those of some numbers of rays at which a design is evaluated: a fixed pattern at its own only, where asked for.
+
+    What is bought fires all its rays; subsets of them may rank designs of several sizes in another order.
+    """
+    size, chosen, asked = pattern_size(design), layout_of(design).counts(design), list(asked)
+    if size in asked:
+        return [size]
+    if chosen is not None:
+        return [count for count in asked if count in chosen]
+    return [count for count in asked if count not in alone and (size is None or count <= size)]
+
+
+def numbers_alone(counts: Iterable[int], budgets: Iterable[int]) -> list[int]:
+    """Those of the usual numbers of rays that only fixed patterns have and that take baselines minutes."""
+    return [count for count in counts if count > max(MOST_SHARED, *budgets)]
+
+
+def usual_numbers(designs: Iterable[DesignSpec], budgets: Iterable[int]) -> list[int]:
+    """The numbers to evaluate at where none is asked for: the task's, those of fixed patterns, and of chosen rays."""
+    designs = list(designs)
+    sizes = {size for size in map(pattern_size, designs) if size is not None}
+    chosen = (layout_of(design).counts(design) or () for design in designs)
+    return fired_numbers(designs, sorted(sizes.union(budgets, *chosen)))
+
+
+def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[int]:
+    """Those of some numbers of rays that any design can fire, in their order; all without a design.
+
+    Raises:
+        ConfigError: No design can fire any of them.
+    """
+    asked = list(dict.fromkeys(counts))
+    fired = {count for design in designs for count in numbers_fired(design, asked)}
+    kept = [count for count in asked if not designs or count in fired]
+    if asked and not kept:
+        chosen = sorted({count for design in designs for count in layout_of(design).counts(design) or ()})
+        sizes = [size for size in map(pattern_size, designs) if size is not None]
+        why = "all are fixed patterns"
+        hint = "a design of more parts: lidardesign catalog show NAME --rays N --out FILE"
+        if chosen:
+            why, hint = "rays were chosen at other numbers", "lidardesign fit RUN --layout selected --rays N"
+        who = "no design fires"
+        if len(designs) == 1:
+            who = f"{designs[0].name} does not fire"
+            why = "its rays were chosen at other numbers" if chosen else "it is a fixed pattern"
+        raise ConfigError(
+            f"{who} {_listed(asked, 'or')} rays: {why}",
+            where="--rays",
+            allowed=_listed(chosen, "or") if chosen else f"at most {max(sizes)}",
+            hint=hint,
+        )
+    return kept
+
+
+def left_out(designs: Sequence[DesignSpec], counts: Iterable[int], alone: Sequence[int] = ()) -> list[str]:
+    """Which designs have no row at which numbers of rays, one line each, for people."""
+    asked = sorted(set(counts))
+    lines = []
+    for design in designs:
+        size, fired = pattern_size(design), numbers_fired(design, asked)
+        beyond = [count for count in asked if count not in fired]
+        if size is not None and fired and size not in fired:
+            some = _listed(fired, "and")
+            lines.append(f"{design.name} fires {size} rays, its fixed pattern: at {some} rays an even subset of them")
+        if beyond:
+            counts = layout_of(design).counts(design)
+            fires = f"{size} rays, its fixed pattern"
+            fires = fires if counts is None else f"{_listed(counts, 'or')} rays, at which they were chosen"
+            lines.append(f"{design.name} fires {fires}: it is left out at {_listed(beyond, 'and')} rays")
+    fired = {count for design in designs for count in numbers_fired(design, asked)}
+    empty = [count for count in asked if designs and count not in fired]
+    if alone:
+        lines.append(f"at {_listed(alone, 'and')} rays fixed patterns are scored alone; --rays adds baselines there")
+    if empty:
+        lines.append(f"no design fires {_listed(empty, 'or')} rays: nothing is evaluated there")
+    return lines
+
+
+def _listed(counts: Sequence[int], last: str) -> str:
+    texts = [str(count) for count in counts]
+    return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} {last} {texts[-1]}"

@@ -1,0 +1,313 @@
+"""Scores of designs and baselines on held-out scenes, at equal rays and at equal bandwidth.
+
+Honest by construction: every design and baseline sees the same scenes; a scene where the returns are too few
+to score counts as a failure at the metric's worst value and is never dropped; baselines are built from
+training scenes alone. In each scene the rays of all rows are traced together, frame by frame, and rows that fire the
+same rays are scored once. All rows of a scene meet the same effects: those that the scene calls for with any of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from lidardesign.errors import BackgroundNote
+from lidardesign.numerics import ROUNDING
+from lidardesign.registry import plugin_guard
+from lidardesign.run.clock import Progress, phase
+from lidardesign.scenes.scene import Scene, group_numbers
+from lidardesign.scenes.triangles import SecondCasts
+from lidardesign.scoring.baselines.cma import CMA
+from lidardesign.scoring.baselines.greedy import GREEDY, greedy_rays
+from lidardesign.scoring.evaluation.effects import effect_notes, effect_summaries
+from lidardesign.scoring.evaluation.entries import Entry, entries_of, strongest_rival
+from lidardesign.scoring.evaluation.mounting import MountError
+from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
+from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, silent_notes
+from lidardesign.scoring.scenes.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
+from lidardesign.sensors.compare import outside_notes
+from lidardesign.sensors.sensor import MOST_RAYS
+from lidardesign.simulate.plan import EffectPlan, Planner
+from lidardesign.task import Metric, Score, notes_of
+
+# A second cast from beside also finds what a ray just passes: of rays in all directions, 2 in a million (measured).
+OUTLINE_SHARE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """All entries under a planner's effects: by key their score in every scene, each with the time that it took [s];
+    a plan per scene, and the time to plan [s]."""
+
+    scores: Mapping[tuple[Any, ...], Sequence[tuple[Score, float]]]
+    plans: Sequence[EffectPlan]
+    planning_seconds: float
+    second_casts: SecondCasts
+
+
+def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Evaluation:
+    """Score every design and baseline on every held-out scene.
+
+    Arguments:
+        request: What to evaluate.
+        progress: Called with the name of the scene, the scenes done, and all scenes.
+
+    Raises:
+        ConfigError: No scenes, designs of one name, an unknown baseline, a layout that cannot be had, or an effect that
+            was named and cannot be simulated here.
+        PluginError: The task's score raised, or returned something that is no finite score.
+    """
+    request.check()
+    entries = entries_of(request)
+    passes = 1 + request.audit + (request.mount_error is not None)
+    scored = _score_all(request, entries, request.planner, _part(progress, 0, passes))
+    rows = _rows(request, entries, scored)
+    effects = effect_summaries(scored.plans)
+    audit = _audit(request, entries, rows, scored.plans, _part(progress, 1, passes)) if request.audit else None
+    last = _part(progress, passes - 1, passes)
+    mounting = request.mount_error and _mounting(request, request.mount_error, entries, rows, scored.plans, last)
+    searches = [entry.search for entry in entries if entry.search is not None]
+    plain = [row for row in rows if row.matched_to is None]
+    matched = [row for row in rows if row.matched_to is not None]
+    return Evaluation(
+        metric=request.metric,
+        scenes=len(request.test),
+        rows=plain,
+        paired=_pairs(plain, request.seed),
+        equal_bandwidth=matched,
+        paired_bandwidth=_bandwidth_pairs(plain, matched, request.seed),
+        notes=[
+            *_notes(request, entries, matched),
+            *worst_notes([*plain, *matched], request.metric),
+            *(search.note(request.designs[0].name, request.metric) for search in searches),
+            *slipped_notes(scored.second_casts),
+            *effect_notes(effects, request.planner.choice),
+        ],
+        detector=request.planner.detector.name,
+        effects=effects,
+        planning_seconds=scored.planning_seconds,
+        audit=audit,
+        mounting=mounting,
+        searches=searches,
+        strongest_rival=strongest_rival(request, entries, middle_rays(plain)),
+    )
+
+
+def _part(progress: Progress | None, number: int, passes: int) -> Progress | None:
+    if progress is None:
+        return None
+    return lambda name, done, total: progress(name, number * total + done, passes * total)
+
+
+@phase("audit")
+def _audit(
+    request: EvaluationRequest,
+    entries: Sequence[Entry],
+    rows: Sequence[Row],
+    plans: Sequence[EffectPlan],
+    progress: Progress | None,
+) -> Audit:
+    """The same entries under all effects that there are, with the same random numbers."""
+    planner = replace(request.planner, choice="all")
+    scored = _score_all(request, entries, planner, progress, [planner.chosen_from(plan) for plan in plans])
+    paired = list(zip(effect_summaries(plans), effect_summaries(scored.plans), strict=True))
+    metric = request.metric
+    return Audit(
+        metric.tolerance,
+        metric.unit,
+        audit_rows(rows, _rows(request, entries, scored), request.seed),
+        skipped=[planned.name for planned, every in paired if every.scenes_on > planned.scenes_on],
+        unavailable=[every.name for _, every in paired if every.missing is not None],
+    )
+
+
+@phase("mounting")
+def _mounting(
+    request: EvaluationRequest,
+    error: MountError,
+    entries: Sequence[Entry],
+    rows: Sequence[Row],
+    plans: Sequence[EffectPlan],
+    progress: Progress | None,
+) -> Mounting:
+    """The entries at equal rays with misplaced sensors, under the same effects, and what that costs them."""
+    careless = [
+        replace(entry, name=str(number), redraw=partial(_misplaced, error, entry, request.seed))
+        for number, entry in enumerate(entries)
+        if entry.matched_to is None
+    ]
+    scored = _score_all(request, careless, request.planner, progress, plans)
+    exact = [row for row in rows if row.matched_to is None]
+    found = [replace(row, design=own.design) for row, own in zip(_rows(request, careless, scored), exact, strict=True)]
+    return Mounting(error, found, [_pair(row, own, request.seed) for row, own in zip(found, exact, strict=True)])
+
+
+def _misplaced(error: MountError, entry: Entry, seed: int, scene: int) -> RaysPerCondition:
+    return error.misplaced(entry.drawn(scene), seed, scene)
+
+
+@phase("held-out scenes")
+def _score_all(
+    request: EvaluationRequest,
+    entries: Sequence[Entry],
+    planner: Planner,
+    progress: Progress | None,
+    known: Sequence[EffectPlan] = (),
+) -> _Scored:
+    """All scenes, here or by workers; plans that are known are not made again."""
+    jobs = {entry.key: entry for entry in entries}
+    scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in jobs.values()], planner, known)
+    scenes = request.scorer(scene_pass, progress)
+    of_entries = zip(*(scene.scores for scene in scenes), strict=True)
+    return _Scored(
+        dict(zip(jobs, of_entries, strict=True)),
+        [scene.plan for scene in scenes],
+        sum(scene.planning_seconds for scene in scenes),
+        sum((scene.second_casts for scene in scenes), SecondCasts()),
+    )
+
+
+@phase("intervals")
+def _rows(request: EvaluationRequest, entries: Sequence[Entry], scored: _Scored) -> list[Row]:
+    return [_row(request, entry, scored.scores[entry.key]) for entry in entries]
+
+
+def _row(request: EvaluationRequest, entry: Entry, scores: Sequence[tuple[Score, float]]) -> Row:
+    values = np.array([score.value for score, _ in scores])
+    groups = group_numbers(request.test)
+    mean, low, high = mean_interval(values, request.seed, groups)
+    # the mean of each further figure over the scenes that give it; figures that are not finite are left out
+    finite: dict[str, list[float]] = {}
+    for name, value in (item for score, _ in scores for item in score.details.items()):
+        finite.setdefault(name, []).extend([float(value)] * math.isfinite(value))
+    return Row(
+        design=entry.name,
+        rays=entry.rays,
+        value=mean,
+        ci_low=low,
+        ci_high=high,
+        failures=sum(score.failed for score, _ in scores),
+        bandwidth_mbps=entry.mbps(request.bandwidth),
+        seconds=sum(seconds for _, seconds in scores),
+        per_scene=values,
+        details={name: float(np.mean(values)) for name, values in finite.items() if values},
+        baseline=entry.baseline,
+        matched_to=entry.matched_to,
+        matched_rays=entry.matched_rays,
+        groups=groups,
+    )
+
+
+def _pair(first: Row, second: Row, seed: int, rays_b: int | None = None) -> Paired:
+    mean, low, high = paired_difference(first.per_scene, second.per_scene, seed, first.groups)
+    return Paired(first.design, second.design, first.rays, mean, low, high, rays_b)
+
+
+@phase("intervals")
+def _pairs(rows: Sequence[Row], seed: int) -> list[Paired]:
+    """Every design against every baseline and every later design, at equal numbers of rays."""
+    return [
+        _pair(row, other, seed)
+        for index, row in enumerate(rows)
+        if not row.baseline
+        for other in rows[index + 1 :]
+        if other.rays == row.rays and other.design != row.design
+    ]
+
+
+@phase("intervals")
+def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], seed: int) -> list[Paired]:
+    designs = {(row.design, row.rays): row for row in rows if not row.baseline}
+    return [_pair(designs[row.matched_to, row.matched_rays], row, seed, row.rays) for row in matched]
+
+
+def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequence[Row]) -> list[str]:
+    positions = max(len(entry.positions) for entry in entries)
+    notes = left_out(request.designs, request.rays, request.alone)
+    if positions > 1:
+        counted = f"rays and bandwidth count per position; every scene is seen from {positions} positions"
+        notes.append(BackgroundNote(counted))
+    notes += group_notes(request.test)
+    if GREEDY in request.baselines and request.greedy is not None:
+        notes += greedy_rays(request.task, positions, set(request.rays).difference(request.alone))[1]
+    with plugin_guard(request.task.name):
+        notes += notes_of(request.task, request.config, request.space)
+    for design in request.designs:
+        notes += outside_notes(design, request.space)
+    own = sorted((entry for entry in entries if not entry.baseline), key=lambda entry: entry.rays)
+    shared = [entry for entry in own if entry.rays not in request.alone]
+    # of each design the most rays, which come last
+    fired = {f"{entry.name!r}": entry.positions for entry in own}
+    notes += silent_notes(request.test, fired)
+    found = {(row.matched_to, row.matched_rays, row.design) for row in matched}
+    beyond = {
+        (entry.name, name)
+        for entry in shared
+        for name in request.baselines
+        if request.equal_bandwidth and name not in (CMA, GREEDY) and (entry.name, entry.rays, name) not in found
+    }
+    if beyond:
+        designs, names = (", ".join(sorted(set(column))) for column in zip(*beyond, strict=True))
+        notes.append(
+            f"more than {MOST_RAYS:,} rays of {names} fit in the bandwidth of {designs}: they are not compared at "
+            "equal bandwidth; the gates are far longer than what scenes return"
+        )
+    empty = [row for row in matched if row.rays == 0]
+    if empty:
+        names = ", ".join(sorted({row.design for row in empty}))
+        notes.append(f"at equal bandwidth not one ray of {names} fits in {len(empty)} rows, which fail in every scene")
+    return notes
+
+
+def group_notes(scenes: Sequence[Scene]) -> list[str]:
+    """What intervals are over, where that are not just the held-out scenes."""
+    groups = int(group_numbers(scenes).max()) + 1
+    if len(scenes) == 1:
+        return ["only one held-out scene, so there are no intervals"]
+    if groups == 1:
+        return [f"all {len(scenes)} held-out scenes are of one group, {scenes[0].group!r}: there are no intervals"]
+    if groups == len(scenes):
+        return []
+    of = f"the {len(scenes)} held-out scenes are of {groups} groups"
+    if groups >= FEWEST_RESAMPLED:
+        return [BackgroundNote(f"{of}, and intervals are over groups")]
+    return [f"{of}, too few for narrow intervals: they are Student's t intervals over groups"]
+
+
+def worst_notes(rows: Sequence[Row], metric: Metric) -> list[str]:
+    """How many scenes score the worst value: what they differ in beyond it is not seen.
+
+    The row that is named is a design's, if one of them has such scenes, and has the most of them; rows without rays
+    have a note of their own.
+    """
+    counts = [int(np.isclose(row.per_scene, metric.worst, rtol=ROUNDING, atol=0.0).sum()) for row in rows]
+    some = [(row, count) for row, count in zip(rows, counts, strict=True) if count and row.rays]
+    if not some:
+        return []
+    row, count = max(some, key=lambda one: (not one[0].baseline, one[1]))
+    note = f"{count} of {len(row.per_scene)} scenes of {row.design!r} at {row.rays} rays score the worst value, "
+    note += f"{metric.worst:g} {metric.unit}".rstrip()
+    if row.failures:
+        note += f" ({row.failures} failed)"
+    others = len(some) - 1
+    further = f"{others} other rows" if others > 1 else "another row"
+    note = f"{note}; so do some of {further}" if others else note
+    return [BackgroundNote(note) if row.baseline else note]
+
+
+def slipped_notes(casts: SecondCasts) -> list[str]:
+    """How many rays slipped between the triangles of meshes, where that are more than pass their outlines."""
+    if casts.found <= OUTLINE_SHARE * casts.rays:
+        return []
+    note = f"{casts.found:,} of {casts.rays:,} rays ({casts.found / casts.rays:.2%}) had slipped between triangles, as "
+    return [
+        BackgroundNote(
+            f"{note}happens at the vertices of a mesh; a second cast, slightly shifted, found what they meet"
+        )
+    ]

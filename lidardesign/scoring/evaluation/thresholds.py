@@ -1,0 +1,117 @@
+"""Thresholds of designs: no worse than a limit, better than a rival, and moved by no effect that was skipped.
+
+Each check raises a `ThresholdError`, with which commands exit 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from lidardesign.errors import ThresholdError
+from lidardesign.estimates import figure_and_interval
+from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, verdict
+
+
+def difference_text(pair: Paired, better: str, unit: str) -> str:
+    """A difference as a sentence: who is better by how much, or that no difference was found.
+
+    Arguments:
+        pair: The difference.
+        better: Of the metric, `lower` or `higher`.
+        unit: The metric's.
+    """
+    sign = 1.0 if pair.difference > 0 else -1.0
+    word = "better" if (sign < 0) == (better == "lower") else "worse"
+    ends = (None, None) if pair.ci_low is None or pair.ci_high is None else (sign * pair.ci_low, sign * pair.ci_high)
+    low, high = ends if None in ends else sorted(ends)
+    unit = "percentage points" if unit == "%" else unit
+    size, low_text, high_text = figure_and_interval(abs(pair.difference), low, high)
+    by = f"{size} {unit}".rstrip()
+    rays = f"at {pair.rays} rays" if pair.rays_b in (None, pair.rays) else f"at {pair.rays} and {pair.rays_b} rays"
+    none = f"no difference between {pair.a} and {pair.b} was found {rays}"
+    if low is None:
+        return f"{none} ({by} {word})"
+    if low > 0:
+        return f"{pair.a} is {word} than {pair.b} by {by} ({low_text} to {high_text}) {rays}"
+    return f"{none} ({by} {word}, {low_text} to {high_text})"
+
+
+def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:
+    """Rows of designs whose mean misses a limit in the metric's unit; baselines never count.
+
+    Where lower is better, a row misses the limit by lying above it; where higher is better, by lying below
+    it: `--fail-above` then reads as "fail where worse than". A value equal to the limit meets it.
+    """
+    sign = 1.0 if evaluation.metric.better == "lower" else -1.0
+    return [row for row in evaluation.rows if not row.baseline and sign * row.value > sign * limit]
+
+
+def check_limit(evaluation: Evaluation, limit: float) -> None:
+    """Refuse designs that are worse than a limit in the metric's unit.
+
+    Raises:
+        ThresholdError: One is, at one of the numbers of rays.
+    """
+    missed, unit = worse_than_threshold(evaluation, limit), evaluation.metric.unit
+    if missed:
+        bound = "at most" if evaluation.metric.better == "lower" else "at least"
+        rows = ", ".join(f"{row.design} at {row.rays} rays: {row.value:.4g} {unit}" for row in missed)
+        raise ThresholdError(rows, where="--fail-above", allowed=f"{bound} {limit:g} {unit}")
+
+
+def check_better(evaluation: Evaluation, name: str) -> None:
+    """Refuse designs that are not better than a baseline or another design, by the interval of the difference.
+
+    Arguments:
+        evaluation: The scores.
+        name: Of the baseline or design.
+
+    Raises:
+        ThresholdError: One is worse at one of its numbers of rays, no difference was found, or there is nothing to
+            compare it with.
+    """
+    turned = {(pair.b, pair.rays): _turned(pair) for pair in evaluation.paired if pair.a == name}
+    pairs = turned | {(pair.a, pair.rays): pair for pair in evaluation.paired if pair.b == name}
+    rows = [row for row in evaluation.rows if not row.baseline and row.design != name]
+    held = [(row, pairs.get((row.design, row.rays))) for row in rows]
+    missed = [(row, pair) for row, pair in held if pair is None or verdict(evaluation, pair) != "better"]
+    if not missed:
+        return
+    metric = evaluation.metric
+    said = [
+        f"{name} has no score at {row.rays} rays to compare {row.design} with"
+        if pair is None
+        else difference_text(pair, metric.better, metric.unit)
+        for row, pair in missed
+    ]
+    is_open = any(pair is not None and verdict(evaluation, pair) == "open" for _, pair in missed)
+    raise ThresholdError(
+        "; ".join(said),
+        where="--fail-unless-better",
+        allowed=f"better than {name} at every number of rays",
+        hint="score more held-out scenes, in which smaller differences are found" if is_open else None,
+    )
+
+
+def _turned(pair: Paired) -> Paired:
+    ends = (None, None) if pair.ci_low is None or pair.ci_high is None else (-pair.ci_high, -pair.ci_low)
+    return replace(pair, a=pair.b, b=pair.a, difference=-pair.difference, ci_low=ends[0], ci_high=ends[1])
+
+
+def check_audit(evaluation: Evaluation) -> None:
+    """Refuse an audit in which skipped effects change a row by more than the metric's tolerance.
+
+    Raises:
+        ThresholdError: They do.
+    """
+    audit = evaluation.audit
+    if audit is not None and audit.failed:
+        rows = ", ".join(f"{row.design} at {row.rays} rays by {abs(row.difference):.4g}" for row in audit.failed)
+        there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
+        raise ThresholdError(
+            f"skipped effects move {rows} {audit.unit}",
+            where="--effects audit",
+            allowed=f"at most {audit.tolerance:g} {audit.unit}, the metric's tolerance",
+            hint="--effects all, or a smaller --range-tolerance-mm or --return-tolerance; skipped: "
+            + ", ".join(name for name in audit.skipped if name in there),
+        )

@@ -1,0 +1,252 @@
+"""Held-out scenes scored by worker processes of this machine, or by the workers of a dask scheduler.
+
+A scene is sent with its rays, and is scored by the same function as in this process: the scores are the same for any
+number of workers. Rows' seconds are the workers' own, so they add up to more than the time that passed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import re
+import signal
+import sys
+import threading
+import types
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from itertools import islice
+from typing import Any
+
+from lidardesign import __version__
+from lidardesign.errors import ConfigError, LidardesignError, NumericalError, page
+from lidardesign.registry import distribution_of, load_task
+from lidardesign.run.clock import Progress
+from lidardesign.scoring.scenes.scene_scores import ScenePass, SceneScores, Scorer, score_here, score_in_scene
+from lidardesign.task import Task
+
+ADDRESS = re.compile(r"tcp://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
+MOST_PROCESSES = 1024
+OPTION = "--workers"
+# A scheduler that listens answers at once; workers of a batch system may still be waiting for their machines.
+SCHEDULER_SECONDS, WORKER_SECONDS = 10.0, 60.0
+SAME_HINT = "install the same versions of lidardesign and of the task for the scheduler and all workers"
+# Scenes beyond what runs, so that no worker waits for this process.
+AHEAD = 2
+_one_at_a_time = threading.Lock()
+
+
+def check_workers(text: str) -> int | str:
+    """The value of `--workers`: a number of processes, or the address of a scheduler.
+
+    Raises:
+        ConfigError: It is neither.
+    """
+    text = text.strip()
+    address = ADDRESS.fullmatch(text)
+    if address and 0 < int(address.group(2)) <= 65_535:
+        return text
+    if re.fullmatch("[0-9]{1,9}", text) and 1 <= int(text) <= MOST_PROCESSES:
+        return int(text)
+    allowed = f"a whole number from 1 to {MOST_PROCESSES}, or tcp://HOST:PORT of a dask scheduler"
+    raise ConfigError(f"{text!r}", where=OPTION, allowed=allowed)
+
+
+@contextlib.contextmanager
+def scorer_of(workers: int | str, task: Task, scenes: int) -> Iterator[Scorer]:
+    """The scorer of a number of processes, or of a scheduler's address; its processes end with the context.
+
+    Raises:
+        ConfigError: No scheduler answers, it has no workers, or the task is not the installed one of its name.
+        NumericalError: A worker died.
+    """
+    if isinstance(workers, int) and min(workers, scenes) == 1:
+        yield score_here
+        return
+    if type(load_task(task.name)) is not type(task):
+        raise ConfigError(
+            f"task {task.name} is not the installed task of this name",
+            where=OPTION,
+            hint="workers import a task by its entry point; without workers any task will do",
+        )
+    opened = _cluster(workers, task) if isinstance(workers, str) else _processes(min(workers, scenes))
+    with opened as (executor, threads):
+        yield partial(_score_by, executor, threads)
+
+
+def _score_by(
+    executor: Executor, threads: Callable[[], int], scenes: ScenePass, progress: Progress | None
+) -> list[SceneScores]:
+    """As `score_here`; answers are taken in the order of the scenes, so of several errors the first one is raised."""
+    total, found = len(scenes.scenes), list[SceneScores]()
+    numbers, waiting = iter(range(total)), deque[Future[SceneScores]]()
+    versions = _versions(scenes.task)
+    if progress:
+        progress(scenes.scenes[0].name, 0, total)
+    while len(found) < total:
+        for number in islice(numbers, max(threads() + AHEAD - len(waiting), 0)):
+            asked = (list(scenes.fired(number)), scenes.planner, scenes.known(number), scenes.seed)
+            scene = scenes.scenes[number]
+            waiting.append(executor.submit(_score_there, versions, scenes.task, scenes.metric, scene, *asked))
+        first = waiting.popleft()
+        while not wait([first], WORKER_SECONDS).done:
+            threads()
+        found.append(first.result())
+        if progress:
+            progress(scenes.scenes[len(found) - 1].name, len(found), total)
+    return found
+
+
+def _score_there(versions: str, task: Task, *asked: Any) -> SceneScores:
+    """A scene's scores, in a worker, whose threads take turns: tasks need not be safe to be called twice at a time."""
+    _check_versions(versions, task)
+    with _one_at_a_time:
+        return score_in_scene(task, *asked)
+
+
+def _versions(task: Task) -> str:
+    """Of this program and of a task's package."""
+    return f"lidardesign {__version__} with {distribution_of(task.name) or 'no such task'}"
+
+
+def _check_versions(wanted: str, task: Task) -> None:
+    if _versions(task) != wanted:
+        raise ConfigError(f"the cluster has {_versions(task)}", where=OPTION, allowed=wanted, hint=SAME_HINT)
+
+
+@contextlib.contextmanager
+def _processes(count: int) -> Iterator[tuple[Executor, Callable[[], int]]]:
+    """Worker processes of this machine, all started at once and killed at the end, whatever they are doing."""
+    others = multiprocessing.active_children()
+    executor = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_end_with_parent)
+    try:
+        with _undisturbed():
+            for _ in range(count):
+                # a process is started where none is idle, and none is before it is up
+                executor.submit(os.getpid)
+        yield executor, lambda: count
+    except BlockingIOError as error:
+        raise ConfigError(f"{count} processes could not be started: {error.strerror}", where=OPTION) from error
+    except BrokenProcessPool as error:
+        raise NumericalError(
+            "a worker process died",
+            where=OPTION,
+            hint="memory is the usual cause, and fewer workers need less; --workers 1 needs no second process",
+        ) from error
+    finally:
+        for process in multiprocessing.active_children():
+            if process not in others:
+                process.kill()
+        executor.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """Let a worker end at once where the process that asks has gone, in the middle of a scene too."""
+
+    def watch() -> None:
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Processes started in here never see a terminal's Ctrl-C, and do not run the user's script again."""
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        sys.modules["__main__"] = script
+
+
+@contextlib.contextmanager
+def _cluster(address: str, task: Task) -> Iterator[tuple[Executor, Callable[[], int]]]:
+    """The workers of a scheduler that is running already; it hands scenes of lost workers to others.
+
+    What dask.distributed would log about lost connections is left to the errors that are raised.
+    """
+    try:
+        with warnings.catch_warnings():
+            # packages announce their own removals
+            warnings.simplefilter("ignore")
+            from distributed import Client, KilledWorker
+    except ImportError:
+        raise ConfigError(
+            "workers of a cluster need dask.distributed, which is not installed",
+            where=OPTION,
+            hint="pip install 'lidardesign[cluster]'",
+        ) from None
+    hint = f"{page('cluster.md')} has the commands that start a scheduler and its workers"
+    logger = logging.getLogger("distributed")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    with contextlib.ExitStack() as opened:
+        opened.callback(logger.setLevel, level)
+        opened.enter_context(warnings.catch_warnings())
+        # many rays make a long message, which the work on them outweighs
+        warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
+        try:
+            client = _answered(lambda: Client(address, timeout=SCHEDULER_SECONDS, set_as_default=False))
+        except (OSError, ValueError) as error:
+            why = " ".join(str(error).split()) or "something listens there, but it is not a dask scheduler"
+            raise ConfigError(f"no scheduler answers at {address}: {why}", where=OPTION, hint=hint) from None
+        opened.callback(client.close)
+
+        def threads() -> int:
+            client.wait_for_workers(1, timeout=WORKER_SECONDS)
+            return sum(client.nthreads().values())
+
+        try:
+            threads()
+            _check_cluster(client, task)
+            yield client.get_executor(pure=False), threads
+        except KilledWorker as error:
+            why = "the workers of a scene died, one after the other"
+            raise NumericalError(why, where=OPTION, hint="their logs say why; memory is the usual cause") from error
+        except TimeoutError as error:
+            why = f"the scheduler at {address} had no worker within {WORKER_SECONDS:g} s"
+            raise ConfigError(why, where=OPTION, hint=hint) from error
+        except (CancelledError, OSError) as error:
+            raise ConfigError(f"the scheduler at {address} was lost", where=OPTION, hint=hint) from error
+
+
+def _check_cluster(client: Any, task: Task) -> None:
+    """Refuse a scheduler or workers without these versions: they would only die of what they are sent."""
+    try:
+        for ask in (client.run_on_scheduler, client.run):
+            ask(_check_versions, _versions(task), task)
+    except LidardesignError:
+        raise
+    except Exception as error:
+        # an ImportError, in whatever dask makes of it
+        raise ConfigError(f"the cluster cannot run this program: {error}", where=OPTION, hint=SAME_HINT) from error
+
+
+def _answered(connect: Callable[[], Any]) -> Any:
+    """The result of a connection; the client itself waits for ever where something else than a scheduler listens.
+
+    Raises:
+        TimeoutError: Nothing came of it.
+    """
+    answer: Future[Any] = Future()
+
+    def work() -> None:
+        try:
+            answer.set_result(connect())
+        except Exception as error:
+            # raised where it was asked for
+            answer.set_exception(error)
+
+    threading.Thread(target=work, daemon=True).start()
+    # its own time comes first where nothing listens
+    return answer.result(1.5 * SCHEDULER_SECONDS)

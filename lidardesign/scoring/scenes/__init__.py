@@ -1,0 +1,1 @@
+"""What one set of rays is worth in one scene, and intervals over scenes."""

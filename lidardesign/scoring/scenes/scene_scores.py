@@ -1,0 +1,266 @@
+"""Scores of many sets of rays in every scene, each scene under the effects that it calls for.
+
+A scene is the unit of work: all its rays are planned and traced together, and what comes of it depends on nothing
+else. So scenes can be scored one after the other here, or by workers (`lidardesign.scoring.evaluation.workers`), to the same
+numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidardesign.errors import PluginError
+from lidardesign.registry import plugin_guard
+from lidardesign.run.clock import Progress, phase
+from lidardesign.scenes.casting import SceneCaster
+from lidardesign.scenes.rays import Rays, Returns
+from lidardesign.scenes.scene import Scene
+from lidardesign.scenes.triangles import SecondCasts
+from lidardesign.simulate.detector.physics import Physics
+from lidardesign.simulate.plan import EffectPlan, Planner
+from lidardesign.simulate.returns import build_casters, simulate_many
+from lidardesign.task import Metric, Score, Task
+
+RaysPerCondition = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
+# Rays times frames that are traced together: their returns take 24 bytes each.
+MOST_RETURNS = 4_000_000
+# So many scenes and frames show whether targets return anything; a larger share of them in which nothing does is told.
+WATCHED, MOST_SILENT = 16, 0.5
+
+
+def score_lists(
+    task: Task,
+    metric: Metric,
+    scene: Scene,
+    jobs: Sequence[RaysPerCondition],
+    casters: Sequence[SceneCaster],
+    physics: Physics | None = None,
+) -> Iterator[tuple[Score, float]]:
+    """Scores of many sets of rays in one scene, in their order, each with its share of the time [s].
+
+    As many are traced together as a bounded memory allows. Chance is the same for all sets and another one at each
+    position.
+
+    Arguments:
+        task: Whose score is taken.
+        metric: What it means.
+        scene: The scene.
+        jobs: The sets of rays.
+        casters: One per frame.
+        physics: The detector and the effects that are on; None: geometry alone.
+    """
+    for group in _groups(jobs, scene.frames):
+        started = time.perf_counter()
+        lists = [rays for positions in group for rays in positions]
+        found = iter(
+            simulate_many(
+                scene,
+                lists,
+                casters=casters,
+                physics=physics,
+                repeats=[number for positions in group for number in range(len(positions))],
+            )
+        )
+        rays = sum(_count(positions) for positions in group)
+        per_ray = (time.perf_counter() - started) / max(rays, 1)
+        for positions in group:
+            returns = [frame for _ in positions for frame in next(found)]
+            started = time.perf_counter()
+            score = checked_score(task, metric, scene, returns)
+            yield score, time.perf_counter() - started + per_ray * _count(positions)
+
+
+def _count(positions: RaysPerCondition) -> int:
+    return sum(len(rays) for rays in positions)
+
+
+def _groups(jobs: Sequence[RaysPerCondition], frames: int) -> Iterator[list[RaysPerCondition]]:
+    group: list[RaysPerCondition] = []
+    size = 0
+    for positions in jobs:
+        returns = _count(positions) * frames
+        if group and size + returns > MOST_RETURNS:
+            yield group
+            group, size = [], 0
+        group.append(positions)
+        size += returns
+    if group:
+        yield group
+
+
+@phase("metric")
+def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
+    """What a task makes of returns in a scene; a failure has the metric's worst value.
+
+    A value beyond the worst one counts as the worst, so that failing is never the better choice.
+
+    Raises:
+        PluginError: The task's score raised, or returned something that is no finite score.
+    """
+    where = f"task {task.name}, metric {metric.name}, scene {scene.name}"
+    try:
+        with plugin_guard(task.name):
+            score = task.score(scene, returns)
+    except PluginError as error:
+        raise PluginError(f"scoring failed: {error.message}", where=where, hint=error.hint) from error
+    if not isinstance(score, Score):
+        raise PluginError(f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score")
+    if not isinstance(score.details, Mapping) or not all(isinstance(name, str) for name in score.details):
+        raise PluginError(
+            f"score returned the details {score.details!r}", where=where, allowed="numbers by name, as {'seen': 3.0}"
+        )
+    bad = [name for name, value in score.details.items() if not _is_number(value)]
+    if bad:
+        raise PluginError(
+            f"score returned the detail {bad[0]!r}: {score.details[bad[0]]!r}", where=where, allowed="a number"
+        )
+    if score.failed:
+        return Score(float(metric.worst), failed=True, details=dict(score.details))
+    if not _is_number(score.value) or not math.isfinite(score.value):
+        raise PluginError(
+            f"score returned {score.value!r}",
+            where=where,
+            allowed="a finite number",
+            hint="where there are too few returns, return Score(metric.worst, failed=True)",
+        )
+    clip = min if metric.better == "lower" else max
+    return Score(clip(float(score.value), float(metric.worst)), details=dict(score.details))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def silent_notes(scenes: Sequence[Scene], fired: Mapping[str, RaysPerCondition]) -> list[str]:
+    """Which sets of rays have no return from any target in most of a few scenes and frames.
+
+    Arguments:
+        scenes: The scenes, of which some are looked at, without effects.
+        fired: The rays of each set, from all its positions, by what it is called.
+    """
+    frames = [(scene, frame) for scene in scenes for frame in range(scene.frames)]
+    watched = [frames[number] for number in np.unique(np.linspace(0, len(frames) - 1, WATCHED).astype(int))]
+    casters = [SceneCaster(scene, frame) for scene, frame in watched]
+    notes = []
+    for name, positions in fired.items():
+        rays = Rays.joined(positions)
+        silent = 0
+        for (scene, _), caster in zip(watched, casters, strict=True):
+            hits = caster.first_hit(rays.origin_m, rays.direction)
+            is_target = np.array([body.is_target for body in scene.bodies])
+            in_gate = (rays.gate_m[:, 0] <= hits.range_m) & (hits.range_m < rays.gate_m[:, 1])
+            silent += not (in_gate & (hits.body >= 0) & is_target[hits.body]).any()
+        if silent > MOST_SILENT * len(watched):
+            notes.append(
+                f"in {silent} of {len(watched)} frames that were checked, no ray of {name} returns from a target; "
+                "where that is not expected, check that its places, directions and gates are right, and in metres"
+            )
+    return notes
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePass:
+    """Sets of rays to be scored in all held-out scenes.
+
+    Arguments:
+        task: Whose score is taken.
+        metric: What it means.
+        seed: Root of the effects' random streams.
+        scenes: The held-out scenes.
+        fired: The sets of rays that are fired in a scene, by its number.
+        planner: How their effects are chosen.
+        plans: The plan of every scene where it is known already; empty: they are made.
+    """
+
+    task: Task
+    metric: Metric
+    seed: int
+    scenes: Sequence[Scene]
+    fired: Callable[[int], Sequence[RaysPerCondition]]
+    planner: Planner
+    plans: Sequence[EffectPlan] = ()
+
+    def known(self, number: int) -> EffectPlan | None:
+        """The plan of a scene, if it is known."""
+        return self.plans[number] if self.plans else None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneScores:
+    """What came of a scene.
+
+    Arguments:
+        plan: What was simulated.
+        planning_seconds: Time to find that out [s].
+        scores: Of every set of rays, in their order, each with its share of the time [s].
+        second_casts: How often meshes had to be asked twice, in planning too.
+    """
+
+    plan: EffectPlan
+    planning_seconds: float
+    scores: Sequence[tuple[Score, float]]
+    second_casts: SecondCasts = field(default_factory=SecondCasts)
+
+
+# Scores all held-out scenes of a pass, in their order.
+Scorer = Callable[[ScenePass, Progress | None], Sequence[SceneScores]]
+
+
+def score_here(scenes: ScenePass, progress: Progress | None) -> list[SceneScores]:
+    """Score scene by scene in this process, so that only one scene's casters are held at a time.
+
+    Arguments:
+        scenes: The scenes, what is fired there, and under which effects.
+        progress: Called with the name of the scene, the scenes done, and all scenes.
+    """
+    found = []
+    total = len(scenes.scenes)
+    for number, scene in enumerate(scenes.scenes):
+        if progress:
+            progress(scene.name, number, total)
+        sets, known = scenes.fired(number), scenes.known(number)
+        found.append(score_in_scene(scenes.task, scenes.metric, scene, sets, scenes.planner, known, scenes.seed))
+    if progress:
+        progress("", total, total)
+    return found
+
+
+def score_in_scene(
+    task: Task,
+    metric: Metric,
+    scene: Scene,
+    lists: Sequence[RaysPerCondition],
+    planner: Planner,
+    known: EffectPlan | None,
+    seed: int,
+) -> SceneScores:
+    """Score sets of rays in one scene.
+
+    Arguments:
+        task: Whose score is taken.
+        metric: What it means.
+        scene: The scene.
+        lists: The sets of rays.
+        planner: How effects are chosen.
+        known: The plan; None makes it for all the rays together.
+        seed: Root of the effects' random streams.
+
+    Raises:
+        ConfigError: An effect that was named cannot be simulated here, or a gate lies outside the histogram.
+        PluginError: The task's score raised, or returned something that is no finite score.
+    """
+    casters = build_casters(scene)
+    started = time.perf_counter()
+    plan = known or planner.plan(scene, [rays for positions in lists for rays in positions], casters)
+    seconds = time.perf_counter() - started
+    return SceneScores(
+        plan,
+        seconds,
+        list(score_lists(task, metric, scene, lists, casters, planner.physics(plan, seed))),
+        sum((caster.second_casts for caster in casters), SecondCasts()),
+    )

@@ -1,0 +1,1 @@
+"""Sensors, the designs that they make up, and the files of designs."""

@@ -1,0 +1,181 @@
+"""Two designs beside each other, sensor by sensor; what a design costs to read out; and whether it fits a space at all.
+
+Sensors of the same names are compared by name; otherwise each sensor of one design with one of the other so that all
+differences together are smallest, where a metre of place and of gate counts as much as a radian at the designs' range.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidardesign.layouts.layout import shares_of
+from lidardesign.layouts.rays import layout_of
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.space import RANGE, DesignSpace, angles
+
+RIGHT_ANGLE_M = 1.0
+# How far a rig of others may stand beside a space, in sizes of it: the diagonal of its box of origins and its reach.
+FAR_SIZES = 10.0
+MODEL_KEYS = ("bin_ps", "bits_per_bin", "rate_hz")
+
+
+@dataclass(frozen=True, eq=False)
+class SensorPair:
+    """Two sensors that stand for one another; one is None where the other design has more.
+
+    Arguments:
+        first, second: Of the first and the second design.
+    """
+
+    first: Sensor | None
+    second: Sensor | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Names and the differences, second minus first: metres, degrees and shares; None for a sensor left over."""
+        named = {"a": self.first.name if self.first else None, "b": self.second.name if self.second else None}
+        if self.first is None or self.second is None:
+            return {**named, "difference": None}
+        first, second = self.first, self.second
+        fields = np.degrees(np.subtract(second.field_of_view_rad, first.field_of_view_rad))
+        gates = np.subtract(second.gate_m, first.gate_m)
+        return {
+            **named,
+            "difference": {
+                "place_m": float(np.linalg.norm(second.origin_m - first.origin_m)),
+                "boresight_deg": math.degrees(angle_between(first.boresight, second.boresight)),
+                "roll_deg": math.degrees(math.remainder(second.roll_rad - first.roll_rad, math.tau)),
+                "horizontal_deg": float(fields[0]),
+                "vertical_deg": float(fields[1]),
+                "gate_start_m": float(gates[0]),
+                "gate_end_m": float(gates[1]),
+                "weight": second.weight - first.weight,
+                "rays": None if first.rays is None or second.rays is None else second.rays - first.rays,
+            },
+        }
+
+
+def angle_between(first: np.ndarray, second: np.ndarray) -> float:
+    """The angle of two unit vectors (3,), exact for the smallest too [rad]."""
+    return 2 * math.atan2(float(np.linalg.norm(first - second)), float(np.linalg.norm(first + second)))
+
+
+def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[SensorPair]:
+    """The sensors of two designs in pairs, in the order of the first; those left over at the end."""
+    by_name = {sensor.name: sensor for sensor in second.sensors}
+    if {sensor.name for sensor in first.sensors} == set(by_name):
+        return [SensorPair(sensor, by_name[sensor.name]) for sensor in first.sensors]
+    from scipy.optimize import linear_sum_assignment
+
+    range_m = float(np.mean([sensor.range_m for sensor in (*first.sensors, *second.sensors)])) or RIGHT_ANGLE_M
+    one, other = (
+        {
+            "place": np.array([sensor.origin_m for sensor in design.sensors]),
+            "look": range_m * np.array([sensor.boresight for sensor in design.sensors]),
+            "gate": np.array([sensor.gate_m for sensor in design.sensors]),
+            "field": range_m * np.array([sensor.field_of_view_rad for sensor in design.sensors]),
+        }
+        for design in (first, second)
+    )
+    # how different each sensor of one design is from each of the other, shape (G, H) [m]
+    distances_m = sum(np.linalg.norm(one[key][:, None] - other[key][None], axis=2) for key in one)
+    rows, columns = linear_sum_assignment(distances_m)
+    pairs = [SensorPair(first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)]
+    pairs += [SensorPair(sensor, None) for index, sensor in enumerate(first.sensors) if index not in rows]
+    return pairs + [SensorPair(None, sensor) for index, sensor in enumerate(second.sensors) if index not in columns]
+
+
+@dataclass(frozen=True)
+class BandwidthUse:
+    """The bandwidth of a design.
+
+    Arguments:
+        model: The read-out: that of the design's own budget.
+        low_mbps, high_mbps: Least and most over the knots of a track, else the same [Mbit/s]; of one ray where the
+            design leaves its rays open.
+        rays: Rays per frame; None where they are open.
+    """
+
+    model: Bandwidth
+    low_mbps: float
+    high_mbps: float
+    rays: int | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for scripts."""
+        model = {name: getattr(self.model, name) for name in MODEL_KEYS}
+        rays = {"rays": self.rays, "of_one_ray": self.rays is None}
+        return {"low_mbps": self.low_mbps, "high_mbps": self.high_mbps, **rays, **model}
+
+
+def readout_of(design: DesignSpec) -> BandwidthUse:
+    """What a design's gates cost, by the read-out of its own constraints or the usual one."""
+    budget = design.constraints.get("budget") or {}
+    model = Bandwidth(**{name: float(budget[name]) for name in MODEL_KEYS if budget.get(name) is not None})
+    track = design.track
+    if track is not None:
+        widths = track.gate_m[..., 1] - track.gate_m[..., 0]
+        found = [model.mbps_of_widths(row) for row in widths]
+        return BandwidthUse(model, min(found), max(found), len(track.sensor))
+    if design.ray_table is not None:
+        once = model.mbps(design.ray_table)
+        return BandwidthUse(model, once, once, len(design.ray_table))
+    widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in design.sensors])
+    count = layout_of(design).own_count(design)
+    if count is None:
+        once = float(design.weights @ np.array([model.mbps_of_widths(width) for width in widths]))
+    else:
+        once = model.mbps_of_widths(widths, shares_of(design, count))
+    return BandwidthUse(model, once, once, count)
+
+
+def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
+    """What is said of a design far outside a design space, one line at most.
+
+    Arguments:
+        design: Its sensors' mean origins and gates, and its rays' where it has a table of them.
+        space: The design space of the run that it is scored in.
+    """
+    low, high = np.array(space.low[:3]), np.array(space.high[:3])
+    size_m = float(np.linalg.norm(high - low)) + space.high[RANGE]
+    origins_m = np.array([sensor.origin_m for sensor in design.sensors]).reshape(-1, 3)
+    starts_m = np.array([sensor.gate_m[0] for sensor in design.sensors])
+    if design.ray_table is not None:
+        origins_m = np.concatenate([origins_m, design.ray_table.origin_m])
+        starts_m = np.concatenate([starts_m, design.ray_table.gate_m[:, 0]])
+    unit = "are its lengths in millimetres?"
+    apart_m = np.linalg.norm(np.maximum(np.maximum(origins_m - high, low - origins_m), 0.0), axis=1)
+    if len(apart_m) and apart_m.max() > FAR_SIZES * size_m:
+        return [f"{design.name} stands {apart_m.max():.4g} m outside the run's design space; {unit}"]
+    if len(starts_m) and starts_m.max() > FAR_SIZES * size_m:
+        return [
+            f"{design.name} listens from {starts_m.max():.4g} m on, and the run's design space ends at "
+            f"{space.high[RANGE]:.4g} m; {unit}"
+        ]
+    return []
+
+
+def outside_space(design: DesignSpec, space: DesignSpace) -> str:
+    """How much of a design lies outside a design space, as "3 of 361 rays ... outside"; nothing where all is inside.
+
+    Arguments:
+        design: Its rays where it has a table of them, else its sensors' mean origins, boresights and gates.
+        space: The design space that it is scored in; along its conditions designs are moved.
+    """
+    table, sensors = design.ray_table, design.sensors
+    if table is not None:
+        what, origins_m, directions, gates_m = "rays", table.origin_m, table.direction, table.gate_m
+    else:
+        what, origins_m = "sensors", np.array([sensor.origin_m for sensor in sensors]).reshape(-1, 3)
+        directions = np.array([sensor.boresight for sensor in sensors]).reshape(-1, 3)
+        gates_m = np.array([sensor.gate_m for sensor in sensors]).reshape(-1, 2)
+    # what a gate hears inside the space, if anything
+    range_m = np.clip((space.low[RANGE] + space.high[RANGE]) / 2, gates_m[:, 0], gates_m[:, 1])
+    points = np.column_stack([origins_m, *angles(directions), range_m])
+    points[:, space.conditioned] = np.array(space.low)[list(space.conditioned)]
+    outside = int((~space.contains(points)).sum())
+    return f"{outside} of {len(points)} {what} start, point or listen outside" if outside else ""

@@ -1,0 +1,229 @@
+"""What a list of rays returns in a scene: exact first hits, or what a detector makes of them where effects are on.
+
+Rays are traced from the sensor, not from the start of the gate, so whatever stands between the sensor and the
+gate hides what is behind it.
+
+With effects, light is followed in the order in which it travels: beams leave (`footprint`), meet what stands or moves
+there (`motion`), come back from it directly and by detours (`specular`, `multipath`), to a receiver that may stand
+elsewhere (`shadowing`), weakened by the air (`atmosphere`); then photons are counted and timed (`detection`). Each
+effect is one module of `simulate.effects`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.run.clock import phase
+from lidardesign.scenes.casting import SceneCaster, checked_rays
+from lidardesign.scenes.rays import Hits, Outcome, Rays, Returns, gate_outcomes
+from lidardesign.scenes.receivers import path_windows, range_of_path
+from lidardesign.scenes.scene import Scene
+from lidardesign.simulate.detector.light import Background, Beams, Echoes, direct_echoes
+from lidardesign.simulate.detector.physics import Physics, check_windows
+from lidardesign.simulate.effects.ambient import add_ambient
+from lidardesign.simulate.effects.atmosphere import through_air
+from lidardesign.simulate.effects.footprint import split_beams
+from lidardesign.simulate.effects.motion import moving_tracer, still_tracer
+from lidardesign.simulate.effects.multipath import interreflections
+from lidardesign.simulate.effects.shadowing import visible_echoes
+from lidardesign.simulate.effects.specular import detours
+
+
+def simulate(
+    scene: Scene, rays: Rays, *, casters: Sequence[SceneCaster] | None = None, physics: Physics | None = None
+) -> list[Returns]:
+    """The returns of rays in every time frame of a scene.
+
+    Arguments:
+        scene: What the rays meet; targets and occluders both stop them.
+        rays: The rays, fired anew in each frame, N of them.
+        casters: One caster per frame, as `build_casters` makes them; None builds them here.
+        physics: A detector and the effects that are on; None, or none on: geometry alone.
+
+    Returns:
+        One `Returns` per frame, each with N outcomes.
+
+    Raises:
+        ConfigError: The number of casters is not the scene's number of frames.
+    """
+    return simulate_many(scene, [rays], casters=casters, physics=physics)[0]
+
+
+@phase("tracing")
+def simulate_many(
+    scene: Scene,
+    lists: Sequence[Rays],
+    *,
+    casters: Sequence[SceneCaster] | None = None,
+    physics: Physics | None = None,
+    repeats: Sequence[int] | None = None,
+) -> list[list[Returns]]:
+    """The returns of several lists of rays in every time frame of a scene, each as `simulate` gives them.
+
+    All lists are traced together: over many frames, most of the time of short lists goes into the calls.
+
+    Arguments:
+        scene: What the rays meet; targets and occluders both stop them.
+        lists: Lists of rays, each fired anew in each frame.
+        casters: One caster per frame; None builds them here.
+        physics: A detector and the effects that are on; each list shares the emitter's energy among its own rays.
+        repeats: For each list, the `Physics.repeat` that its random numbers are of; None: the same for all lists.
+
+    Returns:
+        For each list, one `Returns` per frame.
+
+    Raises:
+        ConfigError: The number of casters is not the scene's number of frames.
+    """
+    casters = build_casters(scene) if casters is None else casters
+    if len(casters) != scene.frames:
+        raise ConfigError(f"{len(casters)} casters", where=f"scene {scene.name}", allowed=f"{scene.frames}")
+    if not lists:
+        return []
+    if physics is not None and physics.effects:
+        each = [physics if repeats is None else replace(physics, repeat=repeats[i]) for i in range(len(lists))]
+        return [
+            [measure(scene, frame, rays, caster, chance) for frame, caster in enumerate(casters)]
+            for rays, chance in zip(lists, each, strict=True)
+        ]
+    ends = np.cumsum([len(rays) for rays in lists])
+    origins, directions, gate_m = (
+        np.concatenate([getattr(rays, name) for rays in lists]) for name in ("origin_m", "direction", "gate_m")
+    )
+    found: list[list[Returns]] = [[] for _ in lists]
+    origins, directions = checked_rays(origins, directions)
+    for frame, caster in enumerate(casters):
+        hits = caster.first_hit_of_checked(origins, directions)
+        outcome = gate_outcomes(hits.range_m, gate_m)
+        returned = outcome == Outcome.RETURN
+        columns = (outcome, np.where(returned, hits.range_m, np.nan), np.where(returned, hits.body, -1))
+        for mine, rays, end in zip(found, lists, ends, strict=True):
+            rows = slice(end - len(rays), end)
+            # copies: a view would keep all the lists' returns alive with it
+            mine.append(Returns(rays, *(column[rows].copy() for column in columns), frame=frame))
+    return found
+
+
+@phase("casters")
+def build_casters(scene: Scene) -> list[SceneCaster]:
+    """One caster per time frame of a scene, to be shared by all designs that are simulated in it."""
+    return [SceneCaster(scene, frame) for frame in range(scene.frames)]
+
+
+def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: Physics) -> Returns:
+    """What a detector reports of rays in a frame of a scene.
+
+    Arguments:
+        scene: What the rays meet.
+        frame: The time frame.
+        rays: The rays that share the emitter's energy, N of them.
+        caster: Of this frame.
+        physics: The detector and at least one effect.
+    """
+    # it loads compiled loops, which geometry alone does without
+    from lidardesign.simulate.detection import detect
+
+    light = followed_light(scene, frame, rays, caster, physics)
+    found = detect(scene, frame, light.windows_m, light.echoes, light.background, physics)
+    # rays without a return keep the outcome of their geometry, or were not detected
+    first = np.full(len(rays), np.inf)
+    np.minimum.at(first, light.beams.ray, light.hits.range_m)
+    outcome = gate_outcomes(first, rays.gate_m)
+    outcome[outcome == Outcome.RETURN] = Outcome.NOT_DETECTED
+    range_m = range_of_path(rays, scene.receiver, found.path_m)
+    detected = np.isfinite(range_m)
+    outcome[detected] = Outcome.RETURN
+    return Returns(rays, outcome, range_m, np.where(detected, found.body, -1), frame=frame)
+
+
+class FollowedLight(NamedTuple):
+    """What arrives of rays' light, before anything is detected."""
+
+    beams: Beams
+    hits: Hits
+    windows_m: np.ndarray
+    echoes: Echoes
+    background: Background
+
+
+def followed_light(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: Physics) -> FollowedLight:
+    """The light of rays on its way out and back, as far as the effects that are on lead it; see `measure`."""
+    effects, detector = physics.effects, physics.detector
+    tracer = moving_tracer(scene, frame) if "motion" in effects else still_tracer(caster)
+    beams = Beams.of(rays)
+    if "footprint" in effects:
+        beams = split_beams(beams, detector)
+    hits = tracer(beams.origin_m, beams.direction, beams.time_s)
+    echoes = direct_echoes(scene, beams, hits)
+    if "shadowing" in effects and scene.receiver is not None:
+        echoes = visible_echoes(scene, beams, hits, echoes, tracer)
+    if "specular" in effects:
+        echoes = Echoes.joined([echoes, detours(scene, beams, hits, tracer)])
+    if "multipath" in effects:
+        echoes = Echoes.joined([echoes, interreflections(scene, frame, rays, physics)])
+    windows_m = path_windows(rays, scene.receiver)
+    background = Background(np.zeros(len(rays)))
+    if "atmosphere" in effects:
+        echoes, background = through_air(scene, rays, beams, hits, windows_m, echoes, detector, background)
+    if "ambient" in effects:
+        background = add_ambient(scene, rays, beams, hits, detector, background)
+    return FollowedLight(beams, hits, windows_m, echoes, background)
+
+
+@dataclass(frozen=True, eq=False)
+class PhotonHistograms:
+    """Counts over time of N rays.
+
+    Arguments:
+        start_m: Where each ray's first bin starts, as half the whole path, shape (N,) [m]. The first and the last bin
+            hold only what lies within the ray's gate.
+        width_m: Of a bin, in half paths [m].
+        number: How many bins each ray has, shape (N,).
+        counts: Photons counted per bin, zero beyond a ray's own bins, shape (N, most bins).
+        pulses: How many pulses each ray got.
+    """
+
+    start_m: np.ndarray
+    width_m: float
+    number: np.ndarray
+    counts: np.ndarray
+    pulses: float
+
+
+def photon_histograms(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: Physics) -> PhotonHistograms:
+    """The histograms that `simulate` finds the returns of rays in, with the same random numbers.
+
+    Arguments:
+        scene: What the rays meet.
+        frame: The time frame.
+        rays: The rays that share the emitter's energy, N of them.
+        caster: Of this frame.
+        physics: A detector that counts photons, and the effects that are on.
+
+    Raises:
+        ConfigError: The detector counts no photons, or its histogram does not cover a gate.
+    """
+    # it loads compiled loops, which geometry alone does without
+    from lidardesign.simulate.detection import ArrivingLight, count_photons
+
+    detector = physics.detector
+    if detector.photons is None:
+        raise ConfigError(
+            f"the detector {detector.name!r} counts no photons",
+            where="--detector",
+            allowed="one with a light budget, as single-photon",
+        )
+    light = followed_light(scene, frame, rays, caster, physics)
+    check_windows(light.windows_m, detector)
+    whole = ArrivingLight.of(light.windows_m, light.echoes, light.background, physics)
+    number = np.diff(whole.bins.offset)
+    counts = np.zeros((len(rays), number.max(initial=0)), np.int64)
+    for begin, end in whole.bins.chunks():
+        filled = np.arange(counts.shape[1]) < number[begin:end, None]
+        counts[begin:end][filled] = count_photons(scene, frame, whole.part(begin, end), physics)
+    return PhotonHistograms(whole.bins.first_m, whole.bins.width_m, number, counts, whole.pulses)
