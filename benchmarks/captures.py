@@ -33,7 +33,7 @@ def add_head(figures: Figures, scene: Any, run: Any, designs: Sequence[Path], op
 
     from lidardesign.formats.galvo import read_galvo, write_galvo
     from lidardesign.layouts.rays import lay_out
-    from lidardesign.sensors.design_file import load_design
+    from lidardesign.formats.designs import load_design
 
     detector = laboratory.load_detector(options.detector)
     laboratory.write_mesh(scene, folder / "head.ply")
@@ -101,7 +101,7 @@ def tour_rows(designs: Sequence[Path], rounds: int) -> list[list[object]]:
 
     from lidardesign.formats.galvo import plan, travel
     from lidardesign.layouts.rays import lay_out
-    from lidardesign.sensors.design_file import load_design
+    from lidardesign.formats.designs import load_design
 
     rows = []
     for path in designs:

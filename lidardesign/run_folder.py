@@ -5,23 +5,20 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.config import RunConfig, load_run_config
-from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.errors import LidardesignError
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.files import sha256_file
 from lidardesign.run.inputs import MESH
-from lidardesign.run.manifest import changed_since_recorded, read_manifest
+from lidardesign.run.manifest import read_manifest
 from lidardesign.scenes.scene import Scene
-from lidardesign.sensors.design_file import load_design
-from lidardesign.sensors.sensor import DesignSpec
-from lidardesign.space import RANGE, DesignSpace
+from lidardesign.space import DesignSpace
 from lidardesign.task import FolderConfig, Metric, Split, Task, conditions_of, metric_of, scenes_of
 
 if TYPE_CHECKING:
@@ -171,115 +168,6 @@ def files_of(path: Path) -> list[Path]:
         with contextlib.suppress(LidardesignError):  # whoever reads the model says what is wrong with it
             return [Path(name) for name, *_ in model_files(path, Path(path.anchor))]
     return sorted(path.iterdir()) if path.is_dir() else [path]
-
-
-def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = None) -> DesignSpec:
-    """A design file or a rig of others.
-
-    One of a run that is not as it was written says so: it may be cut, or mended by hand. A rig says what its file
-    does not.
-
-    Arguments:
-        path: The file.
-        notes: Called with every note.
-        reach_m: How far the rays of a rig are heard where its file does not say so [m].
-
-    Raises:
-        ConfigError, DataError: It cannot be read.
-    """
-    difference = _difference(path)
-    try:
-        design = load_design(path, reach_m)
-    except (ConfigError, DataError) as error:
-        if difference is None:
-            raise
-        hint = f"the file {difference}; fit it again, or correct it"
-        raise type(error)(error.message, where=error.where, allowed=error.allowed, hint=hint) from None
-    if difference is not None:
-        notes(f"{path} {difference}")
-    # only what was read from others has notes
-    further = design.provenance.get("notes") if "source" in design.provenance else None
-    for note in further if isinstance(further, list) else ():
-        notes(f"{path}: {note}")
-    return design
-
-
-def _difference(path: Path) -> str | None:
-    """In what a design differs from the one that its run's manifest has, where it lies in a run."""
-    folder, run = path.absolute().parent, path.absolute().parent.parent
-    if folder.name == DESIGN_FOLDER and path.is_file() and (run / MANIFEST).is_file():
-        with contextlib.suppress(DataError):  # whatever needs the manifest says that it is damaged
-            return changed_since_recorded(run, f"{DESIGN_FOLDER}/{path.name}")
-    return None
-
-
-def open_target(path: Path, notes: Notes = log_note) -> tuple[RunFolder | None, DesignSpec | None]:
-    """Open a run folder, or a design file and the run that it came from.
-
-    Returns:
-        (run, None) for a folder, (run or None, design) for a file.
-
-    Raises:
-        DataError: There is no such file or folder, or it cannot be read.
-    """
-    if path.is_dir():
-        return RunFolder.open(path), None
-    if not path.exists():
-        raise DataError("no such run or design", where=str(path), hint="give a run folder or a design file")
-    design = read_design(path, notes)
-    return run_of(design, path), design
-
-
-def run_of(design: DesignSpec, path: Path) -> RunFolder | None:
-    """The run that a design came from, if it is there."""
-    folder = folder_of(design, path)
-    return None if folder is None else RunFolder.open(folder)
-
-
-def folder_of(design: DesignSpec, path: Path) -> Path | None:
-    """The folder of the run that a design came from, if it is there: its provenance names it relative to its file."""
-    named = design.provenance.get("run")
-    folder = Path(os.path.normpath(path.parent / named)) if isinstance(named, str) else None
-    # a design that was copied elsewhere names a folder that is none of its run's
-    return folder if folder is not None and (folder / MANIFEST).is_file() else None
-
-
-def need_run(run: RunFolder | None, path: Path | str) -> RunFolder:
-    """The run of a design.
-
-    Raises:
-        DataError: The design was not made by a run, or the run has gone.
-    """
-    if run is None:
-        raise DataError(
-            "the run of this design cannot be found",
-            where=str(path),
-            hint="give the run folder (RUN --like FILE for a rig), or put the design back into its designs folder",
-        )
-    return run
-
-
-def relative_folder(folder: Path, path: Path) -> str:
-    """How the file of a design names the folder of its run."""
-    return os.path.relpath(folder.absolute(), path.parent.absolute())
-
-
-def reach_of(runs: Sequence[RunFolder]) -> float | None:
-    """How far any ray of the first run's design space may be heard [m]; None without a run."""
-    return runs[0].config.space.high[RANGE] if runs else None
-
-
-def reach_beside(files: Iterable[Path], runs: Sequence[RunFolder]) -> float | None:
-    """How far rays may be heard in the first of the runs, or in that of the first design that came from one [m]."""
-    if runs:
-        return reach_of(runs)
-    for path in files:
-        # whoever reads it for good says what is wrong with it
-        with contextlib.suppress(LidardesignError):
-            run = run_of(load_design(path), path)
-            if run is not None:
-                return reach_of([run])
-    return None
 
 
 def settings_texts(settings: Sequence[str] | Mapping[str, Any]) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from support.tables import each_row
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.scenes.mesh_files import load_mesh
 from lidardesign.scenes.mujoco_models import model_files
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 from lidardesign.simulate.detector.files import load_detector
 
 ROOT = Path(__file__).parents[1]

@@ -26,7 +26,7 @@ from lidardesign.errors import MAX_SEED, ConfigError, check_choice
 from lidardesign.registry import plugin_guard
 from lidardesign.run.overrides import parse_override
 from lidardesign.run.yaml import dump_yaml
-from lidardesign.sensors.design_file import SCHEMA_FILE
+from lidardesign.sensors.design_file import DesignFile
 from lidardesign.space import DIMENSIONS
 
 if TYPE_CHECKING:
@@ -252,7 +252,9 @@ def schema_of(kind: str, task: Task | None = None) -> dict[str, Any]:
             **schema,
             "title": "Constraints of a design",
         }
-    return json.loads((SCHEMA_FILE if kind == "design" else EVALUATE_SCHEMA).read_text(encoding="utf-8"))
+    if kind == "design":
+        return {"$schema": DIALECT, "$id": "urn:lidardesign:design:2", **DesignFile.model_json_schema()}
+    return json.loads(EVALUATE_SCHEMA.read_text(encoding="utf-8"))
 
 
 def _config_schema(task: Task | None) -> dict[str, Any]:

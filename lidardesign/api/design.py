@@ -23,27 +23,20 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError, names_arguments
 from lidardesign.fitting.fit import fit_design
 from lidardesign.fitting.request import FitOptions, FitRequest
-from lidardesign.layouts.rays import certificates_of
-from lidardesign.mixture.fit import FitResult
+from lidardesign.fitting.result import FitResult
+from lidardesign.formats.designs import need_run, reach_beside, read_design, relative_folder, run_of
+from lidardesign.rays.certificate import certificates_of
+from lidardesign.rays.information import FEW_SCENES
 from lidardesign.run.clock import WAIT_S, Progress, phase
 from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import write_recorded
-from lidardesign.run_folder import (
-    Notes,
-    RunFolder,
-    ignore,
-    log_note,
-    need_run,
-    reach_beside,
-    read_design,
-    relative_folder,
-    run_of,
-)
+from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.compare import outside_space
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_text, save_design
-from lidardesign.sensors.sensor import CERTIFICATES, DesignSpec
 from lidardesign.task import scoring_settings
+from lidardesign.workers import check_workers, opened_workers
 
 if TYPE_CHECKING:
     from lidardesign.report.figures import Figure
@@ -84,10 +77,18 @@ class Design(DesignSource):
         self.result = result
 
     @classmethod
-    def fitted(cls, request: FitRequest, *, notes: Notes = log_note, progress: Progress | None = None) -> Design:
+    def fitted(
+        cls,
+        request: FitRequest,
+        *,
+        workers: int | str = 1,
+        notes: Notes = log_note,
+        progress: Progress | None = None,
+    ) -> Design:
         """The design that a request comes to; it is not saved yet. `progress` is called with every step."""
         steps = ignore if progress is None else (lambda step: progress(step, None, None))
-        result = fit_design(request, notes=notes, progress=steps)
+        with opened_workers(check_workers(str(workers)), request.run.task, FEW_SCENES) as starmap:
+            result = fit_design(request, notes=notes, progress=steps, starmap=starmap)
         return cls(result.design, request.run, None, result)
 
     @property
@@ -112,6 +113,8 @@ class Design(DesignSource):
         like: Path | str | None = None,
         name: str | None = None,
         seed: int | None = None,
+        certify: bool = False,
+        workers: int | str = 1,
         notes: Notes = log_note,
         progress: Progress | None = None,
     ) -> Design:
@@ -121,7 +124,7 @@ class Design(DesignSource):
             sensors: How many, or "best": as many as score best on training scenes.
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
-            layout: grid, density, scan, distributed, selected or spinning.
+            layout: chosen, even or spinning.
             channels: Rings of each sensor of the layout spinning.
             gates: "sensor" or "ray": one gate per sensor, or one per ray.
             level: The share of rays and returns that fields of view and gates contain.
@@ -131,6 +134,8 @@ class Design(DesignSource):
             like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
             name: The design's name; "constrained" by default.
             seed: Seed of all random numbers; the run's by default.
+            certify: Whether every number of rays gets a certificate, not the middle one alone.
+            workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             notes: Called with every note.
             progress: Called with every step, as "choosing 361 rays", and twice None.
 
@@ -153,23 +158,21 @@ class Design(DesignSource):
             like=like,
             name=name,
             seed=seed,
+            certify=certify,
         )
         request = FitRequest.resolve(run, options, self.specification, notes=notes)
-        return Design.fitted(request, notes=notes, progress=progress)
+        return Design.fitted(request, workers=workers, notes=notes, progress=progress)
 
     @names_arguments
-    def rays(
-        self, count: int | None = None, *, at: Mapping[str, float] | None = None, seed: int = 0, notes: Notes = log_note
-    ) -> Rays:
+    def rays(self, count: int | None = None, *, at: Mapping[str, float] | None = None, notes: Notes = log_note) -> Rays:
         """The explicit rays that it fires: origins, directions and gates, by ray.
 
         Arguments:
             count: How many; its own by default, or the largest number of its task.
             at: Values of conditions, as {"x_m": 0.37}.
-            seed: Root of the random streams.
             notes: Called with every note.
         """
-        return self.lay_out(count, at, seed, notes=notes)[1]
+        return self.specification.rays(self.usual_count(notes) if count is None else count, at)
 
     @phase("writing")
     def save(self, path: Path | str | None = None) -> Path:
@@ -204,7 +207,6 @@ class Design(DesignSource):
         rays: int | None = None,
         at: Mapping[str, float] | None = None,
         rate_hz: float | None = None,
-        seed: int = 0,
         robot: Path | None = None,
         notes: Notes = log_note,
     ) -> Exported:
@@ -216,14 +218,13 @@ class Design(DesignSource):
             rays: Rays per frame.
             at: Values of conditions.
             rate_hz: Frames per second, in formats that hold them [Hz].
-            seed: Root of the random streams.
             robot: A robot's MuJoCo model that the sensors are put into (mjcf).
             notes: Called with every note.
         """
         out = None if path is None else Path(path)
         exporter = exporter_of(format, out)
         target = export_target(self.path, out, exporter)
-        return ExportRequest(self, exporter, target, rays, at or {}, rate_hz, seed, robot).write(notes=notes)
+        return ExportRequest(self, exporter, target, rays, at or {}, rate_hz, robot).write(notes=notes)
 
     def figure(self, count: int | None = None) -> Figure:
         """Its sensors in space, with fields of view and gates, and its rays where their number is given (plotly)."""
@@ -235,7 +236,7 @@ class Design(DesignSource):
         """The document of `lidardesign fit --json`: sensors, and what the fit found."""
         place = self.name if self.path is None else str(self.path)
         certificates = certificates_of(self.specification)
-        further = {CERTIFICATES: certificates} if certificates else {}
+        further = {"certificates": certificates} if certificates else {}
         if self.result is None:
             sensors = [sensor.as_dict() for sensor in self.specification.sensors]
             return {"design": place, "frame": self.specification.mount or "world", "sensors": sensors}
@@ -243,7 +244,7 @@ class Design(DesignSource):
 
     def __repr__(self) -> str:
         spec = self.specification
-        rays = "rays left open" if spec.rays is None else f"{spec.rays} rays"
+        rays = "rays left open" if spec.count is None else f"{spec.count} rays"
         return f"<Design {self.name}: {len(spec.sensors)} sensors, layout {spec.layout}, {rays}>"
 
     def _repr_html_(self) -> str:
@@ -357,10 +358,10 @@ def judging_run(designs: Sequence[Design], judge: RunFolder | None, notes: Notes
             hint="name the run whose scenes are used: --in RUN",
         )
     for design in designs:
-        track = design.specification.track
-        if track is not None and track.dimension not in judge.config.space.condition:
+        condition = design.specification.condition
+        if condition is not None and condition not in judge.config.space.condition:
             raise ConfigError(
-                f"its rays follow {track.dimension}, which the task {judge.task.name} does not have as a condition",
+                f"its rays follow {condition}, which the task {judge.task.name} does not have as a condition",
                 where=f"design {design.name}",
                 hint="fit a design at one value: lidardesign fit RUN --at",
             )

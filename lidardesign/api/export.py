@@ -7,18 +7,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lidardesign.errors import BackgroundNote, ConfigError
-from lidardesign.fitting.run_samples import RunTarget, Weighting, may_need_samples, weighted_samples
+from lidardesign.formats.designs import folder_of
 from lidardesign.formats.registry import EXPORTERS, Exporter
-from lidardesign.layouts.rays import lay_out, layout_of, own_count
-from lidardesign.layouts.track import placed
 from lidardesign.run.clock import phase
-from lidardesign.run_folder import Notes, RunFolder, folder_of, log_note
+from lidardesign.run_folder import Notes, RunFolder, log_note
 from lidardesign.scenes.mujoco_models import RobotFile
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 
-# Formats that hold sensors only, so that the number of rays may stay open.
+# Formats that hold sensors only.
 WITHOUT_RAYS = ("sensors-csv", "stl")
 
 
@@ -45,70 +45,41 @@ class DesignSource:
         """The run that it came from, if it is there."""
         return self.run or (None if self.folder is None else RunFolder.open(self.folder))
 
-    @property
-    def leaves_rays_open(self) -> bool:
-        """Whether nothing in the design says how many rays it fires."""
-        return layout_of(self.specification).own_count(self.specification) is None
-
-    def largest_budget(self) -> int:
-        """The rays of a design that leaves them open: the largest number that its task is evaluated at.
+    def usual_count(self, notes: Notes = log_note) -> int:
+        """The number of rays that it is meant to fire, else the largest that its task is evaluated at.
 
         Raises:
-            ConfigError: Its run is not there.
+            ConfigError: It leaves its number of rays open, and its run is not there.
         """
+        if self.specification.count is not None:
+            return self.specification.count
         run = self.opened_run()
         if run is None:
             where = self.specification.name if self.path is None else str(self.path)
             raise ConfigError("the design leaves the number of rays open", where=where, hint="give --rays N")
-        return max(run.task.defaults.rays)
+        count = max(run.task.defaults.rays)
+        notes(BackgroundNote(f"the design leaves the number of rays open; {count} is the task's largest budget"))
+        return count
 
     @phase("rays")
-    def lay_out(
-        self,
-        count: int | None = None,
-        at: Mapping[str, float] | None = None,
-        seed: int = 0,
-        *,
-        may_stay_open: bool = False,
-        notes: Notes = log_note,
+    def at(
+        self, count: int | None = None, at: Mapping[str, float] | None = None, notes: Notes = log_note
     ) -> tuple[DesignSpec, Rays]:
-        """The design and its explicit rays at a condition; another number of rays may need the samples of its run.
-
-        A scan of another number of rays has other sensors, so the design that is given back is that one. A design that
-        leaves its number of rays open takes the largest budget of its task.
+        """The design and its rays at a condition.
 
         Arguments:
-            count: Rays per frame.
+            count: Rays per frame; 0 for sensors alone.
             at: Condition values.
-            seed: Root of the random streams.
-            may_stay_open: Whether sensors alone are wanted where no number is given.
             notes: Called with every note.
 
         Raises:
-            ConfigError: The design is nowhere at such a condition, or needs a run that is not there.
+            ConfigError: The design is nowhere at such a condition, or does not fire so many rays.
         """
-        design, at = self.specification, at or {}
-        if at or design.track is not None:
-            # refuses a wrong place before anything is fitted
-            placed(design, at)
-        if count is None and self.leaves_rays_open and not may_stay_open:
-            count = self.largest_budget()
-            notes(BackgroundNote(f"the design leaves the number of rays open; {count} is the task's largest budget"))
-        samples, retarget = None, None
-        if count is not None and may_need_samples(design) and (self.leaves_rays_open or count != own_count(design)):
-            run = self.opened_run()
-            if run is not None:
-                weighting = Weighting.of(design)
-                retarget = RunTarget(run, weighting=weighting)
-                samples = weighted_samples(run, weighting, retarget)
-        if layout_of(design).one_sensor_per_ray:
-            # most exports fit nothing, and start sooner without what fits
-            from lidardesign.mixture.fit import refitted
-
-            design = refitted(design, count, samples, seed=seed, at=at, retarget=retarget)
-        count = 0 if may_stay_open else count
-        rays = lay_out(design, count, samples, seed=seed, at=at, retarget=retarget)
-        return placed(design, at) if at or design.track is not None else design, rays
+        design = self.specification
+        design = design.at_condition(at or {}) if at or design.condition else design
+        if count == 0:
+            return design, Rays(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 2)), np.empty(0), np.empty(0))
+        return design, design.rays(self.usual_count(notes) if count is None else count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +124,6 @@ class ExportRequest:
         rays: Rays per frame; None takes the design's own.
         at: Condition values.
         rate_hz: Frames per second, in formats that hold it [Hz].
-        seed: Root of the random streams.
         robot: A robot's model that the sensors are put into; None: that of the run of a design that is mounted on a
             body of it, else they are written alone.
     """
@@ -164,13 +134,11 @@ class ExportRequest:
     rays: int | None = None
     at: Mapping[str, float] = field(default_factory=dict)
     rate_hz: float | None = None
-    seed: int = 0
     robot: Path | None = None
 
     def __post_init__(self) -> None:
-        name, layout = self.exporter.name, layout_of(self.source.specification)
-        if self.rays is not None and name in WITHOUT_RAYS and not layout.one_sensor_per_ray:
-            # of a scan another number of rays is another number of sensors
+        name = self.exporter.name
+        if self.rays is not None and name in WITHOUT_RAYS:
             raise ConfigError(f"{name} holds sensors, not rays", where="--rays", hint="leave it out")
         self.exporter.check_rate(self.rate_hz)
 
@@ -192,8 +160,8 @@ class ExportRequest:
             notes: Called with every note.
         """
         file, exporter = self.target if file is None else file, self.exporter
-        open_rays = exporter.name in WITHOUT_RAYS
-        design, rays = self.source.lay_out(self.rays, self.at, self.seed, may_stay_open=open_rays, notes=notes)
+        count = 0 if exporter.name in WITHOUT_RAYS else self.rays
+        design, rays = self.source.at(count, self.at, notes)
         with phase("writing"):
             lost = tuple(exporter.write(design, rays, file, self.rate_hz, self._robot()))
         for note in lost:

@@ -13,18 +13,11 @@ from lidardesign.api.learn import LearnOptions, LearnRequest, check_tolerance
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import DataError, LidardesignError, names_arguments
 from lidardesign.fitting.request import FitOptions, FitRequest
+from lidardesign.formats.designs import folder_of, reach_of, read_design
 from lidardesign.run.clock import Progress
 from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
-from lidardesign.run_folder import (
-    MANIFEST,
-    Notes,
-    RunFolder,
-    folder_of,
-    log_note,
-    reach_of,
-    read_design,
-)
+from lidardesign.run_folder import MANIFEST, Notes, RunFolder, log_note
 
 if TYPE_CHECKING:
     from lidardesign.api.scores import Scores
@@ -136,6 +129,8 @@ class Run(RunFolder):
         like: Path | str | None = None,
         name: str | None = None,
         seed: int | None = None,
+        certify: bool = False,
+        workers: int | str = 1,
         notes: Notes = log_note,
         progress: Progress | None = None,
     ) -> Design:
@@ -145,8 +140,7 @@ class Run(RunFolder):
             sensors: How many, or "best" (the default): as many as score best on training scenes.
             constraints: Constraints, a mapping of them, or a YAML file of them.
             rays: Rays per frame over all sensors.
-            layout: grid, density, scan, distributed, selected or spinning; by default selected, where the task
-                has a method `informs`.
+            layout: chosen, even or spinning; by default chosen, where the task has a method `informs`.
             channels: Rings of each sensor of the layout spinning.
             gates: "sensor" or "ray": one gate per sensor, or one per ray.
             level: The share of rays and returns that fields of view and gates contain.
@@ -156,6 +150,8 @@ class Run(RunFolder):
             like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
             name: The design's name.
             seed: Seed of all random numbers; the run's by default.
+            certify: Whether every number of rays gets a certificate, not the middle one alone.
+            workers: Processes that look at training scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             notes: Called with every note; they are logged by default.
             progress: Called with every step, as "choosing 361 rays", and twice None.
 
@@ -178,8 +174,10 @@ class Run(RunFolder):
             like=like,
             name=name,
             seed=seed,
+            certify=certify,
         )
-        return Design.fitted(FitRequest.resolve(self, options, notes=notes), notes=notes, progress=progress)
+        request = FitRequest.resolve(self, options, notes=notes)
+        return Design.fitted(request, workers=workers, notes=notes, progress=progress)
 
     def designs(self) -> list[Design]:
         """The designs that are saved in the run, by name."""
@@ -330,7 +328,7 @@ def _design_entry(path: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
         design, score = read_design(path), last_score(manifest, path)
     except LidardesignError as error:
         return {**entry, "error": error.message}
-    shape = {"sensors": len(design.sensors), "rays": design.rays, "layout": design.layout}
+    shape = {"sensors": len(design.sensors), "rays": design.count, "layout": design.layout}
     return {**entry, **shape, "score": None if score is None else asdict(score)}
 
 

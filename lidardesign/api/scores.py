@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.api.design import Design, collect_designs, html_table, judging_run, name_apart, named
 from lidardesign.config import with_task_settings
 from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
-from lidardesign.fitting.run_samples import Layouts, twin_without_visibility
-from lidardesign.fitting.select_rays import gate_margin_m, selection_scenes
+from lidardesign.fitting.twin import twin_without_visibility
 from lidardesign.numerics import SLACK
+from lidardesign.rays.training import TrainingScenes
 from lidardesign.run.clock import Progress, outermost_clock, phase, running
 from lidardesign.run_folder import DESIGN_FOLDER, Notes, RunFolder, log_note, settings_texts
 from lidardesign.samples import load_samples
 from lidardesign.scoring.baselines.cma import CMA, DEFAULT_SECONDS, CmaSettings
-from lidardesign.scoring.baselines.greedy import GreedySource
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, NONE, check_baseline
 from lidardesign.scoring.evaluation.last_scores import SCORES, last_scores_of
 from lidardesign.scoring.evaluation.mounting import MountError
@@ -29,10 +28,10 @@ from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_al
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, write_csv
 from lidardesign.scoring.evaluation.score import evaluate as score_designs
 from lidardesign.scoring.evaluation.thresholds import check_audit, check_better, check_limit
-from lidardesign.scoring.evaluation.workers import check_workers, scorer_of
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
+from lidardesign.workers import check_workers, opened_workers
 
 if TYPE_CHECKING:
     from lidardesign.report.figures import Figure
@@ -257,8 +256,9 @@ class ScoreRequest:
         """
         with nullcontext(outermost_clock()) if outermost_clock() else running() as clock:
             request = self.evaluation_request(searching)
-            with scorer_of(check_workers(str(self.options.workers)), request.task, len(request.test)) as scorer:
-                evaluation = score_designs(replace(request, scorer=scorer), progress=progress)
+            workers = check_workers(str(self.options.workers))
+            with opened_workers(workers, request.task, len(request.test)) as starmap:
+                evaluation = score_designs(replace(request, starmap=starmap), progress=progress)
             timings = clock.timings()
         return Scores(evaluation, replace(request, cma=replace(request.cma, show=None)), self.learned, timings, self)
 
@@ -437,8 +437,7 @@ def evaluation_request(
     """
     config, learned = run.config, learned or run
     seed = config.seed if seed is None else seed
-    from_runs = [(design.specification, design.run) for design in designs if design.run is not None]
-    layouts = Layouts.of(from_runs, learned)
+    from_runs = [design.specification for design in designs if design.run is not None]
     return EvaluationRequest(
         task=run.task,
         config=config.task,
@@ -447,12 +446,10 @@ def evaluation_request(
         designs=[design.specification for design in designs],
         rays=sorted(set(rays)),
         baselines=tuple(dict.fromkeys(baselines)),
-        samples=layouts.samples(from_runs),
         train=run.scenes("train", seed),
         test=run.scenes("test", seed if scenes_seed is None else scenes_seed),
         scenes_seed=scenes_seed,
-        lay_out=layouts,
-        without_visibility=(lambda: twin_without_visibility(from_runs[0][0], learned, layouts)) if from_runs else None,
+        without_visibility=partial(twin_without_visibility, from_runs[0], learned) if from_runs else None,
         density=cache(lambda: load_samples(learned.folder, learned.config.space) if learned.has_samples else None),
-        greedy=GreedySource(partial(selection_scenes, run, seed), gate_margin_m(run)),
+        training=TrainingScenes(run, seed),
     )

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.api.design import Design
 from lidardesign.api.scores import ScoreOptions, ScoreRequest, Scores
 from lidardesign.errors import ConfigError, DataError, names_arguments
+from lidardesign.formats.designs import read_design
 from lidardesign.run.clock import Progress, outermost_clock, running
-from lidardesign.run_folder import Notes, RunFolder, log_note, read_design
+from lidardesign.run_folder import Notes, RunFolder, log_note
 from lidardesign.scoring.evaluation.request import usual_numbers
 from lidardesign.scoring.evaluation.seeds import over_seeds
 

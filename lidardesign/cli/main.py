@@ -50,8 +50,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "fit": (
         "lidardesign fit runs/face",
-        "lidardesign fit runs/face --sensors 4 --layout grid --name even",
-        "lidardesign fit runs/face --layout scan --rays 576 --name beams",
+        "lidardesign fit runs/face --sensors 4 --layout even --name even",
+        "lidardesign fit runs/face --gates ray --rays 576 --name beams",
         "lidardesign fit runs/face --parts vl53l8cx,tmf8828 --sensors 2",
         "lidardesign fit runs/face --like robot.sdf --name instead",
         "lidardesign fit runs/warehouse --rays 12 --at x_m=0.37",

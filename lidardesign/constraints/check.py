@@ -1,9 +1,9 @@
 """The independent checker: does a written design keep a written constraint file?
 
-It reads plain documents only and shares no code with the fit: intervals are recomputed from means and spreads,
-compared with the reported ones, and bounds are applied to both; `document` has the definitions. An excluded box is
-broken where an interval of origins reaches into its interior along all three axes. A sensor that is to be a part is one
-where its field of view and range are the part's, and every ray that it fires is one of the part's pattern.
+It reads plain documents only and shares no code with the fit; `document` has the definitions. Chosen rays are held
+against their own sensors' fields and gates. An excluded box is broken where an interval of origins reaches into its
+interior along all three axes. A sensor that is to be a part is one where its field of view and range are the part's, and
+every ray that it fires is one of the part's pattern.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lidardesign.space import direction
 if TYPE_CHECKING:
     from lidardesign.parts.part import Part
 
-# A reported interval may differ from its mean and spread by this share (decimal digits in a file).
+# Rays may leave a field or a gate by this much, in radians or relative: decimal digits in a file.
 AGREEMENT = COARSE_SLACK
 # The bandwidth model counts a width this share above whole bins as whole bins.
 BIN_ROUNDING = SLACK
@@ -72,6 +72,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     rules = constraints.as_document() if hasattr(constraints, "as_document") else dict(constraints or {})
     bounds = space.as_dict() if hasattr(space, "as_dict") else space
     z = NormalDist().inv_cdf((1 + float(document.get("level", 0.95))) / 2)
+    patterns = document.get("patterns") or []
     sensors, each = list(document["sensors"]), list(rules.get("each") or [])
     own_rules = [_over(rules, each[index]) if index < len(each) else rules for index in range(len(sensors))]
     checks = _between("sensors", len(sensors), rules.get("sensors"))
@@ -80,17 +81,14 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
         checks.append(ConstraintCheck("sensors.count", wanted, len(sensors), wanted == len(sensors)))
     for index, (sensor, own) in enumerate(zip(sensors, own_rules, strict=True)):
         name = str(sensor.get("name", index))
-        checks += _consistency(name, sensor, z)
         checks += _origin(name, sensor, own, bounds) + _boresight(name, sensor, own, bounds)
-        checks += _excluded(name, sensor, own, z) + _intervals(name, sensor, own, z)
+        checks += _excluded(name, sensor, own, z) + _intervals(name, sensor, own)
         if bounds is not None:
             checks += _inside_space(name, sensor, bounds)
-    for table in (document.get("ray_table"), *document.get("further_tables", ())):
-        if table:
-            checks += _table(table, own_rules)
-    for track in (document.get("track"), *document.get("further_tracks", ())):
-        if track:
-            checks += _excluded_travel(track, sensors, rules) + _track(track, rules, bounds)
+    for pattern in patterns:
+        checks += _pattern(pattern, own_rules, bounds)
+        if document.get("layout") == "chosen":
+            checks += _astray(pattern, sensors)
     checks += _mounts(sensors, own_rules) + _parts(document, rules.get("parts"))
     return checks + _budget(document, rules.get("budget") or {})
 
@@ -135,30 +133,11 @@ def _within_space(name: str, key: str, space: Mapping[str, Any], *values: float)
     return ConstraintCheck(f"{name}.space.{key}", [low, high], value, bool(kept))
 
 
-def _consistency(name: str, sensor: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
-    """Reported intervals against means and spreads; agreement is no news, a contradiction is."""
-    spread, view = sensor["spread"], sensor["field_of_view_rad"]
-    pairs = [(f"field_of_view_rad.{axis}", view[axis], 2 * z * spread[f"{axis}_rad"]) for axis in ANGLES]
-    start, end = sensor["gate_m"]["start"], sensor["gate_m"]["end"]
-    mean = sensor.get("range_m")
-    if mean is not None:
-        pairs.append(("gate_m.start", start, max(mean - z * spread["range_m"], 0.0)))
-        pairs.append(("gate_m.end", end, mean + z * spread["range_m"]))
-    elif start > 0:
-        pairs.append(("gate_m.width", end - start, 2 * z * spread["range_m"]))
-    size = max(abs(value) for _, *values in pairs for value in values)
-    return [
-        ConstraintCheck(f"{name}.{key}", expected, found, False)
-        for key, found, expected in pairs
-        if not abs(found - expected) <= AGREEMENT * max(size, SLACK)
-    ]
-
-
 def _origin(
     name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Mapping[str, Any] | None
 ) -> list[ConstraintCheck]:
     """Origins in their boxes; one that is pinned next to where the space fixes it is kept by standing there."""
-    mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"]["covariance"]
+    mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"].get("covariance") or np.zeros((3, 3))
     checks = []
     tests = {
         "low_m": lambda value, bound: value >= bound - _slack(bound),
@@ -207,23 +186,14 @@ def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], s
     return [*checks, ConstraintCheck(f"{name}.boresight.azimuth_deg", [low, high], azimuth, bool(kept))]
 
 
-def _intervals(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
-    """Gate and field of view: the worse of the reported and the recomputed interval is checked."""
-    spread, view = sensor["spread"], sensor["field_of_view_rad"]
-    gates = [(sensor["gate_m"]["start"], sensor["gate_m"]["end"])]
-    mean = sensor.get("range_m")
-    if mean is not None:
-        half = z * spread["range_m"]
-        gates.append((max(mean - half, 0.0), mean + half))
-    values = {
-        f"field_of_view.{axis}_deg": [math.degrees(view[axis]), math.degrees(2 * z * spread[f"{axis}_rad"])]
-        for axis in ANGLES
-    }
-    values["gate.start_m"], values["gate.end_m"] = (list(ends) for ends in zip(*gates, strict=True))
-    values["gate.width_m"] = [end - start for start, end in gates]
+def _intervals(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
+    """Gate and field of view."""
+    view, (start, end) = sensor["field_of_view_rad"], (sensor["gate_m"][key] for key in ("start", "end"))
+    values = {f"field_of_view.{axis}_deg": math.degrees(view[axis]) for axis in ANGLES}
+    values |= {"gate.start_m": start, "gate.end_m": end, "gate.width_m": end - start}
     checks = []
     for key, found in values.items():
-        checks += _between(f"{name}.{key}", min(found), _get(rules, *key.split(".")), max(found))
+        checks += _between(f"{name}.{key}", found, _get(rules, *key.split(".")))
     return checks
 
 
@@ -242,7 +212,7 @@ def _mounts(sensors: Sequence[Mapping[str, Any]], own_rules: Sequence[Mapping[st
         mounts, mean = _get(own, "origin", "mounts_m"), list(sensor["origin_m"]["mean"])
         if not mounts:
             continue
-        still = not np.any(sensor["origin_m"]["covariance"])
+        still = not np.any(sensor["origin_m"].get("covariance"))
         there = [mount for mount in mounts if all(abs(a - b) <= _slack(b) for a, b in zip(mean, mount, strict=True))]
         kept = bool(there) and there[0] not in taken and still
         taken += there[:1]
@@ -252,24 +222,10 @@ def _mounts(sensors: Sequence[Mapping[str, Any]], own_rules: Sequence[Mapping[st
 
 def _excluded(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
     """The interval mean -+ z spread of a sensor's origin along each axis, against every excluded box."""
-    mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"]["covariance"]
+    mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"].get("covariance") or np.zeros((3, 3))
     reach = [z * math.sqrt(max(covariance[axis][axis], 0.0)) for axis in range(3)]
     low, high = ([m + sign * r for m, r in zip(mean, reach, strict=True)] for sign in (-1, 1))
     return _outside(name, low, high, rules)
-
-
-def _excluded_travel(
-    track: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], rules: Mapping[str, Any]
-) -> list[ConstraintCheck]:
-    """The excluded boxes that sensors pass through on their way along a track."""
-    axis = AXES.index(track["dimension"])
-    failed: list[ConstraintCheck] = []
-    for sensor in sensors:
-        low, high = list(sensor["origin_m"]["mean"]), list(sensor["origin_m"]["mean"])
-        low[axis], high[axis] = track["knots_m"][0], track["knots_m"][-1]
-        checks = _outside("track", low, high, rules)
-        failed += [check for check in checks if not check.satisfied and check not in failed]
-    return failed
 
 
 def _outside(name: str, low: list[float], high: list[float], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
@@ -293,98 +249,102 @@ def _reaches_into(low: Sequence[float], high: Sequence[float], box: Mapping[str,
     )
 
 
-def _table(table: Mapping[str, Any], own_rules: Sequence[Mapping[str, Any]]) -> list[ConstraintCheck]:
-    """The gates of explicit rays that break a gate bound of their sensor, and the rays that start in excluded boxes."""
-    owners = [own_rules[sensor] for sensor in table["sensor"]]
-    failed = []
-    for ray, (start, end, own) in enumerate(zip(table["gate_start_m"], table["gate_end_m"], owners, strict=True)):
-        for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
-            failed += [c for c in _between(f"ray{ray}.gate.{key}", value, _get(own, "gate", key)) if not c.satisfied]
-    if any(_boxes(own) for own in own_rules):
-        starts = zip(table["origin_x_m"], table["origin_y_m"], table["origin_z_m"], owners, strict=True)
-        failed += [
-            ConstraintCheck(f"ray{ray}.origin.exclude[{index}]", box, start, False)
-            for ray, (*start, own) in enumerate(starts)
-            for index, box in enumerate(_boxes(own))
-            if _reaches_into(start, start, box)
-        ]
-    return failed
+def _pattern(
+    pattern: Mapping[str, Any], own_rules: Sequence[Mapping[str, Any]], space: Mapping[str, Any] | None
+) -> list[ConstraintCheck]:
+    """The gates of rays, and where they start, against the bounds of their sensors, at every knot.
 
-
-def _track(track: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:
-    """Gates and boresights at every knot; in between they are linear, and these bounds are convex.
-
-    Only broken bounds are listed, but for the ends of the track, which must lie in the design space.
+    Between knots they are linear, and these bounds are convex. Only broken ones are listed, but for the ends of a
+    pattern along a condition, which must lie in the design space.
     """
-    failed = []
-    for knot in range(len(track["knots_m"])):
-        rows = (track[key][knot] for key in ("gate_start_m", "gate_end_m", "azimuth_rad", "elevation_rad"))
-        for ray, (start, end, azimuth, elevation) in enumerate(zip(*rows, strict=True)):
-            name = f"ray{ray}.knot{knot}"
-            aimed = {"boresight": {"azimuth_rad": azimuth, "elevation_rad": elevation}}
-            checks = _boresight(name, aimed, rules, space)
+    owners = [own_rules[sensor] for sensor in pattern["sensor"]]
+    knots, failed = list(pattern.get("knots_m") or []), []
+    columns = ("origin_x_m", "origin_y_m", "origin_z_m", "gate_start_m", "gate_end_m")
+    for knot in range(max(len(knots), 1)):
+        for ray, (*place, start, end) in enumerate(zip(*(pattern[key][knot] for key in columns), strict=True)):
+            name = f"ray{ray}.knot{knot}" if knots else f"ray{ray}"
+            checks = _outside(name, place, place, owners[ray])
             for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
-                checks += _between(f"{name}.gate.{key}", value, _get(rules, "gate", key))
+                checks += _between(f"{name}.gate.{key}", value, _get(owners[ray], "gate", key))
             if space is not None:
                 checks.append(_within_space(name, "range_m", space, start, end))
-                checks.append(_within_space(name, "elevation_rad", space, elevation))
-                low, high = (float(value) for value in space["azimuth_rad"])
-                past = (azimuth - low) % (2 * math.pi)
-                inside = past <= high - low + _slack(math.pi) or past >= 2 * math.pi - _slack(math.pi)
-                checks.append(ConstraintCheck(f"{name}.space.azimuth_rad", [low, high], azimuth, bool(inside)))
             failed += [check for check in checks if not check.satisfied]
+    if not knots:
+        return failed
+    # on its way from end to end no ray passes through an excluded box
+    for ray, own in enumerate(owners):
+        ways = [[pattern[key][knot][ray] for knot in range(len(knots))] for key in columns[:3]]
+        low, high = [min(way) for way in ways], [max(way) for way in ways]
+        failed += [check for check in _outside(f"ray{ray}", low, high, own) if not check.satisfied]
     if space is None:
         return failed
-    return [*failed, _within_space("track", track["dimension"], space, track["knots_m"][0], track["knots_m"][-1])]
+    return [*failed, _within_space("pattern", pattern["dimension"], space, knots[0], knots[-1])]
+
+
+def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]]) -> list[ConstraintCheck]:
+    """The chosen rays that look out of their sensor's field of view, or listen out of its gate, at any knot."""
+    owner, failed = np.asarray(pattern["sensor"]), []
+    for index, sensor in enumerate(sensors):
+        own, view, gate = np.flatnonzero(owner == index), sensor["field_of_view_rad"], sensor["gate_m"]
+        columns = ("azimuth_rad", "elevation_rad", "gate_start_m", "gate_end_m")
+        azimuth, elevation, start, end = (np.asarray(pattern[key], dtype=np.float64)[:, own] for key in columns)
+        aimed = sensor["boresight"]
+        frame = boresight_frame(aimed["azimuth_rad"], aimed["elevation_rad"], aimed.get("roll_rad") or 0.0)
+        forward, *across = np.moveaxis(direction(azimuth, elevation) @ frame.T, -1, 0)
+        sideways = np.hypot(*across)
+        # true angles from the boresight, along the field's two axes
+        angle = np.arctan2(sideways, forward) / np.where(sideways > 0, sideways, 1.0)
+        most = [float(np.abs(angle * part).max(initial=0.0)) * 2 for part in across]
+        name = str(sensor.get("name", index))
+        checks = [
+            ConstraintCheck(f"{name}.rays.{axis}_rad", view[axis], value, value <= view[axis] + AGREEMENT)
+            for axis, value in zip(ANGLES, most, strict=True)
+        ]
+        ends = [float(start.min(initial=gate["start"])), float(end.max(initial=gate["end"]))]
+        slack = AGREEMENT * gate["end"]
+        kept = ends[0] >= gate["start"] - slack and ends[1] <= gate["end"] + slack
+        checks.append(ConstraintCheck(f"{name}.rays.gate_m", [gate["start"], gate["end"]], ends, kept))
+        failed += [check for check in checks if not check.satisfied]
+    return failed
 
 
 def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[ConstraintCheck]:
     """The number of rays, and their bandwidth: rays times whole bins times bits times frames [Mbit/s]."""
     bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * PICOSECOND_S / 2
-    widths = _widths(document, bin_m)
-    total = None if widths is None else sum(count for _, count in widths)
-    checks = []
-    declared, limit = document.get("rays"), budget.get("bandwidth_mbps")
-    if declared is not None and total is not None and declared != total:
-        checks.append(ConstraintCheck("rays", declared, total, False))
-    if budget.get("rays") is not None:
-        count = total if total is not None else declared
-        checks.append(ConstraintCheck("budget.rays", budget["rays"], count, count == budget["rays"]))
+    widths = [_pattern_widths(pattern, bin_m) for pattern in document.get("patterns") or ()]
+    asked, limit, checks = budget.get("rays"), budget.get("bandwidth_mbps"), []
+    if not widths and asked is not None:
+        widths = [_even_widths(document["sensors"], asked)]
+    if asked is not None:
+        counts = [len(each) for each in widths]
+        checks.append(ConstraintCheck("budget.rays", asked, counts[-1], counts == [asked]))
     if limit is not None:
         mbps = None
-        if widths is not None:
-            bins = max(
-                sum(count * max(math.ceil(width / bin_m * (1 - BIN_ROUNDING)), 1) for width, count in each)
-                for each in (
-                    widths,
-                    *map(_table_widths, document.get("further_tables", ())),
-                    *(_track_widths(track, bin_m) for track in document.get("further_tracks", ())),
-                )
-            )
-            mbps = bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6
+        if widths:
+            bins = max(np.maximum(np.ceil(each / bin_m * (1 - BIN_ROUNDING)), 1).sum() for each in widths)
+            mbps = float(bins) * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6
         kept = mbps is not None and mbps <= limit + _slack(limit)
         checks.append(ConstraintCheck("budget.bandwidth_mbps", limit, mbps, kept))
     return checks
 
 
-def _widths(document: Mapping[str, Any], bin_m: float) -> list[tuple[float, int]] | None:
-    """Gate widths and how many rays have them, of a track where they cost most; None without a number of rays."""
-    table, track, sensors = document.get("ray_table"), document.get("track"), document["sensors"]
-    if table:
-        return _table_widths(table)
-    if not track:
-        is_open = any(sensor.get("rays") is None for sensor in sensors)
-        return None if is_open else [(s["gate_m"]["end"] - s["gate_m"]["start"], int(s["rays"])) for s in sensors]
-    return _track_widths(track, bin_m)
+def _even_widths(sensors: Sequence[Mapping[str, Any]], rays: int) -> np.ndarray:
+    """The gate width of each of so many even rays, shared out by weight with the largest remainders [m]."""
+    quotas = np.array([sensor["weight"] for sensor in sensors]) * rays
+    counts = np.floor(quotas + AGREEMENT)
+    for index in np.argsort(-(np.round(quotas - counts, 9)), kind="stable")[: rays - int(counts.sum())]:
+        counts[index] += 1
+    widths = [sensor["gate_m"]["end"] - sensor["gate_m"]["start"] for sensor in sensors]
+    return np.repeat(widths, counts.astype(int))
 
 
-def _track_widths(track: Mapping[str, Any], bin_m: float) -> list[tuple[float, int]]:
-    """Gate widths of a track where they cost most.
+def _pattern_widths(pattern: Mapping[str, Any], bin_m: float) -> np.ndarray:
+    """Gate widths of a pattern where they cost most [m].
 
     They are linear between knots, so bins change only where one crosses a whole number, and one place between each two
     of these tells all.
     """
-    width = np.array(track["gate_end_m"], dtype=np.float64) - np.array(track["gate_start_m"], dtype=np.float64)
+    width = np.array(pattern["gate_end_m"], dtype=np.float64) - np.array(pattern["gate_start_m"], dtype=np.float64)
     places = [width]
     for left, right in zip(width[:-1] / bin_m, width[1:] / bin_m, strict=True):
         crossings = [0.0, 1.0]
@@ -396,11 +356,7 @@ def _track_widths(track: Mapping[str, Any], bin_m: float) -> list[tuple[float, i
         places.append(bin_m * ((1 - middle) * left + middle * right))
     every = np.concatenate(places)
     bins = np.maximum(np.ceil(every / bin_m * (1 - BIN_ROUNDING)), 1).sum(axis=1)
-    return [(float(width), 1) for width in every[bins.argmax()]]
-
-
-def _table_widths(table: Mapping[str, Any]) -> list[tuple[float, int]]:
-    return [(end - start, 1) for start, end in zip(table["gate_start_m"], table["gate_end_m"], strict=True)]
+    return every[bins.argmax()]
 
 
 def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list[ConstraintCheck]:
@@ -416,7 +372,7 @@ def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list
             checks.append(ConstraintCheck(name, named or "the catalogue", own or "a sensor of its own", False))
             continue
         found.append(part)
-        wrong = _differences(part, index, sensor, document.get("ray_table"))
+        wrong = _differences(part, index, sensor, next(iter(document.get("patterns") or ()), None))
         checks.append(ConstraintCheck(name, part.name, wrong or part.name, wrong is None))
     for own, rule in (parts.get("each") or {}).items():
         checks += _between(f"parts.each.{own}", sum(part.name == own for part in found), rule)
@@ -453,7 +409,7 @@ def _admitted_part(name: str, named: Sequence[str]) -> Part | None:
     return part if admitted or not named else None
 
 
-def _differences(part: Part, index: int, sensor: Mapping[str, Any], table: Mapping[str, Any] | None) -> str | None:
+def _differences(part: Part, index: int, sensor: Mapping[str, Any], pattern: Mapping[str, Any] | None) -> str | None:
     """What a sensor is that the part is not; None where both are the same."""
     view = sensor["field_of_view_rad"]
     for key, expected in zip(ANGLES, part.field_of_view_rad, strict=True):
@@ -462,18 +418,19 @@ def _differences(part: Part, index: int, sensor: Mapping[str, Any], table: Mappi
     (near, far), gate = part.range_m, sensor["gate_m"]
     if gate["start"] < near - COARSE_SLACK or gate["end"] > far + COARSE_SLACK:
         return f"a gate of {gate['start']:g} to {gate['end']:g} m, and the part measures {near:g} to {far:g} m"
-    if not table:
-        return "no explicit rays"
+    if not pattern:
+        return "no pattern"
     # loaded here because few designs are of parts
     from scipy.spatial import cKDTree
 
-    own = np.flatnonzero(np.asarray(table["sensor"]) == index)
-    azimuth, elevation = (np.asarray(table[key], dtype=np.float64)[own] for key in ("azimuth_rad", "elevation_rad"))
+    own = np.flatnonzero(np.asarray(pattern["sensor"]) == index)
+    angles = ("azimuth_rad", "elevation_rad")
+    azimuth, elevation = (np.asarray(pattern[key][0], dtype=np.float64)[own] for key in angles)
     aimed = sensor["boresight"]
     frame = boresight_frame(aimed["azimuth_rad"], aimed["elevation_rad"], aimed.get("roll_rad") or 0.0)
     to_part = (boresight_frame(*part.centre_rad).T @ frame).T
     away, ray = cKDTree(part.directions).query(direction(azimuth, elevation) @ to_part)
-    starts = np.stack([np.asarray(table[f"origin_{axis}"], dtype=np.float64)[own] for axis in AXES], axis=1)
+    starts = np.stack([np.asarray(pattern[f"origin_{axis}"][0], dtype=np.float64)[own] for axis in AXES], axis=1)
     moved = np.abs(starts - np.asarray(sensor["origin_m"]["mean"])).max(axis=1, initial=0.0) > COARSE_SLACK
     same = len(part.directions) - len(np.unique(part.directions, axis=0))
     # rays that are none of its part's, or are fired from elsewhere or twice

@@ -17,7 +17,8 @@ from lidardesign.constraints.document import MOST_FITTED, Constraints, SensorCon
 from lidardesign.constraints.origins import axes_outside, place_text, snap_place_to_space
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.numerics import SLACK
-from lidardesign.sensors.sensor import DesignSpec, Sensor, interval_factor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, interval_factor
 from lidardesign.space import DIMENSIONS, DesignSpace
 
 # Rays of one direction, or of directions that differ by rounding, have no field of view that could be a bound; those of
@@ -56,7 +57,7 @@ def rig_constraints(
     document: dict[str, Any] = {
         # count, and min with max, exclude one another
         "sensors": own.get("sensors", {"count": len(rig.sensors)}),
-        "budget": {"rays": rig.rays} if rig.rays and rays is None else {},
+        "budget": {"rays": rig.count} if rig.count and rays is None else {},
     }
     result = merged(document, {key: own[key] for key in own if key not in ("sensors", "each")})
     like = [_of_sensor(sensor, space) for sensor in rig.sensors]
@@ -99,6 +100,8 @@ def _of_sensor(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
         for axis in moving:
             low[axis], high[axis] = space.low[axis], space.high[axis]
         bounds["origin"] = {key: [float(v) for v in corner] for key, corner in (("low_m", low), ("high_m", high))}
+        if sensor.region_m > 0:
+            bounds["origin"]["spread_m"] = {"max": sensor.region_m}
     widths = dict(zip(("horizontal_deg", "vertical_deg"), map(math.degrees, sensor.field_of_view_rad), strict=True))
     if max(widths.values()) > SMALLEST_FIELD_DEG:
         narrow = {axis: {"max": max(width, SMALLEST_FIELD_DEG)} for axis, width in widths.items() if width < 360}
@@ -111,7 +114,7 @@ def _of_sensor(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
 
 def _box(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     """Corners of the box of a sensor's origins, (3,) each [m]."""
-    half = interval_factor(sensor.level) * np.sqrt(np.maximum(np.diag(sensor.origin_covariance_m2), 0.0))
+    half = interval_factor(DEFAULT_LEVEL) * np.sqrt(np.maximum(np.diag(sensor.covariance_m2), 0.0))
     return sensor.origin_m - half, sensor.origin_m + half
 
 

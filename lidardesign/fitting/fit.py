@@ -1,4 +1,4 @@
-"""How a design is fitted, its rays chosen on scenes where that is asked for, and checked before anyone sees it.
+"""One road from a density to a design: fit sensors, propose, inform, choose, certify; then check what is written.
 
 Where nobody says how many sensors it has, designs of a few and of more are fitted alike, at the middle number of rays
 and in the bandwidth of those of most sensors. The task scores them on training scenes that were held back; the fewest
@@ -7,113 +7,67 @@ sensors win that are no worse than the best by more than a standard error.
 
 from __future__ import annotations
 
+import itertools
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import islice
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from lidardesign.config import with_task_settings
 from lidardesign.constraints.check import ConstraintCheck, check_design
-from lidardesign.constraints.document import Constraints
+from lidardesign.constraints.document import Constraints, merged
 from lidardesign.constraints.feasibility import check_feasible
+from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
-from lidardesign.fitting import request as fit_choices
-from lidardesign.fitting.request import BEST, FitRequest
+from lidardesign.fitting.chosen import choose_rays
+from lidardesign.fitting.request import BEST, COUNTS, FitRequest
+from lidardesign.fitting.result import FitResult
 from lidardesign.fitting.run_samples import KEY, RunTarget
-from lidardesign.layouts.rays import LAYOUTS
-from lidardesign.layouts.track import travelled
-from lidardesign.mixture.fit import FitResult, rays_at
-from lidardesign.mixture.fit import fit as fit_samples
-from lidardesign.mixture.quantise import SAMPLES_PER_RAY
-from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_condition, condition_text
-from lidardesign.rays import information
+from lidardesign.formats.designs import relative_folder
+from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
+from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
 from lidardesign.rays.information import checked_information
+from lidardesign.rays.pool import Pool, has_pool, pool_of
+from lidardesign.rays.proposals import nearest_samples
+from lidardesign.rays.training import HELD_BACK, TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import versions
 from lidardesign.run.yaml import dump_yaml, parse_yaml
-from lidardesign.run_folder import Notes, ignore, log_note, relative_folder
+from lidardesign.run_folder import Notes, ignore, log_note
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.scene import Scene, group_numbers
-from lidardesign.scoring.baselines.candidates import mean_mbps
-from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
-from lidardesign.sensors.sensor import DesignSpec
 from lidardesign.task import mount_of, random_generator
+from lidardesign.workers import Starmap
+
+# A larger share of scenes about which a design tells nothing is told.
+MOST_SILENT = 0.5
 
 
-class Fitter:
-    """Fits the designs of requests that differ in choices and constraints, to samples weighted by settings of the task.
-
-    Raises:
-        ConfigError: A setting that cannot be, or a name that is not a condition of the density.
-        DataError: The density is too rough, with or without the settings.
-    """
-
-    def __init__(self, request: FitRequest, notes: Notes = log_note, progress: Notes = ignore) -> None:
-        self.run, self.seed, self.notes, self.progress = request.run, request.seed, notes, progress
-        self.target = RunTarget(request.run, weighting=request.weighting)
-        request.run.config.space.at(request.at)
-        with phase("samples"):
-            self.samples = load_samples(request.run.folder, request.run.config.space)
-            self._check_effective_samples("learn longer (--preset standard or fine), or with a larger density.sigma_m")
-            if request.weighting.settings:
-                before = self.samples.effective_sample_size
-                self.samples = self.samples.retargeted(self.target(self.samples.points))
-                self._check_effective_samples("choose a setting nearer to the learned one, or learn with it")
-                now, settings = self.samples.effective_sample_size, ", ".join(request.weighting.settings)
-                notes(BackgroundNote(f"with {settings} the samples have ESS {now:.2f}, and {before:.2f} as learned"))
-
-    def _check_effective_samples(self, hint: str) -> None:
-        """Refuse samples of which too few are effective to fit anything to, whatever the constraints."""
-        effective = self.samples.independent
-        if effective < LEAST_SAMPLES:
-            raise DataError(
-                f"the density is too rough: its {len(self.samples)} samples count as only {effective:.0f}",
-                where=str(self.run.folder),
-                allowed=f"at least {LEAST_SAMPLES}",
-                hint=hint,
-            )
-
-    @cached_property
-    def first_scenes(self) -> dict[str, list[Scene]]:
-        """The first scenes that are chosen on, and that are held back, by purpose; what is found of them stays."""
-        from lidardesign.fitting.select_rays import selection_scenes
-
-        return {
-            purpose: list(islice(selection_scenes(self.run, self.seed, purpose), information.FEW_SCENES))
-            for purpose in ("choice", "held back")
-        }
-
-    @phase("fitting")
-    def fit(self, request: FitRequest, samples: Samples | None = None, **choices: Any) -> FitResult:
-        """The design, by the request's choices and these instead of some of them, to other samples if there are."""
-        samples = self.samples if samples is None else samples
-        if request.at:
-            count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (request.choices.get("rays") or 0))
-            samples = at_condition(samples, request.at, self.target, count, random_generator(request.seed, "condition"))
-            place, ess = condition_text(request.at), samples.effective_sample_size
-            self.notes(BackgroundNote(f"at {place} {len(samples)} samples have ESS {ess:.2f}"))
-        return fit_samples(
-            samples,
-            constraints=request.constraints,
-            seed=request.seed,
-            name=request.name,
-            retarget=self.target,
-            **{**request.choices, **choices},
-        )
-
-
-def fit_design(request: FitRequest, *, notes: Notes = log_note, progress: Notes = ignore) -> FitResult:
-    """Fit the design of a request and check it; nothing is written.
+def fit_design(
+    request: FitRequest,
+    *,
+    notes: Notes = log_note,
+    progress: Notes = ignore,
+    starmap: Starmap = itertools.starmap,
+    samples: Samples | None = None,
+    target: Retarget | None = None,
+) -> FitResult:
+    """Fit the design of a request and check it; nothing is written but what the run keeps of its scenes.
 
     Arguments:
         request: What is asked for.
         notes: Called with every note.
         progress: Called with every step, as "choosing 361 rays".
+        starmap: How training scenes are informed: in this process, or by workers.
+        samples, target: Of another density than the run's, and its log p* at design points.
 
     Returns:
         The fit, whose design says where it came from and whose checks are of the design's own text.
@@ -123,14 +77,11 @@ def fit_design(request: FitRequest, *, notes: Notes = log_note, progress: Notes 
         DataError: The density is too rough.
         InfeasibleError: Constraints that contradict each other, or that the design does not keep.
     """
-    run, weighting, fitter = request.run, request.weighting, Fitter(request, notes, progress)
-    if request.choices["sensors"] == BEST:
-        count = _best_count(fitter, request)
-        request = replace(request, choices={**request.choices, "sensors": count})
-    result = _fitted(fitter, request)
+    fitter = Fitter(request, notes, progress, starmap, samples, target)
+    result = fitter.fit()
     for note in result.notes:
         notes(note)
-    design, further = result.design, {KEY: weighting.as_document()} if weighting.settings else {}
+    run, design = request.run, result.design
     if len(request.names) == len(design.sensors):
         named = (replace(sensor, name=name) for sensor, name in zip(design.sensors, request.names, strict=True))
         design = replace(design, sensors=tuple(named))
@@ -141,50 +92,245 @@ def fit_design(request: FitRequest, *, notes: Notes = log_note, progress: Notes 
         "seed": request.seed,
         "versions": versions(),
     }
+    weighting = {KEY: request.weighting.as_document()} if request.weighting.settings else {}
     with plugin_guard(run.task.name):
         mount = mount_of(run.task, run.config.task)
-    design = replace(design, mount=mount, provenance={**design.provenance, **origin, **further})
+    design = replace(design, mount=mount, provenance={**design.provenance, **origin, **weighting})
     with phase("writing"):
-        checks = check_written(design, request)
-    for note in _silent_notes(fitter, request, design):
-        notes(note)
-    # broken ones were refused
-    return replace(result, design=design, constraints=checks, satisfied=True)
+        return replace(result, design=design, constraints=check_written(design, request))
 
 
-def _silent_notes(fitter: Fitter, request: FitRequest, design: DesignSpec) -> list[str]:
-    """Whether the most rays of a design have hardly a return from scenes that the fit has made anyway."""
-    run, count = request.run, request.choices["rays"] or max(request.run.task.defaults.rays)
-    scenes = vars(fitter).get("first_scenes", {}).get("held back")
-    if not scenes:
-        return []
-    from lidardesign.scoring.evaluation.request import numbers_fired
-    from lidardesign.scoring.scenes.scene_scores import silent_notes
+def check_written(design: DesignSpec, request: FitRequest) -> tuple[ConstraintCheck, ...]:
+    """Check a design's own text against its constraints with code that the fit does not share.
 
-    if not numbers_fired(design, [count]):
-        return []
-    conditions = [request.at] if request.at else run.conditions()
-    fired = tuple(rays_at(design, count, fitter.samples, at=at or None) for at in conditions)
-    return silent_notes(scenes, {f"{design.name!r}": fired})
+    Raises:
+        InfeasibleError: A constraint does not hold.
+    """
+    written = parse_yaml(dump_yaml(design_document(design)), where=design.name).value
+    checks = tuple(check_design(written, request.constraints, request.run.config.space))
+    broken = [check for check in checks if not check.satisfied]
+    if broken:
+        first = broken[0]
+        raise InfeasibleError(
+            f"the best design found breaks {first.name}: {first.value}, bound {first.bound}",
+            conflicts=[check.name for check in broken],
+            hint="loosen one of the constraints; no file was written",
+        )
+    return checks if request.is_constrained else ()
 
 
-def _best_count(fitter: Fitter, request: FitRequest) -> int:
-    """The number of sensors that scores best on training scenes; says what was tried."""
-    if request.constraints is not None:
-        check_feasible(request.constraints, request.run.config.space, rays=request.choices["rays"])
-    scenes, metric = fitter.first_scenes["held back"], request.run.metric
+class Fitter:
+    """Fits designs of one request that differ in the number of their sensors.
 
-    def fit(trial: FitRequest) -> FitResult:
-        fitter.progress(f"trying {trial.choices['sensors']} sensors")
-        return _fitted(fitter, trial, is_trial=True)
+    Arguments:
+        request, notes, progress, starmap, samples, target: See `fit_design`.
 
-    trials = trials_of(request, fitter.samples, scenes, fit)
-    best = best_of(trials, scenes)
-    sign = 1.0 if metric.better == "lower" else -1.0
-    found = ", ".join(f"{trial.sensors}: {sign * trial.scores.mean():.4g}" for trial in trials)
-    text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(scenes)} training scenes "
-    fitter.notes(BackgroundNote(f"{text}in {trials[-1].mbps:.3g} Mbit/s by their number: {found}"))
-    return best.sensors
+    Raises:
+        ConfigError: A setting that cannot be, or a name that is not a condition of the density.
+        DataError: The density is too rough, with or without the settings.
+    """
+
+    def __init__(
+        self,
+        request: FitRequest,
+        notes: Notes,
+        progress: Notes,
+        starmap: Starmap,
+        samples: Samples | None,
+        target: Retarget | None,
+    ) -> None:
+        run, settings = request.run, request.weighting.settings
+        self.request, self.notes, self.progress = request, notes, progress
+        self.target = target or RunTarget(run, weighting=request.weighting)
+        run.config.space.at(request.at)
+        with phase("samples"):
+            loaded = load_samples(run.folder, run.config.space) if samples is None else samples
+            self._check_effective(loaded, "learn longer (--preset standard or fine), or with a larger density.sigma_m")
+            if settings:
+                before = loaded.effective_sample_size
+                loaded = loaded.retargeted(self.target(loaded.points))
+                self._check_effective(loaded, "choose a setting nearer to the learned one, or learn with it")
+                text = f"with {', '.join(settings)} the samples have ESS {loaded.effective_sample_size:.2f}"
+                notes(BackgroundNote(f"{text}, and {before:.2f} as learned"))
+                # scenes weigh their items by the same settings
+                config = with_task_settings(run.task, run.config, settings, option=request.weighting.origin)
+                run = replace(run, config=config)
+            self.samples = self._at(loaded)
+        self.training = TrainingScenes(run, request.seed, starmap, request.at)
+        self.is_pooled = samples is None and not settings and not request.at and has_pool(run)
+
+    def _check_effective(self, samples: Samples, hint: str) -> None:
+        """Refuse samples of which too few are effective to fit anything to, whatever the constraints."""
+        effective = samples.independent
+        if effective < LEAST_SAMPLES:
+            raise DataError(
+                f"the density is too rough: its {len(samples)} samples count as only {effective:.0f}",
+                where=str(self.request.run.folder),
+                allowed=f"at least {LEAST_SAMPLES}",
+                hint=hint,
+            )
+
+    def _at(self, samples: Samples) -> Samples:
+        """The samples at the condition values that the design is for."""
+        at, seed = self.request.at, self.request.seed
+        if not at:
+            return samples
+        moved = at_condition(samples, at, self.target, MOVED_SAMPLES, random_generator(seed, "condition"))
+        ess = moved.effective_sample_size
+        self.notes(BackgroundNote(f"at {condition_text(at)} {len(moved)} samples have ESS {ess:.2f}"))
+        return moved
+
+    @cached_property
+    def pool(self) -> Pool | None:
+        """What is known of rays at the sensors' place; None where their origins are free."""
+        if not self.is_pooled:
+            return None
+        return pool_of(self.request.run, self.samples, self.training, self.progress)
+
+    def fit(self) -> FitResult:
+        """The design of the request."""
+        request = self.request
+        if request.constraints.parts is not None:
+            return self._parts()
+        if request.layout == "spinning":
+            return self._rings()
+        if request.sensors == BEST:
+            request = replace(request, sensors=self._best_count())
+            return self._without_idle(request)
+        return self._fitted(request)
+
+    def _without_idle(self, request: FitRequest) -> FitResult:
+        """The design of as many sensors as all have something to do; says which were left out."""
+        while True:
+            try:
+                result = self._fitted(request, may_idle=True)
+                idle = [index for index, rays in enumerate(result.design.rays_per_sensor() or ()) if not rays]
+                why = f"{len(idle)} of {request.sensors} sensors would fire none of the rays"
+            except InfeasibleError as error:
+                if request.sensors == 1 or error.conflicts != ["--sensors"]:
+                    raise
+                idle, why = [0], str(error.message)
+            if not idle or request.sensors == 1:
+                return result
+            request = replace(request, sensors=max(int(request.sensors) - len(idle), 1))
+            self.notes(f"{why}: fitted again with {request.sensors}")
+
+    @phase("fitting")
+    def _sensors(self, request: FitRequest, constraints: Constraints, rays: int | None) -> FittedSensors:
+        samples = self.samples
+        if samples.space.conditioned:
+            # a sensor that moves along a condition looks everywhere the same way
+            (place, *_) = request.run.conditions(samples.space)
+            samples = nearest_samples(samples, place, 1.0)
+        return fit_sensors(
+            FitProblem(
+                samples=samples,
+                constraints=constraints,
+                sensors=request.sensors,
+                rays=rays,
+                seed=request.seed,
+                level=request.level,
+                retarget=self.target,
+                keeps_bandwidth=request.layout == "even",
+            )
+        )
+
+    def _fitted(self, request: FitRequest, *, is_trial: bool = False, may_idle: bool = False) -> FitResult:
+        """The design of a request whose number of sensors is known.
+
+        Arguments:
+            request: What is asked for.
+            is_trial: Whether its number of sensors is being tried.
+            may_idle: Whether sensors may be left without a ray.
+        """
+        started, constraints, counts = time.perf_counter(), request.constraints, request.counts
+        is_chosen = request.layout == "chosen"
+        fitted = self._sensors(request, constraints, counts[-1] if is_chosen else request.rays)
+        design = DesignSpec(
+            name=request.name,
+            sensors=fitted.sensors,
+            layout=request.layout,
+            constraints=constraints.as_document(),
+            level=request.level,
+            at=dict(request.at),
+        )
+        notes = [*placement_notes(constraints.rules)]
+        if is_chosen:
+            middle = counts[len(counts) // 2]
+            chosen = choose_rays(
+                self.training,
+                self.samples,
+                fitted,
+                constraints,
+                counts,
+                level=request.level,
+                gates=request.gates,
+                pool=self.pool,
+                certified=() if is_trial else counts if request.certify else (middle,),
+                each_fires=not may_idle,
+                is_trial=is_trial,
+                progress=ignore if is_trial else self.progress,
+            )
+            design = replace(design, sensors=chosen.sensors, patterns=chosen.patterns, certificates=chosen.certificates)
+            if chosen.silent > MOST_SILENT:
+                notes.append(
+                    f"about {chosen.silent:.0%} of the training scenes that were held back, no ray tells anything; where "
+                    "that is not expected, check that places, directions and gates are right, and in metres"
+                )
+        elif fitted.rays is not None:
+            design = replace(design, constraints=merged(design.constraints, {"budget": {"rays": fitted.rays}}))
+        result = FitResult.of_fit(design, fitted, self.samples, time.perf_counter() - started)
+        return replace(result, notes=(*notes, *result.notes))
+
+    def _best_count(self) -> int:
+        """The number of sensors that scores best on training scenes; says what was tried."""
+        request, metric = self.request, self.request.run.metric
+        check_feasible(request.constraints, request.run.config.space, rays=request.rays)
+        scenes = self.training.first(HELD_BACK)
+
+        def fit(trial: FitRequest) -> DesignSpec:
+            self.progress(f"trying {trial.sensors} sensors")
+            return self._fitted(trial, is_trial=True, may_idle=True).design
+
+        trials = trials_of(request, scenes, fit)
+        best = best_of(trials, scenes)
+        sign = 1.0 if metric.better == "lower" else -1.0
+        found = ", ".join(f"{trial.sensors}: {sign * trial.scores.mean():.4g}" for trial in trials)
+        text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(scenes)} training scenes "
+        self.notes(BackgroundNote(f"{text}in {trials[-1].mbps:.3g} Mbit/s by their number: {found}"))
+        return best.sensors
+
+    def _parts(self) -> FitResult:
+        from lidardesign.fitting.part_design import choose_parts
+
+        request = self.request
+        return choose_parts(
+            self.samples,
+            request.constraints,
+            count=request.sensors,
+            rays=request.rays,
+            informs=partial(checked_information, request.run.task),
+            scenes=self.training.scenes,
+            seed=request.seed,
+            name=request.name,
+            notes=self.notes,
+            progress=self.progress,
+        )
+
+    def _rings(self) -> FitResult:
+        from lidardesign.fitting.spinning import CHANNELS, choose_rings
+
+        request = self.request
+        return choose_rings(
+            self.samples,
+            request.constraints,
+            count=request.sensors or 1,
+            channels=CHANNELS if request.channels is None else request.channels,
+            rays=request.rays,
+            informs=partial(checked_information, request.run.task),
+            scenes=self.training.scenes,
+            name=request.name,
+        )
 
 
 class Trial(NamedTuple):
@@ -196,14 +342,11 @@ class Trial(NamedTuple):
 
 
 @phase("trials")
-def trials_of(
-    request: FitRequest, samples: Samples, scenes: Sequence[Scene], fit: Callable[[FitRequest], FitResult]
-) -> list[Trial]:
+def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRequest], DesignSpec]) -> list[Trial]:
     """Designs of few sensors and of more, in the bandwidth of those of most: the gates of many fit best.
 
     Arguments:
         request: What is asked for, but for the number of sensors.
-        samples: What layouts follow from.
         scenes: Training scenes that designs are not fitted to.
         fit: Fits the design of a request.
 
@@ -213,25 +356,23 @@ def trials_of(
     from lidardesign.scoring.scenes.scene_scores import score_lists
     from lidardesign.simulate.returns import build_casters
 
-    run, constraints = request.run, request.constraints or Constraints()
-    budgets = sorted(run.task.defaults.rays)
-    rays = request.choices["rays"] or budgets[len(budgets) // 2]
+    run, bounds = request.run, request.constraints
+    rays = request.counts[len(request.counts) // 2]
     conditions = [request.at] if request.at else run.conditions()
     casters = [build_casters(scene) for scene in scenes]
     sign = 1.0 if run.metric.better == "lower" else -1.0
-    low = max(constraints.sensors.min or 1, len(constraints.each))
-    high = constraints.sensors.max or math.inf
+    low = max(bounds.sensors.min or 1, len(bounds.each))
+    high = bounds.sensors.max or math.inf
     trials: list[Trial] = []
     refused = None
-    for count in reversed([count for count in fit_choices.COUNTS if low <= count <= high] or [low]):
-        limited = _within(request.constraints, trials[0].mbps) if trials else request.constraints
-        choices = {**request.choices, "sensors": count, "rays": rays}
+    for count in reversed([count for count in COUNTS if low <= count <= high] or [low]):
+        constraints = _within(bounds, trials[0].mbps) if trials else bounds
         try:
-            design = fit(replace(request, choices=choices, constraints=limited)).design
+            design = fit(replace(request, sensors=count, rays=rays, constraints=constraints))
         except InfeasibleError as error:
             refused = error
             continue
-        fired = tuple(rays_at(design, rays, samples, at=at or None) for at in conditions)
+        fired = tuple(design.rays(rays, at=at or None) for at in conditions)
         scores = [
             next(score_lists(run.task, run.metric, scene, [fired], caster))[0].value
             for scene, caster in zip(scenes, casters, strict=True)
@@ -254,89 +395,8 @@ def best_of(trials: Sequence[Trial], scenes: Sequence[Scene]) -> Trial:
     return best
 
 
-def _within(constraints: Constraints | None, mbps: float) -> Constraints:
+def _within(constraints: Constraints, mbps: float) -> Constraints:
     """Constraints with a bandwidth, where they have none."""
-    document: dict[str, Any] = {} if constraints is None else dict(constraints.as_document())
+    document = constraints.as_document()
     budget = document.get("budget") or {}
     return Constraints.from_mapping({**document, "budget": {"bandwidth_mbps": mbps, **budget}})
-
-
-def _fitted(fitter: Fitter, request: FitRequest, *, is_trial: bool = False) -> FitResult:
-    """The design of a request; in layouts whose rays are chosen, for each number of rays.
-
-    Arguments:
-        fitter: Fits sensors.
-        request: What is asked for.
-        is_trial: Whether rays are chosen on the first scenes alone, without certificates.
-    """
-    samples, run = fitter.samples, request.run
-    layout, rays = request.choices["layout"], request.choices["rays"]
-    constraints = request.constraints or Constraints()
-    if constraints.parts is None and not LAYOUTS[layout].chosen_on_scenes:
-        return fitter.fit(request)
-    from lidardesign.fitting.select_rays import near, select_rays, selection_scenes
-
-    fit_choices.check_chosen(run.task, layout)
-    informs, scenes = partial(checked_information, run.task), partial(selection_scenes, run, request.seed)
-    if constraints.parts is not None:
-        from lidardesign.fitting.part_design import choose_parts
-
-        return choose_parts(
-            samples,
-            constraints,
-            count=request.choices["sensors"],
-            rays=rays,
-            informs=informs,
-            scenes=scenes,
-            seed=request.seed,
-            name=request.name,
-            notes=fitter.notes,
-            progress=fitter.progress,
-        )
-    if layout == "spinning":
-        from lidardesign.fitting.spinning import CHANNELS, choose_rings
-
-        return choose_rings(
-            samples,
-            constraints,
-            count=request.choices["sensors"] or 1,
-            channels=CHANNELS if request.channels is None else request.channels,
-            rays=rays,
-            informs=informs,
-            scenes=scenes,
-            name=request.name,
-        )
-    counts = sorted({request.choices["rays"]} if request.choices["rays"] else set(request.run.task.defaults.rays))
-    if samples.space.conditioned:
-        travelled(samples.space, "selected")
-    # the rays of a track have gates of their own, as those of a scan
-    gates = request.choices["gates"] or ("ray" if samples.space.conditioned else LAYOUTS["selected"].usual_gates)
-    (place, *_) = request.run.conditions(samples.space)
-    # the gates of chosen rays keep a bandwidth; a sensor that moves along a condition looks everywhere the same way
-    fitted = fitter.fit(request, near(samples, place, 1.0), layout="density", rays=counts[-1], gates="ray")
-    fitted = replace(fitted, design=replace(fitted.design, gates=gates))
-    progress = ignore if is_trial else fitter.progress
-    return select_rays(
-        run, fitted, counts, samples, request.seed, fitter.first_scenes, is_trial=is_trial, progress=progress
-    )
-
-
-def check_written(design: DesignSpec, request: FitRequest) -> list[ConstraintCheck]:
-    """Check a design's own text against its constraints with code that the fit does not share.
-
-    Raises:
-        InfeasibleError: A constraint does not hold.
-    """
-    if request.constraints is None:
-        return []
-    written = parse_yaml(dump_yaml(design_document(design)), where=design.name).value
-    checks = list(check_design(written, request.constraints, request.run.config.space))
-    broken = [check for check in checks if not check.satisfied]
-    if broken:
-        first = broken[0]
-        raise InfeasibleError(
-            f"the best design found breaks {first.name}: {first.value}, bound {first.bound}",
-            conflicts=[check.name for check in broken],
-            hint="loosen one of the constraints; no file was written",
-        )
-    return checks

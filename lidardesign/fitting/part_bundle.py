@@ -16,16 +16,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.fitting.part_shapes import PartShape
-from lidardesign.numerics import FULL_TURN, systematic_draw
+from lidardesign.numerics import FULL_TURN
 from lidardesign.parts.catalogue import Pose
-from lidardesign.parts.part import Part, even_subset
+from lidardesign.parts.part import Part
 from lidardesign.rays import kernels
-from lidardesign.rays.coverage import Coverage, InformedScene, gather
-from lidardesign.rays.gates import inform
+from lidardesign.rays.coverage import Coverage, gather
 from lidardesign.rays.information import choosing
+from lidardesign.rays.informed import InformedScene, inform
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
+from lidardesign.sensors.even import even_subset
 from lidardesign.task import Information, random_generator
 
 MOST_CAST = 60_000  # rays of a scene, over all places
@@ -178,20 +179,6 @@ def part_table(informed: Sequence[InformedScene], parts: int) -> Coverage:
 
 
 def _fewer_items(informed: InformedScene, generator: np.random.Generator) -> InformedScene:
-    """A random draw of the items, each as often as it counts; without what returns spoil, which no part can gate."""
+    """A random draw of the items, without what returns spoil, which no part can gate."""
     none = {"spoiling": np.zeros(0, np.int32), "harm": np.zeros(0), "harm_range_m": np.zeros(0), "is_repeated": False}
-    if len(informed.weight) <= MOST_ITEMS:
-        return replace(informed, **none)
-    drawn, times = np.unique(systematic_draw(informed.weight, MOST_ITEMS, generator), return_counts=True)
-    number = np.full(len(informed.weight), -1, dtype=np.int32)
-    number[drawn] = np.arange(len(drawn))
-    kept = number[informed.item] >= 0
-    return replace(
-        informed,
-        ray=informed.ray[kept],
-        item=number[informed.item[kept]],
-        worth=informed.worth[kept],
-        range_m=informed.range_m[kept],
-        weight=times / MOST_ITEMS,
-        **none,
-    )
+    return replace(informed.with_fewer_items(MOST_ITEMS, generator), **none)

@@ -22,10 +22,9 @@ from lidardesign.errors import ConfigError, DataError, InfeasibleError
 from lidardesign.fitting.part_bundle import PartBundle, PlacedPart, part_table, parts_inform
 from lidardesign.fitting.part_sets import ChosenSet, SetLimits, choose_set
 from lidardesign.fitting.part_shapes import broken_keys, shapes_of
-from lidardesign.layouts.grid import low_discrepancy
+from lidardesign.fitting.result import FitResult
 from lidardesign.mixture.bounds import bounds_of, clip_azimuth
 from lidardesign.mixture.features import Axes
-from lidardesign.mixture.fit import FitResult
 from lidardesign.numerics import TINY
 from lidardesign.parts.catalogue import named_parts, part_rays, part_sensor
 from lidardesign.parts.part import Part
@@ -38,8 +37,11 @@ from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.bandwidth import split_budget
-from lidardesign.sensors.design_file import MOST_TABLE_RAYS
-from lidardesign.sensors.sensor import CERTIFICATES, DEFAULT_LEVEL, DesignSpec, interval_factor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design_file import MOST_FILE_RAYS
+from lidardesign.sensors.even import low_discrepancy
+from lidardesign.sensors.pattern import Pattern
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, interval_factor
 from lidardesign.space import angles, observed_point
 from lidardesign.task import Information, random_generator
 
@@ -107,7 +109,7 @@ def choose_parts(
         )
     placed = proposed(every, constraints, samples, seed)
     budget = BandwidthBudget.of(constraints, rays)
-    most = (budget.rays or MOST_TABLE_RAYS) // count
+    most = (budget.rays or MOST_FILE_RAYS) // count
     limits = _limits(placed, constraints, count, most, budget)
     if not limits.may_join((), len(placed)).any():
         bounded = {"budget.bandwidth_mbps": budget.limit_mbps, "parts.power_w": wanted.power_w}
@@ -123,7 +125,7 @@ def choose_parts(
         notes(f"{len(chosen.members)} of {count} parts: no further part tells more or fits the bounds")
     design = _design(name, constraints, [placed[member] for member in chosen.members], budget.rays)
     certificate = certificate_document(
-        rays=design.rays or 0,
+        rays=design.count or 0,
         value=coverage.complete - chosen.value,
         bound=coverage.complete - chosen.bound,
         held_back_value=held_back_loss,
@@ -132,8 +134,7 @@ def choose_parts(
         scenes=len(trained),
         unit=trained[0].unit,
     )
-    design = replace(design, provenance={CERTIFICATES: [certificate]})
-    return FitResult.of_choice(design, constraints, samples, perf_counter() - started)
+    return FitResult.of_choice(replace(design, certificates=(certificate,)), samples, perf_counter() - started)
 
 
 def _chosen_set(
@@ -262,7 +263,7 @@ def _design(name: str, constraints: Constraints, placed: Sequence[PlacedPart], r
         InfeasibleError: The parts have fewer rays than are asked for.
     """
     patterns = [one.part.rays for one in placed]
-    total = min(sum(patterns), MOST_TABLE_RAYS) if rays is None else rays
+    total = min(sum(patterns), MOST_FILE_RAYS) if rays is None else rays
     if total > sum(patterns):
         raise InfeasibleError(
             f"the parts found have {sum(patterns)} rays, not {total}",
@@ -274,9 +275,8 @@ def _design(name: str, constraints: Constraints, placed: Sequence[PlacedPart], r
     sensors = []
     for index, (one, count) in enumerate(zip(placed, counts, strict=True)):
         start, end = one.shape.gate_m
-        sensor = part_sensor(one.part, one.pose, name=f"s{index}", weight=count / total, rays=count)
-        spread_m = (end - start) / (2 * interval_factor(sensor.level))
-        sensors.append(replace(sensor, range_m=(start + end) / 2, spread_range_m=spread_m))
+        sensor = part_sensor(one.part, one.pose, name=f"s{index}", weight=count / total)
+        sensors.append(replace(sensor, gate_m=(start, end)))
     gates = [np.tile(one.shape.gate_m, (count, 1)) for one, count in zip(placed, counts, strict=True)]
     fired = [
         replace(rays, gate_m=gate_m, sensor=np.full(len(rays), index), time_s=np.zeros(len(rays)))
@@ -286,7 +286,6 @@ def _design(name: str, constraints: Constraints, placed: Sequence[PlacedPart], r
         name=name,
         sensors=tuple(sensors),
         layout="fixed",
-        rays=total,
-        ray_table=Rays.joined(fired).as_angles(),
+        patterns=(Pattern.of(Rays.joined(fired).as_angles()),),
         constraints=constraints.as_document(),
     )

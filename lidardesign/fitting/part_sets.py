@@ -85,7 +85,7 @@ def choose_set(coverage: Coverage, limits: SetLimits) -> ChosenSet:
     best = _improved(coverage, limits)
     value, bound = _value(coverage, best), np.inf
     while len(rows):
-        left, allowed = _among(coverage, rows), limits.of(rows)
+        left, allowed = _restrict(coverage, rows), limits.of(rows)
         if math.comb(len(rows), min(limits.count, len(rows))) > FEW_SETS:
             least, reached = _bounds(left, allowed, np.flatnonzero(np.isin(rows, best)), value)
             bound = min(bound, max(least, value))
@@ -93,7 +93,7 @@ def choose_set(coverage: Coverage, limits: SetLimits) -> ChosenSet:
             if kept.sum() < len(rows) / 2:
                 rows = rows[kept]
                 continue
-            rows, left, allowed = rows[kept], _among(left, np.flatnonzero(kept)), allowed.of(np.flatnonzero(kept))
+            rows, left, allowed = rows[kept], _restrict(left, np.flatnonzero(kept)), allowed.of(np.flatnonzero(kept))
         found, is_complete = _searched(left, allowed, value)
         if found:
             best, value = tuple(int(row) for row in rows[list(found)]), _value(left, found)
@@ -101,7 +101,7 @@ def choose_set(coverage: Coverage, limits: SetLimits) -> ChosenSet:
     return ChosenSet(best, value, value)
 
 
-def _among(coverage: Coverage, rows: np.ndarray) -> Coverage:
+def _restrict(coverage: Coverage, rows: np.ndarray) -> Coverage:
     """The table of some candidates."""
     return coverage if len(rows) == coverage.shape[0] else coverage.grouped(rows[:, None])
 

@@ -14,21 +14,13 @@ from lidardesign.constraints.origins import is_mounted, snap_to_space
 from lidardesign.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
 from lidardesign.errors import MAX_SEED, ConfigError, check_choice, check_number
 from lidardesign.fitting.run_samples import Weighting
-from lidardesign.layouts.layout import Layout
-from lidardesign.layouts.rays import LAYOUTS, gates_of, layout_of
+from lidardesign.formats.designs import reach_of, read_design
 from lidardesign.rays.information import informs_rays
 from lidardesign.run.overrides import apply_override, parse_override
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
-from lidardesign.run_folder import (
-    Notes,
-    RunFolder,
-    log_note,
-    reach_of,
-    read_design,
-    settings_texts,
-)
-from lidardesign.sensors.sensor import FITTED_LAYOUTS, LEVELS, MOST_RAYS, DesignSpec, Gates
-from lidardesign.task import Task
+from lidardesign.run_folder import Notes, RunFolder, log_note, settings_texts
+from lidardesign.sensors.design import FITTED_LAYOUTS, DesignSpec, Gates, LayoutName
+from lidardesign.sensors.sensor import LEVELS, MOST_RAYS
 
 BEST = "best"  # as many sensors as score best on training scenes
 COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
@@ -44,9 +36,9 @@ class FitOptions:
     """What a user may choose for a fit; what is left out follows from an earlier design, the constraints or the task.
 
     Arguments:
-        sensors: How many sensors, or "best": as many as score best on training scenes. A scan has one per ray.
+        sensors: How many sensors, or "best": as many as score best on training scenes.
         constraints: Constraints, a mapping of them, or a YAML file of them.
-        layout: grid, density, scan, distributed, selected or spinning.
+        layout: chosen, even or spinning.
         rays: Rays per frame over all sensors.
         channels: Rings of each sensor that spins.
         gates: "sensor" or "ray": one gate per sensor, or one per ray.
@@ -57,6 +49,7 @@ class FitOptions:
         like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
         name: The design's name.
         seed: Seed of all random numbers; the run's by default.
+        certify: Whether every number of rays gets a certificate, not the middle one alone.
 
     Raises:
         ConfigError: A name, a layout or gates that cannot be.
@@ -75,6 +68,7 @@ class FitOptions:
     like: Path | str | None = None
     name: str | None = None
     seed: int | None = None
+    certify: bool = False
 
     def __post_init__(self) -> None:
         if self.name is not None and not NAME_PATTERN.fullmatch(self.name):
@@ -95,7 +89,7 @@ class FitOptions:
             check_number(self.level, "--level", *LEVELS)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FitRequest:
     """A fit with nothing left open.
 
@@ -103,25 +97,35 @@ class FitRequest:
         run: The run whose samples are fitted to.
         name: The design's name.
         seed: Root of the random streams.
-        constraints: Checked constraints, or None.
+        constraints: What the design keeps; nothing where it is free.
+        is_constrained: Whether anybody asked for constraints, which the design is then checked against.
         at: Condition values that the design is for; without any, one for all of them.
-        choices: sensors, layout, rays, gates and level, as `lidardesign.mixture.fit.fit` takes them.
+        sensors: How many sensors, or "best"; None where constraints say so.
+        layout: How rays are laid out.
+        rays: Rays per frame; None takes the task's numbers, or leaves them open.
+        gates: Whether chosen rays have their sensor's gate or their own.
+        level: The share of each marginal that fields of view and gates hold.
         weighting: Settings of the task to whose scenes the density is weighted.
         channels: Rings of each sensor that spins.
         names: What sensors are called, where there are as many; none numbers them.
-        command: For the design's provenance.
+        certify: Whether every number of rays gets a certificate.
     """
 
     run: RunFolder
     name: str
     seed: int
-    constraints: Constraints | None = None
-    at: Mapping[str, float] = field(default_factory=dict)
-    choices: Mapping[str, Any] = field(default_factory=dict)
-    weighting: Weighting = field(default_factory=Weighting)
-    channels: int | None = None
-    names: Sequence[str] = ()
-    command: str = "fit"
+    constraints: Constraints
+    is_constrained: bool
+    at: Mapping[str, float]
+    sensors: int | str | None
+    layout: LayoutName
+    rays: int | None
+    gates: Gates
+    level: float
+    weighting: Weighting
+    channels: int | None
+    names: Sequence[str]
+    certify: bool
 
     @classmethod
     def resolve(
@@ -147,92 +151,99 @@ class FitRequest:
         """
         for note in run.input_notes():
             notes(note)
-        defaults, asked = run.task.defaults, load_constraints(options.constraints, notes=notes)
+        asked = load_constraints(options.constraints, notes=notes)
         if asked is None and base is not None:
             asked = Constraints()
-        constraints, layout, names = _with_rig(options, _with_parts(options, asked, run), run, notes)
-        if constraints is not None:
-            constraints, moved = snap_to_space(constraints, run.config.space)
-            for note in moved:
-                notes(note)
-        rules = constraints or Constraints()
-        layout = layout or _usual_layout(rules, base, run, options)
-        beside = {
-            "--at": options.at or (base is not None and base.at),
-            "--weight": options.weights,
-            "parts": rules.parts,
-        }
-        if LAYOUTS[layout].chosen_on_scenes and any(beside.values()):
-            raise ConfigError(
-                f"layout {layout} with {next(name for name, given in beside.items() if given)}",
-                where="--layout",
-                allowed=", ".join(name for name in FITTED_LAYOUTS if not LAYOUTS[name].chosen_on_scenes),
-                hint="rays are chosen by what scenes show alone",
-            )
-        if options.sensors is not None and LAYOUTS[layout].one_sensor_per_ray:
-            raise ConfigError(
-                f"{options.sensors} sensors for a scan, in which every ray is its own sensor",
-                where="--sensors",
-                hint="give --rays N alone, or another --layout",
-            )
-        channels = options.channels
-        if layout == "spinning" and channels is None and base is not None:
-            channels = base.provenance.get("channels")
-        elif layout != "spinning" and channels is not None:
-            raise ConfigError(f"{channels} channels in the layout {layout}", where="--channels", allowed="spinning")
-        if layout == "spinning" and options.gates == "ray":
-            raise ConfigError("a gate per ray in the layout spinning", where="--gates", allowed="sensor")
-        usual_level = CHOSEN_LEVEL if LAYOUTS[layout].chosen_on_scenes else defaults.level
-        level = options.level if options.level is not None else base.level if base else usual_level
+        constraints, names = _with_rig(options, _with_parts(options, asked, run), run, notes)
+        rules, moved = snap_to_space(constraints or Constraints(), run.config.space)
+        for note in moved:
+            notes(note)
+        layout = _layout(rules, base, run, options)
+        _check_layout(layout, rules, run, options)
         weighting = _weighting(settings_texts(options.weights), base)
         if weighting.settings:
             with_task_settings(run.task, run.config, weighting.settings, option=weighting.origin)
-        most_rays = None if LAYOUTS[layout].leaves_rays_open(options.gates) else max(defaults.rays)
+        channels = options.channels
+        if layout == "spinning" and channels is None and base is not None:
+            channels = base.provenance.get("channels")
         return cls(
-            run,
-            options.name or ("fit" if asked is None else "constrained"),
-            run.config.seed if options.seed is None else options.seed,
-            constraints,
-            {**(base.at if base else {}), **options.at},
-            {
-                "sensors": _sensors(options.sensors, rules, base, LAYOUTS[layout]),
-                "layout": layout,
-                "rays": _rays(options.rays, rules, base, most_rays),
-                "gates": options.gates or _own_gates(base, layout),
-                "level": level,
-            },
-            weighting,
-            channels,
-            names,
-            "fit" if asked is None else "constrain",
+            run=run,
+            name=options.name or ("fit" if asked is None else "constrained"),
+            seed=run.config.seed if options.seed is None else options.seed,
+            constraints=rules,
+            is_constrained=constraints is not None,
+            at={**(base.at if base else {}), **options.at},
+            sensors=_sensors(options.sensors, rules, base, layout),
+            layout=layout,
+            rays=_rays(options.rays, rules, base),
+            gates=_gates(options.gates, base, run, layout),
+            level=_level(options.level, base, run, layout),
+            weighting=weighting,
+            channels=channels,
+            names=names,
+            certify=options.certify,
         )
 
+    @property
+    def command(self) -> str:
+        """For the design's provenance."""
+        return "constrain" if self.is_constrained else "fit"
 
-def check_chosen(task: Task, layout: str) -> None:
-    """Refuse layouts whose rays are chosen where a task has no method informs.
+    @property
+    def counts(self) -> list[int]:
+        """The numbers of rays that are chosen, ascending."""
+        return sorted({self.rays} if self.rays else set(self.run.task.defaults.rays))
+
+
+def _layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, options: FitOptions) -> LayoutName:
+    """The user's layout; else the design's, else rays are chosen where scenes can say what they tell."""
+    if options.layout is not None:
+        return options.layout
+    if constraints.parts is not None:
+        return "even"
+    if base is not None and base.layout in FITTED_LAYOUTS:
+        return base.layout
+    return "chosen" if informs_rays(run.task) and options.like is None else "even"
+
+
+def _check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, options: FitOptions) -> None:
+    """Refuse choices that a layout cannot have.
 
     Raises:
-        ConfigError: It does not.
+        ConfigError: There is one.
     """
-    if not informs_rays(task):
+    if layout != "even" and not informs_rays(run.task):
         raise ConfigError(
-            f"the task {task.name} has no method informs",
+            f"the task {run.task.name} has no method informs",
             where=f"--layout {layout}",
             allowed="tasks with informs",
-            hint="another --layout, or give the task a method informs(scene, returns)",
+            hint="--layout even, or give the task a method informs(scene, returns)",
         )
+    faults = {
+        (f"{options.channels} channels in the layout {layout}", "--channels", "--layout spinning"): (
+            options.channels is not None and layout != "spinning"
+        ),
+        (f"a gate per ray in the layout {layout}", "--gates", "--layout chosen"): (
+            options.gates == "ray" and layout != "chosen" and constraints.parts is None
+        ),
+        ("spinning sensors with --at or --weight", "--layout", "chosen, even"): (
+            layout == "spinning" and (bool(options.at) or bool(options.weights))
+        ),
+        (f"{options.sensors!r} sensors that spin", "--sensors", "a whole number"): (
+            layout == "spinning" and isinstance(options.sensors, str)
+        ),
+    }
+    for (fault, where, allowed), is_found in faults.items():
+        if is_found:
+            raise ConfigError(fault, where=where, allowed=allowed)
 
 
 def _with_rig(
     options: FitOptions, asked: Constraints | None, run: RunFolder, notes: Notes
-) -> tuple[Constraints | None, str | None, tuple[str, ...]]:
-    """Constraints with those of a rig below them, the layout, and the rig's sensors' names; as asked without a rig."""
+) -> tuple[Constraints | None, tuple[str, ...]]:
+    """Constraints with those of a rig below them, and the rig's sensors' names; as asked without a rig."""
     if options.like is None:
-        return asked, options.layout, ()
-    layout = options.layout or "grid"
-    if not LAYOUTS[layout].starts_at_sensors:
-        allowed = [name for name in FITTED_LAYOUTS if LAYOUTS[name].starts_at_sensors]
-        raise ConfigError(f"{layout} together with --like", where="--layout", allowed=", ".join(allowed))
+        return asked, ()
     rig = read_design(Path(options.like), notes, reach_of([run]))
     own, space = Constraints() if asked is None else asked, run.config.space
     keys = " / ".join(key for key in PLACE_KEYS if key in type(run.config.task).model_fields)
@@ -241,7 +252,7 @@ def _with_rig(
     constraints = rig_constraints(rig, space, own, rays=options.rays, hint=hint)
     for line in (*rig_notes(rig, constraints, own), *moved_notes(rig, space, constraints)):
         notes(line)
-    return constraints, layout, tuple(sensor.name for sensor in rig.sensors)
+    return constraints, tuple(sensor.name for sensor in rig.sensors)
 
 
 def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) -> Constraints | None:
@@ -270,51 +281,47 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
     return asked
 
 
-def _usual_layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, options: FitOptions) -> str:
-    """The layout where none is named: the design's; else rays are chosen where scenes can say what they tell."""
-    if constraints.parts is not None:
-        return "grid"
-    if base is not None:
-        layout = layout_of(base)
-        return layout.name if layout.chosen_on_scenes else layout.fitted_as
-    if informs_rays(run.task) and not options.at and not options.weights:
-        return "selected"
-    # a scan has as many sensors as rays
-    return "scan" if run.config.space.conditioned and options.sensors is None else "grid"
-
-
-def _own_gates(base: DesignSpec | None, layout: str) -> Gates | None:
-    """The gates of a design that is fitted again in its layout, where they are not the usual ones."""
-    if base is None or layout_of(base).name != layout:
-        return None
-    gates = gates_of(base)
-    return None if gates == LAYOUTS[layout].usual_gates else gates
-
-
 def _sensors(
-    asked: int | str | None, constraints: Constraints, base: DesignSpec | None, layout: Layout
+    asked: int | str | None, constraints: Constraints, base: DesignSpec | None, layout: LayoutName
 ) -> int | str | None:
     """The number of sensors: the user's, then what the constraints ask for, the design's, the best."""
     bounds = constraints.sensors
-    if asked is None and constraints.parts is not None:
+    if asked is not None:
+        return asked
+    if constraints.parts is not None:
         return constraints.parts.count
-    if layout.name == "spinning" and isinstance(asked, str):
-        raise ConfigError(f"{asked!r} sensors that spin", where="--sensors", allowed="a whole number")
-    if asked is not None or bounds.count is not None or is_mounted(constraints.rules):  # mounts say how many
-        return asked if asked is not None else bounds.count
+    if bounds.count is not None or is_mounted(constraints.rules):  # mounts say how many
+        return bounds.count
     if base is None:
-        return None if layout.one_sensor_per_ray else 1 if layout.name == "spinning" else BEST
+        return 1 if layout == "spinning" else BEST
     usual = max(len(base.sensors), len(constraints.each), bounds.min or 1)
     return min(usual, bounds.max or usual)
 
 
-def _rays(asked: int | None, constraints: Constraints, base: DesignSpec | None, usual: int | None) -> int | None:
-    """The number of rays: the user's, then the constraints', the design's, the usual; parts bring their own."""
+def _rays(asked: int | None, constraints: Constraints, base: DesignSpec | None) -> int | None:
+    """The number of rays: the user's, then the constraints', then the design's where it has a single one."""
     if asked is not None or constraints.parts is not None:
         return asked
     if constraints.budget.rays is not None:
         return constraints.budget.rays
-    return base.rays if base is not None and base.rays is not None else usual
+    return base.count if base is not None and base.counts in (None, [base.count]) else None
+
+
+def _gates(asked: str | None, base: DesignSpec | None, run: RunFolder, layout: LayoutName) -> Gates:
+    """The user's, then the design's; usually one per sensor, and along a condition one per ray."""
+    if asked is not None:
+        return asked
+    if base is not None and layout == base.layout == "chosen":
+        return "ray" if base.has_gates_per_ray else "sensor"
+    return "ray" if layout == "chosen" and run.config.space.conditioned else "sensor"
+
+
+def _level(asked: float | None, base: DesignSpec | None, run: RunFolder, layout: LayoutName) -> float:
+    if asked is not None:
+        return asked
+    if base is not None and base.layout == layout:
+        return base.level
+    return CHOSEN_LEVEL if layout == "chosen" else run.task.defaults.level
 
 
 def _weighting(settings: tuple[str, ...], base: DesignSpec | None) -> Weighting:

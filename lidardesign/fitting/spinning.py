@@ -20,19 +20,22 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import inside_excluded, mounts_of, origin_box
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.mixture.fit import FitResult
+from lidardesign.fitting.result import FitResult
 from lidardesign.numerics import FULL_TURN
 from lidardesign.rays import information
 from lidardesign.rays.certificate import certificate_document, certify
 from lidardesign.rays.choice import Choice, RayCounts, choose
 from lidardesign.rays.coverage import Coverage, gather
-from lidardesign.rays.gates import CANDIDATES_PER_RAY, inform
+from lidardesign.rays.informed import inform
+from lidardesign.rays.proposals import CANDIDATES_PER_RAY
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
-from lidardesign.sensors.design_file import MOST_TABLE_RAYS
-from lidardesign.sensors.sensor import CERTIFICATES, DEFAULT_LEVEL, DesignSpec, Sensor, interval_factor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design_file import MOST_FILE_RAYS
+from lidardesign.sensors.pattern import Pattern
+from lidardesign.sensors.sensor import Sensor
 from lidardesign.space import DesignSpace
 from lidardesign.task import Information
 
@@ -137,7 +140,7 @@ def choose_rings(
         if not len(told.item):
             raise DataError(f"none of {len(first)} rings tells anything about the training scenes", where=name)
         gains = told.gains(np.zeros(len(told.weight)))[:, 0].reshape(-1, elevations).sum(axis=0)
-        candidates = replace(first, elevation_rad=finer(even, gains))
+        candidates = replace(first, elevation_rad=refine_elevations(even, gains))
         coverage, unit = candidates.coverage(every, scenes("choice"), informs)
     with phase("choice"):
         choice, loss, bound = chosen_rings(coverage, candidates.place, count, channels)
@@ -163,17 +166,16 @@ def choose_rings(
             replace(
                 _spinning(candidates, f"s{number}", candidates.places_m[place], reached[sensor == number].max()),
                 weight=1 / count,
-                rays=points * channels,
             )
             for number, place in enumerate(places)
         ),
         layout="spinning",
-        rays=len(table),
-        ray_table=table,
+        patterns=(Pattern.of(table),),
         constraints=constraints.as_document(),
-        provenance={"channels": channels, CERTIFICATES: [certificate]},
+        certificates=(certificate,),
+        provenance={"channels": channels},
     )
-    return FitResult.of_choice(design, constraints, samples, perf_counter() - started)
+    return FitResult.of_choice(design, samples, perf_counter() - started)
 
 
 def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -> tuple[np.ndarray, int]:
@@ -183,9 +185,9 @@ def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -
         ConfigError: So many rings cannot be chosen, or cannot share the rays.
     """
     rings = count * max(channels, 1)
-    points = min(POINTS_PER_TURN, MOST_TABLE_RAYS // rings) if rays is None else rays // rings
+    points = min(POINTS_PER_TURN, MOST_FILE_RAYS // rings) if rays is None else rays // rings
     even = np.unique(np.linspace(space.low[4], space.high[4], CANDIDATES_PER_RAY * max(channels, 1)))
-    most = min(len(even), MOST_TABLE_RAYS // count)
+    most = min(len(even), MOST_FILE_RAYS // count)
     faults = {
         ("the density has conditions", "--layout spinning", "tasks whose sensors do not move"): space.conditioned,
         (f"{channels} channels", "--channels", f"1 to {most}, of as many elevations and rays as there are"): not (
@@ -194,8 +196,8 @@ def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -
         (
             f"{rays} rays of {count} sensors with {channels} channels",
             "--rays",
-            f"a multiple of {rings}, at most {MOST_TABLE_RAYS}: as many for each channel",
-        ): points * rings != (rays or points * rings) or not 0 < points * rings <= MOST_TABLE_RAYS,
+            f"a multiple of {rings}, at most {MOST_FILE_RAYS}: as many for each channel",
+        ): points * rings != (rays or points * rings) or not 0 < points * rings <= MOST_FILE_RAYS,
     }
     for (fault, where, allowed), is_found in faults.items():
         if is_found:
@@ -213,7 +215,7 @@ def places_of(constraints: Constraints, space: DesignSpace) -> np.ndarray:
     return np.unique(places[~inside_excluded(places, rules)], axis=0)
 
 
-def finer(elevation_rad: np.ndarray, gains: np.ndarray) -> np.ndarray:
+def refine_elevations(elevation_rad: np.ndarray, gains: np.ndarray) -> np.ndarray:
     """As many elevations (E,) [rad]: some even ones, and others the denser the more even ones gain (E,)."""
     count = len(elevation_rad)
     even = math.ceil(EVEN_SHARE * count)
@@ -261,18 +263,14 @@ def chosen_rings(coverage: Coverage, place: np.ndarray, count: int, channels: in
 
 def _spinning(rings: RingCandidates, name: str, place_m: np.ndarray, highest_rad: float) -> Sensor:
     """A sensor that stands upright and looks along +x; its field is a full turn, as a part's (see `part_sensor`)."""
-    half, (near, far) = interval_factor(DEFAULT_LEVEL), rings.range_m
     return Sensor(
         name=name,
         weight=1.0,
         origin_m=place_m,
-        origin_covariance_m2=np.zeros((3, 3)),
         azimuth_rad=0.0,
         elevation_rad=0.0,
         roll_rad=0.0,
-        spread_horizontal_rad=FULL_TURN / (2 * half),
         # as far up as down: so its own upright axis is that of its rings
-        spread_vertical_rad=float(highest_rad) / half,
-        range_m=(near + far) / 2,
-        spread_range_m=(far - near) / (2 * half),
+        field_of_view_rad=(FULL_TURN, 2 * float(highest_rad)),
+        gate_m=rings.range_m,
     )

@@ -37,7 +37,7 @@ from lidardesign.run.inputs import RAY_TABLE, read_head
 from lidardesign.run.yaml import plain_number
 from lidardesign.scenes.rays import Rays, fire_times
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 
 NEIGHBOURS = 6
 # Nearest-neighbour tours cost time with the square of their stops; larger ones start from the rays' own order alone.

@@ -18,11 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.formats.names import identifier, numbers, write_folder
-from lidardesign.layouts.grid import field_on_sphere
 from lidardesign.numerics import unit_vectors
 from lidardesign.run.files import write_atomic
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import DesignSpec, Sensor, tangent_directions
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.even import field_on_sphere
+from lidardesign.sensors.sensor import Sensor, tangent_directions
 
 RAYS, BEAMS, FRUSTA = "rays.ply", "beams.ply", "frusta.ply"
 PLACE = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
@@ -58,9 +59,9 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     notes = [*write_folder(path, files), "weights, spreads and origin covariances of the sensors are lost"]
     if len(seen) < len(design.sensors):
         notes.append(f"{len(design.sensors) - len(seen)} of {len(design.sensors)} sensors have no width, so no frustum")
-    moving = [length for length, _ in (sensor.travel_m for _, sensor in seen) if length > 0]
-    if moving:
-        notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: frusta stand in their middles")
+    regions = [sensor.region_m for _, sensor in seen if sensor.region_m > 0]
+    if regions:
+        notes.append(f"{len(regions)} sensors are regions of up to {max(regions):.3g} m: frusta stand in their middles")
     return notes
 
 
@@ -148,9 +149,9 @@ def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         "numbers are millimetres: STL has no units, and CAD programs take that one",
         "sensors only: rays, fields of view, gates, weights and spreads are lost",
     ]
-    moving = [length for length, _ in (sensor.travel_m for sensor in design.sensors) if length > 0]
-    if moving:
-        notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: solids stand in their middles")
+    regions = [sensor.region_m for sensor in design.sensors if sensor.region_m > 0]
+    if regions:
+        notes.append(f"{len(regions)} sensors are regions of up to {max(regions):.3g} m: solids stand in their middles")
     return notes
 
 

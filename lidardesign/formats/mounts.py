@@ -20,7 +20,8 @@ from lidardesign.errors import DataError
 from lidardesign.formats.names import distinct, identifier
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.sensor import Sensor
 from lidardesign.space import angles, direction
 
 

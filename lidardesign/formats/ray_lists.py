@@ -28,7 +28,8 @@ from lidardesign.run.arrays import NUMERIC_KINDS, csv_rows, read_npz
 from lidardesign.run.files import write_atomic
 from lidardesign.run.inputs import RAY_TABLE
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, MOST_RAYS, Sensor, interval_factor
 from lidardesign.space import FULL_TURN, MOST_TURNS, angles, direction
 
 ORIGIN = ("origin_x_m", "origin_y_m", "origin_z_m")
@@ -378,18 +379,20 @@ def _sensor(row: dict[str, float], index: int, where: str) -> Sensor:
     covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     if np.linalg.eigvalsh(covariance).min() < -COARSE_SLACK * np.abs(covariance).max():
         raise DataError("the origin covariance has a negative eigenvalue", where=where)
+    z, middle, spread = interval_factor(DEFAULT_LEVEL), row["time_mean"], row["time_sigma"]
+    across = row["azimuth_sigma"] * math.cos(elevation)
+    if spread == 0:
+        raise DataError("time_sigma is 0: the gate has no width", where=where, allowed="a number above 0")
     return Sensor(
         name=f"sensor_{index + 1}",
         weight=row["weight"],
         origin_m=np.array([row[name] for name in SENSOR_COLUMNS[:3]]),
-        origin_covariance_m2=covariance,
         azimuth_rad=row["azimuth_mean"],
         elevation_rad=elevation,
         roll_rad=0.0,
-        spread_horizontal_rad=row["azimuth_sigma"] * math.cos(elevation),
-        spread_vertical_rad=row["elevation_sigma"],
-        range_m=row["time_mean"],
-        spread_range_m=row["time_sigma"],
+        field_of_view_rad=(min(2 * z * across, FULL_TURN), min(2 * z * row["elevation_sigma"], FULL_TURN)),
+        gate_m=(max(middle - z * spread, 0.0), middle + z * spread),
+        origin_covariance_m2=covariance if covariance.any() else None,
     )
 
 
@@ -399,18 +402,15 @@ def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(SENSOR_COLUMNS)
     lost = {
-        f"the level {design.level:g} is lost: intervals are read back at {DEFAULT_LEVEL:g}":
-            design.level != DEFAULT_LEVEL,
-        "the explicit rays of the layout are lost": design.ray_table is not None,
+        "the patterns of rays are lost": bool(design.patterns),
         "roll is lost: spreads are those along azimuth and elevation":
             any(sensor.roll_rad for sensor in design.sensors),
-        "couplings are lost: direction and range are read back as independent of the origin":
-            any(sensor.coupling is not None for sensor in design.sensors),
     }  # fmt: skip
-    notes = ["names, ray counts, layout and provenance are lost; readers assume level 0.95"]
+    notes = ["names, layout and provenance are lost; readers assume level 0.95"]
     notes += [note for note, applies in lost.items() if applies]
+    z = interval_factor(DEFAULT_LEVEL)
     for sensor in design.sensors:
-        azimuth_sigma, elevation_sigma = sensor.spread_horizontal_rad, sensor.spread_vertical_rad
+        azimuth_sigma, elevation_sigma = (angle / (2 * z) for angle in sensor.field_of_view_rad)
         if sensor.roll_rad != 0:
             # the spreads along azimuth and elevation of a sensor that is rolled about its boresight
             horizontal, vertical = azimuth_sigma, elevation_sigma
@@ -425,10 +425,11 @@ def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
             azimuth_sigma = FULL_TURN
         else:
             azimuth_sigma /= cosine
-        upper = np.asarray(sensor.origin_covariance_m2)[np.triu_indices(3)]
+        covariance = np.zeros((3, 3)) if sensor.origin_covariance_m2 is None else sensor.origin_covariance_m2
+        upper, (start, end) = np.asarray(covariance)[np.triu_indices(3)], sensor.gate_m
         row = [
-            *sensor.origin_m, sensor.azimuth_rad, sensor.elevation_rad, sensor.range_m, *upper,
-            azimuth_sigma, elevation_sigma, sensor.spread_range_m, sensor.weight,
+            *sensor.origin_m, sensor.azimuth_rad, sensor.elevation_rad, (start + end) / 2, *upper,
+            azimuth_sigma, elevation_sigma, (end - start) / (2 * z), sensor.weight,
         ]  # fmt: skip
         writer.writerow([repr(float(value)) for value in row])
     write_atomic(Path(path), buffer.getvalue())

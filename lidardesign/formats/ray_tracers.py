@@ -53,7 +53,7 @@ from lidardesign.formats.names import (
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import angles
 
 SCANNERS, PLATFORMS, SURVEY, SCENE = "scanners.xml", "platforms.xml", ".survey.xml", "scene.xml#scene"

@@ -11,7 +11,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.scenes.mujoco_models import RobotFile
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 
 # A frame of a quarter of an hour, and one of a microsecond.
 SLOWEST_HZ, FASTEST_HZ = 0.001, 1e6

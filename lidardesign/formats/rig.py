@@ -1,6 +1,6 @@
 """A rig as a file of another program describes it, and the design that fires exactly its rays.
 
-The rays go into the explicit table of the layout `fixed`; boresight, field of view and gate of a sensor are those
+The rays are the pattern of the layout `fixed`; boresight, field of view and gate of a sensor are those
 that hold all of its rays.
 """
 
@@ -18,16 +18,9 @@ from lidardesign.errors import DataError
 from lidardesign.run.validation import is_name
 from lidardesign.run.yaml import plain_number
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import (
-    DEFAULT_LEVEL,
-    MOST_RAYS,
-    DesignSpec,
-    Sensor,
-    boresight_frame,
-    interval_factor,
-    tangent_coordinates,
-    tangent_directions,
-)
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.pattern import Pattern
+from lidardesign.sensors.sensor import MOST_RAYS, Sensor, boresight_frame, tangent_coordinates, tangent_directions
 from lidardesign.space import FARTHEST_M, FULL_TURN, angles, direction
 
 # Rounds in which a boresight moves to the middle of its field: away from the poles it rests after two or three.
@@ -151,8 +144,7 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
         path.stem,
         tuple(_sensor(one, name, total) for one, name in zip(gated, names, strict=True)),
         layout="fixed",
-        rays=total,
-        ray_table=Rays.from_angles(*ordered, sensor=np.repeat(np.arange(len(gated)), counts)[order]),
+        patterns=(Pattern.of(Rays.from_angles(*ordered, sensor=np.repeat(np.arange(len(gated)), counts)[order])),),
         provenance={"source": path.name, "format": rig.kind, "notes": notes},
     )
 
@@ -185,7 +177,6 @@ def _sensor(one: RigSensor, name: str, total: int) -> Sensor:
     single = Aim(float(one.azimuth_rad[0]), float(one.elevation_rad[0]), 0.0, (0.0, 0.0))
     count = len(one.azimuth_rad)
     aim = one.aim or (single if count == 1 else aim_of(direction(one.azimuth_rad, one.elevation_rad)))
-    wide = 2 * interval_factor(DEFAULT_LEVEL)
     start, end = float(one.gate_m[:, 0].min()), float(one.gate_m[:, 1].max())
     away = one.origin_m - one.origin_m[0]
     still = not away.any()
@@ -193,15 +184,12 @@ def _sensor(one: RigSensor, name: str, total: int) -> Sensor:
         name=name,
         weight=count / total,
         origin_m=one.origin_m[0].copy() if still else one.origin_m.mean(axis=0),
-        origin_covariance_m2=np.zeros((3, 3)) if still else np.cov(away.T, bias=True),
         azimuth_rad=aim.azimuth_rad,
         elevation_rad=aim.elevation_rad,
         roll_rad=aim.roll_rad,
-        spread_horizontal_rad=min(aim.field_rad[0], FULL_TURN) / wide,
-        spread_vertical_rad=min(aim.field_rad[1], FULL_TURN) / wide,
-        range_m=(start + end) / 2,
-        spread_range_m=(end - start) / wide,
-        rays=count,
+        field_of_view_rad=(min(aim.field_rad[0], FULL_TURN), min(aim.field_rad[1], FULL_TURN)),
+        gate_m=(start, end),
+        origin_covariance_m2=None if still else np.cov(away.T, bias=True),
     )
 
 

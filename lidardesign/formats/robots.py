@@ -57,7 +57,7 @@ from lidardesign.run.files import write_atomic
 from lidardesign.scenes.mujoco_models import RobotFile, load_model, mujoco_warnings, seen_geoms
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 
 WORLD = "world"
 # Half of what a site of one ray is drawn as [m].

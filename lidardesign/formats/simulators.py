@@ -58,7 +58,7 @@ from lidardesign.numerics import FULL_TURN, HALF_DIGITS
 from lidardesign.run.files import write_atomic
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import angles
 
 MIRROR = np.diag([1.0, -1.0, 1.0])

@@ -34,8 +34,8 @@ FINALISTS = 3
 ROUNDING_NATS = ROUNDING
 SEED_SAMPLES = 2000
 SEED_LLOYD_ITERATIONS = 4
-# A component that explains less than this many effective samples has died.
-DEAD_SAMPLES = 2.0
+# A component that rests on fewer effective samples is no sensor: it begins again where there are more.
+LEAST_SAMPLES = 20.0
 MOST_REVIVALS = 3
 # So many samples usually tell that there are more different ones than components.
 FEW_SAMPLES = 256
@@ -219,11 +219,10 @@ def _best_seed(features: Features, bounds: Bounds, generator: np.random.Generato
 
 
 def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
-    """Give dead components half of the heaviest one's samples and go on, where the likelihood gains."""
+    """Give components that rest on too few samples half of the heaviest one's, and go on, while fewer are left."""
     notes: list[str] = []
-    fewest = min(DEAD_SAMPLES, len(features) / len(bounds))
+    dead = _dead(result.mixture, features)
     for _ in range(MOST_REVIVALS):
-        dead = np.flatnonzero(result.mixture.weights * effective_count(features.weights) < fewest)
         if not len(dead):
             break
         labels = responsibilities(result.mixture, features).argmax(axis=1)
@@ -233,9 +232,16 @@ def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator
             _, halves = lloyd(np.ascontiguousarray(part.embedding), part.weights, 2, generator, iterations=2)
             labels[inside[halves == 1]] = component
         again = run_em(mixture_of_labels(features, labels, bounds), features, bounds)
-        if again.log_likelihood < result.log_likelihood:
-            notes.append(f"{len(dead)} of {len(bounds)} sensors explain almost no samples")
+        left = _dead(again.mixture, features)
+        if len(left) >= len(dead):
             break
-        notes.append(BackgroundNote(f"restarted {len(dead)} of {len(bounds)} sensors that had lost all their samples"))
-        result = again
+        notes.append(BackgroundNote(f"restarted {len(dead)} of {len(bounds)} sensors that had lost their samples"))
+        result, dead = again, left
     return replace(result, notes=tuple(notes))
+
+
+def _dead(mixture: Mixture, features: Features) -> np.ndarray:
+    """The components that rest on fewer than `LEAST_SAMPLES` effective samples, or their share of what there are."""
+    fewest = min(LEAST_SAMPLES, len(features) / len(mixture))
+    own = responsibilities(mixture, features) * features.weights[:, None]
+    return np.flatnonzero([effective_count(weights) < fewest for weights in own.T])

@@ -5,14 +5,6 @@ most that any of them sees of its scene point (re-aimed and reweighted as in `su
 drawn from the density. Mounts are taken one after the other, each time the one that newly sees most: this sum
 is submodular, so the greedy choice sees at least 1 - 1/e of what the best choice sees (G. Nemhauser, L. Wolsey
 and M. Fisher 1978). Sensors with constraints of their own are placed together with their mount.
-
-How a ray follows from where it starts: the regressions that a product component leaves out.
-
-A component is a product N(x) N(u) N(r). Its samples, weighted by responsibility, still hold how the angles u
-follow from the origin x and the range from both. Their weighted least squares slopes are kept beside it:
-$E[u \mid x] = D\,(x - \bar x)$ and $E[r \mid x, u] = \bar r + a \cdot (x - \bar x) + b \cdot u$, about the sensor's
-own means. What the regressions leave are the residual spreads. The marginal spreads stay those of the
-constrained fit, so fields of view and gates keep their constraints whatever the slopes are.
 """
 
 from __future__ import annotations
@@ -26,16 +18,16 @@ from lidardesign.constraints.document import SensorRules, rules_of
 from lidardesign.constraints.origins import Mount, fix_origin, fix_origins, mounts_of, mounts_suffice
 from lidardesign.errors import InfeasibleError
 from lidardesign.mixture.bounds import Bounds, Floors, Group, pins_of
-from lidardesign.mixture.components import Mixture, expect, responsibilities
+from lidardesign.mixture.components import Mixture, expect
 from lidardesign.mixture.em import EMResult, fit_mixture, run_em
 from lidardesign.mixture.features import Axes, Features
 from lidardesign.mixture.m_step import maximise
 from lidardesign.mixture.support import Retarget, reaim_samples
-from lidardesign.numerics import SLACK, effective_count, systematic_draw, wrap_angle, wrap_turn
+from lidardesign.numerics import systematic_draw, wrap_angle, wrap_turn
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
-from lidardesign.sensors.sensor import Coupling, Sensor, tangent_coordinates
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
+from lidardesign.sensors.sensor import Sensor
+from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 
 # So many samples tell apart mounts whose shares differ by a hundredth.
@@ -127,10 +119,10 @@ def admitted_mixture(mixture: Mixture, features: Features, bounds: Bounds) -> Mi
     return maximise(mixture, expect(mixture, features), features, bounds, Floors.of(features), 0.0)
 
 
-def sensors_of(ensemble: Ensemble, space: DesignSpace, level: float) -> tuple[Sensor, ...]:
+def sensors_of(ensemble: Ensemble, space: DesignSpace) -> tuple[Sensor, ...]:
     """The fitted components as sensors s0, s1, ... in the order of the constraint file."""
     rows = [
-        _sensor(part, result.mixture, row, space, level)
+        _sensor(part, result.mixture, row, space)
         for part, result in zip(ensemble.parts, ensemble.results, strict=True)
         for row in range(len(part.bounds))
     ]
@@ -140,14 +132,14 @@ def sensors_of(ensemble: Ensemble, space: DesignSpace, level: float) -> tuple[Se
 
 def heaviest_first(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
     """Sensors by weight, named s0, s1, ... in that order."""
-    return _named(sorted(sensors, key=lambda s: (-round(s.weight, 9), s.azimuth_rad, s.elevation_rad, s.range_m)))
+    return _named(sorted(sensors, key=lambda s: (-round(s.weight, 9), s.azimuth_rad, s.elevation_rad, s.gate_m)))
 
 
 def _named(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
     return tuple(replace(sensor, name=f"s{index}") for index, sensor in enumerate(sensors))
 
 
-def _sensor(part: GroupSamples, mixture: Mixture, row: int, space: DesignSpace, level: float) -> Sensor:
+def _sensor(part: GroupSamples, mixture: Mixture, row: int, space: DesignSpace) -> Sensor:
     axes: Axes = part.features.axes
     fixed = [low if pin is None else pin for low, pin in zip(space.low[:3], part.group.pins, strict=True)]
     origin, free = np.array(fixed, dtype=np.float64), list(axes.origin)
@@ -155,19 +147,21 @@ def _sensor(part: GroupSamples, mixture: Mixture, row: int, space: DesignSpace, 
     covariance = np.zeros((3, 3))
     covariance[np.ix_(free, free)] = mixture.origin_covariance_m2[row][np.ix_(free, free)]
     horizontal, vertical = mixture.spread_rad[row]
+    z, middle = part.bounds.interval, float(mixture.range_m[row])
+    half_m = z * float(mixture.spread_range_m[row]) if axes.range else 0.0
     return Sensor(
         name="",
         weight=float(mixture.weights[row]),
         origin_m=origin,
-        origin_covariance_m2=covariance,
         azimuth_rad=float(wrap_turn(wrap_angle(mixture.azimuth_rad[row]))) if axes.horizontal else axes.azimuth_rad,
         elevation_rad=float(mixture.elevation_rad[row]) if axes.vertical else axes.elevation_rad,
         roll_rad=float(mixture.roll_rad[row]),
-        spread_horizontal_rad=float(horizontal * axes.angle_scale) if axes.horizontal else 0.0,
-        spread_vertical_rad=float(vertical) if axes.vertical else 0.0,
-        range_m=float(mixture.range_m[row]),
-        spread_range_m=float(mixture.spread_range_m[row]) if axes.range else 0.0,
-        level=level,
+        field_of_view_rad=(
+            float(2 * z * horizontal * axes.angle_scale) if axes.horizontal else 0.0,
+            float(2 * z * vertical) if axes.vertical else 0.0,
+        ),
+        gate_m=(max(middle - half_m, 0.0), middle + half_m),
+        origin_covariance_m2=covariance if covariance.any() else None,
     )
 
 
@@ -244,99 +238,3 @@ def _greedy(views: dict[tuple[int, Mount], np.ndarray], options: list[list[Mount
         del left[sensor]
         left = {other: [m for m in mounts if m != mount] for other, mounts in left.items()}
     return chosen
-
-
-# A regression on five covariates means nothing from fewer effective samples.
-LEAST_EFFECTIVE_SAMPLES = 30.0
-# Directions of the standardised covariates with less of their variance than this share carry rounding only.
-SMALLEST_VARIANCE_SHARE = SLACK
-
-
-def add_couplings(ensemble: Ensemble, sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
-    """The sensors of an ensemble, in its own order of sensors, with their couplings."""
-    coupled = list(sensors)
-    for part, trace in zip(ensemble.parts, ensemble.results, strict=True):
-        if not part.features.axes.origin:
-            continue
-        share = responsibilities(trace.mixture, part.features) * part.features.weights[:, None]
-        for column, index in enumerate(part.group.sensors):
-            coupling = coupling_of(sensors[index], part.features.points, share[:, column])
-            coupled[index] = replace(sensors[index], coupling=coupling)
-    return tuple(coupled)
-
-
-def coupling_of(sensor: Sensor, points: np.ndarray, weights: np.ndarray) -> Coupling | None:
-    """The coupling of a sensor's weighted samples; None where its origin is fixed or they are too few.
-
-    Slopes are zero along what does not vary. Residual spreads never exceed the sensor's marginal ones.
-
-    Arguments:
-        sensor: Its means, frame and marginal spreads.
-        points: Design points, shape (N, 6).
-        weights: Non-negative, shape (N,).
-    """
-    if not np.any(sensor.origin_covariance_m2) or effective_count(weights) < LEAST_EFFECTIVE_SAMPLES:
-        return None
-    origin, tangent, range_m = relative(sensor, points)
-    free = np.diag(sensor.origin_covariance_m2) > 0
-    angular = np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad])
-    direction_per_m, spread_rad = np.zeros((2, 3)), angular.copy()
-    for axis in np.flatnonzero(angular > 0):
-        slopes, spread = _regression(origin[:, free], tangent[:, axis], weights)
-        direction_per_m[axis, free] = slopes
-        spread_rad[axis] = min(spread, angular[axis])
-    range_per_m, range_per_rad, spread_m = np.zeros(3), np.zeros(2), sensor.spread_range_m
-    if sensor.spread_range_m > 0:
-        covariates = np.concatenate([origin[:, free], tangent[:, angular > 0]], axis=1)
-        slopes, spread = _regression(covariates, range_m, weights)
-        range_per_m[free], range_per_rad[angular > 0] = np.split(slopes, [int(free.sum())])
-        spread_m = min(spread, sensor.spread_range_m)
-    return Coupling(direction_per_m, range_per_m, range_per_rad, spread_rad, float(spread_m))
-
-
-def relative(sensor: Sensor, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Origins (N, 3) [m], tangent angles (N, 2) [rad] and ranges (N,) [m] about a sensor's means.
-
-    Angles along which the sensor has no spread are 0.
-    """
-    tangent = tangent_coordinates(sensor.frame, direction(points[:, AZIMUTH], points[:, ELEVATION]))
-    tangent[:, np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad]) == 0] = 0.0
-    return points[:, :3] - sensor.origin_m, tangent, points[:, RANGE] - sensor.range_m
-
-
-def conditional_means(sensor: Sensor, origin: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """E[u | x] (N, 2) [rad] and E[range | x, u] (N,) [m] at origins (N, 3) and angles (N, 2) about the means."""
-    coupling = sensor.coupling
-    if coupling is None:
-        return np.zeros((len(origin), 2)), np.full(len(origin), sensor.range_m)
-    return (
-        origin @ coupling.direction_per_m.T,
-        sensor.range_m + origin @ coupling.range_per_m + tangent @ coupling.range_per_rad,
-    )
-
-
-def conditional_spreads(sensor: Sensor) -> tuple[np.ndarray, float]:
-    """Standard deviations of the angles given the origin (2,) [rad], and of the range given both [m]."""
-    if sensor.coupling is None:
-        return np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad]), sensor.spread_range_m
-    return sensor.coupling.spread_rad, sensor.coupling.spread_m
-
-
-def _regression(covariates: np.ndarray, values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
-    """Weighted least squares slopes (C,) and the residual standard deviation.
-
-    In standardised covariates through the eigenvectors of their correlation matrix, so that covariates which
-    do not vary, or vary together only, get the smallest slopes that do as well.
-    """
-    share = weights / weights.sum()
-    centred = covariates - share @ covariates
-    deviation = values - share @ values
-    scale = np.sqrt(share @ np.square(centred))
-    unit = np.where(scale > 0, scale, 1.0)
-    standard = centred / unit
-    variances, axes = np.linalg.eigh(standard.T @ (share[:, None] * standard))
-    carried = variances > SMALLEST_VARIANCE_SHARE * max(variances[-1], 0.0)
-    inverse = np.where(carried, 1.0 / np.where(carried, variances, 1.0), 0.0)
-    slopes = axes @ (inverse * (axes.T @ (standard.T @ (share * deviation))))
-    left = deviation - standard @ slopes
-    return np.where(scale > 0, slopes / unit, 0.0), float(np.sqrt(share @ np.square(left)))

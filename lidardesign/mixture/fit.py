@@ -1,299 +1,301 @@
-"""From weighted samples of the density to a design that keeps its constraints, and how far its figures may be off."""
+"""Sensors fitted to weighted samples of the density: the first step from a density to rays.
+
+A sensor stands at one place, unless constraints allow its rays to start all over a region (`origin.spread_m`). Where
+origins are free the mixture is first fitted with them; then each sensor is fixed at the mean of its origins, and fitted
+to all that is seen from there. A field of view that may not hold all of this is fitted to what the mixture gave its
+sensor, so that narrow sensors share the work.
+"""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
-from weakref import WeakKeyDictionary
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.constraints.check import ConstraintCheck, check_design
-from lidardesign.constraints.document import MOST_FITTED, Constraints
-from lidardesign.constraints.feasibility import BandwidthBudget, check_feasible
-from lidardesign.constraints.origins import placement_notes, snap_to_space
-from lidardesign.errors import ConfigError
-from lidardesign.estimates import ROUNDING, Estimate, as_documents, effective_share_error
-from lidardesign.layouts.layout import (
-    FitProblem,
-    Layout,
-    missing_samples,
+from lidardesign.constraints.document import MOST_FITTED, Constraints, SensorRules, rules_of
+from lidardesign.constraints.feasibility import BandwidthBudget, check_feasible, fit_within_budget, most_rays
+from lidardesign.constraints.origins import fix_origins, is_mounted, most_mounted
+from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.estimates import Estimate, effective_share_error
+from lidardesign.mixture.bounds import bounds_of, sensor_groups
+from lidardesign.mixture.components import log_density, responsibilities
+from lidardesign.mixture.em import LEAST_SAMPLES
+from lidardesign.mixture.ensemble import (
+    Ensemble,
+    GroupSamples,
+    choose_mounts,
+    fit_groups,
+    heaviest_first,
+    sensors_of,
 )
-from lidardesign.layouts.rays import LAYOUTS, gates_of, lay_out, layout_of, own_count
-from lidardesign.mixture.bounds import sensor_groups
-from lidardesign.mixture.support import Retarget, Support, conditioned
+from lidardesign.mixture.features import Axes, Features
+from lidardesign.mixture.support import Retarget, Support, check_support, pin_samples, restrict_samples
+from lidardesign.numerics import TINY, effective_count, systematic_draw
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
-from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.design_file import design_document
-from lidardesign.sensors.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Gates, LayoutName, Sensor
-from lidardesign.space import DIMENSIONS, DesignSpace
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor, interval_factor
+from lidardesign.task import random_generator
 
+DEFAULT_SENSORS = 4
 EM_SAMPLES = 20_000
 # Of 7 fits of 10 sensors the worst is then 0.005 nats below the best on held-out samples, with 4 seeds 0.03.
 RESTARTS = 12
+# A field of view this near to the widest that it may have would be wider.
+WIDEST = 0.999
 
-# A design is asked for at many places of a track; the samples and the design decide what a refit finds.
-_REFITS: WeakKeyDictionary[Samples, WeakKeyDictionary[DesignSpec, dict[tuple[int, int], DesignSpec]]]
-_REFITS = WeakKeyDictionary()
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FitProblem:
+    """What sensors are fitted to.
+
+    Arguments:
+        samples: Weighted samples of the learned density, at one value of its conditions.
+        constraints: What the sensors keep, where the space has them.
+        sensors: How many; None takes the constraints' or the usual number.
+        rays: Rays per frame; None leaves them open.
+        seed: Root of the random streams.
+        level: The share of each marginal that intervals hold.
+        retarget: log p* of design points (N, 6), needed where an origin is fixed that the density leaves free.
+        keeps_bandwidth: Whether the sensors' gates keep the bandwidth; those of chosen rays do it by themselves.
+        restarts: Seeds that are tried.
+        em_samples: Samples that the fit works on.
+    """
+
+    samples: Samples
+    constraints: Constraints
+    sensors: int | None = None
+    rays: int | None = None
+    seed: int = 0
+    level: float = DEFAULT_LEVEL
+    retarget: Retarget | None = None
+    keeps_bandwidth: bool = True
+    restarts: int = RESTARTS
+    em_samples: int = EM_SAMPLES
+
+    @property
+    def interval(self) -> float:
+        """The standard deviations on each side of a mean that an interval spans."""
+        return interval_factor(self.level)
 
 
 @dataclass(frozen=True, eq=False)
-class FitResult:
-    """A fitted design and how good it is.
+class FittedSensors:
+    """Sensors, and how well they stand for the samples.
 
     Arguments:
-        design: The design; its provenance is for the caller to fill.
-        log_likelihood: Weighted mean log density of the samples [nats]; None for real parts.
-        admissible_mass: The share of the density inside the constraints; None with pinned origins.
-        ess: Effective share of the samples that were admitted, 0 to 1.
-        satisfied: Whether every constraint holds on the finished design.
-        constraints: The independent checks.
-        seconds: Wall time [s].
+        sensors: In the order of the constraint file, or the heaviest first.
+        log_likelihood: Weighted mean log density of the samples [nats].
+        supports: The admitted samples of each group of sensors.
+        rays: Rays per frame that the bandwidth allows; None leaves them open.
         notes: What happened to sensors, one line each.
-        error_estimates: How far log_likelihood, ess and admissible_mass may be off, and the rays of sensors.
     """
 
-    design: DesignSpec
-    log_likelihood: float | None
-    admissible_mass: float | None
-    ess: float
-    satisfied: bool
-    constraints: list[ConstraintCheck]
-    seconds: float
-    notes: tuple[str, ...] = field(default=())
-    error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    sensors: tuple[Sensor, ...]
+    log_likelihood: Estimate
+    supports: Sequence[Support]
+    rays: int | None
+    notes: tuple[str, ...] = ()
 
-    @classmethod
-    def of_choice(cls, design: DesignSpec, constraints: Constraints, samples: Samples, seconds: float) -> FitResult:
-        """A design that was chosen on scenes instead of being fitted to samples."""
-        checks = check_design(design_document(design), constraints, samples.space)
-        satisfied = all(check.satisfied for check in checks)
-        return cls(design, None, None, samples.effective_sample_size, satisfied, checks, seconds)
+    @property
+    def admissible_mass(self) -> float | None:
+        """The share of the density inside the constraints; None with fixed origins."""
+        masses = [support.mass for support in self.supports if support.mass is not None]
+        return float(max(masses)) if len(masses) == len(self.supports) else None
 
-    def as_dict(self) -> dict[str, Any]:
-        """The contract's JSON keys; the path of the design is for the caller to fill."""
-        return {
-            "design": self.design.name,
-            "frame": self.design.mount or "world",
-            "sensors": [sensor.as_dict() for sensor in self.design.sensors],
-            "log_likelihood": self.log_likelihood,
-            "admissible_mass": self.admissible_mass,
-            "ess": self.ess,
-            "satisfied": self.satisfied,
-            "constraints": [check.as_dict() for check in self.constraints],
-            "seconds": self.seconds,
-            "error_estimates": as_documents(self.error_estimates),
-        }
+    @property
+    def ess(self) -> float:
+        """Effective share of the samples that were admitted, 0 to 1."""
+        points = sum(len(support.points) for support in self.supports)
+        return sum(support.effective for support in self.supports) / max(points, 1)
+
+    def estimates(self, samples: Samples) -> dict[str, Estimate]:
+        """log_likelihood, ess and where it is known admissible_mass, with their standard errors."""
+        sizes = np.array([len(support.points) for support in self.supports])
+        errors = np.array([effective_share_error(support.weights) for support in self.supports])
+        ess = Estimate(self.ess, float(np.linalg.norm(sizes * errors)) / max(int(sizes.sum()), 1))
+        estimates = {"log_likelihood": self.log_likelihood, "ess": ess}
+        if self.admissible_mass is not None:
+            widest = max(self.supports, key=lambda support: support.total)
+            # The standard error of the share m of the density inside the constraints, of weights that sum to 1 in all
+            mass, inside = widest.total, float(np.square(widest.weights).sum())
+            outside = max(float(np.square(samples.weights).sum()) - inside, 0.0)
+            error = math.sqrt((1 - mass) ** 2 * inside + mass**2 * outside)
+            estimates["admissible_mass"] = Estimate(mass, error)
+        return estimates
 
 
-def fit(
-    samples: Samples,
-    *,
-    sensors: int | None = None,
-    layout: LayoutName = "grid",
-    rays: int | None = None,
-    constraints: Constraints | None = None,
-    seed: int = 0,
-    restarts: int = RESTARTS,
-    em_samples: int = EM_SAMPLES,
-    level: float = DEFAULT_LEVEL,
-    name: str = "design",
-    gates: Gates | None = None,
-    retarget: Retarget | None = None,
-) -> FitResult:
-    """Fit sensors to samples of the density under constraints.
-
-    Arguments:
-        samples: Weighted samples of the learned density.
-        sensors: How many; None takes the constraints' or 4. A scan has one component per ray instead.
-        layout: How rays are laid out.
-        rays: Rays per frame; None takes the budget's.
-        constraints: A checked constraint file.
-        seed: Root of the random streams.
-        restarts: Seeds that are tried.
-        em_samples: Samples that the fit works on.
-        level: The share of each marginal that intervals hold.
-        name: The design's name.
-        gates: Whether explicit rays have their sensor's gate or their own; None is the layout's
-            usual ones.
-        retarget: log p* of design points (N, 6), needed where an origin is pinned that the density leaves free.
+def fit_sensors(problem: FitProblem) -> FittedSensors:
+    """Sensors that keep the constraints; each rests on at least `LEAST_SAMPLES` effective samples.
 
     Raises:
-        InfeasibleError: Constraints that contradict each other or hold too little of the density.
-        ConfigError: Options that do not fit together.
+        ConfigError: More sensors than can be fitted, or an origin that cannot be fixed without a target density.
+        InfeasibleError: Constraints that contradict each other or hold too little of the density, or a number of
+            sensors of which one would rest on too few samples.
     """
-    started = time.perf_counter()
-    constraints, moved = snap_to_space(Constraints() if constraints is None else constraints, samples.space)
-    check_options(constraints, samples.space, sensors, LAYOUTS[layout], rays)
-    request = FitProblem(
-        samples=samples,
-        constraints=constraints,
-        rules=constraints.rules,
-        budget=BandwidthBudget.of(constraints, rays),
-        sensors=sensors,
-        seed=seed,
-        restarts=restarts,
-        em_samples=em_samples,
-        level=level,
-        name=name,
-        gates=gates or LAYOUTS[layout].usual_gates,
-        retarget=retarget,
-    )
-    fitted = LAYOUTS[layout].fit(request)
-    design, supports = fitted.design, fitted.supports
-    with phase("checks"):
-        checks = check_design(design_document(design), constraints, samples.space)
-    masses = [support.mass for support in supports if support.mass is not None]
-    return FitResult(
-        design=design,
-        log_likelihood=float(fitted.log_likelihood.value or 0.0),
-        # unknown where an origin is pinned
-        admissible_mass=float(max(masses)) if len(masses) == len(supports) else None,
-        ess=sum(s.effective for s in supports) / max(sum(len(s.points) for s in supports), 1),
-        satisfied=all(check.satisfied for check in checks),
-        constraints=checks,
-        seconds=time.perf_counter() - started,
-        notes=(*moved, *placement_notes(constraints.rules), *fitted.notes),
-        error_estimates=_error_estimates(fitted.log_likelihood, supports, samples, design.sensors),
-    )
+    constraints, samples = problem.constraints, problem.samples
+    if problem.sensors is not None and not 1 <= problem.sensors <= MOST_FITTED:
+        raise ConfigError(f"{problem.sensors} sensors", where="--sensors", allowed=f"1 to {MOST_FITTED}")
+    check_feasible(constraints, samples.space, sensors=problem.sensors, rays=problem.rays)
+    budget, rules = BandwidthBudget.of(constraints, problem.rays), constraints.rules
+    if not problem.keeps_bandwidth:
+        budget = replace(budget, limit_mbps=None)
+    count = _sensor_count(problem, budget)
+    if is_mounted(rules):
+        rules = choose_mounts(rules, samples, count, problem.retarget, problem.seed)
+    supports = _supports(problem, rules, count)
+    ensemble = fit_groups(_group_samples(problem, rules, supports, count), problem.seed, problem.restarts)
+    loose = [index for index in range(count) if _is_loose(rules_of(rules, index), samples)]
+    if loose:
+        ensemble, rules, supports = _fixed(problem, rules, ensemble, loose, count)
+    ensemble, rays = fit_within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), budget)
+    _check_effective(ensemble, supports)
+    sensors = sensors_of(ensemble, samples.space)
+    sensors = sensors if constraints.each else heaviest_first(sensors)
+    return FittedSensors(sensors, _likelihood(ensemble, supports), supports, rays, ensemble.notes)
 
 
-def check_options(
-    constraints: Constraints, space: DesignSpace, sensors: int | None, layout: Layout, rays: int | None
-) -> None:
-    """Options against each other and against the constraints, before anything is computed."""
-    if sensors is not None and not (isinstance(sensors, int) and 1 <= sensors <= MOST_FITTED):
-        raise ConfigError(
-            f"{sensors} sensors", where="--sensors", allowed=f"1 to {MOST_FITTED}", hint="--layout scan has one per ray"
-        )
-    if rays is not None and not 1 <= rays <= MOST_RAYS:
-        raise ConfigError(f"{rays} rays", where="--rays", allowed=f"1 to {MOST_RAYS}")
-    if space.conditioned and not layout.one_sensor_per_ray:
-        names = [DIMENSIONS[index] for index in space.conditioned]
-        raise ConfigError(
-            f"the density has conditions ({', '.join(names)}), and only a scan has rays for all their values",
-            where=f"--layout {layout.name}",
-            hint=f"--layout scan, or {' '.join(f'--at {condition}=VALUE' for condition in names)}",
-        )
-    layout.check_constraints(constraints)
-    count = None if layout.one_sensor_per_ray else sensors
-    check_feasible(constraints, space, sensors=count, rays=rays)
+def _sensor_count(problem: FitProblem, budget: BandwidthBudget) -> int:
+    """The number of sensors: as asked for, else the usual one within the constraints, none without a ray."""
+    constraints, asked = problem.constraints, problem.constraints.sensors
+    if problem.sensors is not None or asked.count is not None:
+        return int(problem.sensors or asked.count or 1)
+    low = max(asked.min or 1, len(constraints.each), 1)
+    mounted = most_mounted(constraints.rules)
+    limits = (asked.max, mounted, budget.rays, most_rays(constraints))
+    high = min((limit for limit in limits if limit is not None), default=math.inf)
+    usual = mounted or len(constraints.each) or DEFAULT_SENSORS
+    return int(min(max(usual, low), max(low, high)))
 
 
-def fit_like(
-    design: DesignSpec,
-    samples: Samples,
-    *,
-    rays: int | None,
-    seed: int,
-    restarts: int = RESTARTS,
-    em_samples: int = EM_SAMPLES,
-    name: str | None = None,
-    retarget: Retarget | None = None,
-) -> DesignSpec:
-    """A design fitted to other samples as a given one was fitted to its own.
+def _is_loose(rules: SensorRules, samples: Samples) -> bool:
+    """Whether a sensor has a free origin, and stands at one place all the same."""
+    (group,) = sensor_groups((rules,), samples.space, 1)
+    free = [axis for axis in range(3) if axis in samples.space.free and group.pins[axis] is None]
+    return bool(free) and rules.origin.spread_m.max is None
+
+
+@phase("support")
+def _supports(
+    problem: FitProblem, rules: Sequence[SensorRules], count: int, shares: np.ndarray | None = None
+) -> list[Support]:
+    """The samples of each group of sensors, refused where they are too few.
 
     Arguments:
-        design: The design whose number of sensors, layout, constraints, level and gates are taken.
-        samples, rays, seed, restarts, em_samples, retarget: See `fit`.
-        name: The new design's name; None is that of the given one.
+        problem: The fit.
+        rules: Of all sensors.
+        count: How many sensors there are.
+        shares: How much each of the samples belongs to each sensor, (N, S), where groups of one sensor share them out.
     """
-    # beside chosen rays only a scan has rays for all values of a condition
-    layout = LAYOUTS["scan"] if design.track is not None else layout_of(design)
-    return fit(
-        samples,
-        sensors=None if layout.one_sensor_per_ray else len(design.sensors),
-        layout=layout.fitted_as,
-        rays=rays,
-        constraints=Constraints.from_mapping(dict(design.constraints), where=f"constraints of {design.name}"),
-        seed=seed,
-        restarts=restarts,
-        em_samples=em_samples,
-        level=design.level,
-        name=name or design.name,
-        gates=gates_of(design),
-        retarget=retarget,
-    ).design
+    supports, samples = [], problem.samples
+    groups = sensor_groups(rules, samples.space, count)
+    for index, group in enumerate(groups):
+        is_free = all(pin is None for pin in group.pins)
+        if is_free:
+            support = restrict_samples(samples, rules, group)
+        else:
+            own = samples if shares is None else _shared(samples, shares[:, list(group.sensors)].sum(axis=1))
+            generator = random_generator(problem.seed, "pinned", index)
+            support = pin_samples(own, rules, group, problem.retarget, problem.em_samples, generator)
+        mass = support.total if is_free else None
+        check_support(support, group, mass=mass, several=len(groups) > 1)
+        supports.append(replace(support, mass=mass))
+    return supports
 
 
-def refitted(
-    design: DesignSpec,
-    count: int | None,
-    samples: Samples | None,
-    *,
-    seed: int = 0,
-    at: Mapping[str, float] | None = None,
-    retarget: Retarget | None = None,
-) -> DesignSpec:
-    """The design that fires so many rays: itself, or fitted anew where every ray is a sensor of its own.
+def _shared(samples: Samples, share: np.ndarray) -> Samples:
+    """The samples, drawn as if only a share of each (N,) were there."""
+    return replace(samples, log_prob=samples.log_prob - np.log(np.maximum(share, TINY)))
 
-    It keeps the design's constraints, but for the number of rays itself. Arguments are those of `lay_out`.
 
-    Raises:
-        ConfigError: There are no samples to fit to, or an origin is pinned.
+@phase("features")
+def _group_samples(
+    problem: FitProblem, rules: Sequence[SensorRules], supports: Sequence[Support], count: int
+) -> list[GroupSamples]:
+    """Features, bounds and shares of each group of sensors.
+
+    Pinned groups share by how much density each pinned origin sees; against groups with a free origin, whose
+    measure is another, they share by numbers of sensors.
     """
-    if count in (None, 0) or not layout_of(design).one_sensor_per_ray or count == own_count(design):
-        return design
-    if samples is None:
-        raise missing_samples(design, count, "sensor")
-    if design.track is None and samples.space.conditioned:
-        # where it was made: one refit then serves all places
-        samples = conditioned(samples, {**(at or {}), **design.at}, retarget)
-    fits = _REFITS.setdefault(samples, WeakKeyDictionary()).setdefault(design, {})
-    if (count, seed) not in fits:
-        document = {**design.constraints}
-        if "budget" in document:
-            document["budget"] = {key: value for key, value in document["budget"].items() if key != "rays"}
-        constraints = Constraints.from_mapping(document, where=f"constraints of {design.name}")
-        if any(pin is not None for group in sensor_groups(constraints.rules, samples.space, 1) for pin in group.pins):
-            raise ConfigError(
-                f"a scan from a pinned origin cannot be refitted to {count} rays without its target density",
-                where=design.name,
-                allowed=f"{own_count(design)} rays",
-                hint=f"lidardesign constrain RUN --layout scan --rays {count} with the same constraints",
-            )
-        fits[count, seed] = fit_like(replace(design, constraints=document), samples, rays=count, seed=seed)
-    return fits[count, seed]
+    space = problem.samples.space
+    groups = sensor_groups(rules, space, count)
+    shares = np.array([len(group.sensors) for group in groups], dtype=np.float64) / count
+    is_pinned = np.array([any(pin is not None for pin in group.pins) for group in groups])
+    totals = np.array([support.total for support in supports])
+    if is_pinned.any():
+        shares[is_pinned] = shares[is_pinned].sum() * totals[is_pinned] / totals[is_pinned].sum()
+    parts = []
+    for index, (group, support) in enumerate(zip(groups, supports, strict=True)):
+        points, weights = support.points, support.weights
+        if len(points) > problem.em_samples:
+            generator = random_generator(problem.seed, "em", index)
+            chosen = systematic_draw(weights, problem.em_samples, generator)
+            points, weights = points[generator.permutation(chosen)], np.ones(problem.em_samples)
+        features = Features.of(points, weights, Axes.of(space, group.pins), space)
+        bounds = bounds_of(rules, space, group.sensors, problem.interval)
+        parts.append(GroupSamples(group, float(shares[index]), features, bounds))
+    return parts
 
 
-def rays_at(
-    design: DesignSpec,
-    count: int,
-    samples: Samples | None,
-    *,
-    at: Mapping[str, float] | None = None,
-    retarget: Retarget | None = None,
-) -> Rays:
-    """The rays of a design at any number of rays, of a scan after another fit; arguments are those of `lay_out`."""
-    return lay_out(refitted(design, count, samples, at=at, retarget=retarget), count, samples, at=at, retarget=retarget)
+def _fixed(
+    problem: FitProblem, rules: Sequence[SensorRules], ensemble: Ensemble, loose: Sequence[int], count: int
+) -> tuple[Ensemble, Sequence[SensorRules], list[Support]]:
+    """The fit again, with loose sensors fixed at the means of their origins."""
+    sensors = sensors_of(ensemble, problem.samples.space)
+    places = [tuple(map(float, sensors[index].origin_m)) if index in loose else None for index in range(count)]
+    fixed = fix_origins(rules, places)
+    supports = _supports(problem, fixed, count)
+    whole = fit_groups(_group_samples(problem, fixed, supports, count), problem.seed, problem.restarts)
+    if not any(
+        _is_widest(part, mixture.mixture.spread_rad) for part, mixture in zip(whole.parts, whole.results, strict=True)
+    ):
+        return whole, fixed, supports
+    supports = _supports(problem, fixed, count, _belonging(problem.samples, ensemble, count))
+    return fit_groups(_group_samples(problem, fixed, supports, count), problem.seed, problem.restarts), fixed, supports
 
 
-def _error_estimates(
-    log_likelihood: Estimate, supports: Sequence[Support], samples: Samples, sensors: Sequence[Sensor]
-) -> dict[str, Estimate]:
-    """Everything that a fit reports with an error, by name.
+def _is_widest(part: GroupSamples, spread_rad: np.ndarray) -> bool:
+    """Whether a constraint keeps a field of view from being wider, (K, 2) [rad]."""
+    return bool((spread_rad >= WIDEST * part.bounds.spread_high).any())
 
-    The admitted samples' ESS; the share of the density that they stand for where it is known; and how many of the rays
-    that a sensor fires its weight would give to another one, as rays are whole, where they are not open.
+
+def _belonging(samples: Samples, ensemble: Ensemble, count: int) -> np.ndarray:
+    """How much each sample belongs to each sensor of a fit with free origins, (N, S)."""
+    shares = np.zeros((len(samples), count))
+    for part, result in zip(ensemble.parts, ensemble.results, strict=True):
+        features = Features(
+            samples.points, samples.weights, part.features.axes, part.features.centre, part.features.scale
+        )
+        shares[:, list(part.group.sensors)] = responsibilities(result.mixture, features)
+    return shares
+
+
+def _check_effective(ensemble: Ensemble, supports: Sequence[Support]) -> None:
+    """Refuse components that rest on too few samples."""
+    for part, result, support in zip(ensemble.parts, ensemble.results, supports, strict=True):
+        own = responsibilities(result.mixture, part.features) * part.features.weights[:, None]
+        worth = support.effective / max(effective_count(part.features.weights), 1.0)
+        for sensor, weights in zip(part.group.sensors, own.T, strict=True):
+            found = effective_count(weights) * min(worth, 1.0)
+            if found < LEAST_SAMPLES:
+                raise InfeasibleError(
+                    f"sensor {sensor} of {len(ensemble.order)} would rest on {found:.0f} effective samples of the density",
+                    conflicts=["--sensors"],
+                    allowed=f"at least {LEAST_SAMPLES}",
+                    hint="fewer sensors, or learn longer (--preset standard or fine)",
+                )
+
+
+def _likelihood(ensemble: Ensemble, supports: Sequence[Support]) -> Estimate:
+    """The log-likelihood of a fit and its standard error over other samples [nats].
+
+    A fit on fewer samples than were admitted knows as much as they are worth, and one on more no more than those.
+    That the sensors were fitted to these very samples is not in it.
     """
-    sizes = np.array([len(support.points) for support in supports])
-    errors = np.array([effective_share_error(support.weights) for support in supports])
-    share = sum(support.effective for support in supports) / max(sizes.sum(), 1)
-    ess = Estimate(share, float(np.linalg.norm(sizes * errors)) / max(int(sizes.sum()), 1))
-    estimates = {"log_likelihood": log_likelihood, "ess": ess}
-    if all(support.mass is not None for support in supports):
-        widest = max(supports, key=lambda support: support.total)
-        # The standard error of the share m of the density inside the constraints, of weights that sum to 1 in all
-        mass, inside = widest.total, float(np.square(widest.weights).sum())
-        outside = max(float(np.square(samples.weights).sum()) - inside, 0.0)
-        estimates["admissible_mass"] = Estimate(mass, math.sqrt((1 - mass) ** 2 * inside + mass**2 * outside))
-    counts = [sensor.rays for sensor in sensors]
-    if None not in counts:
-        rays = np.array(counts, dtype=np.float64)
-        wanted = rays.sum() * np.array([sensor.weight for sensor in sensors])
-        estimates["rays"] = Estimate(float(rays.sum()), float(np.abs(rays - wanted).sum() / 2), "rays", ROUNDING)
-    return estimates
+    variance = 0.0
+    for part, result, support in zip(ensemble.parts, ensemble.results, supports, strict=True):
+        weights, values = part.features.weights, log_density(result.mixture, part.features)
+        spread = float(weights @ np.square(values - weights @ values))
+        variance += part.share**2 * spread / min(support.effective, len(values))
+    return Estimate(ensemble.log_likelihood, math.sqrt(variance), "nats")

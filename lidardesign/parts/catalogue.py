@@ -19,22 +19,16 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import ConfigError, page
-from lidardesign.layouts.grid import grid_rows, grid_tangent
-from lidardesign.parts.part import Part, even_subset
+from lidardesign.parts.part import Part
 from lidardesign.parts.statements import PartFile
 from lidardesign.run.clock import phase
 from lidardesign.run.validation import check_model, suggest
 from lidardesign.run.yaml import load_yaml
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import (
-    DEFAULT_LEVEL,
-    MOST_RAYS,
-    DesignSpec,
-    Sensor,
-    boresight_frame,
-    boresight_of,
-    interval_factor,
-)
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.even import even_subset, grid_rows, grid_tangent
+from lidardesign.sensors.pattern import Pattern
+from lidardesign.sensors.sensor import MOST_RAYS, Sensor, boresight_frame, boresight_of
 
 FOLDER = Path(__file__).parent / "files"
 SHIPPED = "lidardesign"
@@ -287,32 +281,22 @@ def part_sensor(
     *,
     name: str = "s0",
     weight: float = 1.0,
-    rays: int | None = None,
-    level: float = DEFAULT_LEVEL,
 ) -> Sensor:
-    """The part as a component of design space: its field of view and its range are the intervals that hold `level`.
+    """The part as a component of design space: its field of view and its range are the component's intervals.
 
     The boresight is the centre of the field. A field of a full turn is a ring about the part's axis, of which the
     component is the Gaussian of the same extents; what the part does see is said by its rays.
     """
     azimuth, elevation, roll = boresight_of(boresight_frame(*part.centre_rad) @ pose.frame)
-    horizontal, vertical = part.field_of_view_rad
-    near, far = part.range_m
-    half = interval_factor(level)
     return Sensor(
         name=name,
         weight=weight,
         origin_m=np.asarray(pose.origin_m, dtype=np.float64),
-        origin_covariance_m2=np.zeros((3, 3)),
         azimuth_rad=azimuth,
         elevation_rad=elevation,
         roll_rad=roll,
-        spread_horizontal_rad=horizontal / (2 * half),
-        spread_vertical_rad=vertical / (2 * half),
-        range_m=(near + far) / 2,
-        spread_range_m=(far - near) / (2 * half),
-        level=level,
-        rays=rays,
+        field_of_view_rad=part.field_of_view_rad,
+        gate_m=part.range_m,
         part=part.name,
     )
 
@@ -323,7 +307,6 @@ def part_design(
     count: int | None = None,
     *,
     name: str | None = None,
-    level: float = DEFAULT_LEVEL,
 ) -> DesignSpec:
     """A design of real parts at poses, with the explicit rays of their patterns; see `part_rays`.
 
@@ -334,19 +317,15 @@ def part_design(
     """
     poses = [poses] if isinstance(poses, Pose) else list(poses)
     rays = part_rays(part, poses, count)
-    shares = np.bincount(rays.sensor, minlength=len(poses))
     sensors = tuple(
-        part_sensor(part, pose, name=f"s{index}", weight=1 / len(poses), rays=int(shares[index]), level=level)
-        for index, pose in enumerate(poses)
+        part_sensor(part, pose, name=f"s{index}", weight=1 / len(poses)) for index, pose in enumerate(poses)
     )
     return DesignSpec(
         name=name or part.name.replace(":", "-"),
         sensors=sensors,
         layout="fixed",
-        rays=len(rays),
-        ray_table=rays.as_angles(),
+        patterns=(Pattern.of(rays.as_angles()),),
         provenance={"catalog": part.name, "product": part.product, "rate_hz": part.rate_hz},
-        level=level,
     )
 
 

@@ -18,7 +18,6 @@ from typing import Any, Literal
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.layouts.grid import grid_rows, low_discrepancy
 from lidardesign.numerics import COARSE_SLACK, sphere_exp, sphere_log
 from lidardesign.parts.statements import (
     Even,
@@ -32,6 +31,7 @@ from lidardesign.parts.statements import (
     Zones,
     ray_count,
 )
+from lidardesign.sensors.even import grid_rows, low_discrepancy
 from lidardesign.space import direction
 
 Projection = Literal["tangent", "sphere", "plane"]
@@ -308,33 +308,3 @@ def disagreements(part: Part) -> list[str]:
         if any(first[0] != second[0] and first[1] != second[1] for first, second in pairs):
             names.append(name)
     return names
-
-
-def even_subset(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices, ascending, of `count` of the points that lie evenly among them: (M, K) to int64 (count,).
-
-    The points are halved along their longest extent until as many groups as wanted are left, each with the same
-    number of points but for one; of each the point nearest to its centre stays. Deterministic, and O(M log M).
-
-    Raises:
-        ConfigError: More are wanted than there are.
-    """
-    if not 0 <= count <= len(points):
-        raise ConfigError(f"{count} of {len(points)} rays", where="rays", allowed=f"0 to {len(points)}")
-    if count == len(points):
-        return np.arange(count)
-    kept: list[int] = []
-    groups = [(np.arange(len(points)), count)] if count else []
-    while groups:
-        members, wanted = groups.pop()
-        inside = points[members]
-        if wanted == 1:
-            kept.append(int(members[np.square(inside - inside.mean(axis=0)).sum(axis=1).argmin()]))
-            continue
-        # to so many digits, so that rounding does not choose among equal extents and positions
-        axis = np.round(np.ptp(inside, axis=0), 9).argmax()
-        order = members[np.argsort(np.round(inside[:, axis], 9), kind="stable")]
-        first = wanted // 2
-        cut = int(np.clip(round(len(order) * first / wanted), first, len(order) - (wanted - first)))
-        groups += [(order[:cut], first), (order[cut:], wanted - first)]
-    return np.sort(np.array(kept, dtype=np.int64))

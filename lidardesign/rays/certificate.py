@@ -5,7 +5,7 @@ For thresholds t >= 0 of items and a price lambda >= 0 of bandwidth, every admis
     F(S) - harm(S) <= sum_u w_u t_u + lambda B
                       + max_R sum_{r in R} max_g [ sum_u w_u (a(r,g,u) - t_u)+ - lambda b(r,g) - h(r,g) ]+
 
-where R holds the best rays of each sensor, as many as it fires (Cornuejols, Fisher and Nemhauser 1977): whatever the
+where R holds the best rays of each group of candidates, as many as may be chosen of it (Cornuejols, Fisher and Nemhauser 1977): whatever the
 thresholds, an item counts at most its threshold and what single rays exceed it by. Subgradients lower the bound, each
 with a part of the one before, as else they zigzag (Camerini, Fratta and Maffioli 1975). For
 concave sums phi(z) <= phi(y) + slope(y) (z - y) takes the place of thresholds, and Frank and Wolfe (1956) choose y.
@@ -21,8 +21,9 @@ import numpy as np
 
 from lidardesign.numerics import COARSE_SLACK, ROUNDING
 from lidardesign.rays import kernels
-from lidardesign.rays.choice import Choice, RayCounts
+from lidardesign.rays.choice import Choice, RayCounts, choose
 from lidardesign.rays.coverage import Coverage
+from lidardesign.sensors.design import DesignSpec
 
 # Of subgradients, at most; more of them lower the bound of 361 rays on faces by less than 0.1 % of the loss.
 ROUNDS = 80
@@ -30,6 +31,7 @@ PRICE_BISECTIONS = 12
 PATIENCE = 5  # rounds without a lower bound after which steps are halved
 PROGRESS = 0.02  # of what the bound exceeds the value by: a bound that is lower by less is not lower
 PROXY = "mean over items of what the returns of the chosen rays leave unknown, by the task's informs"
+PRICES = 7  # of the curve beside none: each half of the one before, from twice what the bits of a free choice are worth
 MEMORY = 0.7  # how much of its last direction a step keeps
 
 
@@ -88,6 +90,14 @@ def certificate_document(
         "proxy": PROXY,
         "unit": unit,
     }
+
+
+CERTIFIED = ("rays", "value", "bound", "gap", "held_back_value", "candidates", "gates", "scenes")
+
+
+def certificates_of(design: DesignSpec) -> list[dict[str, Any]]:
+    """How far from the best a design's choices of rays may be, one entry per number of rays; none that is damaged."""
+    return [entry for entry in design.certificates if all(type(entry.get(name)) in (int, float) for name in CERTIFIED)]
 
 
 def certify(
@@ -155,8 +165,8 @@ class _Admissible:
         most = net[np.arange(len(gate)), gate]
         taken = np.full(len(gate), -1)
         total = 0.0
-        for sensor, count in enumerate(self.counts.most):
-            own = np.flatnonzero((self.counts.sensor == sensor) & (most > 0))
+        for group, count in enumerate(self.counts.most):
+            own = np.flatnonzero((self.counts.group == group) & (most > 0))
             if len(own) > count:
                 own = own[np.argsort(-most[own], kind="stable")[:count]]
             taken[own] = gate[own]
@@ -219,3 +229,23 @@ class Tangents:
         self.made += 1
         self.known += 2 / (self.made + 2) * (coverage.known(taken) - self.known)
         return bound
+
+
+def price_curve(coverage: Coverage, counts: RayCounts, visits: int = 1) -> list[list[float]]:
+    """The loss of choices [in the unit of worth] against their bandwidth [Mbit/s], as pairs that rise and fall.
+
+    Choices that cost more and lose no less than others are left out.
+
+    Arguments:
+        coverage: What the candidates tell.
+        counts: How many rays each sensor fires.
+        visits: Over how many values of a condition the bandwidth is a mean.
+    """
+    free = choose(coverage, counts, passes=0)
+    prices = 2 * free.worth / free.bits * 0.5 ** np.arange(PRICES) if free.bits > 0 else []
+    choices = [free, *(choose(coverage, counts, price=float(price), passes=0) for price in prices)]
+    points: list[list[float]] = []
+    for mbps, loss in sorted((one.bits / visits, coverage.complete - (one.worth - one.harm)) for one in choices):
+        if not points or loss < points[-1][1]:
+            points.append([float(mbps), float(loss)])
+    return points

@@ -48,19 +48,21 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class RayCounts:
-    """How many rays each sensor fires.
+    """How many rays may be chosen, by groups of candidates.
 
     Arguments:
-        sensor: The sensor of each candidate ray, (N,).
-        most: The number of rays of each sensor, (S,).
+        group: The group of each candidate ray, (N,): a sensor, or a value of a condition.
+        most: The number of rays of each group.
+        owner: The sensor of each candidate, (N,), where every sensor has to fire a ray; None where that is left open.
     """
 
-    sensor: np.ndarray
+    group: np.ndarray
     most: np.ndarray
+    owner: np.ndarray | None = None
 
     @staticmethod
     def of_one(rays: int, count: int) -> RayCounts:
-        """One sensor that fires `count` of all rays."""
+        """One group of which `count` rays may be chosen."""
         return RayCounts(np.zeros(rays, dtype=np.intp), np.array([count]))
 
 
@@ -68,7 +70,8 @@ class _Search:
     """A choice under way: what it knows, what each ray would add, and what is left of each sensor's count."""
 
     def __init__(self, coverage: Coverage, counts: RayCounts) -> None:
-        self.coverage, self.sensor, self.left = coverage, counts.sensor, counts.most.copy()
+        self.coverage, self.group, self.left = coverage, counts.group, counts.most.copy()
+        self.owner = counts.owner
         self.cost = coverage.harm
         self.limit_mbps, self.spent_mbps = np.inf, 0.0
         self.gate = np.full(coverage.shape[0], -1)
@@ -80,6 +83,8 @@ class _Search:
         coverage = self.coverage
         self.cost = coverage.harm + price * np.where(np.isfinite(coverage.bits), coverage.bits, 0.0)
         self.limit_mbps = limit_mbps
+        if self.owner is not None:
+            self.take_one_of_each(self.owner)
         self.fill(full)
         for _ in range(passes):
             worth = float(coverage.weight @ coverage.counted(self.known))
@@ -92,9 +97,10 @@ class _Search:
         """What was chosen so far."""
         return Choice(self.gate.copy(), self.coverage.value_of(self.gate), *self.coverage.charge(self.gate), price)
 
-    def best(self) -> tuple[int, int, float]:
-        """The ray and gate that add most now, and what they add; -inf where none may be taken."""
-        may_fire = (self.gate < 0) & (self.left[self.sensor] > 0)
+    def best(self, among: np.ndarray | None = None) -> tuple[int, int, float]:
+        """The ray and gate that add most now, of all or of some, and what they add; -inf where none may be taken."""
+        may_fire = (self.gate < 0) & (self.left[self.group] > 0)
+        may_fire = may_fire if among is None else may_fire & among
         room_mbps = self.limit_mbps - self.spent_mbps
         return kernels.best_gate(self.gains, self.cost, self.coverage.bits, may_fire, room_mbps)
 
@@ -105,7 +111,7 @@ class _Search:
 
     def _count(self, ray: int, gate: int) -> None:
         self.gate[ray] = gate
-        self.left[self.sensor[ray]] -= 1
+        self.left[self.group[ray]] -= 1
         self.spent_mbps += self.coverage.bits[ray, gate]
 
     def drop(self, ray: int) -> None:
@@ -113,12 +119,19 @@ class _Search:
         gate = int(self.gate[ray])
         self.gate[ray] = -1
         self._change(ray, gate, adding=False)
-        self.left[self.sensor[ray]] += 1
+        self.left[self.group[ray]] += 1
         self.spent_mbps -= self.coverage.bits[ray, gate]
 
     def _change(self, ray: int, gate: int, *, adding: bool) -> None:
         coverage = self.coverage
         kernels.change_choice(ray, gate, adding, coverage.entries, coverage.by_item, self.gate, self.known, self.gains)
+
+    def take_one_of_each(self, owner: np.ndarray) -> None:
+        """Takes the best ray of every sensor that fires none."""
+        for sensor in np.setdiff1d(owner, owner[self.gate >= 0]):
+            ray, gate, net = self.best(owner == sensor)
+            if net > -np.inf:
+                self.take(ray, gate)
 
     def fill(self, full: bool) -> None:
         """Takes rays greedily until counts or bandwidth are used up or, unless `full`, none gains."""
@@ -133,6 +146,8 @@ class _Search:
         changed, entries = False, self.coverage.entries
         for ray in np.flatnonzero(self.gate >= 0):
             gate = int(self.gate[ray])
+            if self.owner is not None and np.count_nonzero(self.gate[self.owner == self.owner[ray]] >= 0) == 1:
+                continue  # the only ray of its sensor
             items = entries.item[entries.start[ray] : entries.start[ray + 1]]
             known, gains = self.known[items], self.gains.copy()
             self.drop(int(ray))
@@ -161,9 +176,9 @@ def choose(
 
     Arguments:
         coverage: What the candidates tell.
-        counts: How many rays each sensor fires.
+        counts: How many rays may be chosen.
         price: What 1 Mbit/s costs, in the unit of worth.
-        full: Whether each sensor fires all its rays, also those that gain nothing.
+        full: Whether so many are chosen, also those that gain nothing.
         passes: How often each ray may be swapped.
     """
     search = _Search(coverage, counts)

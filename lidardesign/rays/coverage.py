@@ -17,12 +17,9 @@ import numpy as np
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.numerics import SLACK
 from lidardesign.rays import kernels
-from lidardesign.rays.information import require_valid
-from lidardesign.scenes.rays import Returns
-from lidardesign.task import Information
+from lidardesign.rays.informed import LARGEST, InformedScene
 
 MOST_GATES = 8  # of a ray: an entry keeps one bit for each
-LARGEST = np.zeros(0)  # the table of items that count the largest worth
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,76 +161,6 @@ class Coverage:
         """Bits [Mbit/s] and harm of a choice of one gate per ray, -1 for none, (N,)."""
         rays = np.flatnonzero(gate >= 0)
         return float(self.bits[rays, gate[rays]].sum()), float(self.harm[rays, gate[rays]].sum())
-
-
-@dataclass(frozen=True, eq=False)
-class InformedScene:
-    """What a task says of a scene's returns, with the ranges that say through which gates they are heard.
-
-    Arguments:
-        ray, item: Of each pair, int32 (E,).
-        worth: Above 0, float32 (E,).
-        range_m: The range of its return, (E,) [m].
-        weight: What items count, (U,); they sum to 1.
-        spoiling: Rays whose returns spoil something, one entry per return, (H,).
-        harm, harm_range_m: What each of these spoils, and its range [m], (H,).
-        sums: The table of sums, or `LARGEST`.
-        complete: What an item counts of which nothing is left to know.
-        is_repeated: Whether a ray may tell of an item by several frames, of which the largest worth counts.
-        unit: Of worth.
-    """
-
-    ray: np.ndarray
-    item: np.ndarray
-    worth: np.ndarray
-    range_m: np.ndarray
-    weight: np.ndarray
-    spoiling: np.ndarray
-    harm: np.ndarray
-    harm_range_m: np.ndarray
-    sums: np.ndarray
-    complete: float
-    is_repeated: bool
-    unit: str
-
-    @classmethod
-    def of(cls, information: Information, returns: Sequence[Returns]) -> InformedScene:
-        """What is kept of the returns of all candidate rays, through open gates.
-
-        Raises:
-            PluginError: Pairs, weights or harm that cannot be.
-        """
-        range_m = np.stack([frame.range_m for frame in returns])
-        require_valid(information, range_m.shape[1], len(returns))
-        tells = np.flatnonzero(information.worth > 0)
-        ray, item = information.ray[tells], information.item[tells]
-        count = len(information.frame)
-        weight = np.ones(count) if information.weight is None else np.asarray(information.weight, dtype=np.float64)
-        harm = np.zeros_like(range_m) if information.harm is None else np.asarray(information.harm)
-        spoiling = np.nonzero(harm)
-        return cls(
-            ray=ray.astype(np.int32),
-            item=item.astype(np.int32),
-            worth=information.worth[tells].astype(np.float32),
-            range_m=range_m[information.source[tells], ray],
-            weight=weight / weight.sum(),
-            spoiling=spoiling[1],
-            harm=harm[spoiling],
-            harm_range_m=range_m[spoiling],
-            sums=LARGEST if information.sums is None else np.asarray(information.sums, dtype=np.float64),
-            complete=information.complete,
-            is_repeated=information.seen_in is not None,
-            unit=information.unit,
-        )
-
-    @cached_property
-    def telling_returns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Every return that tells something: its ray (K,) and range (K,) [m]."""
-        # a return tells of several items
-        order = np.lexsort((self.range_m, self.ray))
-        ray, range_m = self.ray[order], self.range_m[order]
-        is_first = np.append(True, (np.diff(ray) > 0) | (np.diff(range_m) > 0))[: len(ray)]
-        return ray[is_first].astype(np.intp), range_m[is_first]
 
 
 def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndarray) -> Coverage:

@@ -1,4 +1,4 @@
-"""What is chosen from: rays cast into scenes, what they tell there, and a few gates for each.
+"""Gates of candidate rays: a few for each, from what the ray or its sensor returns, inside what constraints allow.
 
 Gates hold quantiles of what a ray, and rays near it, return that tells something. Narrow gates cost fewer bits and lose
 what lies outside; which of them pays is for the choice.
@@ -6,50 +6,66 @@ what lies outside; which of them pays is for the choice.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from lidardesign.layouts.gates import central_intervals
-from lidardesign.rays.coverage import InformedScene
-from lidardesign.scenes.rays import Outcome, Rays, Returns
-from lidardesign.scenes.scene import Scene
-from lidardesign.simulate.returns import simulate_many
-from lidardesign.task import Information
+from lidardesign.constraints.document import SensorRules
+from lidardesign.mixture.bounds import Bounds, bounds_of
+from lidardesign.mixture.m_step import fit_gate
+from lidardesign.rays.informed import InformedScene
+from lidardesign.run.clock import phase
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.sensor import Sensor, interval_factor
+from lidardesign.space import DesignSpace
 
-CANDIDATES_PER_RAY = 5
 # Shares of what a ray returns that its gates hold; the first of them counts what rays near it return too.
 LEVELS = (1.0, 1.0, 0.98, 0.9, 0.75)
 SENSOR_LEVELS = (1.0, 0.98, 0.9, 0.75, 0.5, 0.25)  # the same of what all rays of a sensor return
 NEIGHBOURS = 7  # of a ray, with itself: those around it in a hexagonal lattice
 FEWEST_RETURNS = 3  # of a ray by itself, below which its gates rest on those of rays near it
+# Gates are at least this wide: a thousandth of what one bin of 100 ps resolves [m].
+THINNEST_GATE_M = 1.5e-5
 
 
-def inform(
-    scene: Scene,
-    rays: Rays,
-    visits: Sequence[slice],
-    informs: Callable[[Scene, Sequence[Returns]], Information],
-) -> InformedScene:
-    """What a task says of the returns of rays in a scene, through the rays' own gates.
+@dataclass(frozen=True, eq=False)
+class GateLimits:
+    """What the gates of a design's rays keep.
 
     Arguments:
-        scene: The scene.
-        rays: All candidates.
-        visits: The rays at each condition, one after the other; at the other conditions these have no returns.
-        informs: What the task says of a scene's returns.
+        sensors: Those that fire the rays.
+        rules: What constraints ask of them.
+        level: The share of each marginal that intervals hold.
+        space: The design space.
+        margin_m: By how much gates that hold all returns are longer at both ends: other scenes differ.
+        is_shared: Whether all rays of a sensor have one gate.
     """
-    fired = simulate_many(scene, [rays.subset(visit) for visit in visits])
-    returns = [_among(rays, visit, frame) for visit, frames in zip(visits, fired, strict=True) for frame in frames]
-    return InformedScene.of(informs(scene, returns), returns)
 
+    sensors: Sequence[Sensor]
+    rules: Sequence[SensorRules]
+    level: float
+    space: DesignSpace
+    margin_m: float
+    is_shared: bool
 
-def _among(rays: Rays, fired: slice, returns: Returns) -> Returns:
-    """The returns of some rays among all rays, of which the others return nothing."""
-    outcome, range_m, body = np.full(len(rays), Outcome.MISS), np.full(len(rays), np.nan), np.full(len(rays), -1)
-    outcome[fired], range_m[fired], body[fired] = returns.outcome, returns.range_m, returns.body
-    return Returns(rays, outcome, range_m, body, returns.frame)
+    @phase("gates")
+    def choices(self, rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene]) -> np.ndarray:
+        """A few gates for each of some rays inside these limits, (N, G, 2) [m].
+
+        Arguments:
+            rays: Candidates, with the widest gates that they may have.
+            visits: The rays at each condition; only those of one are near each other.
+            informed: What the task says of training scenes.
+        """
+        gates_m = (sensor_gates if self.is_shared else gate_choices)(rays, visits, informed, self.margin_m)
+        for index, sensor in enumerate(self.sensors):
+            own = rays.sensor == index
+            wanted = gates_m[own].reshape(-1, 2)
+            bounds = bounds_of(self.rules, self.space, (index,), interval_factor(self.level))
+            allowed = bounded_gates(wanted, sensor, bounds.take(np.zeros(len(wanted), dtype=np.int64)))
+            gates_m[own] = allowed.reshape(-1, *gates_m.shape[1:])
+        return gates_m
 
 
 def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
@@ -62,10 +78,12 @@ def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[Informe
         margin_m: By how much gates that hold all of a ray's returns are longer at both ends: other scenes differ.
     """
     count = len(rays)
-    ray, range_m = _telling_returns(informed)
+    ray, range_m = _informative_returns(informed)
     if not len(ray):
         return np.repeat(rays.gate_m[:, None], len(LEVELS), axis=1)
-    count = len(rays)
+    # loaded here because sensors of one gate need no neighbours
+    from scipy.spatial import cKDTree
+
     seen = rays.origin_m + np.median(range_m) * rays.direction
     near = [
         visit.start + rows
@@ -86,7 +104,7 @@ def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[Informe
 
 def sensor_gates(rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
     """A few gates of each ray's sensor, each narrower than the one before, (N, G, 2) [m]; as `gate_choices`."""
-    ray, range_m = _telling_returns(informed)
+    ray, range_m = _informative_returns(informed)
     sensor, sensors = rays.sensor[ray], int(rays.sensor.max()) + 1
     ends, _ = central_intervals(range_m, np.ones(len(ray)), sensor, sensors, np.array(SENSOR_LEVELS))
     narrow = _inside(rays, ends[rays.sensor], SENSOR_LEVELS, margin_m)
@@ -101,7 +119,74 @@ def _inside(rays: Rays, ends_m: np.ndarray, levels: Sequence[float], margin_m: f
     return np.where(np.isnan(ends_m), own, np.clip(ends_m + wider, own[..., :1], own[..., 1:]))
 
 
-def _telling_returns(informed: Sequence[InformedScene]) -> tuple[np.ndarray, np.ndarray]:
+def _informative_returns(informed: Sequence[InformedScene]) -> tuple[np.ndarray, np.ndarray]:
     """Every return that tells something: its ray (K,) and range (K,) [m]."""
-    returns = [scene.telling_returns for scene in informed]
+    returns = [scene.informative_returns for scene in informed]
     return tuple(np.concatenate(column) for column in zip(*returns, strict=True))
+
+
+def central_intervals(
+    values: np.ndarray, weights: np.ndarray, labels: np.ndarray, count: int, level: float | np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The central `level` of weighted values in each cell, and how many equal weights each rests on.
+
+    Arguments:
+        values: Shape (N,).
+        weights: Non-negative, shape (N,).
+        labels: The cell of each value, shape (N,).
+        count: Number of cells K.
+        level: The share that an interval holds, or several of any shape.
+
+    Returns:
+        Ends, shape (K, ..., 2), NaN for cells without weight; effective counts, shape (K,).
+    """
+    shares = np.stack([(1 - np.asarray(level)) / 2, (1 + np.asarray(level)) / 2], axis=-1)
+    ends, effective = np.full((count, *shares.shape), np.nan), np.zeros(count)
+    order = np.lexsort((values, labels))
+    starts = np.searchsorted(labels[order], np.arange(count + 1))
+    for cell in np.flatnonzero(np.diff(starts)):
+        part = order[starts[cell] : starts[cell + 1]]
+        mass = weights[part].sum()
+        if mass <= 0:
+            continue
+        share = (np.cumsum(weights[part]) - weights[part] / 2) / mass
+        ends[cell] = np.interp(shares, share, values[part])
+        # shares first: squares of weights below 1e-160 are zero
+        effective[cell] = 1 / np.square(weights[part] / mass).sum()
+    return ends, effective
+
+
+def admissible_gates(wanted_m: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
+    """The gates inside bounds that suit the wanted ones best: centre and spread, shape (K,) each [m].
+
+    Best as the likelihood of ranges whose interval is the wanted gate, which is what the M-step maximises;
+    a gate that keeps its bounds stays as it is.
+
+    Arguments:
+        wanted_m: Start and end, shape (K, 2) [m].
+        bounds: One row per gate.
+    """
+    centre, half = wanted_m.mean(axis=1), np.diff(wanted_m, axis=1)[:, 0] / 2
+    smallest = THINNEST_GATE_M / (2 * bounds.interval)
+    return fit_gate(centre, np.square(np.maximum(half / bounds.interval, smallest)), bounds, smallest)
+
+
+def admitted_gates(wanted_m: np.ndarray, bounds: Bounds) -> np.ndarray:
+    """Start and end of the gates that `admissible_gates` finds, shape (K, 2) [m]."""
+    centre, spread = admissible_gates(wanted_m, bounds)
+    half = bounds.interval * spread
+    # half an ulp may take a gate that starts at 0 below it
+    return np.maximum(np.stack([centre - half, centre + half], axis=1), 0.0)
+
+
+def bounded_gates(wanted: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndarray:
+    """Wanted gates (K, 2), those that break a bound replaced by the best gate that keeps all of them [m]."""
+    start, end = sensor.gate_m
+    width = np.diff(wanted, axis=1)[:, 0]
+    broken = (wanted[:, 0] > bounds.start_high) | (wanted[:, 1] < bounds.end_low) | (width < bounds.width_low)
+    if not broken.any():
+        return wanted
+    if end <= start:
+        return np.tile([start, end], (len(wanted), 1))
+    inner = replace(bounds, start_low=np.full(len(wanted), start), end_high=np.full(len(wanted), end))
+    return np.where(broken[:, None], np.clip(admitted_gates(wanted, inner), start, end), wanted)

@@ -25,6 +25,8 @@ from lidardesign.task import Information, Task
 FEW_SCENES, MOST_SCENES = 50, 400
 # Rays: what candidates of more tell of scenes takes long, and gigabytes.
 MOST_SELECTED = 5000
+MOST_ENTRIES = 10_000_000  # of a table, some 200 MB: scenes of few items may be more
+MOST_ITEMS = 100  # of a scene, drawn at random: what many scenes ask is known well enough by a part of it
 # Of the candidates' returns so many are chosen, or about so many: lengths follow from it, and they are no thresholds.
 CHOSEN_SHARE = 0.2
 # A return tells about what is nearer than so many mean spacings of the chosen ones: sqrt(5), so that on a surface it is

@@ -1,14 +1,12 @@
-"""Rays chosen from candidates on as many training scenes as it takes, for several numbers of rays.
+"""Rays chosen from candidates, for several numbers of rays: the fourth step from a density to rays.
 
-Scenes cost a cast each, so choices rest on many more of them than a density is learned from: they are doubled until a
-choice loses little more on scenes held back than on its own. Every number of rays is a choice of its own: swaps leave
-no prefixes.
+Every number of rays is a choice of its own: swaps leave no prefixes. Where nobody says on how many scenes, they are
+doubled until a choice loses little more on scenes held back than on its own.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,72 +14,57 @@ import numpy as np
 
 from lidardesign.errors import DataError, InfeasibleError
 from lidardesign.numerics import SLACK
-from lidardesign.rays import information
-from lidardesign.rays.certificate import certificate_document, certify
+from lidardesign.rays.certificate import certificate_document, certify, price_curve
 from lidardesign.rays.choice import MOST_PASSES, Choice, RayCounts, choose, choose_within
-from lidardesign.rays.coverage import Coverage, InformedScene, gather
-from lidardesign.rays.curve import gap_among_more, price_curve
-from lidardesign.rays.gates import inform
+from lidardesign.rays.coverage import Coverage, gather
+from lidardesign.rays.information import CHOSEN_SHARE, FEW_SCENES, MOST_ENTRIES
+from lidardesign.rays.informed import InformedScene
+from lidardesign.rays.training import CHOICE, HELD_BACK, TrainingScenes
 from lidardesign.run.clock import phase
-from lidardesign.scenes.rays import Rays, Returns
-from lidardesign.scenes.scene import Scene
+from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
-from lidardesign.task import Information
 
 # Where bandwidth has no limit ten percent more of it must bring two percent less loss, or so much more worth
 SHARE_PER_BANDWIDTH = 0.2
 # Of the loss on scenes held back: what twice the scenes must have gained, or a choice lose less on its own scenes, for
 # twice as many again to gain about a hundredth.
 SMALLEST_GAIN, SMALLEST_GAP = 0.02, 0.05
-MOST_ENTRIES = 10_000_000  # of the table, some 200 MB: scenes of few items may be more
 
 
 @dataclass(frozen=True, eq=False)
-class SelectionProblem:
+class Selection:
     """What rays are chosen from, and for.
 
     Arguments:
         rays: Candidates with the widest gates that they may have.
         visits: Which of them fire at each of the values of a condition, one after the other; all at once without.
-        shares: The share of the rays that each sensor fires, (S,); None leaves it to the choice.
         gates: A few gates for each of some rays, (N, G, 2) [m], of what their returns tell about scenes.
-        informs: What a task says of a scene's returns.
-        scenes: Training scenes without end for a purpose, `choice` or `held back`.
         bandwidth: What reading out costs.
         limit_mbps: The most that it may cost; inf without a limit, where bits have a price.
-        one_gate: Whether all rays of a sensor have one gate.
-        most_scenes: On how many scenes rays are chosen at most.
+        shares: The share of the rays that each sensor fires, (S,); None leaves it to the choice.
+        is_shared: Whether all rays of a sensor have one gate.
+        each_fires: Whether every sensor has to fire a ray.
+        share: The share of the candidates that is chosen, at the largest number of rays.
         name: Of the design, for messages.
-        further: As many rays again, which may not be chosen: a certificate says what they would gain.
-        is_trial: Whether rays alone are wanted, of the first scenes and without certificates.
-        progress: Called with every step.
     """
 
     rays: Rays
     visits: Sequence[slice]
-    shares: np.ndarray | None
     gates: Callable[[Rays, Sequence[slice], Sequence[InformedScene]], np.ndarray]
-    informs: Callable[[Scene, Sequence[Returns]], Information]
-    scenes: Callable[[str], Iterator[Scene]]
     bandwidth: Bandwidth
-    limit_mbps: float
-    one_gate: bool
-    most_scenes: int
-    name: str
-    further: Rays | None = None
-    is_trial: bool = False
-    progress: Callable[[str], None] = lambda step: None
-
-    @phase("what returns tell")
-    def inform(self, scenes: Iterator[Scene], count: int) -> list[InformedScene]:
-        """What the task says of the next so many scenes; they are not kept."""
-        return [inform(scene, self.rays, self.visits, self.informs) for scene in itertools.islice(scenes, count)]
+    limit_mbps: float = np.inf
+    shares: np.ndarray | None = None
+    is_shared: bool = False
+    each_fires: bool = False
+    share: float = CHOSEN_SHARE
+    name: str = "rays"
 
     def counts(self, count: int, visit: slice = slice(None)) -> RayCounts:
-        """How many of the candidates, or of some, each sensor fires at each value of a condition."""
+        """How many of the candidates, or of some, may be chosen at each value of a condition."""
         place = np.repeat(np.arange(len(self.visits)), [one.stop - one.start for one in self.visits])[visit]
         if self.shares is None:
-            return RayCounts(place, np.full(len(self.visits), count))
+            owner = self.rays.sensor[visit] if self.each_fires else None
+            return RayCounts(place, np.full(len(self.visits), count), owner)
         most = np.tile(split_budget(self.shares, count), len(self.visits))
         return RayCounts(place * len(self.shares) + self.rays.sensor[visit], most)
 
@@ -89,6 +72,19 @@ class SelectionProblem:
         """What the candidates tell about scenes, with the cost of their gates."""
         one_bin = self.bandwidth.mbps_of_widths(np.zeros(1))
         return gather(informed, gates_m, one_bin * self.bandwidth.bins(gates_m[..., 1] - gates_m[..., 0]))
+
+    def check_informative(self, coverage: Coverage, scenes: int) -> None:
+        """Refuse candidates none of which tells anything.
+
+        Raises:
+            DataError: So it is.
+        """
+        if not len(coverage.item):
+            raise DataError(
+                f"none of {len(self.rays)} candidate rays tells anything about {scenes} training scenes",
+                where=self.name,
+                hint="let sensors look at the targets: constrain less, or learn longer",
+            )
 
     @phase("choice")
     def choices(self, coverage: Coverage, count: int, passes: int = MOST_PASSES) -> list[Choice]:
@@ -196,81 +192,121 @@ class Selected:
 
     Arguments:
         rays: Those of each value of a condition, in the order of their sensors.
-        certificate: `value` and `bound` of the loss on the scenes chosen on, `gap`, `held_back_value`, and the numbers
-            of `rays`, `candidates`, `gates` and `scenes`; at the middle number of rays `gap_doubled`, the gap with
-            candidates doubled, and `curve`, the price curve as pairs of Mbit/s and loss. A trial has none of it.
+        certificate: `value` and `bound` of the loss on the scenes chosen on, `gap`, `held_back_value`, the numbers of
+            `rays`, `candidates`, `gates` and `scenes`, and `curve`, the price curve as pairs of Mbit/s and loss; None
+            where it was not asked for.
+        silent: The share of scenes held back about which the rays tell nothing.
     """
 
     rays: Sequence[Rays]
-    certificate: dict[str, Any]
+    certificate: dict[str, Any] | None
+    silent: float
 
 
-def select(problem: SelectionProblem, counts: Sequence[int]) -> list[Selected]:
+def select(
+    selection: Selection,
+    informed: Sequence[InformedScene],
+    held_back: Sequence[InformedScene],
+    counts: Sequence[int],
+    certified: Sequence[int] = (),
+    progress: Callable[[str], None] = lambda step: None,
+) -> list[Selected]:
     """The rays that are chosen at each of some numbers of rays, ascending.
+
+    Arguments:
+        selection: What they are chosen from.
+        informed: What the candidates' returns tell about the scenes that they are chosen on.
+        held_back: The same of scenes that are held back.
+        counts: Numbers of rays.
+        certified: Those of them for which a bound is found.
+        progress: Called with every step.
 
     Raises:
         DataError: No candidate tells anything about the scenes.
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
-    middle = counts[len(counts) // 2]
-    held_back = [] if problem.is_trial else problem.inform(problem.scenes("held back"), information.FEW_SCENES)
-    informed: list[InformedScene] = []
-    scenes, wanted, loss = problem.scenes("choice"), information.FEW_SCENES * (1 if problem.is_trial else 2), np.inf
-    while True:
-        problem.progress(f"choosing rays on {wanted} training scenes")
-        informed += problem.inform(scenes, wanted - len(informed))
-        gates_m = problem.gates(problem.rays, problem.visits, informed)
-        coverage = problem.coverage(informed, gates_m)
-        if not len(coverage.item):
-            raise DataError(
-                f"none of {len(problem.rays)} candidate rays tells anything about {len(informed)} training scenes",
-                where=problem.name,
-                hint="let sensors look at the targets: constrain less, or learn longer",
-            )
-        # how many scenes are enough, and which gate sensors share, swaps hardly change
-        choices = problem.choices(coverage, middle, passes=0)
-        judged = coverage if problem.is_trial else problem.coverage(held_back, gates_m)
-        before, loss = loss, judged.loss_of(_gate_of(choices))
-        is_large = 2 * wanted > problem.most_scenes or 2 * len(coverage.item) > MOST_ENTRIES
-        if problem.is_trial or is_large or are_enough(before, loss, coverage.loss_of(_gate_of(choices))):
-            break
-        wanted *= 2
-    rays, shared = problem.rays, None
-    if problem.one_gate:
-        shared = _shared_gates(coverage, replace(choices[0], gate=_gate_of(choices)), rays.sensor, problem.limit_mbps)
-        own = shared[rays.sensor]
+    gates_m = selection.gates(selection.rays, selection.visits, informed)
+    coverage, judged = selection.coverage(informed, gates_m), selection.coverage(held_back, gates_m)
+    selection.check_informative(coverage, len(informed))
+    rays = selection.rays
+    if selection.is_shared:
+        # which gate sensors share, swaps hardly change
+        choices = selection.choices(coverage, counts[len(counts) // 2], passes=0)
+        choice = replace(choices[0], gate=_gate_of(choices))
+        own = _shared_gates(coverage, choice, rays.sensor, selection.limit_mbps)[rays.sensor]
         coverage, judged = coverage.through(own), judged.through(own)
         gates_m = gates_m[np.arange(len(rays)), own][:, None]
     selected = []
     for count in counts:
-        problem.progress(f"choosing {count} rays")
-        choices = problem.choices(coverage, count)
+        progress(f"choosing {count} rays")
+        choices = selection.choices(coverage, count)
         gate = _gate_of(choices)
         tables = []
-        for visit, choice in zip(problem.visits, choices, strict=True):
+        for visit, choice in zip(selection.visits, choices, strict=True):
             chosen = visit.start + choice.rays
             chosen = chosen[np.lexsort((chosen, rays.sensor[chosen]))]
             tables.append(replace(rays.subset(chosen), gate_m=gates_m[chosen, gate[chosen]]).as_angles())
-        selected.append(Selected(tables, {}))
-        if problem.is_trial:
-            continue
-        value, bound = problem.certified(coverage, choices)
-        document = certificate_document(
-            rays=count,
-            value=value,
-            bound=bound,
-            held_back_value=judged.loss_of(gate),
-            candidates=len(rays),
-            gates=gates_m.shape[1],
-            scenes=len(informed),
-            unit=informed[0].unit,
-        )
-        if count == middle:
-            document["curve"] = price_curve(coverage, problem.counts(count), len(problem.visits))
-            if problem.further is not None:
-                document["gap_doubled"] = _gap_doubled(problem, problem.further, count, shared)
-        selected[-1] = Selected(tables, document)
+        document = None
+        if count in certified:
+            value, bound = selection.certified(coverage, choices)
+            document = certificate_document(
+                rays=count,
+                value=value,
+                bound=bound,
+                held_back_value=judged.loss_of(gate),
+                candidates=len(rays),
+                gates=gates_m.shape[1],
+                scenes=len(informed),
+                unit=informed[0].unit,
+            )
+            document["curve"] = price_curve(coverage, selection.counts(count), len(selection.visits))
+        fired = np.where(gate[:, None] >= 0, gates_m[np.arange(len(rays)), gate], 0.0)
+        selected.append(Selected(tables, document, silent_share(held_back, fired)))
     return selected
+
+
+def silent_share(scenes: Sequence[InformedScene], gate_m: np.ndarray) -> float:
+    """The share of scenes about which no return inside its ray's gate tells anything, 0 without scenes.
+
+    Arguments:
+        scenes: What all rays tell through open gates.
+        gate_m: The gate of each ray, closed where it does not fire, (N, 2) [m].
+    """
+    heard = [(gate_m[one.ray, 0] <= one.range_m) & (one.range_m < gate_m[one.ray, 1]) for one in scenes]
+    return float(np.mean([not through.any() for through in heard])) if heard else 0.0
+
+
+def inform_enough(
+    selection: Selection, training: TrainingScenes, count: int, most_scenes: int, progress: Callable[[str], None]
+) -> tuple[list[InformedScene], list[InformedScene]]:
+    """What candidates tell about as many scenes as a choice of so many rays needs, and about others held back.
+
+    Arguments:
+        selection: The candidates.
+        training: The scenes.
+        count: How many rays will fire.
+        most_scenes: How many scenes there are at most.
+        progress: Called with every step.
+
+    Raises:
+        DataError: No candidate tells anything about the scenes.
+    """
+    rays, visits = selection.rays, selection.visits
+    held_back = training.inform(HELD_BACK, rays, visits, 0, FEW_SCENES, selection.share)
+    informed: list[InformedScene] = []
+    wanted, loss = 2 * FEW_SCENES, np.inf
+    while True:
+        progress(f"finding out what {len(rays)} rays tell about {wanted} training scenes")
+        informed += training.inform(CHOICE, rays, visits, len(informed), wanted, selection.share)
+        gates_m = selection.gates(rays, visits, informed)
+        coverage = selection.coverage(informed, gates_m)
+        selection.check_informative(coverage, wanted)
+        gate = _gate_of(selection.choices(coverage, count, passes=0))
+        before, loss = loss, selection.coverage(held_back, gates_m).loss_of(gate)
+        is_large = 2 * wanted > most_scenes or 2 * len(coverage.item) > MOST_ENTRIES
+        if is_large or are_enough(before, loss, coverage.loss_of(gate)):
+            return informed, held_back
+        wanted *= 2
 
 
 def are_enough(before: float, loss: float, own: float) -> bool:
@@ -282,15 +318,3 @@ def are_enough(before: float, loss: float, own: float) -> bool:
         own: What it loses on the scenes that it was chosen on.
     """
     return loss >= (1 - SMALLEST_GAIN) * before and loss - own <= SMALLEST_GAP * loss
-
-
-@phase("certificate")
-def _gap_doubled(problem: SelectionProblem, further: Rays, count: int, shared: np.ndarray | None) -> float:
-    """The gap of a choice among the candidates on the first scenes, against choices among twice as many."""
-    own, rays = len(problem.rays), Rays.joined([problem.rays, further])
-    doubled = replace(problem, rays=rays, visits=[slice(0, len(rays))])
-    informed = doubled.inform(doubled.scenes("choice"), information.FEW_SCENES)
-    coverage = doubled.coverage(informed, doubled.gates(rays, doubled.visits, informed))
-    coverage = coverage if shared is None else coverage.through(shared[rays.sensor])
-    limit = None if np.isinf(problem.limit_mbps) else problem.limit_mbps
-    return gap_among_more(coverage, doubled.counts(count), np.arange(len(rays)) < own, limit)

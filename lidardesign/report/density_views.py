@@ -14,51 +14,54 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtri
 
-from lidardesign.layouts.grid import low_discrepancy
-from lidardesign.layouts.track import placed
 from lidardesign.numerics import FULL_TURN, effective_count, wrap_turn
 from lidardesign.report.drawing import body_triangles, drawn_share
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Plane, Scene
-from lidardesign.sensors.sensor import DesignSpec, Sensor, tangent_directions
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.even import low_discrepancy
+from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, DesignSpace, angles, observed_point
 
 POINTS = 48_000  # of a design, shared by its sensors
 FEWEST = 64  # of a sensor
-PLACES = 9  # along a track
+PLACES = 9  # along a condition
 
 
 def mixture_points(design: DesignSpec) -> tuple[np.ndarray, np.ndarray]:
     """Points of a design's mixture and their weights, shapes (N, 6) and (N,); the weights sum to 1.
 
-    A track counts at evenly spread knots, equally.
+    Along a condition evenly spread knots count equally.
     """
-    moments, track = [design], design.track
-    if track is not None:
-        knots = np.unique(np.linspace(0, len(track.knots) - 1, PLACES).round().astype(int))
-        moments = [placed(design, {track.dimension: float(track.knots[index])}) for index in knots]
+    moments, name = [design], design.condition
+    if name is not None:
+        knots = design.patterns[-1].knots
+        some = np.unique(np.linspace(0, len(knots) - 1, PLACES).round().astype(int))
+        moments = [design.at_condition({name: knots[index]}) for index in some]
     sensors = [sensor for moment in moments for sensor in moment.sensors]
     weights = np.concatenate([moment.weights for moment in moments]) / len(moments)
     count = max(POINTS // len(sensors), FEWEST)
     normal = ndtri(low_discrepancy(count, 6))
-    points = np.concatenate([sensor_points(sensor, normal) for sensor in sensors])
+    z = interval_factor(design.level)
+    points = np.concatenate([sensor_points(sensor, normal, z) for sensor in sensors])
     return points, np.repeat(weights / count, count)
 
 
-def sensor_points(sensor: Sensor, normal: np.ndarray) -> np.ndarray:
+def sensor_points(sensor: Sensor, normal: np.ndarray, z: float) -> np.ndarray:
     """Design points of a sensor at standard normal coordinates, (N, 6) to (N, 6): origin, direction and range.
 
     Ranges below 0 are none, and become 0.
+
+    Arguments:
+        sensor: The sensor.
+        normal: Standard normal coordinates.
+        z: Standard deviations on each side of a mean that its field of view and gate span.
     """
     # a with A A' = covariance, also where that is singular: origins are often fixed along an axis
-    values, vectors = np.linalg.eigh(np.asarray(sensor.origin_covariance_m2, dtype=np.float64))
+    values, vectors = np.linalg.eigh(np.asarray(sensor.covariance_m2, dtype=np.float64))
     origin = normal[:, :3] @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-    spread, follow = np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad]), sensor.coupling
-    tangent, range_m = normal[:, 3:5] * spread, sensor.range_m + sensor.spread_range_m * normal[:, 5]
-    if follow is not None:
-        tangent = origin @ follow.direction_per_m.T + normal[:, 3:5] * follow.spread_rad
-        range_m = sensor.range_m + origin @ follow.range_per_m + tangent @ follow.range_per_rad
-        range_m = range_m + follow.spread_m * normal[:, 5]
+    tangent, (start, end) = normal[:, 3:5] * np.array(sensor.field_of_view_rad) / (2 * z), sensor.gate_m
+    range_m = (start + end) / 2 + (end - start) / (2 * z) * normal[:, 5]
     azimuth, elevation = angles(tangent_directions(sensor.frame, tangent))
     return np.column_stack([origin + sensor.origin_m, azimuth, elevation, np.maximum(range_m, 0.0)])
 

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from lidardesign.layouts.grid import field_on_sphere
 from lidardesign.numerics import TINY
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Round, Scene
 from lidardesign.scenes.surface import grid_faces, round_triangles
+from lidardesign.sensors.even import field_on_sphere
 from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
 
 MOST_FACES = 40_000  # of a scene's meshes, and of its round bodies; more would make the page large and slow to open
@@ -112,7 +112,7 @@ def origin_lines(sensor: Sensor, level: float) -> np.ndarray:
 
     One in each plane of two principal axes; none where origins hardly spread.
     """
-    variances, axes = np.linalg.eigh(sensor.origin_covariance_m2)
+    variances, axes = np.linalg.eigh(sensor.covariance_m2)
     reach = interval_factor(level) * np.sqrt(np.clip(variances, 0.0, None))
     if reach.max() < SMALLEST_SPREAD_M:
         return np.zeros((0, 3), dtype=np.float32)

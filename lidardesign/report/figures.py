@@ -20,7 +20,7 @@ from lidardesign.report.series import Against, Series, axis_titles, log_ticks, l
 from lidardesign.report.view import encoded
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.evaluation.results import Evaluation
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure

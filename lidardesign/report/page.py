@@ -55,7 +55,6 @@ from lidardesign.run.manifest import read_manifest, versions
 from lidardesign.scoring.accuracy.settings import Sweep
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.results import Evaluation
-from lidardesign.sensors.sensor import CERTIFICATES
 from lidardesign.space import observed_point
 from lidardesign.task import random_generator
 
@@ -270,7 +269,7 @@ def evaluation_report(
 
 
 def _origin(provenance: Mapping[str, object]) -> str:
-    elsewhere = ("versions", "task", "run", CERTIFICATES)
+    elsewhere = ("versions", "task", "run")
     told = [f"{name} {value}" for name, value in provenance.items() if name not in elsewhere]
     return ", ".join(told) or "made by hand"
 

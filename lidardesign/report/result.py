@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lidardesign.estimates import figure_and_interval
-from lidardesign.layouts.rays import certificates_of
+from lidardesign.rays.certificate import certificates_of
 from lidardesign.report.markup import folded, paragraphs
 from lidardesign.report.tables import counted, held_out_scenes, table
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, verdict
 from lidardesign.scoring.evaluation.thresholds import difference_text
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 
 MOST_SENTENCES = 3  # of designs that have one each; a table says the same of all
 MOST_NOTES = 2  # that are not folded

@@ -15,15 +15,14 @@ import numpy as np
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.slack import SPACE_MARK, ConstraintSlack, constraint_slack
-from lidardesign.layouts.track import placed
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.evaluation.entries import ordered_conditions
-from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired, pattern_size
+from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Evaluation
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
-from lidardesign.sensors.sensor import DesignSpec
 from lidardesign.simulate.returns import build_casters, simulate_many
 from lidardesign.space import DesignSpace
 
@@ -124,7 +123,7 @@ def scene_figure(
     drawn = []
     for design, rays, (length_m, outcome) in zip(designs, every, outcomes, strict=True):
         keep = np.array(_spread(len(rays[0]), budget), dtype=np.int64)
-        at, some = tuple(placed(design, where) for where in chosen), tuple(one.subset(keep) for one in rays)
+        at, some = tuple(design.at_condition(where) for where in chosen), tuple(one.subset(keep) for one in rays)
         drawn.append(DrawnDesign(design, at, some, length_m[..., keep], outcome[..., keep], len(rays[0])))
     return SceneFigure(scene, frames, chosen, tuple(drawn), planner is not None, len(places))
 
@@ -173,8 +172,8 @@ def evaluated_scene(evaluation: Evaluation, request: EvaluationRequest) -> Scene
     """An evaluation's designs in its first held-out scene, with the effects that the scenes call for."""
 
     def laid_out(design: DesignSpec, at: Conditions) -> Rays:
-        count = design.rays or pattern_size(design) or max(numbers_fired(design, request.rays, request.alone))
-        return request.lay_out(design, count, request.samples.get(design.name), at=at)
+        count = design.count or max(numbers_fired(design, request.rays, request.alone))
+        return design.rays(count, at=at or None)
 
     planner = request.planner if any(effect.on for effect in evaluation.effects) else None
     places = ordered_conditions(request)

@@ -22,7 +22,7 @@ from lidardesign.scoring.evaluation.results import (
     leading_detail,
     verdict,
 )
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 
 MOST_SENSORS = 60  # listed in a table
 TINY = 1e-4  # from here on the limit is shown

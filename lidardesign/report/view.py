@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.layouts.grid import field_on_sphere
 from lidardesign.numerics import EPSILON_FLOAT32
 from lidardesign.report.drawing import (
     MOST_FACES,
@@ -34,6 +33,7 @@ from lidardesign.report.scene_figure import DrawnDesign, SceneFigure
 from lidardesign.report.series import OUTCOME_WORDS, Series
 from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Body
+from lidardesign.sensors.even import field_on_sphere
 from lidardesign.sensors.sensor import Sensor, interval_factor
 
 MOST_SENSORS = 40  # drawn as frusta and switched one by one; a scan has hundreds, and its rays say it all
@@ -192,7 +192,7 @@ def _design(one: DrawnDesign, look: Series) -> dict[str, Any]:
 
 def _cone(sensor: Sensor, level: float) -> np.ndarray:
     """Origin, forward, horizontal and vertical (3 each), field of view, gate (2 each), three axes of its origins."""
-    variances, axes = np.linalg.eigh(sensor.origin_covariance_m2)
+    variances, axes = np.linalg.eigh(sensor.covariance_m2)
     reach = interval_factor(level) * np.sqrt(np.clip(variances, 0.0, None))
     # what hardly spreads looks like one place; the largest axis comes first
     spread = np.where(reach < SMALLEST_SPREAD_M, 0.0, reach) * axes

@@ -7,6 +7,7 @@ of every ray is read out once per frame, so the bandwidth is sum(bins) * bits * 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,3 +102,8 @@ def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
     order = np.argsort(-np.round(quotas - shares, REMAINDER_DECIMALS), kind="stable")
     shares[order[: int(count) - int(shares.sum())]] += 1
     return shares
+
+
+def mean_mbps(positions: Sequence[Rays], bandwidth: Bandwidth) -> float:
+    """What reading rays out costs, averaged over condition values [Mbit/s]."""
+    return math.fsum(bandwidth.mbps(rays) for rays in positions) / len(positions)

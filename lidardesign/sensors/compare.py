@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.layouts.layout import shares_of
-from lidardesign.layouts.rays import layout_of
+from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.sensor import Sensor
 from lidardesign.space import RANGE, DesignSpace, angles
 
 RIGHT_ANGLE_M = 1.0
@@ -54,7 +54,6 @@ class SensorPair:
                 "gate_start_m": float(gates[0]),
                 "gate_end_m": float(gates[1]),
                 "weight": second.weight - first.weight,
-                "rays": None if first.rays is None or second.rays is None else second.rays - first.rays,
             },
         }
 
@@ -71,7 +70,7 @@ def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[SensorPair]:
         return [SensorPair(sensor, by_name[sensor.name]) for sensor in first.sensors]
     from scipy.optimize import linear_sum_assignment
 
-    range_m = float(np.mean([sensor.range_m for sensor in (*first.sensors, *second.sensors)])) or RIGHT_ANGLE_M
+    range_m = float(np.mean([sensor.gate_m for sensor in (*first.sensors, *second.sensors)])) or RIGHT_ANGLE_M
     one, other = (
         {
             "place": np.array([sensor.origin_m for sensor in design.sensors]),
@@ -95,8 +94,8 @@ class BandwidthUse:
 
     Arguments:
         model: The read-out: that of the design's own budget.
-        low_mbps, high_mbps: Least and most over the knots of a track, else the same [Mbit/s]; of one ray where the
-            design leaves its rays open.
+        low_mbps, high_mbps: Least and most over the knots of a condition, else the same [Mbit/s]; of one ray where the
+            design leaves its number of rays open.
         rays: Rays per frame; None where they are open.
     """
 
@@ -116,37 +115,32 @@ def readout_of(design: DesignSpec) -> BandwidthUse:
     """What a design's gates cost, by the read-out of its own constraints or the usual one."""
     budget = design.constraints.get("budget") or {}
     model = Bandwidth(**{name: float(budget[name]) for name in MODEL_KEYS if budget.get(name) is not None})
-    track = design.track
-    if track is not None:
-        widths = track.gate_m[..., 1] - track.gate_m[..., 0]
-        found = [model.mbps_of_widths(row) for row in widths]
-        return BandwidthUse(model, min(found), max(found), len(track.sensor))
-    if design.ray_table is not None:
-        once = model.mbps(design.ray_table)
-        return BandwidthUse(model, once, once, len(design.ray_table))
+    if design.patterns:
+        gate_m = design.patterns[-1].gate_m
+        found = [model.mbps_of_widths(row) for row in gate_m[..., 1] - gate_m[..., 0]]
+        return BandwidthUse(model, min(found), max(found), design.count)
     widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in design.sensors])
-    count = layout_of(design).own_count(design)
-    if count is None:
+    if design.count is None:
         once = float(design.weights @ np.array([model.mbps_of_widths(width) for width in widths]))
     else:
-        once = model.mbps_of_widths(widths, shares_of(design, count))
-    return BandwidthUse(model, once, once, count)
+        once = model.mbps_of_widths(widths, design.rays_per_sensor())
+    return BandwidthUse(model, once, once, design.count)
 
 
 def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
     """What is said of a design far outside a design space, one line at most.
 
     Arguments:
-        design: Its sensors' mean origins and gates, and its rays' where it has a table of them.
+        design: Its sensors' origins and gates, and those of its rays where it has patterns.
         space: The design space of the run that it is scored in.
     """
     low, high = np.array(space.low[:3]), np.array(space.high[:3])
     size_m = float(np.linalg.norm(high - low)) + space.high[RANGE]
     origins_m = np.array([sensor.origin_m for sensor in design.sensors]).reshape(-1, 3)
     starts_m = np.array([sensor.gate_m[0] for sensor in design.sensors])
-    if design.ray_table is not None:
-        origins_m = np.concatenate([origins_m, design.ray_table.origin_m])
-        starts_m = np.concatenate([starts_m, design.ray_table.gate_m[:, 0]])
+    for pattern in design.patterns:
+        origins_m = np.concatenate([origins_m, pattern.origin_m.reshape(-1, 3)])
+        starts_m = np.concatenate([starts_m, pattern.gate_m[..., 0].reshape(-1)])
     unit = "are its lengths in millimetres?"
     apart_m = np.linalg.norm(np.maximum(np.maximum(origins_m - high, low - origins_m), 0.0), axis=1)
     if len(apart_m) and apart_m.max() > FAR_SIZES * size_m:
@@ -163,12 +157,13 @@ def outside_space(design: DesignSpec, space: DesignSpace) -> str:
     """How much of a design lies outside a design space, as "3 of 361 rays ... outside"; nothing where all is inside.
 
     Arguments:
-        design: Its rays where it has a table of them, else its sensors' mean origins, boresights and gates.
+        design: Its rays where it has patterns, else its sensors' origins, boresights and gates.
         space: The design space that it is scored in; along its conditions designs are moved.
     """
-    table, sensors = design.ray_table, design.sensors
-    if table is not None:
-        what, origins_m, directions, gates_m = "rays", table.origin_m, table.direction, table.gate_m
+    sensors = design.sensors
+    if design.patterns:
+        rays = Rays.joined([design.patterns[-1].at(knot) for knot in design.patterns[-1].knots or (None,)])
+        what, origins_m, directions, gates_m = "rays", rays.origin_m, rays.direction, rays.gate_m
     else:
         what, origins_m = "sensors", np.array([sensor.origin_m for sensor in sensors]).reshape(-1, 3)
         directions = np.array([sensor.boresight for sensor in sensors]).reshape(-1, 3)

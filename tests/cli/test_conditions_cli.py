@@ -10,7 +10,7 @@ from support.command_line import caller, files_under, make_run
 from support.conditioned_runs import log_target, make_conditioned_run
 
 from lidardesign.layouts.rays import lay_out
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 
 
 @pytest.fixture

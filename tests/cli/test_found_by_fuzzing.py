@@ -27,7 +27,7 @@ from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.mesh_files import check_mesh, load_mesh
 from lidardesign.scoring.captures.capture import load_capture
 from lidardesign.sensors.bandwidth import split_budget
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 from lidardesign.sensors.sensor import MOST_RAYS, interval_factor
 from lidardesign.space import FARTHEST_M, DesignSpace
 

@@ -16,7 +16,7 @@ from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.fitting.part_shapes import PartShape, gate_inside, shapes_of
-from lidardesign.layouts.grid import grid_rows
+from lidardesign.sensors.even import grid_rows
 from lidardesign.layouts.rays import LAYOUTS, lay_out
 from lidardesign.mixture.features import Axes
 from lidardesign.parts.catalogue import (

@@ -13,7 +13,7 @@ from support.tables import each_row
 
 from lidardesign.layouts import distributed as lines
 from lidardesign.layouts.distributed import in_region, normal_ball
-from lidardesign.layouts.grid import low_discrepancy
+from lidardesign.sensors.even import low_discrepancy
 from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.ensemble import coupling_of
 from lidardesign.mixture.fit import fit

@@ -21,7 +21,7 @@ from lidardesign.layouts.rays import lay_out
 from lidardesign.run.xml import _Builder
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.receivers import rotation_of_quaternion, rotation_of_rpy
-from lidardesign.sensors.design_file import load_design, save_design
+from lidardesign.formats.designs import load_design, save_design
 from lidardesign.sensors.sensor import (
     DesignSpec,
     Sensor,

@@ -16,7 +16,7 @@ from lidardesign.errors import InfeasibleError
 from lidardesign.layouts.gates import seen_from
 from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.fit import fit, rays_at
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 from lidardesign.sensors.sensor import DesignSpec, interval_factor
 from lidardesign.space import observed_point
 

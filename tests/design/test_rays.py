@@ -12,7 +12,7 @@ from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.layouts.gates import log_density, members, seen_from
-from lidardesign.layouts.grid import grid_rows, grid_tangent
+from lidardesign.sensors.even import grid_rows, grid_tangent
 from lidardesign.layouts.rays import LAYOUTS, gates_of, lay_out, own_count
 from lidardesign.mixture.fit import rays_at, refitted
 from lidardesign.samples import Samples

@@ -24,7 +24,7 @@ from lidardesign.density.learned import FlatTarget
 from lidardesign.density.objective.visibility import Optics
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.sampling import draw_samples, log_density_of, log_prob_of_unit
-from lidardesign.layouts.grid import low_discrepancy
+from lidardesign.sensors.even import low_discrepancy
 from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.bounds import sensor_groups
 from lidardesign.mixture.components import log_density

@@ -12,7 +12,7 @@ from lidardesign.formats.galvo_angles import SPEED_OF_LIGHT_M_PER_PS
 from lidardesign.formats.mounts import angles_between
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.layouts.rays import lay_out
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 from lidardesign.sensors.sensor import DesignSpec, Sensor
 
 

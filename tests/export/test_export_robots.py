@@ -22,7 +22,7 @@ from lidardesign.layouts.rays import lay_out
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.mujoco_models import RobotFile, bodies_from_mujoco, load_model
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 from lidardesign.sensors.sensor import DesignSpec
 
 ROBOTS = ("mjcf", "sdf", "urdf", "xacro", "carla", "isaac-usd")

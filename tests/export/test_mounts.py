@@ -17,7 +17,7 @@ from lidardesign.formats.names import (
     renamed_note,
     xml_text,
 )
-from lidardesign.layouts.grid import grid_tangent
+from lidardesign.sensors.even import grid_tangent
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.receivers import rotation_of_quaternion
 from lidardesign.sensors.sensor import DesignSpec, tangent_directions

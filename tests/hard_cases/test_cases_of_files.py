@@ -22,7 +22,7 @@ from lidardesign.fitting.request import load_constraints
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import parse_yaml
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 from lidardesign.simulate.detector.files import load_detector
 
 BOMB_LEVELS = 7

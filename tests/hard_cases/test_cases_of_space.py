@@ -20,7 +20,7 @@ from lidardesign.errors import ConfigError, DataError, NumericalError
 from lidardesign.formats.ray_lists import SENSOR_COLUMNS
 from lidardesign.registry import load_task
 from lidardesign.scenes.scene import Body, Plane, Scene, Sphere, rigid
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 from lidardesign.space import (
     AZIMUTH,
     DIMENSIONS,

@@ -30,7 +30,7 @@ from lidardesign.run.yaml import load_yaml
 from lidardesign.scenes.mesh_files import SUFFIXES, list_mesh_files, load_mesh
 from lidardesign.scenes.mujoco_models import model_files
 from lidardesign.scoring.captures.capture import load_capture
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 from lidardesign.simulate.detector.files import load_detector
 
 DOCS = Path(__file__).parents[2] / "docs" / "formats.md"

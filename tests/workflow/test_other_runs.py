@@ -17,7 +17,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.evaluation.thresholds import difference_text
 from lidardesign.sensors.compare import outside_space
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 from lidardesign.space import DIMENSIONS, direction
 
 LAYOUTS = ("grid", "selected")

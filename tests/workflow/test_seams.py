@@ -20,7 +20,7 @@ from lidardesign.samples import Samples, save_samples
 from lidardesign.scenes.scene import Body, Capsule, Mesh, Scene, Sphere, rigid
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.sensors.design_file import load_design, save_design
+from lidardesign.formats.designs import load_design, save_design
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
 

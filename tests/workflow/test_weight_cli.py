@@ -19,7 +19,7 @@ from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import Samples, load_samples, save_samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.scenes.scene_scores import checked_score
-from lidardesign.sensors.design_file import load_design
+from lidardesign.formats.designs import load_design
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import RANGE, direction
 from lidardesign.task import scenes_of

@@ -135,8 +135,8 @@ def capture(
 def _rays_and_run(path: Path, count: int | None, at: dict[str, float], output: Output) -> tuple[Rays, Path | None]:
     """The rays of a design file, or of what was exported of it for a scanner, at least one; and its run's folder."""
     from lidardesign.api.export import DesignSource
+    from lidardesign.formats.designs import folder_of, read_design
     from lidardesign.formats.galvo import is_galvo_file, read_galvo
-    from lidardesign.run_folder import folder_of, read_design
 
     folder = None
     if not path.exists():
@@ -152,7 +152,7 @@ def _rays_and_run(path: Path, count: int | None, at: dict[str, float], output: O
         rays = read_galvo(path)
     else:
         specification = read_design(path, output.remark)
-        rays = DesignSource(specification, path=path).lay_out(count, at, notes=output.remark)[1]
+        rays = DesignSource(specification, path=path).at(count, at, output.remark)[1]
         folder = folder_of(specification, path)
     if not len(rays):
         raise DataError("fires no ray", where=str(path), hint="give --rays N" if not count else None)

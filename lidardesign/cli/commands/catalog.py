@@ -16,7 +16,7 @@ from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
     from lidardesign.parts.part import Part
-    from lidardesign.sensors.sensor import DesignSpec
+    from lidardesign.sensors.design import DesignSpec
 
 # How several parts at one place are turned against each other.
 ARRANGEMENTS = ("interleaved", "beside")

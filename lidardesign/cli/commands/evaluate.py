@@ -156,15 +156,7 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
-    workers: Annotated[
-        str,
-        typer.Option(
-            "--workers",
-            metavar="N|tcp://HOST:PORT",
-            help="Score with this many processes on this machine, or with the workers of a dask scheduler (extra: "
-            "cluster). The scores are the same.",
-        ),
-    ] = "1",
+    workers: options.Workers = "1",
     accuracy: Annotated[
         bool,
         typer.Option(

@@ -76,7 +76,7 @@ def export(
                 export_target,
                 exporter_of,
             )
-            from lidardesign.run_folder import read_design
+            from lidardesign.formats.designs import read_design
 
         if list_formats:
             return _list(output)

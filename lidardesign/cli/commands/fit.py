@@ -35,6 +35,8 @@ def fit(
     like: options.Like = None,
     name: options.Name = "fit",
     seed: options.Seed = None,
+    certify: options.Certify = False,
+    workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
@@ -58,11 +60,12 @@ def fit(
             like=like,
             name=name,
             seed=seed,
+            certify=certify,
         )
-        run_fit(FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark), output)
+        run_fit(FitRequest.resolve(RunFolder.open(run), chosen, notes=output.remark), output, workers)
 
 
-def run_fit(request: FitRequest, output: Output) -> None:
+def run_fit(request: FitRequest, output: Output, workers: str) -> None:
     """Fit the design of a request, save it, and give the result."""
     from lidardesign.api.design import Design
     from lidardesign.sensors.design_file import design_text
@@ -72,7 +75,8 @@ def run_fit(request: FitRequest, output: Output) -> None:
     check_writable(path)
     check_lock(request.run.folder)
     with output.progress("fitting") as progress:
-        design = Design.fitted(request, notes=output.remark, progress=lambda step, *_: progress.show(label=step))
+        shown = lambda step, *_: progress.show(label=step)  # noqa: E731
+        design = Design.fitted(request, workers=workers, notes=output.remark, progress=shown)
     try:
         design.save()
     except LidardesignError:
@@ -120,6 +124,8 @@ def constrain(
     like: options.Like = None,
     name: options.Name = "constrained",
     seed: options.Seed = None,
+    certify: options.Certify = False,
+    workers: options.Workers = "1",
     json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
@@ -129,7 +135,7 @@ def constrain(
         with phase("libraries"):
             from lidardesign.constraints.document import Constraints
             from lidardesign.fitting.request import FitOptions, FitRequest, load_constraints
-            from lidardesign.run_folder import need_run, open_target
+            from lidardesign.formats.designs import need_run, open_target
 
         chosen = FitOptions(
             sensors=options.sensor_count(sensors),
@@ -145,6 +151,7 @@ def constrain(
             like=like,
             name=name,
             seed=seed,
+            certify=certify,
         )
         run, design = open_target(target, output.remark)
-        run_fit(FitRequest.resolve(need_run(run, target), chosen, design, notes=output.remark), output)
+        run_fit(FitRequest.resolve(need_run(run, target), chosen, design, notes=output.remark), output, workers)

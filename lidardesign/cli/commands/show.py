@@ -17,7 +17,7 @@ from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
     from lidardesign.sensors.compare import BandwidthUse
-    from lidardesign.sensors.sensor import DesignSpec
+    from lidardesign.sensors.design import DesignSpec
 
 DESIGN_COLUMNS, VALUE_COLUMNS = ("design", "layout", "sensors", "rays"), ("value", "95 % interval", "difference")
 IDEAL = "ideal"
@@ -25,7 +25,7 @@ IDEAL = "ideal"
 DECIMALS = 6
 SENSOR_COLUMNS = (
     "first", "second", "place [m]", "looks [deg]", "roll [deg]", "field of view [deg]", "gate start [m]",
-    "gate end [m]", "weight", "rays",
+    "gate end [m]", "weight",
 )  # fmt: skip
 
 
@@ -50,10 +50,10 @@ def show(
         with phase("libraries"):
             from lidardesign.constraints.check import check_design
             from lidardesign.constraints.slack import room_of
-            from lidardesign.layouts.track import placed
-            from lidardesign.run_folder import RunFolder, reach_beside, reach_of, read_design, run_of
+            from lidardesign.formats.designs import reach_beside, reach_of, read_design, run_of
+            from lidardesign.run_folder import RunFolder
             from lidardesign.sensors.compare import outside_notes, readout_of
-            from lidardesign.sensors.design_file import design_document, track_document
+            from lidardesign.sensors.design_file import design_document, pattern_document
 
         condition = options.parse_at(at)
         run = None if space_of is None else RunFolder.open(space_of)
@@ -61,7 +61,7 @@ def show(
         files = [design] if other is None else [design, other]
         reach_m = reach_of(given) if other is None else reach_beside(files, given)
         read = [read_design(path, output.remark, reach_m) for path in files]
-        shown = [placed(one, condition) if condition else one for one in read]
+        shown = [one.at_condition(condition) if condition else one for one in read]
         if other is not None:
             return _show_differences(files, shown, output)
         specification = read[0]
@@ -81,18 +81,19 @@ def show(
             "design": str(design),
             "name": specification.name,
             "layout": specification.layout,
-            "rays": specification.rays,
+            "rays": specification.count,
             "level": specification.level,
             "at": dict(specification.at),
             "frame": specification.mount or "world",
             "sensors": [sensor.as_dict() for sensor in specification.sensors],
-            "track": track_document(specification.track) if specification.track is not None else None,
+            "patterns": [pattern_document(pattern) for pattern in specification.patterns],
             "constraints": specification.constraints,
             "checks": [
                 {**check.as_dict(), "room": left.room, "tight": left.is_tight}
                 for check, left in zip(checks, map(room_of, checks), strict=True)
             ],
             "bandwidth": readout.as_dict(),
+            "certificates": [*specification.certificates],
             "provenance": specification.provenance,
         }
 
@@ -208,7 +209,6 @@ def _show_pair(document: dict[str, Any], rich: RichConsole) -> None:
             _signed(apart["roll_deg"]),
             f"{_signed(apart['horizontal_deg'])} x {_signed(apart['vertical_deg'])}",
             *(_signed(apart[name], 3) for name in ("gate_start_m", "gate_end_m", "weight")),
-            "-" if apart["rays"] is None else f"{apart['rays']:+d}",
         ]
         for pair in document["sensors"]
         if (apart := pair["difference"]) is not None

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from lidardesign.constraints.check import ConstraintCheck
-    from lidardesign.sensors.sensor import DesignSpec, Track
+    from lidardesign.sensors.design import DesignSpec
 
 MOST_ROWS = 20
 MOST_NAMED = 4
@@ -35,17 +35,17 @@ def with_error(estimate: dict[str, Any]) -> str:
 
 def show_design(design: DesignSpec, rich: RichConsole) -> None:
     """Print a design's sensors as a table, with angles in degrees; a place that all share stands above it."""
-    if design.track is not None:
-        _show_track(design, design.track, rich)
+    if design.condition is not None:
+        _show_along(design, rich)
         _show_certificates(design, rich)
         return
-    rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
+    rays = f"{design.count} rays per frame" if design.count else "rays per frame left open"
     sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
     title = f"{design.name}: {sensors}, layout {design.layout}, {rays}{_condition(design)}"
     where, poses = _poses(design)
     cells = [
-        {"sensor": pose["sensor"], "weight": f"{sensor.weight:.3f}", "rays": number(sensor.rays), **pose}
-        for sensor, pose in list(zip(design.sensors, poses, strict=True))[:MOST_ROWS]
+        {"sensor": pose["sensor"], "weight": f"{sensor.weight:.3f}", "rays": number(rays), **pose}
+        for sensor, rays, pose in list(zip(design.sensors, _rays_of(design), poses, strict=True))[:MOST_ROWS]
     ]
     headings = [name.replace(" [deg]", "\n[deg]") for name in cells[0]]
     rows = [list(row.values()) for row in cells]
@@ -57,7 +57,7 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
 
 def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
     """Print what chosen rays leave unknown, and how much less any other choice of the same candidates could leave."""
-    from lidardesign.layouts.rays import certificates_of
+    from lidardesign.rays.certificate import certificates_of
 
     columns = ("rays", "loss", "on other scenes", "less by at most", "candidates", "scenes")
     rows = [
@@ -75,32 +75,37 @@ def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
         rich.print(text_table(columns, rows, "\nrays chosen on training scenes", columns))
 
 
-def _show_track(design: DesignSpec, track: Track, rich: RichConsole) -> None:
-    """Print the rays of a track as a table: from where to where each looks and listens over its travel."""
+def _rays_of(design: DesignSpec) -> list[int | None]:
+    """How many rays each sensor fires of the largest number that the design was made for."""
+    counts = design.rays_per_sensor()
+    return [None] * len(design.sensors) if counts is None else counts.tolist()
+
+
+def _show_along(design: DesignSpec, rich: RichConsole) -> None:
+    """Print rays that differ along a condition as a table: from where to where each looks and listens over its travel."""
     from numpy import degrees
 
-    from lidardesign.layouts.track import travels
-
-    first, last = travels(track)
-    title = f"{design.name}: {len(track.sensor)} rays at every {track.dimension} from {first:g} to {last:g}"
-    title += f" (travel {last - first:g} m, {len(track.knots)} knots)\nsensors in the middle of their travel"
-    title += f", at {design.sensors[0].as_text()['origin [m]']} m in {design.frame}"
+    pattern, name = design.patterns[-1], design.condition
+    first, last = pattern.ends
+    title = f"{design.name}: {len(pattern)} rays at every {name} from {first:g} to {last:g}"
+    title += f" (travel {last - first:g} m, {len(pattern.knots)} knots)\nsensors at"
+    title += f" {design.sensors[0].as_text()['origin [m]']} m in {design.frame}, carried along {name}"
     figures = ("azimuth\n[deg]", "elevation\n[deg]", "gate start\n[m]", "gate end\n[m]", "gate width\n[m]")
     rows = [
         (
             design.sensors[sensor].name,
-            _span(degrees(track.azimuth_rad[:, ray]), 2),
-            _span(degrees(track.elevation_rad[:, ray]), 2),
-            _span(track.gate_m[:, ray, 0], 3),
-            _span(track.gate_m[:, ray, 1], 3),
-            _span(track.gate_m[:, ray, 1] - track.gate_m[:, ray, 0], 3),
+            _span(degrees(pattern.azimuth_rad[:, ray]), 2),
+            _span(degrees(pattern.elevation_rad[:, ray]), 2),
+            _span(pattern.gate_m[:, ray, 0], 3),
+            _span(pattern.gate_m[:, ray, 1], 3),
+            _span(pattern.gate_m[:, ray, 1] - pattern.gate_m[:, ray, 0], 3),
         )
-        for ray, sensor in list(enumerate(track.sensor))[:MOST_ROWS]
+        for ray, sensor in list(enumerate(pattern.sensor))[:MOST_ROWS]
     ]
     rich.print(text_table(("ray", *figures), rows, title, figures, overflow="fold"))
-    if len(track.sensor) > MOST_ROWS:
-        rich.print(f"... and {len(track.sensor) - MOST_ROWS} more rays; --json lists all")
-    rich.print(f"--at {track.dimension}=VALUE shows the rays at one place")
+    if len(pattern) > MOST_ROWS:
+        rich.print(f"... and {len(pattern) - MOST_ROWS} more rays; --json lists all")
+    rich.print(f"--at {name}=VALUE shows the rays at one place")
 
 
 def _span(values: np.ndarray, decimals: int) -> str:
@@ -172,26 +177,21 @@ def show_fit(
     known = [f"{name} {with_error(estimates[key])}" for name, key in figures.items() if key in estimates]
     known.append(f"{number(document['seconds'], 3)} s" + (" (+- are standard errors)" if known else ""))
     rich.print(", ".join(known))
-    rays = estimates.get("rays")
-    if rays is not None and rays["error"] > 0:
-        rich.print(f"whole rays: {number(rays['error'], 2)} of {rays['value']:.0f} are not where the weights put them")
 
 
 def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:
     """A line per sensor; rays are those of the largest number that was chosen."""
-    from lidardesign.layouts.rays import certificates_of
-
-    counts = [str(entry["rays"]) for entry in certificates_of(design)] or [str(design.rays)] * bool(design.rays)
+    counts = [str(count) for count in design.counts or [design.count] if count is not None]
     several = f"{', '.join(counts[:-1])} or " if counts[:-1] else ""
     rays = f"{several}{counts[-1]} rays {_frames(design)}" if counts else "any number of rays"
     sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
     rich.print(f"{design.name}: {sensors}, {rays} (layout {design.layout}){_condition(design)}", soft_wrap=True)
     where, cells = _poses(design)
     rich.print(where, soft_wrap=True)
-    if any(sensor.rays is not None for sensor in design.sensors):
+    if counts:
         heading = f"rays of {counts[-1]}" if several else "rays"
-        rayed = zip(design.sensors, cells, strict=True)
-        cells = [{"sensor": cell["sensor"], heading: number(sensor.rays), **cell} for sensor, cell in rayed]
+        rayed = zip(_rays_of(design), cells, strict=True)
+        cells = [{"sensor": cell["sensor"], heading: number(rays), **cell} for rays, cell in rayed]
     print_table(None, list(cells[0]), [list(cell.values()) for cell in cells[:MOST_ROWS]], rich, text=("sensor",))
     if len(cells) > MOST_ROWS:
         rich.print(f"... and {len(design.sensors) - MOST_ROWS} more sensors; --json lists all")
@@ -199,17 +199,15 @@ def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:
 
 def _frames(design: DesignSpec) -> str:
     """Where so many rays are fired: in every frame, or at every value of a condition."""
-    if design.track is None:
+    if design.condition is None:
         return "per frame"
-    from lidardesign.layouts.track import travels
-
-    first, last = travels(design.track)
-    return f"at every {design.track.dimension} from {first:g} to {last:g}"
+    first, last = design.patterns[-1].ends
+    return f"at every {design.condition} from {first:g} to {last:g}"
 
 
 def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
     """Among how many rays, on how many scenes, and how far from the best choice that may be."""
-    from lidardesign.layouts.rays import certificates_of
+    from lidardesign.rays.certificate import certificates_of
 
     entries = certificates_of(design)
     if entries:

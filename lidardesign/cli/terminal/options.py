@@ -28,11 +28,10 @@ Layout = Annotated[
     str | None,
     typer.Option(
         "--layout",
-        metavar="grid|density|scan|distributed|selected|spinning",
-        help="Where rays lie: evenly in the field of view, by density, each its own sensor, starting all over the "
-        "origins, chosen on training scenes, or on chosen rings.",
-        show_default="the design's, else selected; grid or scan where rays cannot be chosen",
-        autocompletion=words("grid|density|scan|distributed|selected|spinning"),
+        metavar="chosen|even|spinning",
+        help="Rays chosen on training scenes, even in the field of view, or on rings that are chosen.",
+        show_default="the design's, else chosen; even where rays cannot be chosen",
+        autocompletion=words("chosen|even|spinning"),
     ),
 ]
 At = Annotated[
@@ -52,7 +51,7 @@ RayCount = Annotated[
         min=1,
         max=1_000_000,
         help="Rays per frame, over all sensors.",
-        show_default="left open, or the task's most",
+        show_default="the task's numbers; even rays leave it open",
     ),
 ]
 Channels = Annotated[
@@ -79,8 +78,8 @@ Gates = Annotated[
     typer.Option(
         "--gates",
         metavar="sensor|ray",
-        help="One gate per sensor, or one per ray; in a scan every ray is a sensor.",
-        show_default="sensor; ray where rays are distributed, or chosen along a condition",
+        help="One gate per sensor, or one per ray.",
+        show_default="the design's, else sensor; ray where rays are chosen along a condition",
         autocompletion=words("sensor|ray"),
     ),
 ]
@@ -89,7 +88,7 @@ Sensors = Annotated[
     typer.Option(
         "--sensors",
         metavar="N|best",
-        help="Number of sensors (a scan has one per ray); best: by the task's score on training scenes.",
+        help="Number of sensors; best: by the task's score on training scenes.",
         show_default="the design's, else best",
     ),
 ]
@@ -111,6 +110,21 @@ Weights = Annotated[
         help="Weight the learned density for another setting of the task, such as importance; nothing is learned "
         "again. Repeatable.",
         show_default=False,
+    ),
+]
+Workers = Annotated[
+    str,
+    typer.Option(
+        "--workers",
+        metavar="N|tcp://HOST:PORT",
+        help="Look at scenes with this many processes on this machine, or with the workers of a dask scheduler (extra: "
+        "cluster). The results are the same.",
+    ),
+]
+Certify = Annotated[
+    bool,
+    typer.Option(
+        "--certify", help="Bound what any other choice could gain at every number of rays, not the middle one."
     ),
 ]
 Preset = Annotated[

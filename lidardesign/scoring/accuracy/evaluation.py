@@ -17,11 +17,11 @@ from lidardesign.scenes.receivers import path_windows
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.accuracy.probes import AccuracyRequest
 from lidardesign.scoring.accuracy.settings import Measurement, Sweep, timed, with_memory
-from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Row
 from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_lists
 from lidardesign.scoring.scenes.statistics import mean_interval
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import EFFECTS, Detector, Physics, check_windows
 from lidardesign.simulate.plan import EffectPlan, Planner, predicted_seconds
@@ -116,13 +116,12 @@ def physics_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
 
 
 def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, RaysPerCondition]:
-    counts = sorted(set(asked.rays))
+    counts = numbers_fired(design, sorted(set(asked.rays))) or [design.count]
     with plugin_guard(asked.task.name):
         conditions = conditions_of(asked.task, asked.config, asked.space)
     each = len(conditions) * asked.test[0].frames
     count = max([one for one in counts if one * each <= RAYS_PER_SCENE], default=counts[0])
-    samples = asked.samples.get(design.name)
-    return count, tuple(asked.lay_out(design, count, samples, at=condition) for condition in conditions)
+    return count, tuple(design.rays(count, at=condition or None) for condition in conditions)
 
 
 def _paired(values: np.ndarray, reference: np.ndarray) -> tuple[float, float]:

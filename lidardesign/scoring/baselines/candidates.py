@@ -16,7 +16,7 @@ import numpy as np
 from lidardesign.numerics import EPSILON
 from lidardesign.scenes.rays import Rays, fire_times
 from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
-from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
@@ -184,11 +184,6 @@ def rays_within(limit_mbps: float, bandwidth: Bandwidth, gate_m: np.ndarray) -> 
     while count and bandwidth.mbps_of_widths(width_m, count) > limit_mbps:
         count -= 1
     return count
-
-
-def mean_mbps(positions: RaysPerCondition, bandwidth: Bandwidth) -> float:
-    """What reading rays out costs, averaged over condition values [Mbit/s]."""
-    return math.fsum(bandwidth.mbps(rays) for rays in positions) / len(positions)
 
 
 def whole_range(space: DesignSpace) -> np.ndarray:

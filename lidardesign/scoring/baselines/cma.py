@@ -20,18 +20,17 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import BandwidthBudget
 from lidardesign.constraints.origins import mounts_of
 from lidardesign.errors import BackgroundNote
-from lidardesign.layouts.gates import admitted_gates
-from lidardesign.layouts.rays import layout_of
-from lidardesign.mixture.bounds import bounds_of, clip_azimuth
+from lidardesign.mixture.bounds import bounds_of
 from lidardesign.mixture.features import Axes
 from lidardesign.numerics import SLACK, TINY, sphere_exp, sphere_log, wrap_angle
+from lidardesign.rays.gates import admitted_gates
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.baselines.candidates import mean_mbps
 from lidardesign.scoring.baselines.views import OutOfTimeError, TrainingObjective
 from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
-from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import DesignSpec, boresight_frame, interval_factor
+from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.sensor import boresight_frame, interval_factor
 from lidardesign.space import DesignSpace, angles, direction
 from lidardesign.task import Metric, random_generator
 
@@ -113,20 +112,14 @@ class MovableSensors:
 
     def __init__(self, design: DesignSpec, start: RaysPerCondition, space: DesignSpace, bandwidth: Bandwidth) -> None:
         constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
-        every, self._single = Rays.joined(start), layout_of(design).one_sensor_per_ray
+        every, z = Rays.joined(start), interval_factor(design.level)
         self.start, self.count, self._axes = start, int(every.sensor.max()) + 1, Axes.of(space)
-        self._rays_bounded = self._single or design.track is not None
-        self._bounds = bounds_of(constraints.rules, space, tuple(range(self.count)), interval_factor(design.level))
+        self._bounds = bounds_of(constraints.rules, space, tuple(range(self.count)), z)
         models = (bandwidth, BandwidthBudget.of(constraints, None).model)
         self._limits = [(model, mean_mbps(start, model)) for model in models]
-        if self._single:
-            middle = np.zeros((self.count, 3))
-            np.add.at(middle, every.sensor, every.direction)
-            self._aim, spread = np.stack([*angles(middle), np.zeros(self.count)], axis=1), np.zeros((self.count, 2))
-        else:
-            sensors = design.sensors[: self.count]
-            self._aim = np.array([(one.azimuth_rad, one.elevation_rad, one.roll_rad) for one in sensors])
-            spread = np.array([(one.spread_horizontal_rad, one.spread_vertical_rad) for one in sensors])
+        sensors = design.sensors[: self.count]
+        self._aim = np.array([(one.azimuth_rad, one.elevation_rad, one.roll_rad) for one in sensors])
+        spread = np.array([one.field_of_view_rad for one in sensors]) / (2 * z)
         self._frames = np.array([boresight_frame(*aim) for aim in self._aim])
         sides = self._changes(every, spread)
         if any(mounts_of(rules) or rules.origin.exclude for rules in constraints.rules):
@@ -153,7 +146,7 @@ class MovableSensors:
             sides[..., AZIMUTH] = -bounds.azimuth_half - offset, bounds.azimuth_half - offset
         if axes.vertical:
             sides[..., ELEVATION] = bounds.elevation_low - self._aim[:, 1], bounds.elevation_high - self._aim[:, 1]
-        if axes.angular == 2 and not self._single:
+        if axes.angular == 2:
             sides[..., ROLL] = np.array([-math.pi, math.pi])[:, None]
         wide = np.array([axes.horizontal, axes.vertical]) & (spread > 0)
         widest = np.minimum(bounds.spread_high * [axes.angle_scale, 1.0], math.pi / 2 / bounds.interval)
@@ -199,9 +192,6 @@ class MovableSensors:
             offset = np.stack(angles(rays.direction), axis=1) - self._aim[sensor, :2]
             offset[:, 0] = wrap_angle(offset[:, 0])
             azimuth, elevation = (self._aim[sensor, :2] + own[:, AIM][:, :2] + offset * np.exp(own[:, FIELD])).T
-        if self._rays_bounded:
-            azimuth = clip_azimuth(azimuth, rows)
-            elevation = np.clip(elevation, rows.elevation_low, rows.elevation_high)
         middle, half = rays.gate_m.mean(axis=1) + own[:, 8], np.ptp(rays.gate_m, axis=1) / 2 * np.exp(own[:, 9])
         gate_m = np.stack([middle - half, middle + half], axis=1)
         varied = own[:, GATE].any(axis=1, keepdims=True)

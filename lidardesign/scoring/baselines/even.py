@@ -14,9 +14,9 @@ from typing import Protocol
 
 import numpy as np
 
-from lidardesign.layouts.grid import grid_rows, grid_tangent, low_discrepancy
 from lidardesign.numerics import TINY, unit_vectors
 from lidardesign.sensors.bandwidth import split_budget
+from lidardesign.sensors.even import grid_rows, grid_tangent, low_discrepancy
 from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, DesignSpace, angles, direction
 

@@ -1,7 +1,7 @@
 """The baseline `greedy`: rays and gates chosen on training scenes as a design's are, but without any density.
 
 Candidates are even over where training scenes return: on the lattice of `silhouette`, with free origins in the crops of
-`bounding`. Which of them fire, and through which gates, is chosen as by `fit --layout selected`: by what the task says
+`bounding`. Which of them fire, and through which gates, is chosen as by `fit`: by what the task says
 that returns tell about scenes, of the same scenes, as many, and in the bandwidth of the design beside it. Where no
 design has gates per ray there is one gate, that of the crops, and at equal rays it costs what it costs.
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -23,7 +23,6 @@ import numpy as np
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, fire_times
-from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.bounding import Crop, crop_kinds
 from lidardesign.scoring.baselines.candidates import rays_at, rays_within, whole_range
 from lidardesign.scoring.baselines.even import even_placement
@@ -35,26 +34,16 @@ from lidardesign.space import AZIMUTH, DesignSpace
 from lidardesign.task import Task
 
 if TYPE_CHECKING:
-    from lidardesign.rays.coverage import Coverage, InformedScene
-    from lidardesign.rays.selection import SelectionProblem
+    from lidardesign.rays.coverage import Coverage
+    from lidardesign.rays.informed import InformedScene
+    from lidardesign.rays.selection import Selection
+    from lidardesign.rays.training import TrainingScenes
 
 GREEDY = "greedy"
 USUAL_SCENES = 200  # that rays are chosen on where no design says on how many it was
 # Rays over all values of a condition: choosing more would take longer than all else in an evaluation.
 MOST_CHOSEN = 2000
 SMALLEST_SHARE = 0.1  # of even rays that return: where fewer do, candidates are those that return most often
-
-
-class GreedySource(NamedTuple):
-    """What rays are chosen by, beside the task.
-
-    Arguments:
-        scenes: Training scenes without end for a purpose, as designs with chosen rays are chosen on.
-        margin_m: By how much gates that hold all of a ray's returns are longer at both ends.
-    """
-
-    scenes: Callable[[str], Iterator[Scene]]
-    margin_m: float
 
 
 def greedy_rays(task: Task, positions: int, counts: Iterable[int]) -> tuple[list[int], list[str]]:
@@ -79,7 +68,7 @@ class Fired(NamedTuple):
 class _Table(NamedTuple):
     """What all candidates tell about the training scenes through each of their gates, (N, G, 2) [m]."""
 
-    problem: SelectionProblem
+    selection: Selection
     coverage: Coverage
     gates_m: np.ndarray
 
@@ -89,10 +78,9 @@ class GreedyCandidate:
     """Chosen rays as a baseline's layout.
 
     Arguments:
-        task: Says what returns tell.
         views: The training scenes, for where they return.
         spaces: The design space at each of the condition values.
-        source: Scenes to choose on, and the margin of gates.
+        training: Scenes to choose on, as designs with chosen rays are chosen on.
         scenes: On how many scenes rays are chosen.
         gates_per_ray: Whether each ray has a gate of its own.
         candidates: How many rays are chosen from, at each of the values.
@@ -102,10 +90,9 @@ class GreedyCandidate:
 
     name: ClassVar[str] = GREEDY
     drawn_anew: ClassVar[bool] = False
-    task: Task
     views: TrainingViews
     spaces: Sequence[DesignSpace]
-    source: GreedySource
+    training: TrainingScenes
     scenes: int
     gates_per_ray: bool
     candidates: int
@@ -139,14 +126,14 @@ class GreedyCandidate:
         from lidardesign.rays.choice import choose, choose_within
 
         table, values = self._table, len(self.spaces)
-        counts = table.problem.counts(count)
+        counts = table.selection.counts(count)
         with phase("choice"):
             choice = choose_within(table.coverage, counts, limit_mbps * values)
             if len(choice.rays) < count * values:
                 # no design spends less than one bin per ray
                 choice = choose(table.coverage, counts, price=1 / COARSE_SLACK)
         gate_m = table.gates_m[choice.rays, choice.gate[choice.rays]]
-        fired = replace(table.problem.rays.subset(choice.rays), gate_m=gate_m)
+        fired = replace(table.selection.rays.subset(choice.rays), gate_m=gate_m)
         time_s = fire_times(count, self.bandwidth.rate_hz)
         # candidates are in the order of the values, and as many are chosen at each
         places = np.arange(count * values).reshape(values, count)
@@ -191,26 +178,15 @@ class GreedyCandidate:
 
     @cached_property
     def _table(self) -> _Table:
-        from lidardesign.rays.information import checked_information
-        from lidardesign.rays.selection import SelectionProblem
+        from lidardesign.rays.selection import Selection
+        from lidardesign.rays.training import CHOICE
 
         ends = np.cumsum([0, *map(len, self._proposed)]).tolist()
-        problem = SelectionProblem(
-            rays=Rays.joined(self._proposed),
-            visits=[slice(*pair) for pair in itertools.pairwise(ends)],
-            shares=None,
-            gates=self._gates,
-            informs=partial(checked_information, self.task),
-            scenes=self.source.scenes,
-            bandwidth=self.bandwidth,
-            limit_mbps=np.inf,
-            one_gate=False,
-            most_scenes=self.scenes,
-            name=GREEDY,
-        )
-        informed = problem.inform(problem.scenes("choice"), self.scenes)
-        gates_m = problem.gates(problem.rays, problem.visits, informed)
-        return _Table(problem, problem.coverage(informed, gates_m), gates_m)
+        visits = [slice(*pair) for pair in itertools.pairwise(ends)]
+        selection = Selection(Rays.joined(self._proposed), visits, self._gates, self.bandwidth, name=GREEDY)
+        informed = self.training.inform(CHOICE, selection.rays, visits, 0, self.scenes)
+        gates_m = selection.gates(selection.rays, visits, informed)
+        return _Table(selection, selection.coverage(informed, gates_m), gates_m)
 
     @phase("gates")
     def _gates(self, rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene]) -> np.ndarray:
@@ -220,7 +196,7 @@ class GreedyCandidate:
         own = rays.gate_m[:, None]
         if not self.gates_per_ray:
             return own
-        gates_m = gate_choices(rays, visits, informed, self.source.margin_m)
+        gates_m = gate_choices(rays, visits, informed, self.training.margin_m)
         middle, half = gates_m[:, -1:].mean(axis=2), self.bandwidth.bin_m / 2
         one_bin = np.stack([np.maximum(middle - half, 0.0), middle + half], axis=2)
         return np.concatenate([gates_m, one_bin], axis=1)

@@ -12,8 +12,8 @@ more candidate layouts; where there are several, the best on training scenes is 
   `lidardesign.scoring.baselines.silhouette`.
 - `greedy`: rays chosen on training scenes without a density, see `lidardesign.scoring.baselines.greedy`.
 - `occupancy`: see `lidardesign.scoring.baselines.occupancy`.
-- `no-visibility`: a design fitted anew to the density without its occlusion term; the number of sensors, the layout,
-  the constraints, the level and the seed stay. It is not weighted, even where the design is.
+- `no-visibility`: the first design fitted anew to the density without its occlusion term; the number of sensors, the
+  layout, the constraints, the level and the seed stay. It is not weighted, even where the design is.
 - `cma`: see `lidardesign.scoring.baselines.cma`.
 
 Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
@@ -22,34 +22,29 @@ Where the density has conditions, every baseline is laid out at each of their va
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.mixture.fit import fit_like
-from lidardesign.mixture.support import Retarget
 from lidardesign.run.clock import phase
-from lidardesign.samples import Samples
-from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.bounding import bounding
-from lidardesign.scoring.baselines.candidates import BaselineLayout, Candidate, LayoutSite, most_within, whole_range
+from lidardesign.scoring.baselines.candidates import BaselineLayout, Candidate, LayoutSite, whole_range
 from lidardesign.scoring.baselines.cma import CMA
 from lidardesign.scoring.baselines.even import even_placement
-from lidardesign.scoring.baselines.greedy import GREEDY
+from lidardesign.scoring.baselines.greedy import GREEDY, Fired
 from lidardesign.scoring.baselines.occupancy import occupancy
 from lidardesign.scoring.baselines.silhouette import lloyd, silhouette
 from lidardesign.scoring.baselines.views import RAY_AXES, TrainingViews
 from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 
 Judge = Callable[[Sequence[RaysPerCondition]], Sequence[float]]
 NO_VISIBILITY = "no-visibility"
-CLOSE_ENOUGH = 0.98  # of the bandwidth: every further step may be another fit
 
 
 class Option(NamedTuple):
@@ -236,64 +231,39 @@ def check_baseline(name: str, *, where: str = "baselines") -> None:
         raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=", ".join(BASELINES))
 
 
-class LayOut(Protocol):
-    """Lays out so many rays of a design at a condition value."""
-
-    def __call__(
-        self, design: DesignSpec, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
-    ) -> Rays:
-        """As `lidardesign.mixture.fit.rays_at`."""
-
-
-def fitted_twin(design: DesignSpec, samples: Samples, *, name: str, retarget: Retarget | None = None) -> DesignSpec:
-    """A design fitted to other samples as a given one was fitted to its own.
-
-    Arguments:
-        design: The design whose sensors, layout, constraints, level and seed are taken.
-        samples: Samples of the other density.
-        name: Of the twin.
-        retarget: log p* of the other density, where the fit needs it.
-    """
-    seed = design.provenance.get("seed")
-    seed = seed if isinstance(seed, int) else 0
-    return fit_like(design, samples, rays=design.rays, seed=seed, name=name, retarget=retarget)
-
-
 class TwinCandidate:
-    """A design as a baseline's layout.
+    """A design that is fitted anew for each number of rays, as a baseline's layout.
 
     Arguments:
-        design: The design.
-        samples: What it is laid out by at other numbers of rays.
+        fit: The design with so many rays, within a bandwidth [Mbit/s] or without a limit.
         conditions: The condition values.
-        lay_out: How it becomes rays.
+        fired: What the designs beside it fire.
     """
 
     drawn_anew = False
+    name = NO_VISIBILITY
 
     def __init__(
-        self, design: DesignSpec, samples: Samples, conditions: Sequence[Mapping[str, float]], lay_out: LayOut
+        self,
+        fit: Callable[[int, float | None], DesignSpec],
+        conditions: Sequence[Mapping[str, float]],
+        fired: Sequence[Fired],
     ) -> None:
-        self.name = design.name
-        self._design, self._samples, self._conditions, self._lay_out = design, samples, conditions, lay_out
-        self._known: dict[int, RaysPerCondition] = {}
+        self._fit, self._conditions, self._fired = fit, conditions, fired
+        self._known: dict[tuple[int, float | None], RaysPerCondition] = {}
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> RaysPerCondition:
         """See `lidardesign.scoring.baselines.candidates.Candidate`."""
-        if count not in self._known:
-            self._known[count] = tuple(
-                self._lay_out(self._design, count, self._samples, at=condition) for condition in self._conditions
-            )
-        return self._known[count]
+        return self._rays(count, None)
 
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
-    ) -> RaysPerCondition | None:
-        """See `lidardesign.scoring.baselines.candidates.Candidate`."""
-        return most_within(
-            lambda count: self.positions(spaces, count),
-            limit_mbps,
-            bandwidth,
-            self._design.rays or max(len(self._design.sensors), 1),
-            close_enough=CLOSE_ENOUGH,
-        )
+    ) -> RaysPerCondition:
+        """As many rays as the design of this bandwidth fires."""
+        return self._rays(max(one.rays for one in self._fired if one.mbps == limit_mbps), limit_mbps)
+
+    def _rays(self, count: int, limit_mbps: float | None) -> RaysPerCondition:
+        if (count, limit_mbps) not in self._known:
+            design = self._fit(count, limit_mbps)
+            self._known[count, limit_mbps] = tuple(design.rays(count, at=at or None) for at in self._conditions)
+        return self._known[count, limit_mbps]

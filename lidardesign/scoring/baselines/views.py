@@ -9,12 +9,12 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from lidardesign.layouts.grid import low_discrepancy
 from lidardesign.numerics import wrap_turn
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.candidates import opened_gate, whole_range
 from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_lists
+from lidardesign.sensors.even import low_discrepancy
 from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import build_casters

@@ -14,21 +14,21 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.layouts.rays import gates_of, layout_of
-from lidardesign.layouts.track import travels
-from lidardesign.rays.gates import CANDIDATES_PER_RAY
+from lidardesign.rays.certificate import certificates_of
+from lidardesign.rays.proposals import CANDIDATES_PER_RAY
+from lidardesign.rays.training import HELD_BACK
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines import cma
-from lidardesign.scoring.baselines.candidates import Candidate, mean_mbps
+from lidardesign.scoring.baselines.candidates import Candidate
 from lidardesign.scoring.baselines.greedy import GREEDY, USUAL_SCENES, Fired, GreedyCandidate, greedy_rays
 from lidardesign.scoring.baselines.simple import Baselines, Option, TwinCandidate
 from lidardesign.scoring.baselines.views import TrainingObjective, TrainingViews
 from lidardesign.scoring.evaluation.request import EvaluationRequest, fired_numbers, numbers_fired
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_here
-from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import CERTIFICATES, DesignSpec
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_scenes
+from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import conditions_of
 
 # Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
@@ -84,10 +84,10 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     """All rows to be: designs at the numbers of rays that they can fire, baselines, then those at each one's bandwidth.
 
     Raises:
-        ConfigError: No design can fire any of the numbers of rays, or a track ends before where it is evaluated.
+        ConfigError: No design can fire any of the numbers of rays, or its rays end before where it is evaluated.
     """
     conditions = _conditions(request)
-    _check_tracks(request, conditions)
+    _check_ends(request, conditions)
     counts = fired_numbers(request.designs, request.rays)
     designs = [
         Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
@@ -95,7 +95,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         for count in numbers_fired(design, counts, request.alone)
     ]
     shared = [count for count in counts if count not in request.alone]
-    choosable = [] if request.greedy is None else greedy_rays(request.task, len(conditions), shared)[0]
+    choosable = [] if request.training is None else greedy_rays(request.task, len(conditions), shared)[0]
     starts = {one.rays: one.positions for one in designs if one.name == request.designs[0].name}
     baselines = Baselines(
         request.space,
@@ -103,8 +103,8 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         request.seed,
         partial(_judge, request),
         conditions=conditions,
-        gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
-        without_visibility=partial(_twin, request, conditions) if request.without_visibility else None,
+        gates_per_ray=any(design.has_gates_per_ray for design in request.designs),
+        without_visibility=partial(_twin, request, conditions, designs) if request.without_visibility else None,
         optimised=partial(_optimised, request, conditions, starts) if request.designs else None,
         chosen=partial(_chosen, request, conditions, designs, max(choosable, default=0)),
     )
@@ -131,22 +131,18 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     ]
 
 
-def has_gates_per_ray(design: DesignSpec) -> bool:
-    """True for a design whose rays have gates of their own, be it that each is a sensor."""
-    return gates_of(design) == "ray" or layout_of(design).one_sensor_per_ray
-
-
-def _check_tracks(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> None:
+def _check_ends(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> None:
     for design in request.designs:
-        if design.track is None:
+        name = design.condition
+        if name is None:
             continue
-        name, (first, last) = design.track.dimension, travels(design.track)
+        first, last = design.patterns[-1].ends
         beyond = [one[name] for one in conditions if name in one and not first <= one[name] <= last]
         if beyond:
             raise ConfigError(
-                f"its track goes from {name}={first:g} to {last:g}, but designs are evaluated at {beyond[0]:g} too",
+                f"its rays go from {name}={first:g} to {last:g}, but designs are evaluated at {beyond[0]:g} too",
                 where=f"design {design.name}",
-                hint="fit a track of the whole way: lidardesign fit RUN",
+                hint="fit a design of the whole way: lidardesign fit RUN",
             )
 
 
@@ -177,12 +173,15 @@ def ordered_conditions(request: EvaluationRequest) -> list[dict[str, float]]:
 def _laid_out(
     request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], design: DesignSpec, count: int
 ) -> RaysPerCondition:
-    samples = request.samples.get(design.name)
-    return tuple(request.lay_out(design, count, samples, at=condition) for condition in conditions)
+    return tuple(design.rays(count, at=condition or None) for condition in conditions)
 
 
-def _twin(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> Candidate:
-    return TwinCandidate(*request.without_visibility(), conditions, request.lay_out)
+def _twin(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], designs: Sequence[Entry]) -> Candidate:
+    return TwinCandidate(request.without_visibility, conditions, _fired(request, designs))
+
+
+def _fired(request: EvaluationRequest, designs: Sequence[Entry]) -> list[Fired]:
+    return [Fired(entry.rays, entry.mbps(request.bandwidth)) for entry in designs]
 
 
 def _optimised(
@@ -208,16 +207,15 @@ def _chosen(
     most: int,
     views: TrainingViews,
 ) -> Candidate:
-    numbers = [one["scenes"] for design in request.designs for one in design.provenance.get(CERTIFICATES, ())]
+    numbers = [one["scenes"] for design in request.designs for one in certificates_of(design)]
     return GreedyCandidate(
-        task=request.task,
         views=views,
         spaces=[request.space.at(condition) for condition in conditions],
-        source=request.greedy,
+        training=request.training,
         scenes=max(numbers, default=USUAL_SCENES),
-        gates_per_ray=any(has_gates_per_ray(design) for design in request.designs),
+        gates_per_ray=any(design.has_gates_per_ray for design in request.designs),
         candidates=CANDIDATES_PER_RAY * most,
-        fired=[Fired(entry.rays, entry.mbps(request.bandwidth)) for entry in designs],
+        fired=_fired(request, designs),
         bandwidth=request.bandwidth,
     )
 
@@ -281,7 +279,7 @@ def strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: 
     affordable = int(LARGEST_RIVAL_SHARE * fired / (rays * len(rivals)))
     scenes = held_back_scenes(request, min(max(affordable, FEWEST_RIVAL_SCENES), MOST_RIVAL_SCENES))
     scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in rivals], request.planner)
-    found = score_here(replace(scene_pass, scenes=scenes), None)
+    found = score_scenes(replace(scene_pass, scenes=scenes))
     means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
     values = dict(zip((entry.name for entry in rivals), means, strict=True))
     return StrongestRival.best_of(values, request.metric.better, rays, len(scenes))
@@ -289,7 +287,7 @@ def strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: 
 
 def held_back_scenes(request: EvaluationRequest, count: int) -> list[Scene]:
     """Training scenes that no rival's rays were chosen on; the first ones where a request has no others."""
-    scenes = iter(request.train) if request.greedy is None else request.greedy.scenes("held back")
+    scenes = iter(request.train) if request.training is None else request.training.scenes(HELD_BACK)
     return list(itertools.islice(scenes, count))
 
 

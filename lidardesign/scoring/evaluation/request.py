@@ -6,28 +6,28 @@ for an even subset of them.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 from lidardesign.errors import ConfigError, PluginError
-from lidardesign.layouts.rays import layout_of
-from lidardesign.mixture.fit import rays_at
+from lidardesign.rays.training import TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.cma import CmaSettings
-from lidardesign.scoring.baselines.greedy import GreedySource
-from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, LayOut, check_baseline
+from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, check_baseline
 from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, ScenePass, Scorer, score_here
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, ScenePass
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Task, metric_of, mount_of
+from lidardesign.workers import Starmap
 
 # Fixed patterns of more rays are scored without baselines, unless their number is asked for: scans have 100,000.
 MOST_SHARED = 2000
@@ -46,19 +46,17 @@ class EvaluationRequest:
         rays: Numbers of rays per frame; with conditions, per condition value. See `numbers_fired`.
         baselines: Names of baselines.
         bandwidth: The read-out model.
-        samples: Samples of the learned density by design name, for layouts that need them.
         equal_bandwidth: Whether baselines are also given each design's bandwidth.
         train, test: Training scenes (for baselines) and held-out scenes.
-        lay_out: How a design becomes a ray list of a given length.
-        without_visibility: The design that stands for the baseline `no-visibility`, and the samples that it was
-            fitted to; called when that is asked for.
+        without_visibility: Fits the design that stands for the baseline `no-visibility`, with so many rays within a
+            bandwidth [Mbit/s] or without a limit; None where there is none.
         density: Samples of what was learned, for figures; None where a run has none.
-        greedy: What the baseline `greedy` chooses by; None: it is left out.
+        training: Scenes that the baseline `greedy` chooses on; None: it is left out.
         cma: How long the baseline `cma` searches, and who is told how it stands.
         planner: The detector, and how the effects that are simulated are chosen.
         audit: Whether all rows are scored under all effects too.
         mount_error: How carelessly sensors are mounted in rows beside the exact ones; None: there are none.
-        scorer: What scores the held-out scenes: this process, or workers (`evaluate.workers`) to the same numbers.
+        starmap: How held-out scenes are scored: in this process, or by workers, to the same numbers.
         scenes_seed: Root of the held-out scenes; None: `seed`.
         alone: Those numbers of rays at which fixed patterns are evaluated without baselines and other designs.
     """
@@ -71,19 +69,17 @@ class EvaluationRequest:
     rays: Sequence[int]
     baselines: Sequence[str] = ALWAYS
     bandwidth: Bandwidth = field(default_factory=Bandwidth)
-    samples: Mapping[str, Samples] = field(default_factory=dict)
     equal_bandwidth: bool = True
     train: Sequence[Scene] = ()
     test: Sequence[Scene] = ()
-    lay_out: LayOut = rays_at
-    without_visibility: Callable[[], tuple[DesignSpec, Samples]] | None = None
+    without_visibility: Callable[[int, float | None], DesignSpec] | None = None
     density: Callable[[], Samples | None] = lambda: None
-    greedy: GreedySource | None = None
+    training: TrainingScenes | None = None
     cma: CmaSettings = field(default_factory=CmaSettings)
     planner: Planner = field(default_factory=Planner)
     audit: bool = False
     mount_error: MountError | None = None
-    scorer: Scorer = score_here
+    starmap: Starmap = itertools.starmap
     scenes_seed: int | None = None
     alone: Sequence[int] = ()
 
@@ -132,17 +128,12 @@ class EvaluationRequest:
         return ScenePass(self.task, self.metric, self.seed, self.test, fired, planner, plans)
 
 
-def pattern_size(design: DesignSpec) -> int | None:
-    """The rays of a design's fixed pattern; None where a design can be laid out at any number."""
-    return layout_of(design).most_count(design)
-
-
 def numbers_fired(design: DesignSpec, asked: Iterable[int], alone: Sequence[int] = ()) -> list[int]:
     """Those of some numbers of rays at which a design is evaluated: a fixed pattern at its own only, where asked for.
 
     What is bought fires all its rays; subsets of them may rank designs of several sizes in another order.
     """
-    size, chosen, asked = pattern_size(design), layout_of(design).counts(design), list(asked)
+    size, chosen, asked = design.size, design.counts, list(asked)
     if size in asked:
         return [size]
     if chosen is not None:
@@ -158,8 +149,8 @@ def numbers_alone(counts: Iterable[int], budgets: Iterable[int]) -> list[int]:
 def usual_numbers(designs: Iterable[DesignSpec], budgets: Iterable[int]) -> list[int]:
     """The numbers to evaluate at where none is asked for: the task's, those of fixed patterns, and of chosen rays."""
     designs = list(designs)
-    sizes = {size for size in map(pattern_size, designs) if size is not None}
-    chosen = (layout_of(design).counts(design) or () for design in designs)
+    sizes = {design.size for design in designs if design.size is not None}
+    chosen = (design.counts or () for design in designs)
     return fired_numbers(designs, sorted(sizes.union(budgets, *chosen)))
 
 
@@ -173,12 +164,12 @@ def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[
     fired = {count for design in designs for count in numbers_fired(design, asked)}
     kept = [count for count in asked if not designs or count in fired]
     if asked and not kept:
-        chosen = sorted({count for design in designs for count in layout_of(design).counts(design) or ()})
-        sizes = [size for size in map(pattern_size, designs) if size is not None]
+        chosen = sorted({count for design in designs for count in design.counts or ()})
+        sizes = [design.size for design in designs if design.size is not None]
         why = "all are fixed patterns"
         hint = "a design of more parts: lidardesign catalog show NAME --rays N --out FILE"
         if chosen:
-            why, hint = "rays were chosen at other numbers", "lidardesign fit RUN --layout selected --rays N"
+            why, hint = "rays were chosen at other numbers", "lidardesign fit RUN --rays N"
         who = "no design fires"
         if len(designs) == 1:
             who = f"{designs[0].name} does not fire"
@@ -197,13 +188,13 @@ def left_out(designs: Sequence[DesignSpec], counts: Iterable[int], alone: Sequen
     asked = sorted(set(counts))
     lines = []
     for design in designs:
-        size, fired = pattern_size(design), numbers_fired(design, asked)
+        size, fired = design.size, numbers_fired(design, asked)
         beyond = [count for count in asked if count not in fired]
         if size is not None and fired and size not in fired:
             some = _listed(fired, "and")
             lines.append(f"{design.name} fires {size} rays, its fixed pattern: at {some} rays an even subset of them")
         if beyond:
-            counts = layout_of(design).counts(design)
+            counts = design.counts
             fires = f"{size} rays, its fixed pattern"
             fires = fires if counts is None else f"{_listed(counts, 'or')} rays, at which they were chosen"
             lines.append(f"{design.name} fires {fires}: it is left out at {_listed(beyond, 'and')} rays")

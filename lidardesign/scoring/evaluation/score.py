@@ -29,7 +29,7 @@ from lidardesign.scoring.evaluation.entries import Entry, entries_of, strongest_
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
 from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, silent_notes
+from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_scenes, silent_notes
 from lidardesign.scoring.scenes.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.sensors.sensor import MOST_RAYS
@@ -163,7 +163,7 @@ def _score_all(
     """All scenes, here or by workers; plans that are known are not made again."""
     jobs = {entry.key: entry for entry in entries}
     scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in jobs.values()], planner, known)
-    scenes = request.scorer(scene_pass, progress)
+    scenes = score_scenes(scene_pass, progress, request.starmap)
     of_entries = zip(*(scene.scores for scene in scenes), strict=True)
     return _Scored(
         dict(zip(jobs, of_entries, strict=True)),

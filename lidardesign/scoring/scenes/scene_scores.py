@@ -1,12 +1,12 @@
 """Scores of many sets of rays in every scene, each scene under the effects that it calls for.
 
 A scene is the unit of work: all its rays are planned and traced together, and what comes of it depends on nothing
-else. So scenes can be scored one after the other here, or by workers (`lidardesign.scoring.evaluation.workers`), to the same
-numbers.
+else. So scenes can be scored one after the other here, or by workers (`lidardesign.workers`), to the same numbers.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,6 +25,7 @@ from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.returns import build_casters, simulate_many
 from lidardesign.task import Metric, Score, Task
+from lidardesign.workers import Starmap
 
 RaysPerCondition = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
 # Rays times frames that are traced together: their returns take 24 bytes each.
@@ -207,24 +208,26 @@ class SceneScores:
     second_casts: SecondCasts = field(default_factory=SecondCasts)
 
 
-# Scores all held-out scenes of a pass, in their order.
-Scorer = Callable[[ScenePass, Progress | None], Sequence[SceneScores]]
-
-
-def score_here(scenes: ScenePass, progress: Progress | None) -> list[SceneScores]:
-    """Score scene by scene in this process, so that only one scene's casters are held at a time.
+def score_scenes(
+    scenes: ScenePass, progress: Progress | None = None, starmap: Starmap = itertools.starmap
+) -> list[SceneScores]:
+    """Score scene by scene, so that only one scene's casters are held at a time; or by workers, to the same numbers.
 
     Arguments:
         scenes: The scenes, what is fired there, and under which effects.
         progress: Called with the name of the scene, the scenes done, and all scenes.
+        starmap: How scenes are scored.
     """
-    found = []
-    total = len(scenes.scenes)
+    found, total = [], len(scenes.scenes)
+    asked = (
+        (scenes.task, scenes.metric, scene, list(scenes.fired(n)), scenes.planner, scenes.known(n), scenes.seed)
+        for n, scene in enumerate(scenes.scenes)
+    )
+    results = iter(starmap(score_in_scene, asked))
     for number, scene in enumerate(scenes.scenes):
         if progress:
             progress(scene.name, number, total)
-        sets, known = scenes.fired(number), scenes.known(number)
-        found.append(score_in_scene(scenes.task, scenes.metric, scene, sets, scenes.planner, known, scenes.seed))
+        found.append(next(results))
     if progress:
         progress("", total, total)
     return found

@@ -1,12 +1,15 @@
-"""Even layouts: a cell-centred grid of any number of rays in a field of view, and points that fill a cube evenly."""
+"""Even rays: a cell-centred grid of any number in a field of view, points that fill a cube, and subsets of points."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
-from lidardesign.sensors.sensor import Sensor
+from lidardesign.errors import ConfigError
+from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays, fire_times
+from lidardesign.sensors.sensor import Sensor, tangent_directions
 
 RECURRENCE_AXES = 2
 PRIMES = (2, 3, 5, 7, 11, 13)
@@ -88,3 +91,44 @@ def field_on_sphere(sensor: Sensor) -> tuple[float, float]:
     corner = math.hypot(horizontal, vertical) / 2
     scale = math.pi / corner if corner > math.pi else 1.0
     return scale * horizontal, scale * vertical
+
+
+def even_rays(sensors: Sequence[Sensor], counts: Sequence[int]) -> Rays:
+    """A grid of so many rays in the field of view of each sensor, with its gate, from its place."""
+    tangents = [grid_tangent(*field_on_sphere(one), int(n)) for one, n in zip(sensors, counts, strict=True)]
+    sensor = np.repeat(np.arange(len(sensors)), counts)
+    looking = [tangent_directions(one.frame, tangent) for one, tangent in zip(sensors, tangents, strict=True)]
+    origin_m = np.array([one.origin_m for one in sensors], dtype=np.float64)[sensor]
+    gate_m = np.array([one.gate_m for one in sensors], dtype=np.float64)[sensor]
+    times = fire_times(len(sensor), DEFAULT_RATE_HZ)
+    return Rays(origin_m, np.concatenate(looking), gate_m, sensor, times)
+
+
+def even_subset(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices, ascending, of `count` of the points that lie evenly among them: (M, K) to int64 (count,).
+
+    The points are halved along their longest extent until as many groups as wanted are left, each with the same
+    number of points but for one; of each the point nearest to its centre stays. Deterministic, and O(M log M).
+
+    Raises:
+        ConfigError: More are wanted than there are.
+    """
+    if not 0 <= count <= len(points):
+        raise ConfigError(f"{count} of {len(points)} rays", where="rays", allowed=f"0 to {len(points)}")
+    if count == len(points):
+        return np.arange(count)
+    kept: list[int] = []
+    groups = [(np.arange(len(points)), count)] if count else []
+    while groups:
+        members, wanted = groups.pop()
+        inside = points[members]
+        if wanted == 1:
+            kept.append(int(members[np.square(inside - inside.mean(axis=0)).sum(axis=1).argmin()]))
+            continue
+        # to so many digits, so that rounding does not choose among equal extents and positions
+        axis = np.round(np.ptp(inside, axis=0), 9).argmax()
+        order = members[np.argsort(np.round(inside[:, axis], 9), kind="stable")]
+        first = wanted // 2
+        cut = int(np.clip(round(len(order) * first / wanted), first, len(order) - (wanted - first)))
+        groups += [(order[:cut], first), (order[cut:], wanted - first)]
+    return np.sort(np.array(kept, dtype=np.int64))

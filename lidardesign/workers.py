@@ -1,12 +1,13 @@
-"""Held-out scenes scored by worker processes of this machine, or by the workers of a dask scheduler.
+"""Scenes looked at by worker processes of this machine, or by the workers of a dask scheduler.
 
-A scene is sent with its rays, and is scored by the same function as in this process: the scores are the same for any
-number of workers. Rows' seconds are the workers' own, so they add up to more than the time that passed.
+A scene is sent with its rays, and the same function works on it as in this process: the results are the same for any
+number of workers. Seconds that they report are their own, so they add up to more than the time that passed.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import multiprocessing
 import os
@@ -17,18 +18,16 @@ import threading
 import types
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from lidardesign import __version__
 from lidardesign.errors import ConfigError, LidardesignError, NumericalError, page
 from lidardesign.registry import distribution_of, load_task
-from lidardesign.run.clock import Progress
-from lidardesign.scoring.scenes.scene_scores import ScenePass, SceneScores, Scorer, score_here, score_in_scene
 from lidardesign.task import Task
 
 ADDRESS = re.compile(r"tcp://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
@@ -40,6 +39,15 @@ SAME_HINT = "install the same versions of lidardesign and of the task for the sc
 # Scenes beyond what runs, so that no worker waits for this process.
 AHEAD = 2
 _one_at_a_time = threading.Lock()
+Result = TypeVar("Result")
+
+
+class Starmap(Protocol):
+    """Calls a function with each of some tuples of arguments; gives the results in their order, as `itertools.starmap`."""
+
+    def __call__(self, function: Callable[..., Result], asked: Iterable[tuple[Any, ...]]) -> Iterable[Result]:
+        """The results."""
+        ...
 
 
 def check_workers(text: str) -> int | str:
@@ -59,15 +67,20 @@ def check_workers(text: str) -> int | str:
 
 
 @contextlib.contextmanager
-def scorer_of(workers: int | str, task: Task, scenes: int) -> Iterator[Scorer]:
-    """The scorer of a number of processes, or of a scheduler's address; its processes end with the context.
+def opened_workers(workers: int | str, task: Task, scenes: int) -> Iterator[Starmap]:
+    """Calls by a number of processes, or by a scheduler's address; processes end with the context.
+
+    Arguments:
+        workers: As `check_workers` gives it.
+        task: Whose scenes are looked at.
+        scenes: How many there are at least; no more processes are started.
 
     Raises:
         ConfigError: No scheduler answers, it has no workers, or the task is not the installed one of its name.
         NumericalError: A worker died.
     """
     if isinstance(workers, int) and min(workers, scenes) == 1:
-        yield score_here
+        yield itertools.starmap
         return
     if type(load_task(task.name)) is not type(task):
         raise ConfigError(
@@ -77,37 +90,34 @@ def scorer_of(workers: int | str, task: Task, scenes: int) -> Iterator[Scorer]:
         )
     opened = _cluster(workers, task) if isinstance(workers, str) else _processes(min(workers, scenes))
     with opened as (executor, threads):
-        yield partial(_score_by, executor, threads)
+        yield partial(_map_there, executor, threads, task)
 
 
-def _score_by(
-    executor: Executor, threads: Callable[[], int], scenes: ScenePass, progress: Progress | None
-) -> list[SceneScores]:
-    """As `score_here`; answers are taken in the order of the scenes, so of several errors the first one is raised."""
-    total, found = len(scenes.scenes), list[SceneScores]()
-    numbers, waiting = iter(range(total)), deque[Future[SceneScores]]()
-    versions = _versions(scenes.task)
-    if progress:
-        progress(scenes.scenes[0].name, 0, total)
-    while len(found) < total:
-        for number in islice(numbers, max(threads() + AHEAD - len(waiting), 0)):
-            asked = (list(scenes.fired(number)), scenes.planner, scenes.known(number), scenes.seed)
-            scene = scenes.scenes[number]
-            waiting.append(executor.submit(_score_there, versions, scenes.task, scenes.metric, scene, *asked))
+def _map_there(
+    executor: Executor,
+    threads: Callable[[], int],
+    task: Task,
+    function: Callable[..., Result],
+    asked: Iterable[tuple[Any, ...]],
+) -> Iterator[Result]:
+    """Results in the order of what was asked, so of several errors the first one is raised."""
+    asked, waiting, versions = iter(asked), deque[Future[Result]](), _versions(task)
+    while True:
+        for arguments in islice(asked, max(threads() + AHEAD - len(waiting), 0)):
+            waiting.append(executor.submit(_call, versions, task, function, *arguments))
+        if not waiting:
+            return
         first = waiting.popleft()
         while not wait([first], WORKER_SECONDS).done:
             threads()
-        found.append(first.result())
-        if progress:
-            progress(scenes.scenes[len(found) - 1].name, len(found), total)
-    return found
+        yield first.result()
 
 
-def _score_there(versions: str, task: Task, *asked: Any) -> SceneScores:
-    """A scene's scores, in a worker, whose threads take turns: tasks need not be safe to be called twice at a time."""
+def _call(versions: str, task: Task, function: Callable[..., Result], *arguments: Any) -> Result:
+    """A call in a worker, whose threads take turns: tasks need not be safe to be called twice at a time."""
     _check_versions(versions, task)
     with _one_at_a_time:
-        return score_in_scene(task, *asked)
+        return function(*arguments)
 
 
 def _versions(task: Task) -> str:

@@ -1,0 +1,206 @@
+"""Rays that are chosen on training scenes for fitted sensors: the second to the fifth step from a density to rays.
+
+The density proposes rays inside the sensors, scenes that nothing was learned from say what each of them tells, and those
+are chosen that are most informative together. Fields of view and gates then shrink to the rays that are fired. Along a
+condition, as a robot's position, rays are chosen at each of its values that the task judges at, and become a pattern.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lidardesign.constraints.document import Constraints, SensorRules, rules_of
+from lidardesign.errors import check_number
+from lidardesign.mixture.fit import FittedSensors
+from lidardesign.numerics import COARSE_SLACK
+from lidardesign.rays.gates import GateLimits
+from lidardesign.rays.information import FEW_SCENES, MOST_SCENES, MOST_SELECTED
+from lidardesign.rays.informed import InformedScene
+from lidardesign.rays.pool import Pool
+from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, owners, rays_of_points
+from lidardesign.rays.selection import Selected, Selection, inform_enough, select
+from lidardesign.rays.training import CHOICE, TrainingScenes
+from lidardesign.run.clock import phase
+from lidardesign.samples import Samples
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.pattern import Pattern
+from lidardesign.sensors.sensor import Sensor, tangent_directions
+from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, angles, direction
+from lidardesign.task import random_generator
+
+# Rounds in which a boresight moves to the middle of its rays: away from the poles it rests after two or three.
+CENTRING_ROUNDS = 8
+# Fields hold their outermost rays, whatever digits of angles a file rounds.
+FIELD_SLACK = COARSE_SLACK / 10
+
+
+class ChosenRays(NamedTuple):
+    """Sensors with the rays that were chosen for them.
+
+    Arguments:
+        sensors: With fields of view and gates no larger than their rays need.
+        patterns: One for each number of rays, ascending.
+        certificates: Of the numbers of rays that were certified.
+        idle: Indices of sensors that fire no ray at the largest number.
+        silent: The share of scenes held back about which the largest number of rays tells nothing.
+    """
+
+    sensors: tuple[Sensor, ...]
+    patterns: tuple[Pattern, ...]
+    certificates: tuple[dict[str, object], ...]
+    idle: tuple[int, ...]
+    silent: float
+
+
+def choose_rays(
+    training: TrainingScenes,
+    samples: Samples,
+    fitted: FittedSensors,
+    constraints: Constraints,
+    counts: Sequence[int],
+    *,
+    level: float,
+    gates: str,
+    pool: Pool | None,
+    certified: Sequence[int] = (),
+    each_fires: bool = False,
+    is_trial: bool = False,
+    progress: Callable[[str], None] = lambda step: None,
+) -> ChosenRays:
+    """The rays of fitted sensors, one choice for each number of rays.
+
+    Arguments:
+        training: Training scenes of the run.
+        samples: Of the density, at all values of its condition.
+        fitted: The sensors.
+        constraints: What sensors and rays keep.
+        counts: Numbers of rays, ascending; along a condition, at each of its values.
+        level: The share of each marginal that the sensors' intervals hold.
+        gates: "sensor" or "ray": one gate per sensor, or one per ray.
+        pool: What is known of rays at their place; None casts candidates anew.
+        certified: The numbers of rays for which a bound is found.
+        each_fires: Whether every sensor has to fire a ray.
+        is_trial: Whether the first few scenes are enough where candidates are cast anew.
+        progress: Called with every step.
+
+    Raises:
+        ConfigError: More rays than can be chosen.
+        DataError: No ray inside the sensors tells anything about the training scenes.
+        InfeasibleError: A bandwidth in which no choice of so many rays fits.
+    """
+    check_number(counts[-1], "--rays", 1, MOST_SELECTED)
+    budget, conditions = constraints.budget, training.run.conditions(samples.space)
+    proposals = Proposals(fitted.sensors, constraints.rules, level, samples)
+    wanted = CANDIDATES_PER_RAY * counts[-1]
+    picked = None if pool is None else _picked(pool, proposals, conditions, wanted)
+    lists = picked[0] if picked else _drawn(proposals, conditions, wanted, training.seed)
+    ends = np.cumsum([0, *map(len, lists)]).tolist()
+    limits = GateLimits(
+        fitted.sensors, constraints.rules, level, samples.space, training.margin_m, is_shared=gates != "ray"
+    )
+    selection = Selection(
+        rays=Rays.joined(lists),
+        visits=[slice(*pair) for pair in itertools.pairwise(ends)],
+        gates=limits.choices,
+        bandwidth=Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz),
+        limit_mbps=np.inf if budget.bandwidth_mbps is None else budget.bandwidth_mbps,
+        shares=np.array([sensor.weight for sensor in fitted.sensors]) if len(lists) > 1 else None,
+        is_shared=gates != "ray",
+        each_fires=each_fires,
+    )
+    if picked:
+        informed, held_back = picked[1:]
+    elif is_trial:
+        informed = training.inform(CHOICE, selection.rays, selection.visits, 0, FEW_SCENES)
+        held_back = []
+    else:
+        # each of a few values of a condition sees little of a scene
+        most_scenes = MOST_SCENES * (1 + (len(lists) > 1))
+        informed, held_back = inform_enough(selection, training, counts[len(counts) // 2], most_scenes, progress)
+    selected = select(selection, informed, held_back, counts, certified, progress)
+    patterns = tuple(_pattern(one, conditions, samples) for one in selected)
+    per_sensor = patterns[-1].per_sensor(len(fitted.sensors))
+    sensors = tuple(
+        _around_rays(sensor, index, patterns, rules_of(constraints.rules, index), samples)
+        for index, sensor in enumerate(fitted.sensors)
+    )
+    weights = per_sensor / per_sensor.sum()
+    return ChosenRays(
+        tuple(replace(sensor, weight=float(weight)) for sensor, weight in zip(sensors, weights, strict=True)),
+        patterns,
+        tuple(one.certificate for one in selected if one.certificate is not None),
+        tuple(np.flatnonzero(per_sensor == 0).tolist()),
+        selected[-1].silent,
+    )
+
+
+@phase("candidates")
+def _drawn(proposals: Proposals, conditions: Sequence[dict[str, float]], count: int, seed: int) -> list[Rays]:
+    return [
+        proposals.draw(count, at, random_generator(seed, "candidates", number)) for number, at in enumerate(conditions)
+    ]
+
+
+@phase("candidates")
+def _picked(
+    pool: Pool, proposals: Proposals, conditions: Sequence[dict[str, float]], count: int
+) -> tuple[list[Rays], list[InformedScene], list[InformedScene]] | None:
+    """The first so many rays of a pool inside the sensors at each condition, and what they tell; None of too few."""
+    number, known, lists = np.full(len(pool.points), -1), 0, []
+    for visit, at in zip(pool.visits, conditions, strict=True):
+        sensors, points = proposals.sensors_at(at), pool.points[visit]
+        owner, fired = owners(sensors, proposals.rules, proposals.level, points, proposals.samples.space.at(at))
+        chosen = np.flatnonzero(owner >= 0)[:count]
+        if len(chosen) < count:
+            return None
+        number[visit.start + chosen] = known + np.arange(count)
+        known += count
+        lists.append(rays_of_points(fired[chosen], owner[chosen], sensors))
+    informed, held_back = ([scene.of_rays(number) for scene in part] for part in (pool.informed, pool.held_back))
+    return lists, informed, held_back
+
+
+def _pattern(selected: Selected, conditions: Sequence[dict[str, float]], samples: Samples) -> Pattern:
+    if len(conditions) == 1:
+        return Pattern.of(selected.rays[0])
+    (axis,) = samples.space.conditioned
+    name, ends = DIMENSIONS[axis], (samples.space.low[axis], samples.space.high[axis])
+    return Pattern.along(name, [at[name] for at in conditions], selected.rays, ends)
+
+
+def _around_rays(
+    sensor: Sensor, index: int, patterns: Sequence[Pattern], rules: SensorRules, samples: Samples
+) -> Sensor:
+    """A sensor with the smallest field of view and gate that hold its rays, and that constraints allow."""
+    rows = [(pattern, pattern.sensor == index) for pattern in patterns]
+    azimuth_rad, elevation_rad = (
+        np.concatenate([getattr(pattern, name)[:, own].ravel() for pattern, own in rows])
+        for name in ("azimuth_rad", "elevation_rad")
+    )
+    gate_m = np.concatenate([pattern.gate_m[:, own].reshape(-1, 2) for pattern, own in rows])
+    if not len(gate_m):
+        return sensor
+    looking, widest = direction(azimuth_rad, elevation_rad), np.array(sensor.field_of_view_rad)
+    fields, bounds = rules.field_of_view, rules.boresight
+    least = np.radians([fields.horizontal_deg.min or 0.0, fields.vertical_deg.min or 0.0])
+    ends = (bounds.azimuth_deg.min, bounds.azimuth_deg.max, bounds.elevation_deg.min, bounds.elevation_deg.max)
+    may_turn = all(end is None for end in ends) and {AZIMUTH, ELEVATION} <= set(samples.space.free)
+    tried, best, smallest = sensor, sensor, math.inf
+    for _ in range(CENTRING_ROUNDS if may_turn else 1):
+        tangent = tried.tangent_of(looking)
+        view = np.maximum(2 * np.abs(tangent).max(axis=0) * (1 + FIELD_SLACK) + FIELD_SLACK, least)
+        view = np.minimum(np.where(widest > 0, view, 0.0), widest + FIELD_SLACK)
+        area = float(view[view > 0].prod())
+        if (2 * np.abs(tangent).max(axis=0) <= np.minimum(view, widest) + FIELD_SLACK).all() and area < smallest:
+            best, smallest = replace(tried, field_of_view_rad=tuple(np.minimum(view, widest).tolist())), area
+        middle = (tangent.min(axis=0) + tangent.max(axis=0)) / 2
+        azimuth, elevation = (float(angle) for angle in angles(tangent_directions(tried.frame, middle[None])[0]))
+        tried = replace(tried, azimuth_rad=azimuth, elevation_rad=elevation)
+    return replace(best, gate_m=(float(gate_m[:, 0].min()), float(gate_m[:, 1].max())))

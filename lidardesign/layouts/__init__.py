@@ -1,1 +1,0 @@
-"""From sensors to rays: grids, density, scans, distributed rays, and tracks."""

@@ -1,0 +1,197 @@
+"""What training scenes show of a pool of rays: found once, kept in the run, and picked from by every fit.
+
+Where origins are given a change of constraints changes neither the scenes nor what rays return there. So rays are drawn
+from the whole density, more than any design chooses from, and what their returns tell about training scenes is kept in
+a file of the run. A fit picks those inside its sensors. The file says what it was made of: with another mesh, setting,
+seed or version of the program or the task it is made anew, and what is read is bit for bit what is found without it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import inspect
+import io
+import itertools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign import __file__ as package_file
+from lidardesign.errors import LidardesignError
+from lidardesign.rays.gates import gate_choices
+from lidardesign.rays.information import CHOSEN_SHARE, MOST_SCENES, MOST_SELECTED
+from lidardesign.rays.informed import InformedScene
+from lidardesign.rays.proposals import CANDIDATES_PER_RAY, draw_order, nearest_samples
+from lidardesign.rays.selection import Selection, inform_enough
+from lidardesign.rays.training import TrainingScenes
+from lidardesign.registry import distribution_of
+from lidardesign.run.arrays import read_npz
+from lidardesign.run.clock import phase
+from lidardesign.run.files import write_atomic
+from lidardesign.run.inputs import SAMPLES
+from lidardesign.run.manifest import read_manifest, versions
+from lidardesign.run_folder import RunFolder, input_hashes
+from lidardesign.samples import FILE_NAME as SAMPLES_FILE
+from lidardesign.samples import Samples
+from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
+from lidardesign.task import random_generator
+
+FILE_NAME = "informed.npz"
+# So many times as many rays as are chosen from at the task's largest number: sensors see a part of them each.
+POOL_FACTOR = 3
+MOST_BYTES = 300_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Rays drawn from the whole density, and what they tell.
+
+    Arguments:
+        points: Their design points, shape (N, 6), in an order in which any first few are a fair draw.
+        visits: Which of them are at each value of the condition, one after the other.
+        informed: What their returns tell about the scenes that rays are chosen on.
+        held_back: The same of scenes that are held back.
+    """
+
+    points: np.ndarray
+    visits: Sequence[slice]
+    informed: Sequence[InformedScene]
+    held_back: Sequence[InformedScene]
+
+
+def has_pool(run: RunFolder) -> bool:
+    """Whether all sensors of a run stand at one given place, but for conditions."""
+    space = run.config.space
+    return not [axis for axis in range(3) if axis in space.free and axis not in space.conditioned]
+
+
+@phase("pool")
+def pool_of(run: RunFolder, samples: Samples, training: TrainingScenes, progress: Callable[[str], None]) -> Pool:
+    """The pool of a run: as it is kept there, or found anew and kept if it can be written.
+
+    Arguments:
+        run: The run, whose sensors stand at one place (see `has_pool`).
+        samples: Of its density.
+        training: Its training scenes.
+        progress: Called with every step.
+
+    Raises:
+        DataError: No ray tells anything about the scenes.
+    """
+    path, key = run.folder / FILE_NAME, _key(run, training.seed)
+    with contextlib.suppress(LidardesignError, KeyError, ValueError):
+        arrays = read_npz(path, SAMPLES)
+        if bytes(arrays["key"]).decode() == key:
+            return _unpacked(arrays)
+    arrays = _packed(_found(run, samples, training, progress))
+    buffer = io.BytesIO()
+    np.savez(buffer, key=np.frombuffer(key.encode(), dtype=np.uint8), **arrays)
+    if buffer.tell() <= MOST_BYTES:
+        # a run that cannot be written, or a full disk, costs time alone
+        with contextlib.suppress(LidardesignError):
+            write_atomic(path, buffer.getvalue())
+    return _unpacked(arrays)
+
+
+def _found(run: RunFolder, samples: Samples, training: TrainingScenes, progress: Callable[[str], None]) -> Pool:
+    conditions, counts = run.conditions(), sorted(run.task.defaults.rays)
+    size = POOL_FACTOR * CANDIDATES_PER_RAY * min(counts[-1], MOST_SELECTED)
+    parts = []
+    for number, at in enumerate(conditions):
+        near = nearest_samples(samples, at)
+        order = draw_order(near.weights, random_generator(training.seed, "pool", number))
+        _, first = np.unique(near.points[order, :RANGE], axis=0, return_index=True)
+        parts.append(near.points[order[np.sort(first)[:size]]])
+    ends = np.cumsum([0, *map(len, parts)]).tolist()
+    points, visits = np.concatenate(parts), [slice(*pair) for pair in itertools.pairwise(ends)]
+    gate_m = np.tile([run.config.space.low[RANGE], run.config.space.high[RANGE]], (len(points), 1))
+    looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
+    rays = Rays(points[:, :3], looking, gate_m, np.zeros(len(points)), np.zeros(len(points)))
+    gates, share = partial(gate_choices, margin_m=training.margin_m), CHOSEN_SHARE / POOL_FACTOR
+    selection = Selection(rays, visits, gates, Bandwidth(), share=share)
+    # each of a few values of a condition sees little of a scene
+    most_scenes = MOST_SCENES * (1 + (len(conditions) > 1))
+    return Pool(points, visits, *inform_enough(selection, training, counts[len(counts) // 2], most_scenes, progress))
+
+
+def _key(run: RunFolder, seed: int) -> str:
+    """A hash of everything that a pool follows from."""
+    task = type(run.task)
+    source = inspect.getsourcefile(task)
+    folders = [Path(package_file).parent, *([Path(source).parent] if source else [])]
+    made_of = {
+        "config": run.config.as_document(),
+        "inputs": input_hashes(run.config.task),
+        "samples": (read_manifest(run.folder)["files"].get(SAMPLES_FILE) or {}).get("sha256"),
+        "seed": seed,
+        "versions": versions(),
+        "task": [distribution_of(run.task.name), task.__module__, task.__qualname__],
+        # of programs that are being written: their source as well as its version
+        "source": [_stamp(path) for folder in folders for path in sorted(folder.rglob("*.py"))],
+    }
+    return hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _stamp(path: Path) -> tuple[str, int, int]:
+    found = path.stat()
+    return str(path), found.st_size, found.st_mtime_ns
+
+
+def _packed(pool: Pool) -> dict[str, np.ndarray]:
+    """The arrays of a pool: those of all scenes one after the other, and where each begins."""
+    scenes = [*pool.informed, *pool.held_back]
+    small = np.uint16 if len(pool.points) <= np.iinfo(np.uint16).max else np.int32
+    kinds = {"ray": small, "item": np.uint16, "worth": np.float32, "range_m": np.float32, "weight": np.float64}
+    kinds |= {"spoiling": small, "harm": np.float32, "harm_range_m": np.float32}
+    arrays = {
+        name: np.concatenate([np.asarray(getattr(scene, name)) for scene in scenes]).astype(kind)
+        for name, kind in kinds.items()
+    }
+    sizes = [[len(scene.ray), len(scene.weight), len(scene.spoiling)] for scene in scenes]
+    first = scenes[0]
+    return {
+        **arrays,
+        "points": pool.points,
+        "visits": np.array([[visit.start, visit.stop] for visit in pool.visits]),
+        "starts": np.concatenate([np.zeros((1, 3), dtype=np.int64), np.cumsum(sizes, axis=0)]),
+        "complete": np.array([scene.complete for scene in scenes]),
+        "chosen_on": np.array(len(pool.informed)),
+        "sums": first.sums,
+        "is_repeated": np.array(first.is_repeated),
+        "unit": np.frombuffer(first.unit.encode(), dtype=np.uint8),
+    }
+
+
+def _unpacked(arrays: Mapping[str, np.ndarray]) -> Pool:
+    scenes, starts = [], arrays["starts"]
+    shared = {
+        "sums": arrays["sums"],
+        "is_repeated": bool(arrays["is_repeated"]),
+        "unit": bytes(arrays["unit"]).decode(),
+    }
+    for number, complete in enumerate(arrays["complete"].tolist()):
+        entries, items, spoils = (slice(*starts[number : number + 2, kind]) for kind in range(3))
+        scenes.append(
+            InformedScene(
+                ray=arrays["ray"][entries].astype(np.int32),
+                item=arrays["item"][entries].astype(np.int32),
+                worth=arrays["worth"][entries],
+                range_m=arrays["range_m"][entries].astype(np.float64),
+                weight=arrays["weight"][items],
+                spoiling=arrays["spoiling"][spoils].astype(np.intp),
+                harm=arrays["harm"][spoils].astype(np.float64),
+                harm_range_m=arrays["harm_range_m"][spoils].astype(np.float64),
+                complete=complete,
+                **shared,
+            )
+        )
+    chosen_on = int(arrays["chosen_on"])
+    visits = [slice(int(start), int(stop)) for start, stop in arrays["visits"]]
+    return Pool(arrays["points"], visits, scenes[:chosen_on], scenes[chosen_on:])

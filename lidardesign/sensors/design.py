@@ -1,0 +1,192 @@
+"""A design: sensors, and the patterns that they fire.
+
+Chosen rays have a pattern for each number of rays that they were chosen for. Even rays follow from the sensors at any
+number. Real parts and spinning sensors have one pattern, of which an even subset may be fired.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays, fire_times
+from lidardesign.sensors.bandwidth import split_budget
+from lidardesign.sensors.even import even_rays, even_subset
+from lidardesign.sensors.pattern import TRAVELLED, Pattern, with_coordinates
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor
+from lidardesign.space import DIMENSIONS
+
+# Chosen on training scenes, even in fields of view, rings of sensors that turn, and what real parts have.
+LayoutName = Literal["chosen", "even", "spinning", "fixed"]
+# Those in which sensors are fitted: the rays of real parts are what they are.
+FITTED_LAYOUTS: tuple[LayoutName, ...] = ("chosen", "even", "spinning")
+# Whether every ray has its sensor's gate or its own.
+Gates = Literal["sensor", "ray"]
+
+
+@dataclass(frozen=True, eq=False)
+class DesignSpec:
+    """A LiDAR system: sensors, the patterns that they fire, and where it came from.
+
+    Arguments:
+        name: The file's stem, the row's name in tables.
+        sensors: At least one.
+        layout: `chosen`: rays chosen on training scenes; `even`: a grid in each field of view; `spinning`: chosen
+            rings; `fixed`: the rays of real parts or of a rig.
+        patterns: Its rays, by ascending number; none of the layout `even`.
+        constraints: The constraint document that it satisfies (plain values).
+        certificates: How far from the best each choice of rays may be, one entry per number of rays.
+        provenance: Command, seed, run and versions, for people.
+        level: The share of each marginal that fields of view and gates hold.
+        at: The condition values that the design is for, where it is for one, as {"x_m": 0.37}.
+        mount: The body of a robot that it is on, in whose frame places and directions are; None: in the world.
+    """
+
+    name: str
+    sensors: tuple[Sensor, ...]
+    layout: LayoutName = "even"
+    patterns: tuple[Pattern, ...] = ()
+    constraints: dict[str, Any] = field(default_factory=dict)
+    certificates: tuple[dict[str, Any], ...] = ()
+    provenance: dict[str, Any] = field(default_factory=dict)
+    level: float = DEFAULT_LEVEL
+    at: Mapping[str, float] = field(default_factory=dict)
+    mount: str | None = None
+
+    @property
+    def frame(self) -> str:
+        """The frame of its places and directions, in words: the world's, or that of a robot's body."""
+        return "the world's frame" if self.mount is None else f"the frame of the robot's body {self.mount!r}"
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Shares of the rays, shape (S,), summing to 1."""
+        weights = np.array([sensor.weight for sensor in self.sensors], dtype=np.float64)
+        return weights / weights.sum()
+
+    @property
+    def count(self) -> int | None:
+        """The number of rays that it is meant to fire: that of its largest pattern, or its budget; None: any."""
+        return len(self.patterns[-1]) if self.patterns else (self.constraints.get("budget") or {}).get("rays")
+
+    @property
+    def counts(self) -> list[int] | None:
+        """The numbers of rays that it was chosen for, ascending; None where it can fire others."""
+        return [len(pattern) for pattern in self.patterns] if self.layout == "chosen" else None
+
+    @property
+    def size(self) -> int | None:
+        """The number of rays of its fixed pattern, of which it may fire an even subset; None where it has none."""
+        return None if self.layout in ("chosen", "even") else self.count
+
+    @property
+    def condition(self) -> str | None:
+        """The condition along which its rays differ, as "x_m"; None where they do not."""
+        return self.patterns[-1].dimension if self.patterns else None
+
+    @property
+    def has_gates_per_ray(self) -> bool:
+        """Whether rays of one sensor have gates of their own."""
+        return any(pattern.gates == "ray" for pattern in self.patterns)
+
+    def pattern(self, count: int) -> Pattern | None:
+        """The pattern of a number of rays; None where it has none."""
+        return next((pattern for pattern in self.patterns if len(pattern) == count), None)
+
+    def rays_per_sensor(self, count: int | None = None) -> np.ndarray | None:
+        """How many rays each sensor fires, of a number or of its own, shape (S,); None where that is open."""
+        count = self.count if count is None else count
+        if count is None:
+            return None
+        pattern = self.pattern(count)
+        return split_budget(self.weights, count) if pattern is None else pattern.per_sensor(len(self.sensors))
+
+    def rays(
+        self,
+        count: int | None = None,
+        at: Mapping[str, float] | None = None,
+        rate_hz: float = DEFAULT_RATE_HZ,
+    ) -> Rays:
+        """The rays that it fires, evenly over a frame; every other part of the program asks here.
+
+        Arguments:
+            count: Rays per frame; None takes its own number.
+            at: Condition values, as {"x_m": 0.37}: rays that differ along it are those there, others move there.
+            rate_hz: Frames per second [Hz].
+
+        Raises:
+            ConfigError: It does not fire so many rays, no number is known, or it cannot be at such a place.
+        """
+        count = self.count if count is None else count
+        if count is None:
+            raise ConfigError("the design names no number of rays", where=self.name, hint="give --rays N")
+        here = self.at_condition(at or {}) if at or self.condition else self
+        rays = here._rays(count)
+        return rays if rate_hz == DEFAULT_RATE_HZ else replace(rays, time_s=fire_times(len(rays), rate_hz))
+
+    def _rays(self, count: int) -> Rays:
+        pattern = self.pattern(count)
+        if pattern is not None:
+            return pattern.at()
+        if self.layout == "even":
+            return even_rays(self.sensors, split_budget(self.weights, count))
+        if self.size is not None and count <= self.size:
+            table = self.patterns[-1].at()
+            shares = split_budget(self.patterns[-1].per_sensor(len(self.sensors)), count)
+            own = [np.flatnonzero(table.sensor == index) for index in range(len(shares))]
+            chosen = [rows[even_subset(table.direction[rows], int(n))] for rows, n in zip(own, shares, strict=True)]
+            return replace(table.subset(np.sort(np.concatenate(chosen))), time_s=fire_times(count, DEFAULT_RATE_HZ))
+        if self.counts is not None:
+            raise ConfigError(
+                f"{count} rays, which were not chosen",
+                where=self.name,
+                allowed=", ".join(map(str, self.counts)),
+                hint=f"lidardesign fit RUN --rays {count}",
+            )
+        raise ConfigError(
+            f"{count} rays, but the design's fixed pattern has {self.size}",
+            where=self.name,
+            allowed=f"at most {self.size}",
+            hint="a design of more parts: lidardesign catalog show NAME --rays N --out FILE",
+        )
+
+    def at_condition(self, at: Mapping[str, float]) -> DesignSpec:
+        """The design as it is at one value of its conditions, with patterns of one knot.
+
+        Patterns along a condition give their rays there. Other designs are carried by what moves: the named coordinate
+        of every origin becomes the value; directions and gates stay.
+
+        Raises:
+            ConfigError: A name that is no coordinate, a value beyond the ends of a pattern, or none where rays differ.
+        """
+        moves = self._moves(at)
+        sensors = tuple(replace(sensor, origin_m=with_coordinates(sensor.origin_m, moves)) for sensor in self.sensors)
+        if self.condition is None:
+            patterns = tuple(pattern.moved(moves) for pattern in self.patterns)
+        else:
+            patterns = tuple(Pattern.of(pattern.at(at.get(self.condition))) for pattern in self.patterns)
+        return replace(self, sensors=sensors, patterns=patterns, at={**self.at, **at})
+
+    def _moves(self, at: Mapping[str, float]) -> dict[int, float]:
+        """The coordinates of origins that change. Only origins move; a design for one direction is not for another."""
+        for name, value in at.items():
+            if name not in DIMENSIONS:
+                raise ConfigError(
+                    f"{name!r} is not a dimension of the design space", where="--at", allowed=", ".join(DIMENSIONS)
+                )
+            if not math.isfinite(value):
+                raise ConfigError(f"{name}={value}", where="--at", allowed="a finite number")
+            allowed = TRAVELLED if self.condition is None else (self.condition,)
+            if name not in allowed and self.at.get(name) != value:
+                raise ConfigError(
+                    f"{self.name} cannot be moved to {name}={value:g}",
+                    where="--at",
+                    allowed=f"{name}={self.at[name]:g}" if name in self.at else ", ".join(allowed),
+                    hint=f"lidardesign fit RUN --at {name}={value:g}",
+                )
+        return {DIMENSIONS.index(name): float(value) for name, value in at.items() if name in TRAVELLED}
