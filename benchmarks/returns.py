@@ -39,12 +39,18 @@ def cases() -> dict[str, tuple[str, str, Mapping[str, Any]]]:
     if ARM_MODEL.exists():
         settings = {"model": ARM_MODEL, "targets": ["link7"], "origin_box_m": 0.3, "metric": "seen"}
         found["7-axis arm"] = ("mujoco", "draft", settings)
-    package = importlib.util.find_spec("dm_control")
-    if package is not None and package.submodule_search_locations:
-        model = Path(package.submodule_search_locations[0]) / "suite" / "humanoid.xml"
-        settings = {"model": model, "targets": ["*hand"], "origin_box_m": 0.3, "metric": "seen"}
+    if (settings := humanoid_settings()) is not None:
         found["humanoid"] = ("mujoco", "draft", settings)
     return found
+
+
+def humanoid_settings() -> Mapping[str, Any] | None:
+    """Keys of the task for a humanoid's hands, with origins free in a box; None where the model is not installed."""
+    package = importlib.util.find_spec("dm_control")
+    if package is None or not package.submodule_search_locations:
+        return None
+    model = Path(package.submodule_search_locations[0]) / "suite" / "humanoid.xml"
+    return {"model": model, "targets": ["*hand"], "origin_box_m": 0.3, "metric": "seen"}
 
 
 def with_returns(run: Any, folder: Path) -> tuple[Any, dict[str, float]]:
