@@ -30,10 +30,10 @@ Figures = dict[tuple[str, str, str], list[tuple[float, float]]]
 def add_head(figures: Figures, scene: Any, run: Any, designs: Sequence[Path], options: Any, folder: Path) -> None:
     """Capture a head without a gate, and along every design with one; score all of them."""
     import capture as laboratory
-
-    from lidardesign.formats.galvo import read_galvo, write_galvo
     from lidardesign.layouts.rays import lay_out
+
     from lidardesign.formats.designs import load_design
+    from lidardesign.formats.galvo import read_galvo, write_galvo
 
     detector = laboratory.load_detector(options.detector)
     laboratory.write_mesh(scene, folder / "head.ply")
@@ -73,7 +73,7 @@ def figure_rows(figures: Figures, seed: int) -> list[list[object]]:
     """Means over heads with 95 % intervals, and the difference to uniform rays head by head."""
     import numpy as np
 
-    from lidardesign.scoring.scenes.statistics import mean_interval, paired_difference
+    from lidardesign.scoring.statistics import mean_interval, paired_difference
 
     rows = []
     for (estimator, name, gate), values in sorted(figures.items(), key=_place):
@@ -99,9 +99,10 @@ def tour_rows(designs: Sequence[Path], rounds: int) -> list[list[object]]:
     """Travel of the mirrors and the median time of finding their order."""
     import statistics
 
-    from lidardesign.formats.galvo import plan, travel
     from lidardesign.layouts.rays import lay_out
+
     from lidardesign.formats.designs import load_design
+    from lidardesign.formats.galvo import plan, travel
 
     rows = []
     for path in designs:

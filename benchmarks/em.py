@@ -19,9 +19,8 @@ from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
 from lidardesign.mixture.bounds import Bounds, Floors
-from lidardesign.mixture.components import expect, log_density
+from lidardesign.mixture.components import Axes, Features, expect, log_density
 from lidardesign.mixture.em import fit_mixture, seed_mixture
-from lidardesign.mixture.features import Axes, Features
 from lidardesign.mixture.m_step import maximise
 from lidardesign.samples import load_samples
 from lidardesign.sensors.sensor import interval_factor

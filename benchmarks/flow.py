@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from zuko.lazy import LazyInverse
 from zuko.transforms import MonotonicRQSTransform
 
-from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.network import DesignFlow
 
 FEATURES = 6
 CHECKED_POINTS = 32

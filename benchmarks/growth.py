@@ -179,9 +179,8 @@ def simulation(options: Any) -> Growth:
 def mixtures(options: Any) -> Growth:
     """EM on samples of a mixture of as many components, by the number of sensors."""
     from lidardesign.mixture.bounds import Bounds, Floors
-    from lidardesign.mixture.components import expect
+    from lidardesign.mixture.components import Axes, Features, expect
     from lidardesign.mixture.em import fit_mixture, seed_mixture
-    from lidardesign.mixture.features import Axes, Features
     from lidardesign.mixture.m_step import maximise
     from lidardesign.sensors.sensor import interval_factor
     from lidardesign.space import DesignSpace
@@ -220,7 +219,7 @@ def dimensions(options: Any) -> Growth:
     import torch
 
     from lidardesign.config import DensitySettings, LearningSettings
-    from lidardesign.density.flow.coordinates import Coordinates
+    from lidardesign.density.coordinates import Coordinates
     from lidardesign.density.objective.target import build_target
     from lidardesign.space import DesignSpace
 
@@ -259,7 +258,7 @@ def flow_of(coordinates: Any, settings: Any) -> Any:
     """The flow that learning would make."""
     import torch
 
-    from lidardesign.density.flow.network import DesignFlow
+    from lidardesign.density.network import DesignFlow
 
     sizes = {"layers": settings.layers, "hidden": settings.hidden, "bins": settings.bins}
     generator = torch.Generator().manual_seed(0)

@@ -90,8 +90,8 @@ class Bench:
     def measured(self, samples: Any, choices: Mapping[str, Any], count: int) -> Measured:
         """Designs of one kind at a number of rays."""
         import numpy as np
-
         from lidardesign.layouts.rays import lay_out
+
         from lidardesign.mixture.fit import fit
 
         found, rays = [], None
@@ -132,7 +132,7 @@ def in_region(scene: Any, points: Any) -> Any:
 
 def percent(values: Any, plain: Any) -> tuple[str, str]:
     """How much lower or higher values are than others of the same heads, and its 95 % interval, in percent."""
-    from lidardesign.scoring.scenes.statistics import paired_difference
+    from lidardesign.scoring.statistics import paired_difference
 
     found = [100 * value / plain.mean() for value in paired_difference(values, plain, 0)]
     return f"{found[0]:+.1f}", f"{found[1]:+.1f} to {found[2]:+.1f}"

@@ -28,11 +28,12 @@ STAGES = ("poses", "shared rays", "returns", "choice")
 
 def chosen(options: Any, kinds: int) -> dict[str, Any]:
     """One choice, with the processor time of its stages [s]."""
+    from lidardesign.fitting.select_rays import selection_scenes
+
     from lidardesign.constraints.document import Constraints
-    from lidardesign.fitting.part_bundle import PartBundle, part_table, parts_inform
     from lidardesign.fitting.part_design import proposed
     from lidardesign.fitting.part_sets import SetLimits, choose_set
-    from lidardesign.fitting.select_rays import selection_scenes
+    from lidardesign.fitting.part_shapes import PartBundle, part_table, parts_inform
     from lidardesign.parts.catalogue import named_parts
     from lidardesign.rays.information import checked_information
     from lidardesign.run_folder import RunFolder

@@ -120,7 +120,7 @@ def paired_rows(entries: list[Any], tallies: list[Tally], seed: int) -> list[lis
     """Every design against every baseline at equal rays, scene by scene."""
     import numpy as np
 
-    from lidardesign.scoring.scenes.statistics import paired_difference
+    from lidardesign.scoring.statistics import paired_difference
 
     rows = []
     for entry, tally in zip(entries, tallies, strict=True):

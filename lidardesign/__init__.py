@@ -52,7 +52,9 @@ __all__ = [
 _HOMES = {
     "lidardesign.constraints.document": "Constraints",
     "lidardesign.scenes.rays": "Rays Returns",
-    "lidardesign.scenes.scene": "Ambient Body Box Capsule Cylinder Ellipsoid Medium Mesh Plane Receiver Scene Sphere rigid",
+    "lidardesign.scenes.scene": (
+        "Ambient Body Box Capsule Cylinder Ellipsoid Medium Mesh Plane Receiver Scene Sphere rigid"
+    ),
     "lidardesign.space": "DesignSpace",
     "lidardesign.task": "Defaults Information Metric Score Split Task TaskConfig random_generator",
     "lidardesign.api.design": "Design",

@@ -43,7 +43,7 @@ Result = TypeVar("Result")
 
 
 class Starmap(Protocol):
-    """Calls a function with each of some tuples of arguments; gives the results in their order, as `itertools.starmap`."""
+    """Calls a function with each of some tuples of arguments; results in their order, as `itertools.starmap`."""
 
     def __call__(self, function: Callable[..., Result], asked: Iterable[tuple[Any, ...]]) -> Iterable[Result]:
         """The results."""

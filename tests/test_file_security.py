@@ -10,9 +10,9 @@ from lidardesign_tasks.robot.arm_robot import load_robot
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.formats.designs import load_design
 from lidardesign.scenes.mesh_files import load_mesh
 from lidardesign.scenes.mujoco_models import model_files
-from lidardesign.formats.designs import load_design
 from lidardesign.simulate.detector.files import load_detector
 
 ROOT = Path(__file__).parents[1]

@@ -22,8 +22,7 @@ from lidardesign.api.export import (
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError, names_arguments
 from lidardesign.fitting.fit import fit_design
-from lidardesign.fitting.request import FitOptions, FitRequest
-from lidardesign.fitting.result import FitResult
+from lidardesign.fitting.request import FitOptions, FitRequest, FitResult
 from lidardesign.formats.designs import need_run, reach_beside, read_design, relative_folder, run_of
 from lidardesign.rays.certificate import certificates_of
 from lidardesign.rays.information import FEW_SCENES

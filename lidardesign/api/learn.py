@@ -35,7 +35,7 @@ from lidardesign.run_folder import (
 from lidardesign.task import FolderConfig, Task, notes_of
 
 if TYPE_CHECKING:
-    from lidardesign.density.learn import LearnProgress, LearnResult
+    from lidardesign.density.training.learn import LearnProgress, LearnResult
 
 LOCK = ".lock"
 # Endings of the folders beside a run that is replaced: of the new run, and of the old one for an instant.
@@ -205,7 +205,7 @@ class LearnRequest:
             ConfigError, DataError: Unusable settings or scenes, or a folder that cannot be written.
         """
         with phase("libraries"):
-            from lidardesign.density.learn import forecast, prepare_training_data
+            from lidardesign.density.training.learn import forecast, prepare_training_data
 
         settings, writes = self.settings, [f"{self.folder}/{name}" for name in LEARNED_FILES]
         for path in writes:
@@ -242,7 +242,7 @@ class LearnRequest:
         self, clock: Clock, progress: Callable[[LearnProgress], None] | None, remark: Notes | None
     ) -> LearnResult:
         with phase("libraries"):
-            from lidardesign.density.learn import learn
+            from lidardesign.density.training.learn import learn
 
         folder, settings, budget_s = self.place, self.settings, self.options.time_budget_s
         with _new_folder(folder), run_lock(folder):

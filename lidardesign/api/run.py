@@ -21,8 +21,8 @@ from lidardesign.run_folder import MANIFEST, Notes, RunFolder, log_note
 
 if TYPE_CHECKING:
     from lidardesign.api.scores import Scores
-    from lidardesign.density.learned import LearnedDensity
-    from lidardesign.density.verdict import Verdict
+    from lidardesign.density.training.learned import LearnedDensity
+    from lidardesign.density.training.verdict import Verdict
 
 FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
 
@@ -58,7 +58,7 @@ class LearnedQuality:
 
     @property
     def _verdict(self) -> Verdict:
-        from lidardesign.density.verdict import Verdict
+        from lidardesign.density.training.verdict import Verdict
 
         return Verdict.of(self.misplaced, self.kl_nats, self.ess)
 
@@ -108,7 +108,7 @@ class Run(RunFolder):
     @property
     def density(self) -> LearnedDensity:
         """The learned density: `sample(count)` and `log_prob(points)`; needs torch, and makes the training scenes."""
-        from lidardesign.density.learned import LearnedDensity
+        from lidardesign.density.training.learned import LearnedDensity
 
         return LearnedDensity(self.folder, self.task, self.config)
 

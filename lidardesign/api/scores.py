@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.api.design import Design, collect_designs, html_table, judging_run, name_apart, named
 from lidardesign.config import with_task_settings
 from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
-from lidardesign.fitting.twin import twin_without_visibility
+from lidardesign.fitting.fit import twin_without_visibility
 from lidardesign.numerics import SLACK
 from lidardesign.rays.training import TrainingScenes
 from lidardesign.run.clock import Progress, outermost_clock, phase, running
@@ -198,7 +198,7 @@ class ScoreRequest:
         if options.accuracy:
             # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes
             with phase("libraries"):
-                from lidardesign.density.learned import check_kept
+                from lidardesign.density.training.learned import check_kept
 
             check_kept(learned.folder)
         overrides = settings_texts(options.settings)

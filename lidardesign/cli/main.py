@@ -19,16 +19,18 @@ from lidardesign.cli.commands.fit import constrain, fit
 from lidardesign.cli.commands.learn import learn
 from lidardesign.cli.commands.show import show
 from lidardesign.cli.commands.tasks import tasks_app
-from lidardesign.cli.terminal.environment import make_streams_tolerant, set_thread_defaults, terminate_cleanly
 from lidardesign.cli.terminal.options import StrictCommand
 from lidardesign.cli.terminal.output import (
     EXIT_BROKEN_PIPE,
     Output,
     close_stdout_guard,
     forget_stdout,
+    make_streams_tolerant,
     print_json,
     print_message,
     report_error,
+    set_thread_defaults,
+    terminate_cleanly,
 )
 from lidardesign.errors import page
 

@@ -2,8 +2,8 @@
 
 It reads plain documents only and shares no code with the fit; `document` has the definitions. Chosen rays are held
 against their own sensors' fields and gates. An excluded box is broken where an interval of origins reaches into its
-interior along all three axes. A sensor that is to be a part is one where its field of view and range are the part's, and
-every ray that it fires is one of the part's pattern.
+interior along all three axes. A sensor that is to be a part has the part's field of view and range, and fires rays of
+the part's pattern.
 """
 
 from __future__ import annotations

@@ -1,36 +1,44 @@
-"""Laws of the task contract, the task that they are tried on, and what became of each of them."""
+"""Laws of the task contract, the task that they are tried on, and what became of each of them.
+
+A digest of what a value holds, whatever the process: what is equal in content has the same one.
+
+Rays that see a scene's targets, and what becomes of their returns when they are disturbed.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import random
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field, fields, is_dataclass
+from enum import Enum
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import BaseModel
 
 from lidardesign.config import RunConfig
-from lidardesign.contract.fingerprint import fingerprint
-from lidardesign.contract.probing import rays_at_targets
 from lidardesign.errors import LidardesignError, PluginError
 from lidardesign.registry import AUTHOR_HINT, plugin_guard
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.rays import Rays, Returns
-from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.scenes.scene_scores import checked_score
+from lidardesign.scenes.rays import Outcome, Rays, Returns
+from lidardesign.scenes.scene import Body, Scene
+from lidardesign.scenes.surface import sample_body
+from lidardesign.scoring.scene_scores import checked_score
 from lidardesign.simulate.returns import build_casters, simulate
+from lidardesign.space import AZIMUTH, ELEVATION, FARTHEST_M, RANGE, DesignSpace, aim, direction
 from lidardesign.task import Metric, Score, Split, Task, conditions_of, metric_of, scenes_of
 
 PACKAGE = Path(__file__).parents[1]
 # Libraries that tasks call, and that errors are raised in when they are called wrongly.
 LIBRARIES = ("numpy", "scipy", "trimesh", "pydantic", "mujoco")
-Outcome = Literal["pass", "fail", "skip"]
+LawOutcome = Literal["pass", "fail", "skip"]
 # What comes before all laws: name, group and statement.
 LOADS = (
     "plugin loads",
@@ -98,7 +106,7 @@ class Finding:
     law: str
     group: str
     statement: str
-    outcome: Outcome
+    outcome: LawOutcome
     detail: str
     seconds: float = 0.0
     figures: Mapping[str, float] = field(default_factory=dict)
@@ -292,3 +300,147 @@ class Subject:
         """The checked score of returns."""
         with self.calling("score"):
             return checked_score(self.task, self.metric, scene, returns)
+
+
+DEEPEST = 40
+# What of scenes and bodies no ray meets, or what is told apart otherwise.
+UNSEEN = ("name", "group", "notes", "truth", "bodies", "poses", "importance")
+
+
+def fingerprint(value: Any) -> str:
+    """SHA-256 of the content of dataclasses, arrays, models, mappings, sequences and plain values, in hexadecimal.
+
+    Objects of other kinds count by their type and attributes; cached properties of dataclasses do not count.
+    """
+    digest = hashlib.sha256()
+    _add(digest, value, DEEPEST)
+    return digest.hexdigest()
+
+
+def geometry_fingerprint(scene: Scene) -> str:
+    """The same of what rays meet in a scene and what light does there, whatever it and its bodies are called."""
+    return fingerprint([*((np.round(body.poses, 12), *_others(body)) for body in scene.bodies), *_others(scene)])
+
+
+def _others(of: Body | Scene) -> list[Any]:
+    return [getattr(of, field.name) for field in fields(of) if field.name not in UNSEEN]
+
+
+def _add(digest: Any, value: Any, depth: int) -> None:
+    if depth == 0:
+        raise ValueError("values are nested too deeply, or hold themselves")
+    digest.update(f"<{type(value).__qualname__}>".encode())
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        digest.update(f"{value.dtype.str}{value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif value is None or isinstance(value, str | bytes | int | float | complex | np.generic | PurePath | Enum):
+        digest.update(repr(value).encode())
+    else:
+        for part in _parts(value):
+            _add(digest, part, depth - 1)
+    digest.update(b"</>")
+
+
+def _parts(value: Any) -> list[Any]:
+    """What a value is made of, in an order that does not depend on the process."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return [(field.name, getattr(value, field.name)) for field in fields(value)]
+    if isinstance(value, BaseModel):
+        return list(value)
+    if isinstance(value, Mapping):
+        return sorted(value.items(), key=lambda item: repr(item[0]))
+    if isinstance(value, list | tuple | np.ndarray):
+        return list(value)
+    if isinstance(value, Set):
+        return sorted(fingerprint(item) for item in value)
+    if isinstance(value, type) or callable(value):
+        return [getattr(value, "__module__", ""), getattr(value, "__qualname__", "")]
+    return sorted(vars(value).items()) if hasattr(value, "__dict__") else [repr(type(value))]
+
+
+DRAW_ROUNDS = 12
+# Of a scene that moves, so many frames are aimed at.
+MOST_FRAMES = 8
+# Half the gate where the space fixes the range, as a share of it.
+HALF_GATE = 0.05
+SEED = 20_251
+
+
+def rays_at_targets(scene: Scene, space: DesignSpace, casters: Sequence[SceneCaster], count: int) -> Rays:
+    """Rays of a design space to visible points of targets, even over their area, listening all the way.
+
+    Arguments:
+        scene: Whose targets; of moving ones, places in several frames.
+        space: The design space at one condition value.
+        casters: One per frame.
+        count: How many at most; fewer where little can be seen.
+    """
+    generator = np.random.default_rng(SEED)
+    frames = np.unique(np.linspace(0, scene.frames - 1, min(scene.frames, MOST_FRAMES)).astype(int))
+    found: list[np.ndarray] = []
+    for _ in range(DRAW_ROUNDS):
+        for frame in frames:
+            per = -(-count // len(frames))
+            found.append(rays_that_meet(scene, space, casters[frame], int(frame), per, generator))
+        if sum(map(len, found)) >= count:
+            break
+    return full_rays(generator.permutation(np.concatenate(found))[:count], space)
+
+
+def full_rays(points: np.ndarray, space: DesignSpace) -> Rays:
+    """Rays of design points (N, 6) that listen over the whole range of a design space."""
+    low, high = space.low[RANGE], space.high[RANGE]
+    gate = (low, high) if low < high else (low * (1 - HALF_GATE), high * (1 + HALF_GATE))
+    looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
+    count = len(points)
+    return Rays(points[:, :3], looking, np.tile(gate, (count, 1)), np.zeros(count), np.zeros(count))
+
+
+def rays_that_meet(
+    scene: Scene, space: DesignSpace, caster: SceneCaster, frame: int, count: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Rays of a design space towards targets that meet a target first, observed design points of shape (K, 6).
+
+    Arguments:
+        scene: Whose targets, at one of its frames.
+        space: The design space at one condition value.
+        caster: Of that frame.
+        frame: Its number.
+        count: How many are tried.
+        generator: Draws origins and places.
+    """
+    origins = space.sample(count, generator)[:, :3]
+    points = sample_body([body for body in scene.bodies if body.is_target], space, count, generator, frame).points
+    design = aim(origins, points)
+    low, high = np.array(space.low), np.array(space.high)
+    # a space of fewer dimensions hardly ever holds the ray to a point drawn in all three
+    design = np.where(low == high, low, design)
+    hits = caster.first_hit(design[:, :3], direction(design[:, AZIMUTH], design[:, ELEVATION]))
+    design[:, RANGE] = np.where(np.isfinite(hits.range_m), hits.range_m, 2 * FARTHEST_M)
+    kept = np.array([*(body.is_target for body in scene.bodies), False])[hits.body] & space.contains(design)
+    return design[kept]
+
+
+def shuffled(returns: Sequence[Returns], generator: np.random.Generator) -> list[Returns]:
+    """The same returns with their rays in another order, each list in one of its own."""
+    return [returns_of_rays(one, generator.permutation(len(one.rays))) for one in returns]
+
+
+def returns_of_rays(returns: Returns, chosen: np.ndarray) -> Returns:
+    """The returns of the rays at an index or mask."""
+    columns = (returns.outcome[chosen], returns.range_m[chosen], returns.body[chosen])
+    return Returns(returns.rays.subset(chosen), *columns, returns.frame)
+
+
+def without_returns(returns: Sequence[Returns]) -> list[Returns]:
+    """The same rays, none of which received anything."""
+    return [
+        Returns(
+            one.rays,
+            np.full_like(one.outcome, Outcome.MISS),
+            np.full_like(one.range_m, np.nan),
+            np.full_like(one.body, -1),
+            one.frame,
+        )
+        for one in returns
+    ]

@@ -9,8 +9,15 @@ from importlib.util import find_spec
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.contract.fingerprint import fingerprint, geometry_fingerprint
-from lidardesign.contract.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
+from lidardesign.contract.law import (
+    BrokenLawError,
+    Law,
+    LawHolds,
+    NotApplicable,
+    Subject,
+    fingerprint,
+    geometry_fingerprint,
+)
 from lidardesign.errors import LidardesignError
 from lidardesign.rays.information import informs_rays
 from lidardesign.registry import plugin_guard

@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.contract.fingerprint import fingerprint
-from lidardesign.contract.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
-from lidardesign.contract.probing import full_rays, returns_of_rays, shuffled, without_returns
+from lidardesign.contract.law import (
+    BrokenLawError,
+    Law,
+    LawHolds,
+    NotApplicable,
+    Subject,
+    fingerprint,
+    full_rays,
+    returns_of_rays,
+    shuffled,
+    without_returns,
+)
 from lidardesign.numerics import SLACK
 from lidardesign.rays.information import checked_information, informs_rays
 from lidardesign.scenes.rays import Returns

@@ -1,7 +1,7 @@
 """Rays that are chosen on training scenes for fitted sensors: the second to the fifth step from a density to rays.
 
-The density proposes rays inside the sensors, scenes that nothing was learned from say what each of them tells, and those
-are chosen that are most informative together. Fields of view and gates then shrink to the rays that are fired. Along a
+The density proposes rays inside the sensors, scenes that nothing was learned from say what each of them tells, and
+those are chosen that are most informative together. Fields of view and gates then shrink to the rays that are fired. Along a
 condition, as a robot's position, rays are chosen at each of its values that the task judges at, and become a pattern.
 """
 
@@ -21,11 +21,10 @@ from lidardesign.mixture.fit import FittedSensors
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.gates import GateLimits
 from lidardesign.rays.information import FEW_SCENES, MOST_SCENES, MOST_SELECTED
-from lidardesign.rays.informed import InformedScene
 from lidardesign.rays.pool import Pool
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, owners, rays_of_points
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
-from lidardesign.rays.training import CHOICE, TrainingScenes
+from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays

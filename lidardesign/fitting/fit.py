@@ -3,6 +3,8 @@
 Where nobody says how many sensors it has, designs of a few and of more are fitted alike, at the middle number of rays
 and in the bandwidth of those of most sensors. The task scores them on training scenes that were held back; the fewest
 sensors win that are no worse than the best by more than a standard error.
+
+A design's twin of the density without its occlusion term: what occlusion is worth, without learning again.
 """
 
 from __future__ import annotations
@@ -24,9 +26,8 @@ from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
 from lidardesign.fitting.chosen import choose_rays
-from lidardesign.fitting.request import BEST, COUNTS, FitRequest
-from lidardesign.fitting.result import FitResult
-from lidardesign.fitting.run_samples import KEY, RunTarget
+from lidardesign.fitting.request import BEST, COUNTS, FitRequest, FitResult
+from lidardesign.fitting.run_samples import KEY, RunTarget, Weighting
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
@@ -38,7 +39,7 @@ from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import versions
 from lidardesign.run.yaml import dump_yaml, parse_yaml
-from lidardesign.run_folder import Notes, ignore, log_note
+from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
@@ -274,8 +275,8 @@ class Fitter:
             design = replace(design, sensors=chosen.sensors, patterns=chosen.patterns, certificates=chosen.certificates)
             if chosen.silent > MOST_SILENT:
                 notes.append(
-                    f"about {chosen.silent:.0%} of the training scenes that were held back, no ray tells anything; where "
-                    "that is not expected, check that places, directions and gates are right, and in metres"
+                    f"about {chosen.silent:.0%} of the training scenes that were held back, no ray tells anything; "
+                    "where that is not expected, check that places, directions and gates are right, and in metres"
                 )
         elif fitted.rays is not None:
             design = replace(design, constraints=merged(design.constraints, {"budget": {"rays": fitted.rays}}))
@@ -353,7 +354,7 @@ def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRe
     Raises:
         InfeasibleError: No number of sensors keeps the constraints; says why the fewest do not.
     """
-    from lidardesign.scoring.scenes.scene_scores import score_lists
+    from lidardesign.scoring.scene_scores import score_lists
     from lidardesign.simulate.returns import build_casters
 
     run, bounds = request.run, request.constraints
@@ -400,3 +401,61 @@ def _within(constraints: Constraints, mbps: float) -> Constraints:
     document = constraints.as_document()
     budget = document.get("budget") or {}
     return Constraints.from_mapping({**document, "budget": {"bandwidth_mbps": mbps, **budget}})
+
+
+# As many samples as the standard preset of `learn` leaves.
+TWIN_SAMPLES = 100_000
+TWIN_NAME = "no-visibility"
+
+
+def twin_without_visibility(
+    design: DesignSpec, run: RunFolder, rays: int, bandwidth_mbps: float | None = None
+) -> DesignSpec:
+    """A design fitted to the density without its occlusion term as a given one was to its own; it is not weighted.
+
+    Arguments:
+        design: The design whose number of sensors, layout, constraints, level, gates and seed are taken.
+        run: The run that judges.
+        rays: Rays per frame.
+        bandwidth_mbps: The most that its rays may cost; None: what the design's constraints say.
+
+    Raises:
+        DataError: No ray of the design space comes near a target.
+    """
+    from lidardesign.density.objective.proposals import samples_without_visibility
+
+    config, seed = run.config, design.provenance.get("seed")
+    seed = seed if isinstance(seed, int) else 0
+    samples = samples_without_visibility(
+        run.scenes("train", config.seed),
+        config.space,
+        config.density,
+        TWIN_SAMPLES,
+        random_generator(config.seed, "no visibility"),
+    )
+    if not len(samples):
+        raise DataError("no ray of the design space comes near a target", where=f"--baseline {TWIN_NAME}")
+    document = {key: value for key, value in design.constraints.items() if key != "parts"}
+    limit = {} if bandwidth_mbps is None else {"bandwidth_mbps": bandwidth_mbps}
+    document["budget"] = {**document.get("budget", {}), "rays": rays, **limit}
+    # the rays of real parts and rings are what they are: sensors like those have even rays
+    layout = design.layout if design.layout in ("chosen", "even") else "even"
+    request = FitRequest(
+        run=run,
+        name=TWIN_NAME,
+        seed=seed,
+        constraints=Constraints.from_mapping(document, where=f"constraints of {design.name}"),
+        is_constrained=True,
+        at=design.at,
+        sensors=len(design.sensors),
+        layout=layout,
+        rays=rays,
+        gates="ray" if design.has_gates_per_ray and layout == "chosen" else "sensor",
+        level=design.level,
+        weighting=Weighting(),
+        channels=None,
+        names=(),
+        certify=False,
+    )
+    target = RunTarget(run, visibility="off")
+    return fit_design(request, notes=ignore, samples=samples, target=target).design

@@ -19,12 +19,11 @@ from lidardesign.constraints.document import Constraints, SensorRules
 from lidardesign.constraints.feasibility import BandwidthBudget, check_feasible
 from lidardesign.constraints.origins import inside_excluded, mounts_of, origin_box
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
-from lidardesign.fitting.part_bundle import PartBundle, PlacedPart, part_table, parts_inform
 from lidardesign.fitting.part_sets import ChosenSet, SetLimits, choose_set
-from lidardesign.fitting.part_shapes import broken_keys, shapes_of
-from lidardesign.fitting.result import FitResult
+from lidardesign.fitting.part_shapes import PartBundle, PlacedPart, broken_keys, part_table, parts_inform, shapes_of
+from lidardesign.fitting.request import FitResult
 from lidardesign.mixture.bounds import bounds_of, clip_azimuth
-from lidardesign.mixture.features import Axes
+from lidardesign.mixture.components import Axes
 from lidardesign.numerics import TINY
 from lidardesign.parts.catalogue import named_parts, part_rays, part_sensor
 from lidardesign.parts.part import Part

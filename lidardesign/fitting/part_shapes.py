@@ -3,23 +3,41 @@
 A part's field of view and range cannot be narrowed; only outside the design space's range, where no task has anything,
 does its read-out stop. It may be mounted upright or turned by a quarter about its boresight. A component's roll stays
 within an eighth of a turn, so a part that is turned is a component whose two spreads are exchanged.
+
+Real parts at poses as candidates: what each of thousands tells about scenes.
+
+To cast every part at every pose would be millions of rays. Parts at one place share rays: their directions are taken
+apart in cells of a sphere, each cell is cast once from each place, and a part at a pose tells what the cells of its
+rays tell, inside its own gate. Of dense patterns an even subset stands for all, and of many items a random draw. Cells
+are as small as the number of rays to be cast allows. The cell's ray is that of one of the parts, so that patterns in a
+plane stay in it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import numpy as np
 
 from lidardesign.constraints.document import SensorRules
-from lidardesign.mixture.features import Axes
-from lidardesign.numerics import SLACK
+from lidardesign.mixture.components import Axes
+from lidardesign.numerics import FULL_TURN, SLACK
 from lidardesign.parts.catalogue import Pose
 from lidardesign.parts.part import Part, to_angles, to_directions
+from lidardesign.rays import kernels
+from lidardesign.rays.coverage import Coverage, gather
+from lidardesign.rays.information import choosing
+from lidardesign.rays.training import InformedScene, inform
+from lidardesign.run.clock import phase
+from lidardesign.scenes.rays import Rays, Returns
+from lidardesign.scenes.scene import Scene
+from lidardesign.sensors.even import even_subset
 from lidardesign.sensors.sensor import boresight_frame, boresight_of
 from lidardesign.space import RANGE, DesignSpace, angles
+from lidardesign.task import Information, random_generator
 
 BOUNDED = ("field_of_view.horizontal_deg", "field_of_view.vertical_deg", "gate.start_m", "gate.end_m", "gate.width_m")
 
@@ -91,3 +109,158 @@ def broken_keys(shape: PartShape, rules: SensorRules) -> set[str]:
         if bounds.max is not None and value > bounds.max * (1 + SLACK):
             broken.add(f"{key}.max")
     return broken
+
+
+MOST_CAST = 60_000  # rays of a scene, over all places
+MOST_CASTS = 1_000_000  # of a scene, over all its frames
+MOST_MEMBERS = 20_000_000  # rays of all parts' patterns that are told apart
+MOST_ITEMS = 60  # of a scene: the choice of a few parts needs few
+SIZED = 10  # one in so many parts says how large cells are, at first
+COARSE_CELL_RAD = math.radians(3.0)  # from which the size of cells is found
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedPart:
+    """A part at a pose.
+
+    Arguments:
+        shape: The part, upright or turned, and the gate of its rays.
+        pose: Where it stands and looks.
+        place: The number of the mount or origin at which it stands.
+    """
+
+    shape: PartShape
+    pose: Pose
+    place: int
+
+    @property
+    def part(self) -> Part:
+        """The kind of part."""
+        return self.shape.part
+
+
+def cells_of(directions: np.ndarray, size_rad: float) -> tuple[np.ndarray, int]:
+    """The cell of each unit vector (N, 3) on a sphere of rows of nearly square cells, and how many cells there are."""
+    rows = math.ceil(math.pi / size_rad)
+    middle = math.pi * ((np.arange(rows) + 0.5) / rows - 0.5)
+    columns = np.maximum(np.round(2 * rows * np.cos(middle)), 1).astype(np.int64)
+    first = np.concatenate([[0], np.cumsum(columns)])
+    x, y, z = directions.T
+    row = np.clip(((np.arcsin(np.clip(z, -1.0, 1.0)) / math.pi + 0.5) * rows).astype(np.int64), 0, rows - 1)
+    turn = np.mod(np.arctan2(y, x), FULL_TURN) / FULL_TURN
+    return first[row] + np.minimum((turn * columns[row]).astype(np.int64), columns[row] - 1), int(first[-1])
+
+
+class PartBundle:
+    """The rays that parts at poses share.
+
+    Arguments:
+        placed: The parts.
+        most_rays: As many rays as each fires at most, an even subset of its pattern.
+        frames: How often they are cast in a scene.
+
+    `rays` are to be cast; those of part i are `members[first[i]:first[i + 1]]`, some more than once. Of them a part
+    has `usual_rays` in the middle.
+    """
+
+    def __init__(self, placed: Sequence[PlacedPart], most_rays: int, frames: int) -> None:
+        self.placed, self.most_rays = placed, most_rays
+        self.most_pattern = min(most_rays, max(MOST_MEMBERS // len(placed), 1))
+        self._patterns: dict[str, np.ndarray] = {}
+        size_rad, most = COARSE_CELL_RAD, min(MOST_CAST, MOST_CASTS // frames)
+        size_rad *= math.sqrt(len(np.unique(np.concatenate(self._keys(placed[::SIZED], size_rad)))) / most)
+        while True:
+            keys = self._keys(placed, size_rad)
+            cast, index, members = np.unique(np.concatenate(keys), return_index=True, return_inverse=True)
+            if len(cast) <= most:
+                break
+            size_rad *= max(math.sqrt(len(cast) / most), 1.05)
+        self.first = np.cumsum([0, *map(len, keys)])
+        self.members = members.astype(np.int32)
+        self.usual_rays = float(np.median([len(np.unique(key)) for key in keys[::SIZED]]))
+        owner = np.searchsorted(self.first, index, side="right") - 1
+        origin, looking = np.empty((len(cast), 3)), np.empty((len(cast), 3))
+        for part in np.unique(owner):
+            own = owner == part
+            origin[own] = placed[part].pose.origin_m
+            looking[own] = self._looking(placed[part])[index[own] - self.first[part]]
+        gate_m = (min(one.shape.gate_m[0] for one in placed), max(one.shape.gate_m[1] for one in placed))
+        count = len(cast)
+        self.rays = Rays(origin, looking, np.tile(gate_m, (count, 1)), np.zeros(count, dtype=np.intp), np.zeros(count))
+
+    def _looking(self, placed: PlacedPart) -> np.ndarray:
+        part = placed.part
+        if part.name not in self._patterns:
+            rays = part.directions
+            self._patterns[part.name] = rays[even_subset(rays, min(len(rays), self.most_pattern))]
+        return self._patterns[part.name] @ placed.pose.frame
+
+    def _keys(self, placed: Sequence[PlacedPart], size_rad: float) -> list[np.ndarray]:
+        """The number of the cell and place of each part's rays."""
+        keys = []
+        for one in placed:
+            cell, cells = cells_of(self._looking(one), size_rad)
+            keys.append(one.place * cells + cell)
+        return keys
+
+
+@phase("what returns tell")
+def parts_inform(
+    bundle: PartBundle,
+    scenes: Iterable[Scene],
+    informs: Callable[[Scene, Sequence[Returns]], Information],
+    count: int,
+    seed: int,
+    *,
+    first_scene: int = 0,
+    among: Sequence[int] | None = None,
+) -> list[InformedScene]:
+    """What every part tells about scenes; parts are the candidates.
+
+    Arguments:
+        bundle: The parts and their rays.
+        scenes: Training scenes.
+        informs: What a task says of a scene's returns.
+        count: How many parts a design has: what a return tells depends on how many there will be.
+        seed: Root of the draws of items.
+        first_scene: The number of the first scene, for these draws.
+        among: Some of the parts, where others are not asked for.
+    """
+    rows, rays = np.arange(len(bundle.placed)) if among is None else np.array(among), bundle.rays
+    placed = [bundle.placed[row] for row in rows]
+    own = [bundle.members[bundle.first[row] : bundle.first[row + 1]] for row in rows]
+    first, members = np.cumsum([0, *map(len, own)]), bundle.members if among is None else np.concatenate(own)
+    gate_m = np.array([one.shape.gate_m for one in placed])
+    # of dense patterns each ray stands for many
+    fired = np.minimum([one.part.rays for one in placed], bundle.most_rays)
+    times = fired / np.minimum(fired, bundle.most_pattern)
+    share, told = min(count * bundle.usual_rays / len(rays), 1.0), []
+    for number, scene in enumerate(scenes, first_scene):
+        with choosing(share):
+            informed = inform(scene, rays, [slice(0, len(rays))], informs)
+        informed = _fewer_items(informed, random_generator(seed, "items of parts", number))
+        order = np.argsort(informed.ray, kind="stable")
+        start = np.concatenate([[0], np.cumsum(np.bincount(informed.ray, minlength=len(rays)))])
+        entries = kernels.ByRay(
+            start, informed.item[order], informed.worth[order], np.zeros(0, np.uint8), informed.weight, informed.sums
+        )
+        every = np.empty((len(placed), len(informed.weight)), dtype=np.float32)
+        kernels.gather_parts(entries, informed.range_m[order], first, members, gate_m, every)
+        if len(informed.sums):
+            # more counts no more, and bounds are the lower for it
+            every = np.minimum(every * times[:, None], len(informed.sums) - 1, dtype=np.float32)
+        part, item = np.nonzero(every)
+        worth, item, part = every[part, item], item.astype(np.int32), part.astype(np.int32)
+        told.append(replace(informed, ray=part, item=item, worth=worth, range_m=np.zeros(len(part))))
+    return told
+
+
+def part_table(informed: Sequence[InformedScene], parts: int) -> Coverage:
+    """So many parts, each with one gate that is open, beside all items of scenes."""
+    return gather(informed, np.tile([0.0, np.inf], (parts, 1, 1)), np.zeros((parts, 1)))
+
+
+def _fewer_items(informed: InformedScene, generator: np.random.Generator) -> InformedScene:
+    """A random draw of the items, without what returns spoil, which no part can gate."""
+    none = {"spoiling": np.zeros(0, np.int32), "harm": np.zeros(0), "harm_range_m": np.zeros(0), "is_repeated": False}
+    return replace(informed.with_fewer_items(MOST_ITEMS, generator), **none)

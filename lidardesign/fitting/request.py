@@ -1,4 +1,7 @@
-"""What a fit is asked for: the choices of a user, resolved by the run, an earlier design, constraints and a rig."""
+"""What a fit is asked for: the choices of a user, resolved by the run, an earlier design, constraints and a rig.
+
+What a fit or a choice came to: the design, its checks, and how far its figures may be off.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +12,20 @@ from pathlib import Path
 from typing import Any, get_args
 
 from lidardesign.config import with_task_settings
+from lidardesign.constraints.check import ConstraintCheck
 from lidardesign.constraints.document import MOST_FITTED, Constraints
 from lidardesign.constraints.origins import is_mounted, snap_to_space
-from lidardesign.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
 from lidardesign.errors import MAX_SEED, ConfigError, check_choice, check_number
+from lidardesign.estimates import Estimate, as_documents
 from lidardesign.fitting.run_samples import Weighting
 from lidardesign.formats.designs import reach_of, read_design
+from lidardesign.formats.rig import moved_notes, rig_constraints, rig_notes
+from lidardesign.mixture.fit import FittedSensors
 from lidardesign.rays.information import informs_rays
 from lidardesign.run.overrides import apply_override, parse_override
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
 from lidardesign.run_folder import Notes, RunFolder, log_note, settings_texts
+from lidardesign.samples import Samples
 from lidardesign.sensors.design import FITTED_LAYOUTS, DesignSpec, Gates, LayoutName
 from lidardesign.sensors.sensor import LEVELS, MOST_RAYS
 
@@ -358,3 +365,60 @@ def load_constraints(
         return document.locate(path, key=key)
 
     return Constraints.from_mapping(values, where=document.where, locate=locate)
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """A fitted design and how good it is.
+
+    Arguments:
+        design: The design.
+        log_likelihood: Weighted mean log density of the samples [nats]; None where it was chosen on scenes alone.
+        admissible_mass: The share of the density inside the constraints; None with fixed origins.
+        ess: Effective share of the samples that were admitted, 0 to 1.
+        seconds: Wall time [s].
+        constraints: The independent checks.
+        notes: What happened to sensors, one line each.
+        error_estimates: How far log_likelihood, ess and admissible_mass may be off.
+    """
+
+    design: DesignSpec
+    log_likelihood: float | None
+    admissible_mass: float | None
+    ess: float
+    seconds: float
+    constraints: tuple[ConstraintCheck, ...] = ()
+    notes: tuple[str, ...] = ()
+    error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
+
+    @classmethod
+    def of_fit(cls, design: DesignSpec, fitted: FittedSensors, samples: Samples, seconds: float) -> FitResult:
+        """A design whose sensors were fitted to samples."""
+        value, estimates = fitted.log_likelihood.value, fitted.estimates(samples)
+        mass = fitted.admissible_mass
+        return cls(design, value, mass, fitted.ess, seconds, notes=fitted.notes, error_estimates=estimates)
+
+    @classmethod
+    def of_choice(cls, design: DesignSpec, samples: Samples, seconds: float) -> FitResult:
+        """A design that was chosen on scenes instead of being fitted to samples."""
+        return cls(design, None, None, samples.effective_sample_size, seconds)
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether every constraint holds on the finished design."""
+        return all(check.satisfied for check in self.constraints)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's JSON keys; the path of the design is for the caller to fill."""
+        return {
+            "design": self.design.name,
+            "frame": self.design.mount or "world",
+            "sensors": [sensor.as_dict() for sensor in self.design.sensors],
+            "log_likelihood": self.log_likelihood,
+            "admissible_mass": self.admissible_mass,
+            "ess": self.ess,
+            "satisfied": self.satisfied,
+            "constraints": [check.as_dict() for check in self.constraints],
+            "seconds": self.seconds,
+            "error_estimates": as_documents(self.error_estimates),
+        }

@@ -20,14 +20,14 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import inside_excluded, mounts_of, origin_box
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.fitting.result import FitResult
+from lidardesign.fitting.request import FitResult
 from lidardesign.numerics import FULL_TURN
 from lidardesign.rays import information
 from lidardesign.rays.certificate import certificate_document, certify
 from lidardesign.rays.choice import Choice, RayCounts, choose
 from lidardesign.rays.coverage import Coverage, gather
-from lidardesign.rays.informed import inform
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY
+from lidardesign.rays.training import inform
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays, Returns

@@ -18,7 +18,7 @@ from lidardesign.constraints.document import Gate, SensorRules, rules_of
 from lidardesign.constraints.feasibility import azimuth_interval
 from lidardesign.constraints.origins import PINNED_BOX_M, free_boxes, origin_box
 from lidardesign.errors import InfeasibleError
-from lidardesign.mixture.features import Axes, Features
+from lidardesign.mixture.components import Axes, Features
 from lidardesign.numerics import SLACK, wrap_angle
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 

@@ -18,9 +18,8 @@ from lidardesign.constraints.document import SensorRules, rules_of
 from lidardesign.constraints.origins import Mount, fix_origin, fix_origins, mounts_of, mounts_suffice
 from lidardesign.errors import InfeasibleError
 from lidardesign.mixture.bounds import Bounds, Floors, Group, pins_of
-from lidardesign.mixture.components import Mixture, expect
+from lidardesign.mixture.components import Axes, Features, Mixture, expect
 from lidardesign.mixture.em import EMResult, fit_mixture, run_em
-from lidardesign.mixture.features import Axes, Features
 from lidardesign.mixture.m_step import maximise
 from lidardesign.mixture.support import Retarget, reaim_samples
 from lidardesign.numerics import systematic_draw, wrap_angle, wrap_turn

@@ -20,7 +20,7 @@ from lidardesign.constraints.origins import fix_origins, is_mounted, most_mounte
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.estimates import Estimate, effective_share_error
 from lidardesign.mixture.bounds import bounds_of, sensor_groups
-from lidardesign.mixture.components import log_density, responsibilities
+from lidardesign.mixture.components import Axes, Features, log_density, responsibilities
 from lidardesign.mixture.em import LEAST_SAMPLES
 from lidardesign.mixture.ensemble import (
     Ensemble,
@@ -30,7 +30,6 @@ from lidardesign.mixture.ensemble import (
     heaviest_first,
     sensors_of,
 )
-from lidardesign.mixture.features import Axes, Features
 from lidardesign.mixture.support import Retarget, Support, check_support, pin_samples, restrict_samples
 from lidardesign.numerics import TINY, effective_count, systematic_draw
 from lidardesign.run.clock import phase
@@ -280,7 +279,7 @@ def _check_effective(ensemble: Ensemble, supports: Sequence[Support]) -> None:
             found = effective_count(weights) * min(worth, 1.0)
             if found < LEAST_SAMPLES:
                 raise InfeasibleError(
-                    f"sensor {sensor} of {len(ensemble.order)} would rest on {found:.0f} effective samples of the density",
+                    f"sensor {sensor} of {len(ensemble.order)} would rest on {found:.0f} effective samples",
                     conflicts=["--sensors"],
                     allowed=f"at least {LEAST_SAMPLES}",
                     hint="fewer sensors, or learn longer (--preset standard or fine)",

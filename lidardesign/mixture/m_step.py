@@ -18,8 +18,7 @@ import math
 import numpy as np
 
 from lidardesign.mixture.bounds import Bounds, Floors, clip_azimuth
-from lidardesign.mixture.components import SMALLEST_WEIGHT, Mixture, Statistics, frames
-from lidardesign.mixture.features import Features
+from lidardesign.mixture.components import SMALLEST_WEIGHT, Features, Mixture, Statistics, frames
 from lidardesign.mixture.origin_step import OriginLimits, best_origins
 from lidardesign.numerics import COARSE_SLACK, SLACK, box_quadratic_minimum, sphere_exp, sphere_log, wrap_angle
 

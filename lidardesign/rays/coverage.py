@@ -17,7 +17,7 @@ import numpy as np
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.numerics import SLACK
 from lidardesign.rays import kernels
-from lidardesign.rays.informed import LARGEST, InformedScene
+from lidardesign.rays.training import LARGEST, InformedScene
 
 MOST_GATES = 8  # of a ray: an entry keeps one bit for each
 

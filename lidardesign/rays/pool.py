@@ -25,10 +25,9 @@ from lidardesign import __file__ as package_file
 from lidardesign.errors import LidardesignError
 from lidardesign.rays.gates import gate_choices
 from lidardesign.rays.information import CHOSEN_SHARE, MOST_SCENES, MOST_SELECTED
-from lidardesign.rays.informed import InformedScene
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY, draw_order, nearest_samples
 from lidardesign.rays.selection import Selection, inform_enough
-from lidardesign.rays.training import TrainingScenes
+from lidardesign.rays.training import InformedScene, TrainingScenes
 from lidardesign.registry import distribution_of
 from lidardesign.run.arrays import read_npz
 from lidardesign.run.clock import phase

@@ -1,8 +1,8 @@
 """Candidate rays inside sensors: the second step from a density to rays.
 
 They are drawn from the density's samples by weight, each at most once. How far apart rays should be is for the choice
-to find: candidates that were spaced evenly beforehand (by Lloyd's cells) gave designs that were 5 to 9 % worse on faces,
-at equal rays and bandwidth, over three seeds.
+to find: candidates that were spaced evenly beforehand (by Lloyd's cells) gave designs that were 5 to 9 % worse on
+faces, at equal rays and bandwidth, over three seeds.
 """
 
 from __future__ import annotations

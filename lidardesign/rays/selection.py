@@ -18,8 +18,7 @@ from lidardesign.rays.certificate import certificate_document, certify, price_cu
 from lidardesign.rays.choice import MOST_PASSES, Choice, RayCounts, choose, choose_within
 from lidardesign.rays.coverage import Coverage, gather
 from lidardesign.rays.information import CHOSEN_SHARE, FEW_SCENES, MOST_ENTRIES
-from lidardesign.rays.informed import InformedScene
-from lidardesign.rays.training import CHOICE, HELD_BACK, TrainingScenes
+from lidardesign.rays.training import CHOICE, HELD_BACK, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget

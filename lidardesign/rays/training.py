@@ -1,18 +1,32 @@
-"""Training scenes that nothing was learned from, and what a task says that returns tell about them."""
+"""Training scenes that nothing was learned from, and what a task says that returns tell about them.
+
+What the returns of candidate rays tell about training scenes, scene by scene.
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
-from lidardesign.rays.information import CHOSEN_SHARE, FEW_SCENES, MOST_ITEMS, checked_information, choosing
-from lidardesign.rays.informed import InformedScene, inform
+import numpy as np
+
+from lidardesign.numerics import systematic_draw
+from lidardesign.rays.information import (
+    CHOSEN_SHARE,
+    FEW_SCENES,
+    MOST_ITEMS,
+    checked_information,
+    choosing,
+    require_valid,
+)
 from lidardesign.run.clock import phase
 from lidardesign.run_folder import RunFolder
-from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.rays import Outcome, Rays, Returns
 from lidardesign.scenes.scene import Scene
-from lidardesign.task import Task, random_generator
+from lidardesign.simulate.returns import simulate_many
+from lidardesign.task import Information, Task, random_generator
 from lidardesign.workers import Starmap
 
 MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes returned, in the density's sigma
@@ -91,3 +105,129 @@ def informed_scene(
     with choosing(share):
         found = inform(scene, rays, visits, partial(checked_information, task))
     return found.with_fewer_items(MOST_ITEMS, random_generator(seed, "items", purpose, number))
+
+
+Informs = Callable[[Scene, Sequence[Returns]], Information]
+LARGEST = np.zeros(0)  # the table of items that count the largest worth
+
+
+@dataclass(frozen=True, eq=False)
+class InformedScene:
+    """What a task says of a scene's returns, with the ranges that say through which gates they are heard.
+
+    Arguments:
+        ray, item: Of each pair, int32 (E,).
+        worth: Above 0, float32 (E,).
+        range_m: The range of its return, (E,) [m].
+        weight: What items count, (U,); they sum to 1.
+        spoiling: Rays whose returns spoil something, one entry per return, (H,).
+        harm, harm_range_m: What each of these spoils, and its range [m], (H,).
+        sums: The table of sums, or `LARGEST`.
+        complete: What an item counts of which nothing is left to know.
+        is_repeated: Whether a ray may tell of an item by several frames, of which the largest worth counts.
+        unit: Of worth.
+    """
+
+    ray: np.ndarray
+    item: np.ndarray
+    worth: np.ndarray
+    range_m: np.ndarray
+    weight: np.ndarray
+    spoiling: np.ndarray
+    harm: np.ndarray
+    harm_range_m: np.ndarray
+    sums: np.ndarray
+    complete: float
+    is_repeated: bool
+    unit: str
+
+    @classmethod
+    def of(cls, information: Information, returns: Sequence[Returns]) -> InformedScene:
+        """What is kept of the returns of all candidate rays, through open gates.
+
+        Raises:
+            PluginError: Pairs, weights or harm that cannot be.
+        """
+        range_m = np.stack([frame.range_m for frame in returns])
+        require_valid(information, range_m.shape[1], len(returns))
+        tells = np.flatnonzero(information.worth > 0)
+        ray, item = information.ray[tells], information.item[tells]
+        count = len(information.frame)
+        weight = np.ones(count) if information.weight is None else np.asarray(information.weight, dtype=np.float64)
+        harm = np.zeros_like(range_m) if information.harm is None else np.asarray(information.harm)
+        spoiling = np.nonzero(harm)
+        return cls(
+            ray=ray.astype(np.int32),
+            item=item.astype(np.int32),
+            worth=information.worth[tells].astype(np.float32),
+            range_m=range_m[information.source[tells], ray],
+            weight=weight / weight.sum(),
+            spoiling=spoiling[1],
+            harm=harm[spoiling],
+            harm_range_m=range_m[spoiling],
+            sums=LARGEST if information.sums is None else np.asarray(information.sums, dtype=np.float64),
+            complete=information.complete,
+            is_repeated=information.seen_in is not None,
+            unit=information.unit,
+        )
+
+    @cached_property
+    def informative_returns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Every return that informs about something: its ray (K,) and range (K,) [m]."""
+        # a return informs about several items
+        order = np.lexsort((self.range_m, self.ray))
+        ray, range_m = self.ray[order], self.range_m[order]
+        is_first = np.append(True, (np.diff(ray) > 0) | (np.diff(range_m) > 0))[: len(ray)]
+        return ray[is_first].astype(np.intp), range_m[is_first]
+
+    def of_rays(self, number: np.ndarray) -> InformedScene:
+        """The same of some rays alone, which get other numbers, (N,) to (N,); -1 for those that are left out."""
+        kept, spoils = number[self.ray] >= 0, number[self.spoiling] >= 0
+        return replace(
+            self,
+            ray=number[self.ray[kept]].astype(np.int32),
+            item=self.item[kept],
+            worth=self.worth[kept],
+            range_m=self.range_m[kept],
+            spoiling=number[self.spoiling[spoils]],
+            harm=self.harm[spoils],
+            harm_range_m=self.harm_range_m[spoils],
+        )
+
+    def with_fewer_items(self, most: int, generator: np.random.Generator) -> InformedScene:
+        """A random draw of at most so many items, each as often as it counts; all where there are no more."""
+        if len(self.weight) <= most:
+            return self
+        drawn, times = np.unique(systematic_draw(self.weight, most, generator), return_counts=True)
+        number = np.full(len(self.weight), -1, dtype=np.int32)
+        number[drawn] = np.arange(len(drawn))
+        kept = number[self.item] >= 0
+        return replace(
+            self,
+            ray=self.ray[kept],
+            item=number[self.item[kept]],
+            worth=self.worth[kept],
+            range_m=self.range_m[kept],
+            weight=times / most,
+        )
+
+
+def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) -> InformedScene:
+    """What a task says of the returns of rays in a scene, through the rays' own gates.
+
+    Arguments:
+        scene: The scene.
+        rays: All candidates.
+        visits: The rays at each condition, one after the other; at the other conditions these have no returns.
+        informs: What the task says of a scene's returns.
+    """
+    fired = simulate_many(scene, [rays.subset(visit) for visit in visits])
+    returns = [pad_returns(rays, visit, frame) for visit, frames in zip(visits, fired, strict=True) for frame in frames]
+    return InformedScene.of(informs(scene, returns), returns)
+
+
+def pad_returns(rays: Rays, fired: slice, returns: Returns) -> Returns:
+    """The returns of some rays among all rays, of which the others return nothing."""
+    outcome, range_m, body = np.full(len(rays), Outcome.MISS), np.full(len(rays), np.nan), np.full(len(rays), -1)
+    outcome[fired], range_m[fired], body[fired] = returns.outcome, returns.range_m, returns.body
+    return Returns(rays, outcome, range_m, body, returns.frame)

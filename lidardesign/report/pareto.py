@@ -16,7 +16,7 @@ from typing import Any
 from lidardesign.report.figures import LAYOUT
 from lidardesign.report.markup import folded
 from lidardesign.report.tables import plain_number, table
-from lidardesign.scoring.accuracy.settings import Measurement, Sweep
+from lidardesign.scoring.sweep import Measurement, Sweep
 
 # Axes span at least so many times their smallest value, and end so far beyond what they show.
 LEAST_SPAN = 4.0

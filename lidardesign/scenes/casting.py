@@ -16,9 +16,9 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import COARSE_SLACK, SQUARABLE, unit_vectors
-from lidardesign.scenes.primitives import BALL_SLACK, KINDS, SIZES, bounding_radius_m
 from lidardesign.scenes.rays import Crossings, Hits
 from lidardesign.scenes.scene import Body, Mesh, Scene, inverse_rigid
+from lidardesign.scenes.surface import BALL_SLACK, KINDS, SIZES, bounding_radius_m
 from lidardesign.scenes.triangles import FARTHEST_M, SecondCasts, Triangles, advances_m, mesh_caster
 
 # After a triangle the next one is looked for this share of the scene's reach further on.

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from lidardesign.scenes.primitives import BALL_SLACK, BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, SPHERE
+from lidardesign.scenes.surface import BALL_SLACK, BOX, CAPSULE, CYLINDER, ELLIPSOID, PLANE, SPHERE
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -20,8 +20,7 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 from lidardesign.scenes.casting import SceneCaster, checked_rays
-from lidardesign.scenes.rays import Hits, Outcome, Rays, Returns, gate_outcomes
-from lidardesign.scenes.receivers import path_windows, range_of_path
+from lidardesign.scenes.rays import Hits, Outcome, Rays, Returns, gate_outcomes, path_windows, range_of_path
 from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.detector.light import Background, Beams, Echoes, direct_echoes
 from lidardesign.simulate.detector.physics import Physics, check_windows

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Scene, Sphere, rigid
-from lidardesign.scoring.scenes.metrics import discrete_frechet_m
+from lidardesign.scoring.metrics import discrete_frechet_m
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Information, Interval, Metric, Score, Split, random_generator
 from lidardesign_tasks.robot.arm_motion import Arm, Motion

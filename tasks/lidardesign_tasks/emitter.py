@@ -3,7 +3,7 @@
 World frame and heads are those of the task `face`. The detector stands at one place and hears every ray; what is
 designed are the emitters around it: their places, directions and ranges. Light goes from an emitter to the face and
 from there to the detector, so only what both of them see counts, and the range along a ray follows from the whole
-path of its light (`lidardesign.scenes.receivers`). A flood emitter is a sensor whose rays are the dots of its pattern.
+path of its light (`lidardesign.scenes.rays`). A flood emitter is a sensor whose rays are the dots of its pattern.
 """
 
 from __future__ import annotations
@@ -83,9 +83,7 @@ class EmitterTask:
     weighing_keys: ClassVar[tuple[str, ...]] = WEIGHING_KEYS
     Config: ClassVar[type[EmitterConfig]] = EmitterConfig
     metric: ClassVar[Metric] = FaceTask.metric
-    defaults: ClassVar[Defaults] = Defaults(
-        rays=(100, 196, 361, 576), level=0.99, density={"sigma_m": 0.005}
-    )
+    defaults: ClassVar[Defaults] = Defaults(rays=(100, 196, 361, 576), level=0.99, density={"sigma_m": 0.005})
 
     def space(self, config: EmitterConfig) -> DesignSpace:
         """Emitter places in a box around the detector, directions around where it looks."""

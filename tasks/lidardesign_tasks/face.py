@@ -37,23 +37,15 @@ LARGEST_COEFFICIENT = 3.0  # identities further from the mean than this in any m
 class HeadConfig(Importance):
     """The model, how many heads, how they move, how finely they are judged, what counts, and what surrounds them."""
 
-    model: Path | None = Field(
-        None, description="HDF5 file of a morphable model; empty: the embedded head model"
-    )
+    model: Path | None = Field(None, description="HDF5 file of a morphable model; empty: the embedded head model")
     unit: Unit = Field("auto", description="unit of length of the model file")
-    sign: Sign = Field(
-        "auto", description="inside rule of the head's surface; auto: unsigned where it is open"
-    )
+    sign: Sign = Field("auto", description="inside rule of the head's surface; auto: unsigned where it is open")
     train: int = Field(50, ge=1, le=10_000, description="training heads")
     test: int = Field(50, ge=1, le=10_000, description="held-out heads")
     modes: int = Field(100, ge=1, le=10_000, description="use at most this many modes of the model")
-    identity_scale: float = Field(
-        1.0, ge=0, le=3, description="scale of the identity coefficients; 0: the mean head"
-    )
+    identity_scale: float = Field(1.0, ge=0, le=3, description="scale of the identity coefficients; 0: the mean head")
     jitter_rotation_deg: float = Field(4.0, ge=0, le=60, description="standard deviation of the pose [deg]")
-    jitter_translation_m: float = Field(
-        0.008, ge=0, le=0.5, description="standard deviation of the place [m]"
-    )
+    jitter_translation_m: float = Field(0.008, ge=0, le=0.5, description="standard deviation of the place [m]")
     truth_points: int = Field(
         5000, ge=100, le=200_000, description="points of the visible surface that scores compare with"
     )
@@ -64,9 +56,7 @@ class FaceConfig(HeadConfig):
     """Heads, and where the sensor in front of them may be."""
 
     distance_m: float = Field(0.40, ge=0.1, le=5, description="from the mean nose tip to the sensor [m]")
-    origin_box_m: Metres | Vector = Field(
-        0.0, description="half size of the box of sensor origins [m]; 0: fixed"
-    )
+    origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
     half_angle_deg: float = Field(30.0, gt=0, le=80, description="azimuth and elevation span +- this [deg]")
     range_m: Interval = Field((0.05, 1.05), description="shortest and longest range [m]")
 
@@ -75,16 +65,12 @@ class FaceTask:
     """Reconstruct the surface of unknown faces from few rays."""
 
     name: ClassVar[str] = "face"
-    summary: ClassVar[str] = (
-        "flash-LiDAR face scanning on heads of a morphable model, 0.40 m in front of the face"
-    )
+    summary: ClassVar[str] = "flash-LiDAR face scanning on heads of a morphable model, 0.40 m in front of the face"
     api_version: ClassVar[int] = 1
     weighing_keys: ClassVar[tuple[str, ...]] = WEIGHING_KEYS
     Config: ClassVar[type[FaceConfig]] = FaceConfig
     metric: ClassVar[Metric] = Metric("Chamfer distance", "mm", "lower", worst=200.0, tolerance=0.1)
-    defaults: ClassVar[Defaults] = Defaults(
-        rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005}
-    )
+    defaults: ClassVar[Defaults] = Defaults(rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005})
 
     def space(self, config: FaceConfig) -> DesignSpace:
         """Origins in a box around (distance, 0, 0), directions around -x."""
@@ -95,9 +81,7 @@ class FaceTask:
             high=(*(centre + half).tolist(), math.pi + angle, angle, config.range_m[1]),
         )
 
-    def scenes(
-        self, config: FaceConfig, split: Split, seed: int, space: DesignSpace | None = None
-    ) -> Sequence[Scene]:
+    def scenes(self, config: FaceConfig, split: Split, seed: int, space: DesignSpace | None = None) -> Sequence[Scene]:
         """Random heads, see `head_scenes`."""
         return head_scenes(config, space or self.space(config), split, seed)
 

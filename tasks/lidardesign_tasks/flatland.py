@@ -19,7 +19,7 @@ from lidardesign.rays.information import surface_information
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Capsule, Scene, Sphere, rigid
-from lidardesign.scoring.scenes.metrics import chamfer_m
+from lidardesign.scoring.metrics import chamfer_m
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Information, Metric, Score, Split, random_generator
 from lidardesign_tasks.surroundings import Surroundings
@@ -61,9 +61,7 @@ class FlatlandTask:
 
     def space(self, config: FlatlandConfig) -> DesignSpace:
         """The paper's three free dimensions; y, z and elevation are 0."""
-        return DesignSpace(
-            low=(0.0, 0.0, 0.0, math.pi / 4, 0.0, 0.0), high=(1.0, 0.0, 0.0, 3 * math.pi / 4, 0.0, 1.2)
-        )
+        return DesignSpace(low=(0.0, 0.0, 0.0, math.pi / 4, 0.0, 0.0), high=(1.0, 0.0, 0.0, 3 * math.pi / 4, 0.0, 1.2))
 
     def scenes(
         self, config: FlatlandConfig, split: Split, seed: int, space: DesignSpace | None = None
@@ -104,9 +102,7 @@ def in_space(points: np.ndarray) -> np.ndarray:
     return np.column_stack([points, np.zeros(len(points))])
 
 
-def build_scene(
-    config: FlatlandConfig, space: DesignSpace, name: str, generator: np.random.Generator
-) -> Scene:
+def build_scene(config: FlatlandConfig, space: DesignSpace, name: str, generator: np.random.Generator) -> Scene:
     """One scene with its truth: the points of target outlines that an admissible ray sees, (K, 2) [m]."""
     build = discs if config.scene == "discs" else surface
     bodies = build(config.variation, generator)

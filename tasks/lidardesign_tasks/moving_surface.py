@@ -15,7 +15,7 @@ import numpy as np
 from lidardesign.errors import DataError
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.scenes.metrics import SurfaceCloud, visible_surface
+from lidardesign.scoring.metrics import SurfaceCloud, visible_surface
 from lidardesign.space import DesignSpace
 from lidardesign.task import Information, Metric, Score, random_generator
 from lidardesign_tasks.surface import ITEMS, LazyTruth, fewer_points, information_of, surface_score

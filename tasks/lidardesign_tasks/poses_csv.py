@@ -20,7 +20,7 @@ from lidardesign.errors import DataError
 from lidardesign.run.arrays import csv_rows
 from lidardesign.run.inputs import TABLE
 from lidardesign.run.yaml import plain_number
-from lidardesign.scenes.receivers import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.scenes.rays import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.scenes.scene import rigid
 from lidardesign.space import FARTHEST_M
 from lidardesign_tasks.pose import rotation_matrix

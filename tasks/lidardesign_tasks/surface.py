@@ -13,7 +13,7 @@ import numpy as np
 from lidardesign.rays.information import scattered_area_m2, surface_information
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Mesh, Scene
-from lidardesign.scoring.scenes.metrics import (
+from lidardesign.scoring.metrics import (
     SurfaceCloud,
     delaunay_surface,
     ray_spacing,

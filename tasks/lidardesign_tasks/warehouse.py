@@ -95,9 +95,7 @@ class WarehouseTask:
     api_version: ClassVar[int] = 1
     Config: ClassVar[type[WarehouseConfig]] = WarehouseConfig
     metric: ClassVar[Metric] = Metric("miss rate", "%", "lower", worst=100.0, tolerance=0.5)
-    defaults: ClassVar[Defaults] = Defaults(
-        rays=(6, 12, 18), density={"sigma_m": 0.02}
-    )
+    defaults: ClassVar[Defaults] = Defaults(rays=(6, 12, 18), density={"sigma_m": 0.02})
 
     def space(self, config: WarehouseConfig) -> DesignSpace:
         """Elevation and range in the vertical plane y < 0, conditioned on the robot's x.

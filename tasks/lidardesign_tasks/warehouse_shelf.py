@@ -148,9 +148,7 @@ def _poles(plan: ShelfPlan, ends: Interval, top: float, generator: np.random.Gen
     return [_Block((place, place + POLE_M), depth, (FLOOR_M, top)) for place in places for depth in rows]
 
 
-def _boxes_of_a_level(
-    plan: ShelfPlan, ends: Interval, height: float, generator: np.random.Generator
-) -> list[_Block]:
+def _boxes_of_a_level(plan: ShelfPlan, ends: Interval, height: float, generator: np.random.Generator) -> list[_Block]:
     """Boxes beside each other from one end to the other, some with an empty place after them or one behind."""
     blocks: list[_Block] = []
     # the first box may stick out and is then left away: the pattern has no phase at the shelf's end

@@ -16,8 +16,8 @@ from support.command_line import make_run
 import lidardesign as package
 from lidardesign import __version__
 from lidardesign.api.design import Design
-from lidardesign.cli.tables.designs import show_fit
 from lidardesign.cli.terminal import output as console_module
+from lidardesign.cli.terminal.design_tables import show_fit
 from lidardesign.cli.terminal.output import command, plain_json
 from lidardesign.errors import InfeasibleError
 from lidardesign.parts.catalogue import Pose, find_part, part_design

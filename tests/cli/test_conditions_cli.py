@@ -6,10 +6,10 @@ import json
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from support.command_line import caller, files_under, make_run
 from support.conditioned_runs import log_target, make_conditioned_run
 
-from lidardesign.layouts.rays import lay_out
 from lidardesign.formats.designs import load_design
 
 

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from support.command_line import caller, files_under
 
-from lidardesign.cli.tables.scores import show_times
+from lidardesign.cli.terminal.score_tables import show_times
 from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import read_manifest
 

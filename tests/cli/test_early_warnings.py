@@ -14,8 +14,8 @@ from support.tables import each_row
 from lidardesign.config import load_run_config
 from lidardesign.density.objective.prepare import resolution_notes
 from lidardesign.errors import ConfigError, PluginError
-from lidardesign.registry import load_task
 from lidardesign.formats.designs import read_design
+from lidardesign.registry import load_task
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.space import DesignSpace
 from lidardesign.task import notes_of

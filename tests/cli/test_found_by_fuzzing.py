@@ -18,16 +18,16 @@ from support.tables import each_row
 from lidardesign.cli.terminal.output import Output, describe_error
 from lidardesign.constraints.document import MOST_FITTED, Constraints
 from lidardesign.density.fields.grids import _digest, _load
-from lidardesign.density.learned import seconds_at
+from lidardesign.density.training.learned import seconds_at
 from lidardesign.density.training.trainer import _step_of
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.formats.designs import load_design
 from lidardesign.mixture.fit import fit
 from lidardesign.run.manifest import record
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.mesh_files import check_mesh, load_mesh
 from lidardesign.scoring.captures.capture import load_capture
 from lidardesign.sensors.bandwidth import split_budget
-from lidardesign.formats.designs import load_design
 from lidardesign.sensors.sensor import MOST_RAYS, interval_factor
 from lidardesign.space import FARTHEST_M, DesignSpace
 

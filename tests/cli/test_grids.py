@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from support.tables import each_row
 
-from lidardesign.cli.tables.grids import duration, print_table
+from lidardesign.cli.terminal.grids import duration, print_table
 from lidardesign.report.tables import plain_number
 
 HEADINGS = ("design", "rays", "difference (95 % interval)", "seconds")

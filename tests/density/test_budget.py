@@ -10,9 +10,9 @@ import pytest
 from support.learning import BallTask, Interrupter, config_of, result_bytes
 
 from lidardesign.api.learn import MOST_STEPS
-from lidardesign.density.learn import learn, prepare_training_data
 from lidardesign.density.training import trainer as training
 from lidardesign.density.training.checkpoint import load_arrays
+from lidardesign.density.training.learn import learn, prepare_training_data
 from lidardesign.density.training.quality import IndependentProbes
 
 STRETCH = 10
@@ -115,5 +115,5 @@ def test_too_few_probes_stop_nothing(tmp_path, monkeypatch):
     data = prepare_training_data(BallTask(), config)
     few = IndependentProbes(*(values[:99] for values in vars(data.probes).values()))
     assert learn(BallTask(), config, tmp_path).steps == 40
-    monkeypatch.setattr("lidardesign.density.learn.prepare_training_data", lambda *_: replace(data, probes=few))
+    monkeypatch.setattr("lidardesign.density.training.learn.prepare_training_data", lambda *_: replace(data, probes=few))
     assert learn(BallTask(), config, tmp_path).steps == 60

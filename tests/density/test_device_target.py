@@ -12,7 +12,7 @@ import trimesh
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.flow.coordinates import (
+from lidardesign.density.coordinates import (
     Coordinates,
     DeviceTarget,
     log_target,
@@ -20,7 +20,7 @@ from lidardesign.density.flow.coordinates import (
     on_device,
     stays_on,
 )
-from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.target import build_target
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.errors import NumericalError

@@ -10,7 +10,7 @@ import torch
 from support.flows import FLOWS, draw, flow_of
 from support.tables import each_row
 
-from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.network import DesignFlow
 
 
 @each_row("name", FLOWS)

@@ -21,10 +21,10 @@ from lidardesign.density.fields.importance import (
     is_weighted,
     log_weight_grid,
 )
-from lidardesign.density.learn import learn
 from lidardesign.density.objective.prepare import prepare_target
 from lidardesign.density.objective.proposals import independent_points
 from lidardesign.density.objective.target import build_target
+from lidardesign.density.training.learn import learn
 from lidardesign.errors import DataError
 from lidardesign.numerics import logsumexp
 from lidardesign.samples import load_samples

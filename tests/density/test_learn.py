@@ -15,8 +15,7 @@ from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of,
 from support.tables import each_row
 
 from lidardesign.config import LearningSettings
-from lidardesign.density import learn as learning
-from lidardesign.density.learn import learn, prepare_training_data
+from lidardesign.density.training import learn as learning
 from lidardesign.density.training.checkpoint import (
     FOLDER,
     clear_snapshots,
@@ -26,6 +25,7 @@ from lidardesign.density.training.checkpoint import (
     snapshot_name,
     stored_snapshots,
 )
+from lidardesign.density.training.learn import learn, prepare_training_data
 from lidardesign.density.training.sampling import log_density_of
 from lidardesign.density.training.trainer import AVERAGING, BETAS, Adam
 from lidardesign.errors import ConfigError, DataError, PluginError

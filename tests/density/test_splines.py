@@ -8,7 +8,7 @@ import torch
 from support.tables import each_row
 from torch import Tensor
 
-from lidardesign.density.flow.splines import EDGE, array_splines, splines
+from lidardesign.density.network import EDGE, array_splines, splines
 
 BINS, LAYERS = 7, 2
 

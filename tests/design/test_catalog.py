@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lidardesign.layouts.rays import LAYOUTS, lay_out
 from support.command_line import make_run
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.fitting.part_shapes import PartShape, gate_inside, shapes_of
-from lidardesign.sensors.even import grid_rows
-from lidardesign.layouts.rays import LAYOUTS, lay_out
-from lidardesign.mixture.features import Axes
+from lidardesign.mixture.components import Axes
 from lidardesign.parts.catalogue import (
     FOLDER,
     Pose,
@@ -37,6 +36,7 @@ from lidardesign.parts.statements import FIELDS, PartFile, Statement
 from lidardesign.run.validation import check_model
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.sensors.design_file import design_document, design_from_document, load_design, save_design
+from lidardesign.sensors.even import grid_rows
 from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import DesignSpace, direction
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from support.command_line import make_run
 
-from lidardesign.layouts.rays import lay_out
+from lidardesign.formats.designs import load_design
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.compare import angle_between, paired_sensors, readout_of
-from lidardesign.formats.designs import load_design
 from lidardesign.sensors.sensor import DesignSpec, Sensor
 from lidardesign.space import direction
 

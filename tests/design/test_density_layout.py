@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from scipy.spatial import cKDTree
 
-from lidardesign.layouts.rays import lay_out
 from lidardesign.samples import Samples
 from lidardesign.sensors.sensor import DesignSpec, Sensor
 from lidardesign.space import DesignSpace, angles

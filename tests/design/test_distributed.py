@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lidardesign.layouts import distributed as lines
+from lidardesign.layouts.distributed import in_region, normal_ball
+from lidardesign.layouts.rays import lay_out
 from scipy.special import chdtri
 from support.rings import RING
 from support.tables import each_row
 
-from lidardesign.layouts import distributed as lines
-from lidardesign.layouts.distributed import in_region, normal_ball
-from lidardesign.sensors.even import low_discrepancy
-from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.ensemble import coupling_of
 from lidardesign.mixture.fit import fit
+from lidardesign.sensors.even import low_discrepancy
 from lidardesign.sensors.sensor import Sensor, tangent_directions
 from lidardesign.space import angles, observed_point
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lidardesign.layouts.rays import lay_out
 from support.aisles import AISLE
 from support.command_line import caller, make_run
 from support.tables import each_row
@@ -18,7 +19,6 @@ from support.tables import each_row
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, InfeasibleError
-from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.fit import fit
 from lidardesign.samples import Samples
 from lidardesign.sensors.design_file import design_document, load_design, save_design

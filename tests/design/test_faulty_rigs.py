@@ -10,8 +10,8 @@ import pytest
 from support.command_line import make_run
 
 from lidardesign.errors import DataError
-from lidardesign.run.xml import read_xml
 from lidardesign.formats.designs import load_design, save_design
+from lidardesign.run.xml import read_xml
 
 HEADER = "origin_x_m,origin_y_m,origin_z_m,azimuth_deg,elevation_deg,gate_start_m,gate_end_m"
 ROWS = ["0.5,0,0,60,0,0.1,0.9", "0.5,0,0,90,0,0.1,0.9", "0.5,0,0,120,0,0.1,0.9"]

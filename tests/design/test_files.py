@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lidardesign.layouts.rays import gates_of, lay_out
 from support.strategies import finite, length, sensors, width
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError, NumericalError
-from lidardesign.layouts.rays import gates_of, lay_out
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design_file import (

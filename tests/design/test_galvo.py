@@ -6,19 +6,23 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lidardesign.layouts.rays import lay_out
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.formats.galvo import is_galvo_file, read_galvo, short_tour, travel, write_galvo
-from lidardesign.formats.galvo_angles import (
+from lidardesign.formats.galvo import (
     degree_frame,
     gate_m,
     gate_ps,
+    is_galvo_file,
     middle_boresight_deg,
+    read_galvo,
     scan_angles_deg,
     scan_directions,
+    short_tour,
+    travel,
+    write_galvo,
 )
-from lidardesign.layouts.rays import lay_out
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.sensor import DesignSpec, Sensor
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from lidardesign.layouts.gates import admissible_gates, central_intervals
+
 from lidardesign.mixture.bounds import Bounds
 
 LEVEL_FACTOR = 1.96

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.layouts.rays import lay_out
 from lidardesign.sensors.design_file import design_from_document
 
 COUPLING = {

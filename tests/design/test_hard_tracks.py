@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lidardesign.layouts.gates import central_intervals
 from support.conditioned_runs import make_conditioned_run
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.layouts.gates import central_intervals
 from lidardesign.run.yaml import dump_yaml, load_yaml
 from lidardesign.sensors.design_file import design_from_document
 

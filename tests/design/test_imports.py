@@ -9,19 +9,17 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from support.command_line import make_run
 from support.tables import each_row
 
 from lidardesign.constraints.document import Constraints
-from lidardesign.constraints.rig_constraints import rig_constraints
 from lidardesign.errors import DataError, LidardesignError
-from lidardesign.formats.registry import EXPORTERS
-from lidardesign.formats.rig import aim_of
-from lidardesign.layouts.rays import lay_out
-from lidardesign.run.xml import _Builder
-from lidardesign.scenes.rays import Rays
-from lidardesign.scenes.receivers import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.formats.designs import load_design, save_design
+from lidardesign.formats.registry import EXPORTERS
+from lidardesign.formats.rig import aim_of, rig_constraints
+from lidardesign.run.xml import _Builder
+from lidardesign.scenes.rays import Rays, rotation_of_quaternion, rotation_of_rpy
 from lidardesign.sensors.sensor import (
     DesignSpec,
     Sensor,

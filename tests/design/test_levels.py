@@ -6,6 +6,8 @@ import json
 
 import numpy as np
 import pytest
+from lidardesign.layouts.gates import seen_from
+from lidardesign.layouts.rays import lay_out
 from support.aisles import SAMPLES as AISLE_SAMPLES
 from support.command_line import make_run
 from support.designs import drawn_from, three_sensors
@@ -13,10 +15,8 @@ from support.rings import RING
 
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import InfeasibleError
-from lidardesign.layouts.gates import seen_from
-from lidardesign.layouts.rays import lay_out
-from lidardesign.mixture.fit import fit, rays_at
 from lidardesign.formats.designs import load_design
+from lidardesign.mixture.fit import fit, rays_at
 from lidardesign.sensors.sensor import DesignSpec, interval_factor
 from lidardesign.space import observed_point
 

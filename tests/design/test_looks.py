@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidardesign.mixture.features import NEIGHBOURS, Axes, Features, ray_features
+from lidardesign.mixture.components import NEIGHBOURS, Axes, Features, ray_features
 from lidardesign.space import RANGE, DesignSpace, observed_point
 
 SPACE = DesignSpace((0, 0, 0, 0.5, 0, 0.2), (1, 0, 0, 2.5, 0, 1.2))

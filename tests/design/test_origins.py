@@ -14,8 +14,8 @@ from support.tables import each_row
 from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.origins import box_around, free_boxes, inside_excluded, nearest_in_boxes, origin_box
 from lidardesign.mixture.bounds import Bounds, Floors, bounds_of
+from lidardesign.mixture.components import Axes, Features
 from lidardesign.mixture.em import run_em, seed_mixture
-from lidardesign.mixture.features import Axes, Features
 from lidardesign.mixture.m_step import fit_gate
 from lidardesign.mixture.origin_step import (
     OriginLimits,

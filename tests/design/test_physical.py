@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from support import references
 from support.designs import from_the_ceiling
 from support.tables import each_row
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
-from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.bounds import Bounds
+from lidardesign.mixture.components import Axes, Features
 from lidardesign.mixture.em import mixture_of_labels, run_em
-from lidardesign.mixture.features import Axes, Features
 from lidardesign.mixture.fit import fit
 from lidardesign.numerics import clipped_eigenvalues
 from lidardesign.samples import Samples

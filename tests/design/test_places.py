@@ -10,8 +10,8 @@ from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import SAME_PLACE_M, snap_to_space
-from lidardesign.constraints.rig_constraints import rig_constraints
 from lidardesign.errors import InfeasibleError
+from lidardesign.formats.rig import rig_constraints
 from lidardesign.sensors.design_file import design_document, load_design
 from lidardesign.sensors.sensor import DesignSpec, Sensor
 from lidardesign.space import DesignSpace

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lidardesign.layouts.gates import RayRanges, _Prices, central_intervals, gates_within
 from support.tables import each_row
 
-from lidardesign.layouts.gates import RayRanges, _Prices, central_intervals, gates_within
 from lidardesign.mixture.bounds import Bounds
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.sensor import interval_factor

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.mixture.quantise import Nearest, lloyd
+from lidardesign.mixture.em import Nearest, lloyd
 
 
 def cost(features, weights, centres):

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lidardesign.layouts.gates import log_density, members, seen_from
+from lidardesign.layouts.rays import LAYOUTS, gates_of, lay_out, own_count
 from support.designs import SPACE, drawn_from, sensor, three_sensors
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.layouts.gates import log_density, members, seen_from
-from lidardesign.sensors.even import grid_rows, grid_tangent
-from lidardesign.layouts.rays import LAYOUTS, gates_of, lay_out, own_count
 from lidardesign.mixture.fit import rays_at, refitted
 from lidardesign.samples import Samples
 from lidardesign.sensors.bandwidth import split_budget
+from lidardesign.sensors.even import grid_rows, grid_tangent
 from lidardesign.sensors.sensor import MOST_RAYS, DesignSpec, Track, interval_factor, tangent_coordinates
 from lidardesign.space import DesignSpace, angles, direction
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from lidardesign.layouts.rays import lay_out
 from scipy.stats import chi2, norm
 from support.chi_square import UNLIKELY, counts_of_cells, mass_of_cells, p_value
 from support.designs import sensor
@@ -19,13 +20,11 @@ from support.rivals import Rivals
 from support.tables import each_row
 
 from lidardesign.constraints.document import Constraints
-from lidardesign.density.flow.coordinates import Coordinates
-from lidardesign.density.learned import FlatTarget
+from lidardesign.density.coordinates import Coordinates
 from lidardesign.density.objective.visibility import Optics
+from lidardesign.density.training.learned import FlatTarget
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.sampling import draw_samples, log_density_of, log_prob_of_unit
-from lidardesign.sensors.even import low_discrepancy
-from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.bounds import sensor_groups
 from lidardesign.mixture.components import log_density
 from lidardesign.mixture.fit import fit
@@ -34,7 +33,8 @@ from lidardesign.numerics import systematic_draw
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Body, Box, Capsule, Mesh, Scene, Sphere
 from lidardesign.scenes.surface import sample_body
-from lidardesign.scoring.baselines.occupancy import OccupancyGrid
+from lidardesign.scoring.baselines.simple import OccupancyGrid
+from lidardesign.sensors.even import low_discrepancy
 from lidardesign.sensors.sensor import DesignSpec, tangent_coordinates, tangent_directions
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
 

@@ -11,8 +11,8 @@ from support.strategies import sensors
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.formats.ray_lists import SENSOR_COLUMNS, begins_as_sensor_csv, read_sensor_csv, write_sensor_csv
 from lidardesign.formats.designs import load_design
+from lidardesign.formats.ray_lists import SENSOR_COLUMNS, begins_as_sensor_csv, read_sensor_csv, write_sensor_csv
 from lidardesign.sensors.sensor import DesignSpec, Sensor, tangent_coordinates
 from lidardesign.space import direction
 

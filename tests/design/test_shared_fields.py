@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lidardesign.layouts.density import bandwidth_limit, shared_rays
+from lidardesign.layouts.rays import lay_out
 from support.tables import each_row
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
-from lidardesign.layouts.density import bandwidth_limit, shared_rays
-from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.fit import fit
 from lidardesign.samples import Samples
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget

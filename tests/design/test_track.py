@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lidardesign.layouts.rays import lay_out
+from lidardesign.layouts.track import interpolated, placed, track_of, travels
 from support.aisles import AISLE, SAMPLES, shelves
 from support.tables import each_row
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, InfeasibleError
-from lidardesign.layouts.rays import lay_out
-from lidardesign.layouts.track import interpolated, placed, track_of, travels
+from lidardesign.mixture.em import lloyd
 from lidardesign.mixture.fit import fit, rays_at
-from lidardesign.mixture.quantise import lloyd
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays

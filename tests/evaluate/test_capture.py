@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from support.captures import BALL_AT, BALL_M, BIN_PS, C_M_PER_PS, START_PS, ball_range_m, make_capture
 from support.command_line import caller
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.formats.galvo import read_galvo, write_galvo
-from lidardesign.formats.galvo_angles import degree_frame, scan_directions
-from lidardesign.layouts.rays import lay_out
+from lidardesign.formats.galvo import degree_frame, read_galvo, scan_directions, write_galvo
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.captures import scan as capture_ranges
 from lidardesign.scoring.captures.capture import Capture, load_capture

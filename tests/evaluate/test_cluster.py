@@ -12,12 +12,12 @@ import warnings
 from dataclasses import replace
 
 import pytest
+from lidardesign.scoring.evaluation.workers import scorer_of
 from support.workers import make_request, results
 
 from lidardesign.errors import ConfigError
 from lidardesign.scoring.evaluation import workers
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.evaluation.workers import scorer_of
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from support.rivals import balls
 from support.scoring import HitTask, MissTask
 from support.tables import each_row
@@ -17,7 +18,6 @@ from support.tables import each_row
 from lidardesign.api.scores import ScoreOptions
 from lidardesign.cli.commands.evaluate import search_display
 from lidardesign.errors import ConfigError
-from lidardesign.layouts.rays import lay_out
 from lidardesign.numerics import wrap_angle
 from lidardesign.parts.catalogue import Pose, find_part, part_design
 from lidardesign.scoring.baselines import cma

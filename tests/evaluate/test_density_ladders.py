@@ -16,18 +16,18 @@ from support.references import shape_distance
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings, LearningSettings, resolve, save_run_config
+from lidardesign.density.coordinates import Coordinates
 from lidardesign.density.fields.distance import build_field
-from lidardesign.density.flow.coordinates import Coordinates
-from lidardesign.density.flow.network import DesignFlow
-from lidardesign.density.learn import learn
-from lidardesign.density.learned import (
+from lidardesign.density.network import DesignFlow
+from lidardesign.density.objective.target import build_target
+from lidardesign.density.training.learn import learn
+from lidardesign.density.training.learned import (
     LearningSteps,
     gradient,
     in_arithmetic,
     noise_share,
     noise_shares,
 )
-from lidardesign.density.objective.target import build_target
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.errors import NumericalError

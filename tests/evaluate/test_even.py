@@ -10,9 +10,8 @@ from support.rivals import Rivals, balls
 from support.tables import each_row
 
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
-from lidardesign.scoring.baselines.bounding import bounding
 from lidardesign.scoring.baselines.candidates import LayoutSite
-from lidardesign.scoring.baselines.even import Patch, Zone, central_field, even_placement
+from lidardesign.scoring.baselines.even import Patch, Zone, bounding, central_field, even_placement
 from lidardesign.scoring.baselines.views import TrainingViews
 from lidardesign.space import DesignSpace, angles, direction
 

@@ -13,7 +13,7 @@ from support.triangles import naive_triangle_distance_m
 from lidardesign.errors import DataError
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
 from lidardesign.scenes.surface import sample_triangles
-from lidardesign.scoring.scenes.metrics import (
+from lidardesign.scoring.metrics import (
     chamfer_m,
     delaunay_surface,
     nearest_m,

@@ -19,7 +19,7 @@ from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.scoring.evaluation.seeds import over_seeds
-from lidardesign.scoring.scenes.statistics import paired_difference
+from lidardesign.scoring.statistics import paired_difference
 
 DEGREE = math.pi / 180
 ERROR = MountError(0.005, 0.5 * DEGREE)

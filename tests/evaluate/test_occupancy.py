@@ -8,7 +8,7 @@ import pytest
 
 from lidardesign.scenes.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.scoring.baselines.candidates import LayoutSite
-from lidardesign.scoring.baselines.occupancy import AimedPoints, occupancy, occupancy_grid
+from lidardesign.scoring.baselines.simple import AimedPoints, occupancy, occupancy_grid
 from lidardesign.scoring.baselines.views import RAY_AXES
 from lidardesign.space import DesignSpace, direction, observed_point
 

@@ -16,7 +16,7 @@ from lidardesign.report.pareto import (
     panels,
     pareto_figures,
 )
-from lidardesign.scoring.accuracy.settings import Measurement, Sweep
+from lidardesign.scoring.sweep import Measurement, Sweep
 
 NASTY = "</script><img src=x onerror=alert(1)>$x^2"
 

@@ -35,11 +35,10 @@ from lidardesign.report.drawing import (
     round_steps,
     thinned,
 )
-from lidardesign.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure
+from lidardesign.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure, series
 from lidardesign.report.markup import asset
 from lidardesign.report.page import report_html
 from lidardesign.report.scene_figure import MOST_RAY_STEPS, MOST_STEPS, SceneFigure
-from lidardesign.report.series import series
 from lidardesign.report.tables import (
     CommandTimes,
     constraints_table,

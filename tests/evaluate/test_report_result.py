@@ -7,7 +7,7 @@ import pytest
 from support.report_pages import NASTY, make_evaluation, make_row, make_sensor
 from support.tables import each_row
 
-from lidardesign.report.result import headline, result_section
+from lidardesign.report.page import headline, result_section
 from lidardesign.scoring.evaluation.entries import StrongestRival
 from lidardesign.scoring.evaluation.results import Evaluation, Paired
 from lidardesign.sensors.sensor import CERTIFICATES, DesignSpec

@@ -4,7 +4,7 @@ import mmap
 
 from support.tables import each_row
 
-from lidardesign.scoring.accuracy.settings import Measurement, Sweep, timed
+from lidardesign.scoring.sweep import Measurement, Sweep, timed
 
 
 def sweep(*measurements, tolerance=0.1):

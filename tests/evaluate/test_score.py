@@ -9,7 +9,7 @@ from rich.console import Console
 from support.scoring import RAYS, HitTask, MissTask, design, make_request, rows_by_key, scenes
 from support.tables import each_row
 
-from lidardesign.cli.tables.scores import show_evaluation
+from lidardesign.cli.terminal.score_tables import show_evaluation
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.report.figures import scores_figure
 from lidardesign.report.tables import paired_tables
@@ -18,7 +18,7 @@ from lidardesign.scoring.evaluation.entries import FEWEST_RIVAL_SCENES
 from lidardesign.scoring.evaluation.results import csv_text, verdict
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.scoring.evaluation.thresholds import worse_than_threshold
-from lidardesign.scoring.scenes.statistics import mean_interval, paired_difference
+from lidardesign.scoring.statistics import mean_interval, paired_difference
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score

@@ -11,7 +11,7 @@ from support.tables import each_row
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import rigid
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.scenes.scene_scores import silent_notes
+from lidardesign.scoring.scene_scores import silent_notes
 
 
 def silent(evaluation):

@@ -9,8 +9,8 @@ from support.rivals import Rivals, balls
 from support.tables import each_row
 
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scoring.baselines.bounding import bounding
 from lidardesign.scoring.baselines.candidates import LayoutSite
+from lidardesign.scoring.baselines.even import bounding
 from lidardesign.scoring.baselines.silhouette import lloyd, silhouette, survey
 from lidardesign.scoring.baselines.views import TrainingViews
 from lidardesign.sensors.bandwidth import Bandwidth

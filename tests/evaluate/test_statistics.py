@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binom, t, ttest_1samp
 
 from lidardesign.errors import NumericalError
-from lidardesign.scoring.scenes.statistics import mean_interval, paired_difference
+from lidardesign.scoring.statistics import mean_interval, paired_difference
 
 
 def test_the_interval_of_a_normal_sample_is_the_textbook_one():

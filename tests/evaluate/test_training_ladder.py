@@ -12,9 +12,9 @@ from support.small_runs import shifted
 
 from lidardesign.api import scores as scoring
 from lidardesign.config import load_run_config, resolve, save_run_config
-from lidardesign.density.learn import learn
-from lidardesign.density.learned import load_flow, remeasured, seconds_at
 from lidardesign.density.training import trainer as steps
+from lidardesign.density.training.learn import learn
+from lidardesign.density.training.learned import load_flow, remeasured, seconds_at
 from lidardesign.density.training.quality import draw_probes
 from lidardesign.density.training.trainer import Trainer
 from lidardesign.errors import DataError, NumericalError
@@ -23,8 +23,8 @@ from lidardesign.run.manifest import start_manifest
 from lidardesign.scoring.accuracy import sweeps as accuracy
 from lidardesign.scoring.accuracy import training
 from lidardesign.scoring.accuracy.probes import AccuracyRequest
-from lidardesign.scoring.accuracy.settings import Accuracy
 from lidardesign.scoring.evaluation.request import EvaluationRequest
+from lidardesign.scoring.sweep import Accuracy
 from lidardesign.task import random_generator, scenes_of
 
 SMALL = (

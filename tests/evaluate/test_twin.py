@@ -4,11 +4,11 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from lidardesign.layouts.rays import lay_out
 from support.tables import each_row
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
-from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.fit import fit, rays_at
 from lidardesign.samples import Samples
 from lidardesign.scoring.baselines.candidates import mean_mbps

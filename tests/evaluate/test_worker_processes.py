@@ -12,13 +12,13 @@ from dataclasses import replace
 from multiprocessing.context import SpawnProcess
 
 import pytest
+from lidardesign.scoring.evaluation.workers import scorer_of
 from support.command_line import make_run, program
 from support.workers import make_request, results, without_times
 
 from lidardesign.errors import ConfigError, NumericalError, PluginError
 from lidardesign.registry import load_task
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.evaluation.workers import scorer_of
 
 
 def test_processes_score_as_this_one_does_and_end():

@@ -9,6 +9,7 @@ from multiprocessing.reduction import ForkingPickler
 from types import MappingProxyType
 
 import pytest
+from lidardesign.scoring.evaluation.workers import check_workers, scorer_of
 from lidardesign_tasks.flatland import FlatlandTask
 from support.scoring import MissTask
 from support.tables import each_row
@@ -18,7 +19,6 @@ from lidardesign import errors
 from lidardesign.errors import ConfigError, LidardesignError, PluginError
 from lidardesign.scoring.evaluation import workers
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.evaluation.workers import check_workers, scorer_of
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner
 from lidardesign.task import Score

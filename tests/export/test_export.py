@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from support.tables import each_row
 
 from lidardesign.errors import DataError
-from lidardesign.formats.galvo import read_galvo
-from lidardesign.formats.galvo_angles import SPEED_OF_LIGHT_M_PER_PS
+from lidardesign.formats.designs import load_design
+from lidardesign.formats.galvo import SPEED_OF_LIGHT_M_PER_PS, read_galvo
 from lidardesign.formats.mounts import angles_between
 from lidardesign.formats.registry import EXPORTERS
-from lidardesign.layouts.rays import lay_out
-from lidardesign.formats.designs import load_design
 from lidardesign.sensors.sensor import DesignSpec, Sensor
 
 

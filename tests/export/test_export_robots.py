@@ -10,19 +10,19 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from support.rigs import NASTY, even, farthest_nearest, read_sdf, rig, sdf_reader, spinning
 from support.tables import each_row
 
 from lidardesign.api.export import DesignSource, ExportRequest
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.formats.designs import load_design
 from lidardesign.formats.mounts import mounts, quaternion
 from lidardesign.formats.names import identifier
 from lidardesign.formats.registry import EXPORTERS
-from lidardesign.layouts.rays import lay_out
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.mujoco_models import RobotFile, bodies_from_mujoco, load_model
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
-from lidardesign.formats.designs import load_design
 from lidardesign.sensors.sensor import DesignSpec
 
 ROBOTS = ("mjcf", "sdf", "urdf", "xacro", "carla", "isaac-usd")

@@ -17,9 +17,8 @@ from lidardesign.formats.names import (
     renamed_note,
     xml_text,
 )
+from lidardesign.scenes.rays import Rays, rotation_of_quaternion
 from lidardesign.sensors.even import grid_tangent
-from lidardesign.scenes.rays import Rays
-from lidardesign.scenes.receivers import rotation_of_quaternion
 from lidardesign.sensors.sensor import DesignSpec, tangent_directions
 from lidardesign.space import angles, direction
 

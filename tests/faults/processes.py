@@ -19,9 +19,9 @@ from pathlib import Path
 # What learn, fit and evaluate import late; nothing of it may be run here, because threads do not survive a fork.
 LATE = (
     "lidardesign.cli.main", "lidardesign.fitting.run_samples", "lidardesign.density.fields.body_kernels",
-    "lidardesign.density.fields.body_kernels", "lidardesign.density.fields.table_kernels", "lidardesign.density.learn",
-    "lidardesign.density.flow.spline_kernels", "lidardesign.mixture.support", "lidardesign.mixture.fit",
-    "lidardesign.scoring.scenes.metrics", "lidardesign.report.page", "lidardesign.scoring.evaluation.score",
+    "lidardesign.density.fields.body_kernels", "lidardesign.density.fields.table_kernels", "lidardesign.density.training.learn",
+    "lidardesign.density.spline_kernels", "lidardesign.mixture.support", "lidardesign.mixture.fit",
+    "lidardesign.scoring.metrics", "lidardesign.report.page", "lidardesign.scoring.evaluation.score",
     "lidardesign.scoring.evaluation.results", "lidardesign.scoring.evaluation.workers", "lidardesign_tasks.flatland", "plotly.io",
     "rich.table", "torch._dynamo",
 )  # fmt: skip
@@ -44,7 +44,7 @@ class Ended:
 
 def import_all() -> None:
     """Import what commands import, so that forks begin with it."""
-    from lidardesign.cli.terminal.environment import set_thread_defaults
+    from lidardesign.cli.terminal.output import set_thread_defaults
 
     set_thread_defaults()
     for name in LATE:

@@ -11,9 +11,9 @@ from pathlib import Path
 from faults.processes import forked, fresh
 from lidardesign.density.training.checkpoint import load_arrays
 from lidardesign.errors import LidardesignError
+from lidardesign.formats.designs import load_design
 from lidardesign.run.manifest import read_manifest, verify
 from lidardesign.samples import load_samples
-from lidardesign.formats.designs import load_design
 
 SETTINGS = (
     "learning.steps=160", "learning.batch=64", "learning.layers=1", "learning.hidden=12", "learning.samples=1000",

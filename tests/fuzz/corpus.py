@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import trimesh
 import yaml
+from lidardesign.layouts.rays import lay_out
 from scipy.io import savemat
 from support.captures import BIN_PS, BINS, make_capture
 from support.command_line import make_run
@@ -19,7 +20,6 @@ from support.command_line import make_run
 from lidardesign.config import resolve
 from lidardesign.formats.galvo import write_galvo
 from lidardesign.formats.ray_lists import QUERY_COLUMN, write_sensor_csv
-from lidardesign.layouts.rays import lay_out
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, read_manifest
 from lidardesign.run.yaml import dump_yaml

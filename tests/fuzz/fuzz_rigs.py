@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from lidardesign.layouts.rays import lay_out
 from support.command_line import files_under, make_run
 
 from fuzz import corpus
@@ -20,7 +21,6 @@ from fuzz.containers import mutate_npz
 from fuzz.fuzz_runs import rerecord
 from fuzz.mutators import Mutator, mutate_bytes, mutate_json, mutate_text, mutate_yaml
 from lidardesign.formats.registry import EXPORTERS
-from lidardesign.layouts.rays import lay_out
 from lidardesign.parts.catalogue import FOLDER as PARTS
 from lidardesign.sensors.design_file import save_design
 

@@ -75,7 +75,7 @@ def _read_samples(run: Path) -> object:
 
 def _read_progress(run: Path) -> object:
     """As `evaluate --accuracy` does."""
-    from lidardesign.density.learned import seconds_at
+    from lidardesign.density.training.learned import seconds_at
 
     return seconds_at(run)
 
@@ -96,8 +96,8 @@ def _trainer(run: Path) -> object:
     """A trainer at its first step, with a small flow and nothing to train on."""
     import torch
 
-    from lidardesign.density.flow.coordinates import Coordinates
-    from lidardesign.density.learn import make_flow
+    from lidardesign.density.coordinates import Coordinates
+    from lidardesign.density.training.learn import make_flow
     from lidardesign.density.training.trainer import Trainer
 
     config = small_config()

@@ -95,6 +95,7 @@ def read_constraints(path: Path) -> object:
 def read_design(path: Path) -> object:
     """As `show` and `export` do: what was read can be written and read again, and its rays are rays."""
     from lidardesign.layouts.rays import lay_out
+
     from lidardesign.run.yaml import dump_yaml, parse_yaml
     from lidardesign.sensors.design_file import design_document, design_from_document, load_design
 

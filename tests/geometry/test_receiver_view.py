@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.tables import each_row
 
-from lidardesign.scenes.receivers import angles_in_view, in_view, receiver_axes
+from lidardesign.scenes.rays import angles_in_view, in_view, receiver_axes
 from lidardesign.scenes.scene import Receiver
 from lidardesign.space import direction
 

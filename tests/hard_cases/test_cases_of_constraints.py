@@ -25,14 +25,13 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.errors import InfeasibleError
 from lidardesign.mixture.bounds import Bounds
-from lidardesign.mixture.components import log_density
+from lidardesign.mixture.components import Axes, Features, log_density
 from lidardesign.mixture.em import fit_mixture
 from lidardesign.mixture.ensemble import admitted_mixture
-from lidardesign.mixture.features import Axes, Features
 from lidardesign.mixture.fit import fit
 from lidardesign.mixture.support import LEAST_MASS
 from lidardesign.samples import Samples
-from lidardesign.scoring.scenes.metrics import DRAW_ROUNDS
+from lidardesign.scoring.metrics import DRAW_ROUNDS
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design_file import design_document, design_from_document
 from lidardesign.sensors.sensor import interval_factor
@@ -292,7 +291,7 @@ class TestAlmostNothingLeft:
     def test_surfaces_that_hardly_any_ray_sees_are_drawn_a_bounded_number_of_times(self, monkeypatch):
         from lidardesign.errors import DataError
         from lidardesign.scenes.scene import Body, Scene, Sphere
-        from lidardesign.scoring.scenes import metrics
+        from lidardesign.scoring import metrics
 
         draws = []
         exact = metrics.sample_body

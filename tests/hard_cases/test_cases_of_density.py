@@ -12,6 +12,7 @@ import torch
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from lidardesign.layouts.rays import lay_out
 from scipy.spatial.transform import Rotation
 from support import references
 from support.designs import from_the_ceiling
@@ -29,18 +30,17 @@ from lidardesign.config import (
     RunConfig,
     resolve,
 )
+from lidardesign.density.coordinates import Coordinates
 from lidardesign.density.fields.distance import build_field
-from lidardesign.density.flow.coordinates import Coordinates
-from lidardesign.density.flow.network import DesignFlow
-from lidardesign.density.learn import learn
+from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.prepare import ROUNDINGS, UNRESOLVED_SHARE, prepare_target
 from lidardesign.density.objective.quadrature import Quadrature
 from lidardesign.density.objective.surfaces import MovingFrames
 from lidardesign.density.objective.target import build_target
 from lidardesign.density.objective.visibility import MINIMUM_COSINE, Optics, RayBatch, Raycast
+from lidardesign.density.training.learn import learn
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.errors import ConfigError
-from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.fit import fit
 from lidardesign.registry import load_task
 from lidardesign.samples import Samples, load_samples

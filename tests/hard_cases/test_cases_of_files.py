@@ -19,10 +19,10 @@ from lidardesign.density.training.checkpoint import FORMAT, load_arrays, save_ar
 from lidardesign.density.training.trainer import CHECKPOINT
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.fitting.request import load_constraints
+from lidardesign.formats.designs import load_design
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import parse_yaml
-from lidardesign.formats.designs import load_design
 from lidardesign.simulate.detector.files import load_detector
 
 BOMB_LEVELS = 7
@@ -254,8 +254,8 @@ def fresh_trainer(run, hidden):
     """A trainer of a small flow at its first step, with nothing to train on."""
     import torch
 
-    from lidardesign.density.flow.coordinates import Coordinates
-    from lidardesign.density.learn import make_flow
+    from lidardesign.density.coordinates import Coordinates
+    from lidardesign.density.training.learn import make_flow
     from lidardesign.density.training.trainer import Trainer
 
     small = [f"learning.hidden={hidden}", "learning.layers=1", "learning.bins=4"]

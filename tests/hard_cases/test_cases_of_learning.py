@@ -20,12 +20,12 @@ from support.tables import each_row
 
 from lidardesign.cli.main import run as run_program
 from lidardesign.config import DensitySettings
-from lidardesign.density.flow.splines import BoundedSpline
-from lidardesign.density.learn import learn, make_trainer, prepare_training_data
+from lidardesign.density.network import BoundedSpline
 from lidardesign.density.objective.target import Target
 from lidardesign.density.training import quality as measure
 from lidardesign.density.training import trainer as training
 from lidardesign.density.training.checkpoint import load_arrays
+from lidardesign.density.training.learn import learn, make_trainer, prepare_training_data
 from lidardesign.density.training.losses import TOLERANCE_NATS, round_trip_nats
 from lidardesign.errors import DivergenceError
 from lidardesign.samples import load_samples

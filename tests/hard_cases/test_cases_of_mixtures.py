@@ -14,9 +14,8 @@ from support.mixtures import POINT, WHOLE, Z, drawn, features_of, random_mixture
 from support.tables import each_row
 
 from lidardesign.mixture.bounds import Bounds, Floors
-from lidardesign.mixture.components import Mixture, expect, log_density, responsibilities
+from lidardesign.mixture.components import Axes, Features, Mixture, expect, log_density, responsibilities
 from lidardesign.mixture.em import fit_mixture, run_em
-from lidardesign.mixture.features import Axes, Features
 from lidardesign.mixture.fit import fit
 from lidardesign.samples import Samples
 from lidardesign.sensors.design_file import design_document

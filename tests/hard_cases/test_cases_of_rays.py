@@ -20,7 +20,7 @@ from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.scenes.triangles import BESIDE_SHARE, SecondCasts, Triangles
 from lidardesign.scoring.evaluation.score import slipped_notes
-from lidardesign.scoring.scenes.scene_scores import score_in_scene
+from lidardesign.scoring.scene_scores import score_in_scene
 from lidardesign.sensors.design_file import design_from_document
 from lidardesign.simulate.plan import Planner
 from lidardesign.task import Metric, Score

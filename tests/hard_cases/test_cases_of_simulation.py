@@ -21,22 +21,21 @@ from support.heads import EVERYTHING, face_rays, heads
 from support.scoring import design, make_request, rows_by_key
 from support.tables import each_row
 
-from lidardesign.density.learn import refuse_blind_receiver
+from lidardesign.density.training.learn import refuse_blind_receiver
 from lidardesign.errors import DataError
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.rays import Outcome, Rays
-from lidardesign.scenes.receivers import path_of_range, path_windows, range_of_path
+from lidardesign.scenes.rays import Outcome, Rays, path_of_range, path_windows, range_of_path
 from lidardesign.scenes.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.scenes.surface import sample_triangles
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.scoring.scenes.metrics import (
+from lidardesign.scoring.metrics import (
     SurfaceCloud,
     chamfer_m,
     delaunay_surface,
     discrete_frechet_m,
     visible_surface,
 )
-from lidardesign.scoring.scenes.scene_scores import checked_score
+from lidardesign.scoring.scene_scores import checked_score
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import IDEAL, Detector, Physics
 from lidardesign.simulate.plan import Planner

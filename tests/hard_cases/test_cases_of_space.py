@@ -17,10 +17,10 @@ from support.tables import each_row
 from lidardesign.config import DensitySettings, resolve
 from lidardesign.density.objective.target import MINIMUM_POLE_COSINE, build_target
 from lidardesign.errors import ConfigError, DataError, NumericalError
+from lidardesign.formats.designs import load_design
 from lidardesign.formats.ray_lists import SENSOR_COLUMNS
 from lidardesign.registry import load_task
 from lidardesign.scenes.scene import Body, Plane, Scene, Sphere, rigid
-from lidardesign.formats.designs import load_design
 from lidardesign.space import (
     AZIMUTH,
     DIMENSIONS,

@@ -34,15 +34,15 @@ from lidardesign.density.training.checkpoint import load_arrays, save_arrays
 from lidardesign.density.training.quality import coverage, quality
 from lidardesign.errors import LidardesignError
 from lidardesign.fitting import fit as fit_design
+from lidardesign.mixture.em import lloyd
 from lidardesign.mixture.fit import fit
-from lidardesign.mixture.quantise import lloyd
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Scene, Sphere, rigid
-from lidardesign.scoring.scenes.scene_scores import checked_score
-from lidardesign.scoring.scenes.statistics import mean_interval
+from lidardesign.scoring.scene_scores import checked_score
+from lidardesign.scoring.statistics import mean_interval
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lidardesign.rays.curve import gap_among_more, price_curve
 from support.coverages import SUMS, small
 
 from lidardesign.rays.certificate import certify
 from lidardesign.rays.choice import RayCounts, choose, choose_within
 from lidardesign.rays.coverage import LARGEST
-from lidardesign.rays.curve import gap_among_more, price_curve
 
 seeds = st.integers(0, 10_000)
 TABLES = pytest.mark.parametrize("table", [LARGEST, SUMS], ids=["largest", "sums"])

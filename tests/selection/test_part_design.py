@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import certificates_of, lay_out
 from support.command_line import caller, make_run
 from support.tables import each_row
 
@@ -14,9 +15,8 @@ from lidardesign.api.run import open_run
 from lidardesign.constraints.check import check_design
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.fitting import part_design
-from lidardesign.fitting.part_bundle import COARSE_CELL_RAD, PartBundle, cells_of, part_table, parts_inform
 from lidardesign.fitting.part_sets import SetLimits, choose_set
-from lidardesign.layouts.rays import certificates_of, lay_out
+from lidardesign.fitting.part_shapes import COARSE_CELL_RAD, PartBundle, cells_of, part_table, parts_inform
 from lidardesign.parts.catalogue import find_part, part_rays
 from lidardesign.rays import information
 from lidardesign.samples import load_samples

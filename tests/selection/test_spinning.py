@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lidardesign.layouts.rays import certificates_of, lay_out
 from support.command_line import caller, make_run
 from support.coverages import SUMS, small
 
@@ -16,7 +17,6 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError
 from lidardesign.fitting import spinning
 from lidardesign.fitting.spinning import RingCandidates, chosen_rings, finer, places_of
-from lidardesign.layouts.rays import certificates_of, lay_out
 from lidardesign.numerics import FULL_TURN
 from lidardesign.rays.coverage import LARGEST
 from lidardesign.sensors.design_file import design_document, load_design, save_design

@@ -14,7 +14,7 @@ from support.rays import rays_along
 from support.tables import each_row
 
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.receivers import path_windows
+from lidardesign.scenes.rays import path_windows
 from lidardesign.scenes.scene import Body, Box, Medium, Receiver, Scene, rigid
 from lidardesign.simulate.detector.light import Background, Beams, direct_echoes
 from lidardesign.simulate.detector.physics import IDEAL, Detector, Photons

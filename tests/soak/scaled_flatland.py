@@ -13,7 +13,7 @@ from pydantic import Field
 
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Scene
-from lidardesign.scoring.scenes.metrics import chamfer_m
+from lidardesign.scoring.metrics import chamfer_m
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, Split
 

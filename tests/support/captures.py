@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.formats.galvo_angles import degree_frame, scan_directions
+from lidardesign.formats.galvo import degree_frame, scan_directions
 
 C_M_PER_PS = 299_792_458e-12
 BIN_PS = 20.0

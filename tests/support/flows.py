@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.network import DesignFlow
 
 # name -> (which dimensions lie on a circle, conditions): adding a flow to every law below is adding a line
 FLOWS = {

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 
 import torch
 
-import lidardesign.density.learn as density_learn
+import lidardesign.density.training.learn as density_learn
 from lidardesign.config import DensitySettings, LearningSettings, RunConfig
-from lidardesign.density import learn as learning
-from lidardesign.density.learn import prepare_training_data
+from lidardesign.density.training import learn as learning
 from lidardesign.density.training import trainer as training
+from lidardesign.density.training.learn import prepare_training_data
 from lidardesign.scenes.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig

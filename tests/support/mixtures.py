@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from lidardesign.mixture.components import Mixture
-from lidardesign.mixture.features import Axes, Features
+from lidardesign.mixture.components import Axes, Features, Mixture
 from lidardesign.sensors.sensor import interval_factor, tangent_directions
 from lidardesign.space import DesignSpace, angles
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidardesign.scenes.rays import Rays
-from lidardesign.scenes.receivers import receiver_axes
+from lidardesign.scenes.rays import Rays, receiver_axes
 from lidardesign.scenes.scene import Receiver
 from lidardesign.simulate.light_transport import transport as process
 from lidardesign.simulate.light_transport.transport import Lights, Transients

@@ -36,7 +36,7 @@ from lidardesign.rays.information import checked_information
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Returns
 from lidardesign.scenes.scene import Body, Mesh, Scene, Sphere, rigid
-from lidardesign.scoring.scenes.metrics import discrete_frechet_m
+from lidardesign.scoring.metrics import discrete_frechet_m
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import ELEVATION, aim
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
 from support.rays import rays_of_points
@@ -18,15 +19,13 @@ from lidardesign.config import DensitySettings
 from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import propose
 from lidardesign.density.objective.target import build_target
-from lidardesign.layouts.rays import lay_out
 from lidardesign.mixture.fit import fit
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.samples import Samples
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.rays import Outcome
-from lidardesign.scenes.receivers import in_view, path_of_range, range_of_path
+from lidardesign.scenes.rays import Outcome, in_view, path_of_range, range_of_path
 from lidardesign.scenes.scene import Body, Box, Receiver, Scene, Sphere, rigid
-from lidardesign.scoring.scenes.metrics import is_received, is_visible, trial_origins
+from lidardesign.scoring.metrics import is_received, is_visible, trial_origins
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.light import Beams, direct_echoes
 from lidardesign.simulate.detector.physics import EFFECTS, IDEAL, Physics

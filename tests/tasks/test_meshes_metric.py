@@ -12,7 +12,7 @@ from support.tables import each_row
 
 from lidardesign.errors import PluginError
 from lidardesign.scoring.baselines.candidates import rays_at
-from lidardesign.scoring.scenes.scene_scores import checked_score
+from lidardesign.scoring.scene_scores import checked_score
 from lidardesign.simulate.returns import simulate
 from lidardesign.task import Metric, metric_of
 

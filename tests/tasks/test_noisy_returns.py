@@ -24,7 +24,7 @@ from support.tables import each_row
 from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, rigid
 from lidardesign.scoring.baselines.candidates import rays_at
-from lidardesign.scoring.scenes.scene_scores import checked_score, score_lists
+from lidardesign.scoring.scene_scores import checked_score, score_lists
 from lidardesign.simulate.detector.physics import Detector, Physics
 from lidardesign.simulate.returns import build_casters, simulate
 from lidardesign.space import DIMENSIONS, RANGE, DesignSpace

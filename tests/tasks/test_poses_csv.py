@@ -23,7 +23,7 @@ from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.rays.information import checked_information
-from lidardesign.scenes.receivers import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.scenes.rays import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.scenes.scene import rigid
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import aim

@@ -14,7 +14,7 @@ from support.tables import each_row
 
 from lidardesign.contract import BrokenLawError, check_task, contract_of
 from lidardesign.contract.contract import LAWS
-from lidardesign.contract.fingerprint import fingerprint, geometry_fingerprint
+from lidardesign.contract.law import fingerprint, geometry_fingerprint
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import load_task
 from lidardesign.scenes.scene import Body, Medium, Mesh, Scene, Sphere

@@ -14,10 +14,10 @@ from support.tables import each_row
 import lidardesign as package
 from lidardesign.config import load_run_config, save_run_config, with_task_settings
 from lidardesign.errors import ConfigError
+from lidardesign.formats.designs import load_design
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.evaluation.thresholds import difference_text
 from lidardesign.sensors.compare import outside_space
-from lidardesign.formats.designs import load_design
 from lidardesign.space import DIMENSIONS, direction
 
 LAYOUTS = ("grid", "selected")

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import lay_out
 from support import references
 from support.command_line import caller
 
 from lidardesign.config import resolve, save_run_config
 from lidardesign.constraints.document import Constraints
-from lidardesign.layouts.rays import lay_out
+from lidardesign.formats.designs import load_design, save_design
 from lidardesign.mixture.fit import fit
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
@@ -20,7 +21,6 @@ from lidardesign.samples import Samples, save_samples
 from lidardesign.scenes.scene import Body, Capsule, Mesh, Scene, Sphere, rigid
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.formats.designs import load_design, save_design
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
 

@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 import pytest
+from lidardesign.layouts.rays import certificates_of, gates_of, lay_out
 from support.command_line import caller, make_run
 from support.tables import each_row
 
@@ -17,7 +18,6 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import samples_without_visibility
 from lidardesign.errors import ConfigError
 from lidardesign.fitting import select_rays
-from lidardesign.layouts.rays import certificates_of, gates_of, lay_out
 from lidardesign.run_folder import RunFolder
 from lidardesign.samples import save_samples
 from lidardesign.sensors.bandwidth import Bandwidth

@@ -7,19 +7,19 @@ import shutil
 import numpy as np
 import pytest
 import yaml
+from lidardesign.layouts.rays import lay_out
 from support.command_line import make_run
 
 from lidardesign import open_run
 from lidardesign.config import resolve, save_run_config
 from lidardesign.fitting.run_samples import RunTarget, Weighting, weighted_samples
-from lidardesign.layouts.rays import lay_out
+from lidardesign.formats.designs import load_design
 from lidardesign.mixture.fit import fit
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import Samples, load_samples, save_samples
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.scenes.scene_scores import checked_score
-from lidardesign.formats.designs import load_design
+from lidardesign.scoring.scene_scores import checked_score
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import RANGE, direction
 from lidardesign.task import scenes_of

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli.tables.grids import RichConsole, number, print_table
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.completion import words
-from lidardesign.cli.terminal.output import Output, command, keep_times
-from lidardesign.cli.terminal.output_files import claim_outputs
+from lidardesign.cli.terminal.grids import RichConsole, number, print_table
+from lidardesign.cli.terminal.output import Output, claim_outputs, command, keep_times
 from lidardesign.errors import ConfigError, DataError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs

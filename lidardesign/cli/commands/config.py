@@ -10,8 +10,7 @@ import typer
 
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.completion import tasks, words
-from lidardesign.cli.terminal.output import Output, command
-from lidardesign.cli.terminal.output_files import announce
+from lidardesign.cli.terminal.output import Output, announce, command
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_writable

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lidardesign.cli.tables.grids import RichConsole
-from lidardesign.cli.tables.scores import show_accuracy, show_evaluation
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.completion import detectors, words
-from lidardesign.cli.terminal.output import Output, command, keep_times
-from lidardesign.cli.terminal.output_files import claim_outputs
+from lidardesign.cli.terminal.grids import RichConsole
+from lidardesign.cli.terminal.output import Output, claim_outputs, command, keep_times
+from lidardesign.cli.terminal.score_tables import show_accuracy, show_evaluation
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs
 

@@ -8,11 +8,10 @@ from typing import Annotated
 
 import typer
 
-from lidardesign.cli.tables.grids import RichConsole, text_table
 from lidardesign.cli.terminal import options
 from lidardesign.cli.terminal.completion import formats
-from lidardesign.cli.terminal.output import Output, command, keep_times
-from lidardesign.cli.terminal.output_files import announce, written_file
+from lidardesign.cli.terminal.grids import RichConsole, text_table
+from lidardesign.cli.terminal.output import Output, announce, command, keep_times, written_file
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 from lidardesign.run.outputs import check_outputs

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli.tables.designs import show_constraints, show_design
-from lidardesign.cli.tables.grids import RichConsole, difference_cell, duration, number, print_table, value_cells
 from lidardesign.cli.terminal import options
+from lidardesign.cli.terminal.design_tables import show_constraints, show_design
+from lidardesign.cli.terminal.grids import RichConsole, difference_cell, duration, number, print_table, value_cells
 from lidardesign.cli.terminal.output import Output, command
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.run.clock import phase

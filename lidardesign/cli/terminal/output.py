@@ -1,4 +1,9 @@
-"""Output of commands: one JSON document or text for people, messages, exit codes."""
+"""Output of commands: one JSON document or text for people, messages, exit codes.
+
+What the process needs before anything heavy is imported: threads, streams and signals.
+
+Files that a command will write: pages, devices, and folders that are not there yet.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +12,25 @@ import errno
 import json
 import math
 import os
+import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from lidardesign.cli.tables.grids import duration
-from lidardesign.cli.tables.scores import show_times
-from lidardesign.cli.terminal.environment import TerminatedError
+from lidardesign.cli.terminal.grids import duration
 from lidardesign.cli.terminal.progress import ProgressDisplay
+from lidardesign.cli.terminal.score_tables import show_times
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
+from lidardesign.run.files import write_atomic
+from lidardesign.run.outputs import check_outputs
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -334,3 +342,113 @@ def keep_times(
     except (ConfigError, DataError, OSError) as error:
         message = error.message if isinstance(error, ConfigError | DataError) else error.strerror or error
         output.note(f"note: the times of {name} are not kept in {run}: {message}")
+
+
+# One thread each: two thread pools that spin on shared cores make each other 8 to 40 times slower. These must
+# be set before torch and numpy are imported; whoever sets one of them in the environment keeps it.
+THREAD_DEFAULTS = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "PASSIVE",
+}
+
+
+class TerminatedError(KeyboardInterrupt):
+    """SIGTERM, treated like an interruption where things are tidied up."""
+
+
+def set_thread_defaults() -> None:
+    """One thread per numerical library unless the user chose otherwise."""
+    for name, value in THREAD_DEFAULTS.items():
+        os.environ.setdefault(name, value)
+
+
+def make_streams_tolerant() -> None:
+    """Escape characters that the terminal lacks; a stream that was closed swallows its output."""
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:  # closed: else the next file that is opened takes its place, and what is printed there
+            os.open(os.devnull, os.O_RDWR)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - lives as long as the process
+        with contextlib.suppress(AttributeError, ValueError):
+            getattr(sys, name).reconfigure(errors="backslashreplace")
+
+
+def terminate_cleanly() -> None:
+    """Let SIGTERM end the program as Ctrl-C does, so that checkpoints and locks are tidied up."""
+
+    def interrupt(*_: Any) -> None:
+        raise TerminatedError
+
+    with contextlib.suppress(ValueError):
+        signal.signal(signal.SIGTERM, interrupt)
+
+
+PAGE_SUFFIXES = (".html", ".htm")
+
+
+@contextlib.contextmanager
+def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
+    """The file to write for a path: for a pipe or a device one that is copied there when it is whole.
+
+    Raises:
+        DataError: It is a folder, or cannot be written.
+    """
+    if path.is_file() or path.is_dir() or not path.exists():
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
+        staged = Path(folder) / f"file{suffix}"
+        yield staged
+        if staged.is_dir():
+            raise DataError(
+                "is not a folder, and this is a folder of files", where=str(path), hint="give a folder's name"
+            )
+        write_atomic(path, staged.read_bytes())
+
+
+def claim_outputs(output: Output, *, csv: Path | None = None, report: Path | None = None) -> None:
+    """Claim what a command will write: a page for the report, and places that can be written.
+
+    Raises:
+        ConfigError: As of `check_outputs`, or a report whose name says that it is no page.
+        DataError: As of `check_outputs`.
+    """
+    check_outputs({"--csv": csv, "--report": report})
+    # pipes and devices have any name
+    is_page = report is not None and (report.is_file() or not report.exists())
+    if is_page and report.suffix.lower() not in ("", *PAGE_SUFFIXES):
+        raise ConfigError(
+            f"{report.name} is not a name of an HTML page",
+            where="--report",
+            allowed=", ".join(PAGE_SUFFIXES),
+            hint=f"--report {quote(str(report.with_suffix('.html')))}; a browser prints it as PDF",
+        )
+    announce([path for path in (csv, report) if path is not None], output)
+
+
+def announce(paths: Sequence[Path], output: Output) -> None:
+    """Say which folders are made for files, so that a misspelt one is seen; each once, by its topmost new part.
+
+    Where one of the files is standard output, people read everything else on standard error.
+    """
+    if not output.json and any(map(_is_stdout, paths)):
+        output.stream = sys.stderr
+    new: dict[Path, Path] = {}
+    for path in paths:
+        missing = [parent for parent in path.parents if not parent.exists()]
+        if missing:
+            new.setdefault(missing[-1], path)
+    for folder, path in new.items():
+        output.note(f"note: the folder {folder} does not exist yet; it is created for {path}")
+
+
+def _is_stdout(path: Path) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(STDOUT))
+    except OSError:
+        return False

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Self
 
-from lidardesign.cli.tables.grids import duration
+from lidardesign.cli.terminal.grids import duration
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -15,8 +15,8 @@ import numpy as np
 
 from lidardesign.density.fields.grids import Grid, cached_distance_grids, grid_around
 from lidardesign.numerics import EPSILON
-from lidardesign.scenes.primitives import GRID, KINDS, PLANE, SIZES, SPHERE, half_extents_m
 from lidardesign.scenes.scene import Body, Mesh, Scene, inverse_rigid
+from lidardesign.scenes.surface import GRID, KINDS, PLANE, SIZES, SPHERE, half_extents_m
 
 # Frames of one motion are close together: so many of them are looked at, or passed over, at once.
 GROUP_COLUMNS = 16

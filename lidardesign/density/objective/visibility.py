@@ -32,7 +32,7 @@ from lidardesign.density.fields.bodies import Bodies, Pairs
 from lidardesign.density.fields.distance import scene_columns
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.casting import shared_caster, trace_each
-from lidardesign.scenes.receivers import receiver_axes
+from lidardesign.scenes.rays import receiver_axes
 from lidardesign.scenes.scene import Receiver, Scene
 from lidardesign.scenes.triangles import mesh_caster
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction

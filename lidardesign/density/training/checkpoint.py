@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from lidardesign.config import LearningSettings
-from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.network import DesignFlow
 from lidardesign.errors import DataError
 from lidardesign.run.files import remove_stray_temporaries
 from lidardesign.run.inputs import STATE, check_file, parse_json

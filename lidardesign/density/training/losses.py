@@ -27,8 +27,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidardesign.density.flow.coordinates import Coordinates, log_target, log_target_values
-from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.coordinates import Coordinates, log_target, log_target_values
+from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.target import Target
 from lidardesign.density.training.sampling import log_prob_of_unit
 from lidardesign.numerics import effective_sample_size, logsumexp, normalised_weights

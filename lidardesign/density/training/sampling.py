@@ -25,8 +25,8 @@ import numpy as np
 import torch
 from scipy.optimize import brentq
 
-from lidardesign.density.flow.coordinates import Coordinates
-from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.coordinates import Coordinates
+from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.target import Target
 from lidardesign.numerics import logsumexp
 from lidardesign.samples import Samples

@@ -13,14 +13,14 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.registry import plugin_guard
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.receivers import path_windows
+from lidardesign.scenes.rays import path_windows
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.accuracy.probes import AccuracyRequest
-from lidardesign.scoring.accuracy.settings import Measurement, Sweep, timed, with_memory
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Row
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_lists
-from lidardesign.scoring.scenes.statistics import mean_interval
+from lidardesign.scoring.scene_scores import RaysPerCondition, score_lists
+from lidardesign.scoring.statistics import mean_interval
+from lidardesign.scoring.sweep import Measurement, Sweep, timed, with_memory
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import EFFECTS, Detector, Physics, check_windows

@@ -33,7 +33,7 @@ from lidardesign.scoring.accuracy.probes import (
     draw_probes,
     few_columns,
 )
-from lidardesign.scoring.accuracy.settings import Measurement, Sweep
+from lidardesign.scoring.sweep import Measurement, Sweep
 from lidardesign.space import DesignSpace
 
 

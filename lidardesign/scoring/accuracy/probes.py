@@ -17,9 +17,9 @@ from lidardesign.density.objective.target import Target
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.run.manifest import read_manifest
 from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.accuracy.settings import Measurement, Sweep
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.results import Evaluation
+from lidardesign.scoring.sweep import Measurement, Sweep
 from lidardesign.task import random_generator
 
 # Each of a density's choices may misplace a fiftieth of its mass: half of what the best learned flows miss it by.

@@ -7,7 +7,7 @@ import time
 from lidardesign.run.clock import Progress, phase
 from lidardesign.scoring.accuracy import evaluation, fields, training, visibility
 from lidardesign.scoring.accuracy.probes import AccuracyRequest
-from lidardesign.scoring.accuracy.settings import Accuracy, Sweep
+from lidardesign.scoring.sweep import Accuracy, Sweep
 
 # In the order of the pipeline: the phase, its name for progress, and what gives the sweeps, none where the choice does
 # not arise.

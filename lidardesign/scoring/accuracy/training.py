@@ -8,8 +8,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lidardesign.density.learn import FLOW
-from lidardesign.density.learned import (
+from lidardesign.density.training.learn import FLOW
+from lidardesign.density.training.learned import (
     DTYPES,
     LearningSteps,
     Loss,
@@ -23,7 +23,7 @@ from lidardesign.density.learned import (
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import draw_probes as draw_independent_probes
 from lidardesign.scoring.accuracy.probes import AccuracyRequest, density_sweep, draw_probes
-from lidardesign.scoring.accuracy.settings import Measurement, Sweep, timed
+from lidardesign.scoring.sweep import Measurement, Sweep, timed
 from lidardesign.task import random_generator
 
 # A misplaced share of a tenth is then known to 5 %.

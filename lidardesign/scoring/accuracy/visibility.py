@@ -31,7 +31,7 @@ from lidardesign.scoring.accuracy.probes import (
     draw_probes,
     few_columns,
 )
-from lidardesign.scoring.accuracy.settings import Measurement, Sweep, timed
+from lidardesign.scoring.sweep import Measurement, Sweep, timed
 from lidardesign.space import DesignSpace
 
 # log T of hidden points: far below anything that counts, and finite

@@ -15,7 +15,7 @@ import numpy as np
 
 from lidardesign.numerics import EPSILON
 from lidardesign.scenes.rays import Rays, fire_times
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
+from lidardesign.scoring.scene_scores import RaysPerCondition
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction

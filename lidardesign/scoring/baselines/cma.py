@@ -21,13 +21,13 @@ from lidardesign.constraints.feasibility import BandwidthBudget
 from lidardesign.constraints.origins import mounts_of
 from lidardesign.errors import BackgroundNote
 from lidardesign.mixture.bounds import bounds_of
-from lidardesign.mixture.features import Axes
+from lidardesign.mixture.components import Axes
 from lidardesign.numerics import SLACK, TINY, sphere_exp, sphere_log, wrap_angle
 from lidardesign.rays.gates import admitted_gates
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.baselines.views import OutOfTimeError, TrainingObjective
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
+from lidardesign.scoring.scene_scores import RaysPerCondition
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import boresight_frame, interval_factor

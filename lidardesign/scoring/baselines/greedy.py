@@ -23,21 +23,19 @@ import numpy as np
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, fire_times
-from lidardesign.scoring.baselines.bounding import Crop, crop_kinds
 from lidardesign.scoring.baselines.candidates import rays_at, rays_within, whole_range
-from lidardesign.scoring.baselines.even import even_placement
+from lidardesign.scoring.baselines.even import Crop, crop_kinds, even_placement
 from lidardesign.scoring.baselines.silhouette import LEAST_SHARE, lattice_rays, survey
 from lidardesign.scoring.baselines.views import RAY_AXES, TrainingViews
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
+from lidardesign.scoring.scene_scores import RaysPerCondition
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.space import AZIMUTH, DesignSpace
 from lidardesign.task import Task
 
 if TYPE_CHECKING:
     from lidardesign.rays.coverage import Coverage
-    from lidardesign.rays.informed import InformedScene
     from lidardesign.rays.selection import Selection
-    from lidardesign.rays.training import TrainingScenes
+    from lidardesign.rays.training import InformedScene, TrainingScenes
 
 GREEDY = "greedy"
 USUAL_SCENES = 200  # that rays are chosen on where no design says on how many it was

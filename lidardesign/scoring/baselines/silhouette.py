@@ -25,9 +25,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.numerics import TINY, unit_vectors
-from lidardesign.scoring.baselines.bounding import box_crop
 from lidardesign.scoring.baselines.candidates import GatedLayout, LayoutSite
-from lidardesign.scoring.baselines.even import SIXTH, SphereField, even_placement, widened_angles
+from lidardesign.scoring.baselines.even import SIXTH, SphereField, box_crop, even_placement, widened_angles
 from lidardesign.scoring.baselines.views import RAY_AXES, ReturnTable, TrainingViews, dense_rays
 from lidardesign.sensors.even import low_discrepancy
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction

@@ -7,40 +7,52 @@ more candidate layouts; where there are several, the best on training scenes is 
   join the layout: two free axes in all give a grid, more a low-discrepancy set.
 - `random`: rays uniform in the measure of the design space, with the whole range as their gate, drawn anew for
   every scene.
-- `bounding`: one even layout over where the training returns are, see `lidardesign.scoring.baselines.bounding`.
+- `bounding`: one even layout over where the training returns are, see `lidardesign.scoring.baselines.even`.
 - `silhouette` and `lloyd`: rays and gates by what training scenes return, see
   `lidardesign.scoring.baselines.silhouette`.
 - `greedy`: rays chosen on training scenes without a density, see `lidardesign.scoring.baselines.greedy`.
-- `occupancy`: see `lidardesign.scoring.baselines.occupancy`.
+- `occupancy`: see `lidardesign.scoring.baselines.simple`.
 - `no-visibility`: the first design fitted anew to the density without its occlusion term; the number of sensors, the
   layout, the constraints, the level and the seed stay. It is not weighted, even where the design is.
 - `cma`: see `lidardesign.scoring.baselines.cma`.
 
 Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
+
+The baseline `occupancy`: rays towards the cells of a grid that targets occupy, by how often they do.
+
+The grid's cells are cubes; a cell's probability is the share of training scenes and frames in which a target's
+surface lies in it. A ray starts at a uniform admissible origin and is aimed at a uniform point of a cell that is drawn
+by its probability, among all such pairs that the design space admits; nothing asks whether anything stands in
+between. The gate is the central 99 % of the distances to these points. Rays are drawn anew for every scene.
+
+Where an angle is fixed, no ray could be aimed at a given point. Uniform design points are weighted instead: by the
+probability of the cell that they end in, and by the volume that a ray's end sweeps there, which grows with the range
+where one angle is free and not at all where none is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.numerics import TINY
 from lidardesign.run.clock import phase
 from lidardesign.scenes.scene import Scene
-from lidardesign.scoring.baselines.bounding import bounding
-from lidardesign.scoring.baselines.candidates import BaselineLayout, Candidate, LayoutSite, whole_range
+from lidardesign.scenes.surface import sample_body
+from lidardesign.scoring.baselines.candidates import BaselineLayout, Candidate, LayoutSite, opened_gate, whole_range
 from lidardesign.scoring.baselines.cma import CMA
-from lidardesign.scoring.baselines.even import even_placement
+from lidardesign.scoring.baselines.even import bounding, central, even_placement
 from lidardesign.scoring.baselines.greedy import GREEDY, Fired
-from lidardesign.scoring.baselines.occupancy import occupancy
 from lidardesign.scoring.baselines.silhouette import lloyd, silhouette
-from lidardesign.scoring.baselines.views import RAY_AXES, TrainingViews
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
+from lidardesign.scoring.baselines.views import RAY_AXES, TrainingViews, spread_frames
+from lidardesign.scoring.scene_scores import RaysPerCondition
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.space import DesignSpace
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, observed_point
 from lidardesign.task import random_generator
 
 Judge = Callable[[Sequence[RaysPerCondition]], Sequence[float]]
@@ -267,3 +279,132 @@ class TwinCandidate:
             design = self._fit(count, limit_mbps)
             self._known[count, limit_mbps] = tuple(design.rays(count, at=at or None) for at in self._conditions)
         return self._known[count, limit_mbps]
+
+
+CELLS = 64  # along the longest side of the box round all surface points
+MOST_VIEWS = 4096  # scenes times frames that enter the grid, evenly spread where there are more
+SURFACE_POINTS = 400_000  # over all views, between these numbers in each
+FEWEST_POINTS, MOST_POINTS = 256, 4096
+BLOCK = 16_384  # draws at a time
+HOPELESS_BLOCKS = 32  # without one aimed point
+# Rays are drawn from so many times as many weighted points as there are rays, so that few are drawn twice.
+POINTS_PER_RAY = 16
+GATE_POINTS = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyGrid:
+    """How often targets' surfaces lie in the cells of a grid.
+
+    Arguments:
+        low_m: Its lower corner, shape (3,).
+        edge_m: The edge of its cubes.
+        probability: The share of scenes and frames in which a cell is occupied, shape (A, B, C).
+    """
+
+    low_m: np.ndarray
+    edge_m: float
+    probability: np.ndarray
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """The probability of the cells that points (N, 3) lie in, 0 outside the grid, shape (N,)."""
+        cell = np.floor((points - self.low_m) / self.edge_m)
+        inside = ((cell >= 0) & (cell < self.probability.shape)).all(axis=1)
+        found = np.zeros(len(points))
+        found[inside] = self.probability[tuple(cell[inside].astype(np.int64).T)]
+        return found
+
+    def draw(self, count: int, generator: np.random.Generator) -> np.ndarray:
+        """Points uniform in cells that are drawn by their probability, shape (count, 3)."""
+        share = self.probability.ravel() / self.probability.sum()
+        chosen = generator.choice(len(share), count, p=share)
+        cell = np.stack(np.unravel_index(chosen, self.probability.shape), axis=1)
+        return self.low_m + self.edge_m * (cell + generator.random((count, 3)))
+
+
+def occupancy_grid(scenes: Sequence[Scene], space: DesignSpace, seed: int) -> OccupancyGrid:
+    """The grid of all scenes and frames, from points sampled on the surfaces of the targets."""
+    views = spread_frames(scenes, MOST_VIEWS)
+    generator = random_generator(seed, "occupancy grid")
+    count = int(np.clip(SURFACE_POINTS // len(views), FEWEST_POINTS, MOST_POINTS))
+    targets = [[body for body in scene.bodies if body.is_target] for scene in scenes]
+    points = [sample_body(targets[scene], space, count, generator, frame).points for scene, frame in views]
+    everything = np.concatenate(points)
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    # one cell more than fits, so that the highest point has one too
+    edge = float((high - low).max()) / CELLS or 1.0
+    times = np.zeros(np.floor((high - low) / edge).astype(np.int64) + 1)
+    for view in points:
+        times[tuple(np.unique(np.floor((view - low) / edge).astype(np.int64), axis=0).T)] += 1
+    return OccupancyGrid(low, edge, times / len(views))
+
+
+class AimedPoints:
+    """Design points that end in occupied cells, with weights that make their ends uniform in volume.
+
+    Arguments:
+        grid: The cells.
+        space: The design space, or what is left of it at a condition value.
+        seed, number: Root of the draws, and which of the condition values it is.
+    """
+
+    def __init__(self, grid: OccupancyGrid, space: DesignSpace, seed: int, number: int) -> None:
+        self._free_angles = sum(axis in space.free for axis in (AZIMUTH, ELEVATION))
+        self._space = replace(space, measure="angles")
+        self._grid, self._seed, self._number = grid, seed, number
+        self._blocks: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def first(self, effective_samples: int) -> tuple[np.ndarray, np.ndarray]:
+        """The first points (N, 6) worth so many of equal weight, and their weights (N,); fewer where there are not.
+
+        How many were asked for before changes nothing.
+        """
+        chosen: list[tuple[np.ndarray, np.ndarray]] = []
+        total = squares = 0.0
+        while len(chosen) < 128 and total**2 < effective_samples * max(squares, TINY):
+            if len(chosen) == HOPELESS_BLOCKS and total == 0.0:
+                break
+            if len(chosen) == len(self._blocks):
+                self._blocks.append(self._block(len(chosen)))
+            chosen.append(self._blocks[len(chosen)])
+            total += float(chosen[-1][1].sum())
+            squares += float(np.square(chosen[-1][1]).sum())
+        points, weights = zip(*chosen, strict=True) if chosen else ([np.zeros((0, 6))], [np.zeros(0)])
+        return np.concatenate(points), np.concatenate(weights)
+
+    def _block(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        generator = random_generator(self._seed, "occupancy points", self._number, index)
+        points = self._space.sample(BLOCK, generator)
+        if self._free_angles == 2:
+            points = aim(points[:, :3], self._grid.draw(BLOCK, generator))
+            points = self._space.wrap(points[self._space.contains(points)])
+            return points, np.ones(len(points))
+        weights = self._grid.at(observed_point(points)) * points[:, RANGE] ** self._free_angles
+        aimed = weights > 0
+        return points[aimed], weights[aimed]
+
+
+def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> BaselineLayout | None:
+    """The layout; None where no admissible ray ends in an occupied cell.
+
+    At a condition value where none does, rays are uniform in what is left of the space.
+    """
+    if not train:
+        return None
+    grid = occupancy_grid(train, space, seed)
+    points, weights = AimedPoints(grid, space, seed, 0).first(GATE_POINTS)
+    if not len(points):
+        return None
+    drawn = random_generator(seed, "occupancy gate").choice(len(points), GATE_POINTS, p=weights / weights.sum())
+    nearest, furthest = central(points[drawn, RANGE])
+    known: dict[int, AimedPoints] = {}
+
+    def place(count: int, site: LayoutSite) -> np.ndarray:
+        aimed = known.setdefault(site.number, AimedPoints(grid, site.space, seed, 1 + site.number))
+        generator = random_generator(seed, "occupancy baseline", count, site.scene, site.number)
+        found, weights = aimed.first(POINTS_PER_RAY * count)
+        if not len(found):
+            return site.space.sample(count, generator)
+        return found[generator.choice(len(found), count, p=weights / weights.sum())]
+
+    return BaselineLayout("occupancy", place, opened_gate(float(nearest), float(furthest)), drawn_anew=True)

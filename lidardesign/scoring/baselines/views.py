@@ -13,7 +13,7 @@ from lidardesign.numerics import wrap_turn
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.candidates import opened_gate, whole_range
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_lists
+from lidardesign.scoring.scene_scores import RaysPerCondition, score_lists
 from lidardesign.sensors.even import low_discrepancy
 from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.plan import Planner

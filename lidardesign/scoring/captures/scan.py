@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.formats.galvo_angles import degree_frame, middle_boresight_deg, scan_angles_deg, scan_directions
+from lidardesign.formats.galvo import degree_frame, middle_boresight_deg, scan_angles_deg, scan_directions
 from lidardesign.numerics import EPSILON
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.baselines.even import even_unit

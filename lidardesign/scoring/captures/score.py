@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate, median_error, share_error
-from lidardesign.formats.galvo_angles import degree_frame, middle_boresight_deg
+from lidardesign.formats.galvo import degree_frame, middle_boresight_deg
 from lidardesign.numerics import circular_difference
 from lidardesign.run.files import write_atomic
 from lidardesign.scenes.mesh_files import load_mesh
@@ -36,7 +36,7 @@ from lidardesign.scoring.captures.scan import (
     uniform_rays,
     whole_window,
 )
-from lidardesign.scoring.scenes.metrics import (
+from lidardesign.scoring.metrics import (
     SurfaceCloud,
     delaunay_surface,
     ray_spacing,

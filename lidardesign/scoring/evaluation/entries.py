@@ -26,7 +26,7 @@ from lidardesign.scoring.baselines.greedy import GREEDY, USUAL_SCENES, Fired, Gr
 from lidardesign.scoring.baselines.simple import Baselines, Option, TwinCandidate
 from lidardesign.scoring.baselines.views import TrainingObjective, TrainingViews
 from lidardesign.scoring.evaluation.request import EvaluationRequest, fired_numbers, numbers_fired
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_scenes
+from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import conditions_of

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from lidardesign.errors import ConfigError
 from lidardesign.run.yaml import plain_number
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition
+from lidardesign.scoring.scene_scores import RaysPerCondition
 from lidardesign.task import random_generator
 
 OPTION = "--mount-error"

@@ -21,7 +21,7 @@ from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.cma import CmaSettings
 from lidardesign.scoring.baselines.simple import ALWAYS, BASELINES, check_baseline
 from lidardesign.scoring.evaluation.mounting import MountError
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, ScenePass
+from lidardesign.scoring.scene_scores import RaysPerCondition, ScenePass
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.plan import EffectPlan, Planner

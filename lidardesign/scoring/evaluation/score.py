@@ -29,8 +29,8 @@ from lidardesign.scoring.evaluation.entries import Entry, entries_of, strongest_
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
 from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
-from lidardesign.scoring.scenes.scene_scores import RaysPerCondition, score_scenes, silent_notes
-from lidardesign.scoring.scenes.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
+from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes, silent_notes
+from lidardesign.scoring.statistics import FEWEST_RESAMPLED, mean_interval, paired_difference
 from lidardesign.sensors.compare import outside_notes
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.simulate.plan import EffectPlan, Planner

@@ -18,7 +18,7 @@ import numpy as np
 from lidardesign.errors import NumericalError
 from lidardesign.scoring.evaluation.entries import mean_rival
 from lidardesign.scoring.evaluation.results import Evaluation, Mounting, Paired, Row
-from lidardesign.scoring.scenes.statistics import LEVEL, Interval, student_interval
+from lidardesign.scoring.statistics import LEVEL, Interval, student_interval
 
 # Design, rays, and what the bandwidth is matched to; rays at equal bandwidth differ between seeds.
 RowKey: TypeAlias = tuple[str, int | None, str | None, int | None]

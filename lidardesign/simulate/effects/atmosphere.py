@@ -26,8 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.numerics import safe_divide
-from lidardesign.scenes.rays import Hits, Rays
-from lidardesign.scenes.receivers import in_view, path_of_range, range_of_path
+from lidardesign.scenes.rays import Hits, Rays, in_view, path_of_range, range_of_path
 from lidardesign.scenes.scene import Medium, Receiver, Scene
 from lidardesign.simulate.detector.light import Background, Beams, Echoes
 from lidardesign.simulate.detector.physics import Detector, Photons

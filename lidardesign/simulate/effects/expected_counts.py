@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.numerics import COARSE_SLACK, EPSILON, SQUARABLE, TINY, safe_divide
-from lidardesign.scenes.receivers import range_of_path
+from lidardesign.scenes.rays import range_of_path
 from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.simulate.detector.light import spectral_irradiance
 from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, MOST_COUNTS, Detector, bin_width_m, metres

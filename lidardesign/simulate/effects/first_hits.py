@@ -10,8 +10,7 @@ import numpy as np
 
 from lidardesign.numerics import safe_divide
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.rays import Hits, Outcome, Rays, gate_outcomes
-from lidardesign.scenes.receivers import path_of_range, path_windows
+from lidardesign.scenes.rays import Hits, Outcome, Rays, gate_outcomes, path_of_range, path_windows
 from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.detector.light import Beams, direct_echoes
 from lidardesign.simulate.detector.physics import Detector, bins_start, ends_of_bins, metres, resolution_m

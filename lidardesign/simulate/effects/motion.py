@@ -25,9 +25,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidardesign.scenes.casting import Primitives, SceneCaster, shared_caster
-from lidardesign.scenes.primitives import BALL_SLACK, bounding_radius_m
 from lidardesign.scenes.rays import Hits, Rays
 from lidardesign.scenes.scene import Body, Mesh, Scene, Shape, inverse_rigid
+from lidardesign.scenes.surface import BALL_SLACK, bounding_radius_m
 from lidardesign.scenes.triangles import SecondCasts, mesh_caster
 from lidardesign.simulate.detector.light import Tracer
 from lidardesign.simulate.detector.physics import IDEAL, Detector

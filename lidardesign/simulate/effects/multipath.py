@@ -50,8 +50,7 @@ import numpy as np
 
 from lidardesign.numerics import EPSILON_FLOAT32, safe_divide
 from lidardesign.scenes.casting import shared_caster
-from lidardesign.scenes.rays import Hits, Rays
-from lidardesign.scenes.receivers import in_view, path_windows
+from lidardesign.scenes.rays import Hits, Rays, in_view, path_windows
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere
 from lidardesign.simulate.detector.light import Beams, Echoes, direct_echoes
 from lidardesign.simulate.detector.physics import Detector, Physics, resolution_m

@@ -16,8 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from lidardesign.numerics import COARSE_SLACK
-from lidardesign.scenes.rays import Hits, Rays
-from lidardesign.scenes.receivers import in_view
+from lidardesign.scenes.rays import Hits, Rays, in_view
 from lidardesign.scenes.scene import Mesh, Scene
 from lidardesign.simulate.detector.light import Beams, Echoes, Tracer
 from lidardesign.simulate.detector.physics import Detector

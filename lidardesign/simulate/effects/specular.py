@@ -23,8 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.scenes.rays import Hits, Rays
-from lidardesign.scenes.receivers import in_view
+from lidardesign.scenes.rays import Hits, Rays, in_view
 from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.detector.light import Beams, Echoes, Tracer, direct_echoes
 from lidardesign.simulate.detector.physics import Detector

@@ -29,8 +29,7 @@ import numpy as np
 
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.rays import Hits, Rays
-from lidardesign.scenes.receivers import in_view
+from lidardesign.scenes.rays import Hits, Rays, in_view
 from lidardesign.scenes.scene import Scene
 
 # Points whose view is measured, directions from each, and from what they meet: up to forty thousand rays.

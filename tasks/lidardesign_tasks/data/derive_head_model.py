@@ -42,9 +42,7 @@ class Source:
     def __init__(self, wheel: Path) -> None:
         self.archive = zipfile.ZipFile(wheel)
         text = self.archive.read(ROOT + "3dobjs/base.obj").decode()
-        self.vertices = np.array(
-            [line.split()[1:4] for line in text.splitlines() if line.startswith("v ")], float
-        )
+        self.vertices = np.array([line.split()[1:4] for line in text.splitlines() if line.startswith("v ")], float)
         self.faces = dict(self._groups(text))
         paths = [name for name in self.archive.namelist() if name.endswith(".target.gz")]
         self.paths = {name.rsplit("/", 1)[1].removesuffix(".target.gz"): name for name in paths}
@@ -54,19 +52,13 @@ class Source:
         """Triangles of every group, quads split in two."""
         for block in text.split("\ng ")[1:]:
             name, *lines = block.splitlines()
-            quads = [
-                [int(c.split("/")[0]) - 1 for c in line.split()[1:]]
-                for line in lines
-                if line.startswith("f ")
-            ]
+            quads = [[int(c.split("/")[0]) - 1 for c in line.split()[1:]] for line in lines if line.startswith("f ")]
             if quads:
                 yield name, np.array([[q[0], q[i], q[i + 1]] for q in quads for i in range(1, len(q) - 1)])
 
     def target(self, name: str) -> np.ndarray:
         """The displacement of all vertices by a target, shape (V, 3)."""
-        rows = np.array(gzip.decompress(self.archive.read(self.paths[name])).decode().split(), float).reshape(
-            -1, 4
-        )
+        rows = np.array(gzip.decompress(self.archive.read(self.paths[name])).decode().split(), float).reshape(-1, 4)
         displacement = np.zeros_like(self.vertices)
         displacement[rows[:, 0].astype(int)] = rows[:, 1:]
         return displacement
@@ -98,9 +90,7 @@ def random_faces(source: Source, kept: np.ndarray, generator: np.random.Generato
             body = source.target(f"universal-{gender}-{age}-averagemuscle-averageweight")[kept]
             faces += share * body
             for index, name in enumerate(ANCESTRIES):
-                faces += (
-                    share * ancestry[:, index, None, None] * source.target(f"{name}-{gender}-{age}")[kept]
-                )
+                faces += share * ancestry[:, index, None, None] * source.target(f"{name}-{gender}-{age}")[kept]
     for negative, positive in source.sliders():
         amount = np.clip(generator.normal(0, AMPLITUDE, FACES), -LARGEST_AMPLITUDE, LARGEST_AMPLITUDE)
         faces += np.maximum(amount, 0)[:, None, None] * positive[kept]
@@ -115,9 +105,7 @@ def head_triangles(source: Source) -> np.ndarray:
     return triangles[(source.vertices[:, 1] > lowest)[triangles].all(axis=1)]
 
 
-def visible_triangles(
-    vertices: np.ndarray, triangles: np.ndarray, generator: np.random.Generator
-) -> np.ndarray:
+def visible_triangles(vertices: np.ndarray, triangles: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Triangles that are seen from some direction: drops the mouth's inside and the eyes' sockets."""
     caster = SceneCaster(Scene((Body(Mesh(vertices, triangles, "unsigned")),)))
     corners = vertices[triangles]
@@ -156,9 +144,7 @@ def principal_components(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     return mean, basis, values
 
 
-def write_model(
-    path: Path, mean: np.ndarray, basis: np.ndarray, variance: np.ndarray, cells: np.ndarray
-) -> None:
+def write_model(path: Path, mean: np.ndarray, basis: np.ndarray, variance: np.ndarray, cells: np.ndarray) -> None:
     """The layout of the Basel Face Model, version 0.9 [mm]."""
     # rounded to less than 1 micrometre of the face per standard deviation, so that the file compresses
     basis = np.round(basis * 2**19) / 2**19
@@ -188,9 +174,7 @@ def main() -> None:
     mean, basis, variance = principal_components(faces)
     path = Path(__file__).with_name("head_model.h5")
     write_model(path, mean, basis, variance, cells.reshape(-1, 3))
-    print(
-        f"{path.name}: {len(kept)} vertices, {len(triangles)} triangles, {path.stat().st_size / 1e6:.2f} MB"
-    )
+    print(f"{path.name}: {len(kept)} vertices, {len(triangles)} triangles, {path.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

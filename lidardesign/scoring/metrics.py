@@ -17,7 +17,7 @@ import numpy as np
 from lidardesign.errors import DataError
 from lidardesign.numerics import SLACK
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scenes.receivers import in_view
+from lidardesign.scenes.rays import in_view
 from lidardesign.scenes.scene import Receiver, Scene
 from lidardesign.scenes.surface import sample_body, sample_triangles
 from lidardesign.space import RANGE, DesignSpace, aim

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from lidardesign.config import RunConfig
-from lidardesign.density.flow.coordinates import Coordinates, on_device, stays_on
-from lidardesign.density.flow.network import DesignFlow
+from lidardesign.density.coordinates import Coordinates, on_device, stays_on
+from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.prepare import prepare_target, training_scenes
 from lidardesign.density.objective.proposals import independent_points
 from lidardesign.density.objective.scale import scale_notes
@@ -32,14 +32,14 @@ from lidardesign.density.training.trainer import (
     Trainer,
     least_balancing_steps,
 )
-from lidardesign.density.verdict import Verdict
+from lidardesign.density.training.verdict import Verdict
 from lidardesign.errors import BackgroundNote, ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import peak_memory_bytes, phase, running
 from lidardesign.run.manifest import note, record
 from lidardesign.samples import save_samples
-from lidardesign.scenes.receivers import in_view
+from lidardesign.scenes.rays import in_view
 from lidardesign.scenes.scene import Scene
 from lidardesign.space import AZIMUTH, observed_point
 from lidardesign.task import Task, notes_of, random_generator

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.cli.tables.grids import RichConsole, number, print_table, text_table
+from lidardesign.cli.terminal.grids import RichConsole, number, print_table, text_table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -82,7 +82,7 @@ def _rays_of(design: DesignSpec) -> list[int | None]:
 
 
 def _show_along(design: DesignSpec, rich: RichConsole) -> None:
-    """Print rays that differ along a condition as a table: from where to where each looks and listens over its travel."""
+    """Print what rays that differ along a condition do over it: from where to where each looks and listens."""
     from numpy import degrees
 
     pattern, name = design.patterns[-1], design.condition

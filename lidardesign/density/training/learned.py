@@ -21,13 +21,13 @@ import numpy as np
 import torch
 
 from lidardesign.config import LearningSettings, RunConfig
-from lidardesign.density.flow.coordinates import Coordinates
-from lidardesign.density.flow.network import DesignFlow
-from lidardesign.density.learn import FLOW, make_flow, training_scenes
+from lidardesign.density.coordinates import Coordinates
+from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.prepare import prepare_target
 from lidardesign.density.objective.target import Target
 from lidardesign.density.objective.visibility import Optics
 from lidardesign.density.training.checkpoint import load_arrays, stored_snapshots
+from lidardesign.density.training.learn import FLOW, make_flow, training_scenes
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.density.training.quality import IndependentProbes, measure
 from lidardesign.density.training.sampling import LearnedFlow, Thinning, condition_groups, draw_samples, log_density_of

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from itertools import compress
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.cli.tables.grids import RichConsole, difference_cell, duration, number, print_table, value_cells
+from lidardesign.cli.terminal.grids import RichConsole, difference_cell, duration, number, print_table, value_cells
 from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
-    from lidardesign.scoring.accuracy.settings import Accuracy, Measurement, Sweep
     from lidardesign.scoring.evaluation.results import Evaluation, Paired
+    from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep
 
 
 Entry = dict[str, Any]

@@ -1,1 +1,0 @@
-"""What commands print for people: tables of designs, scores, parts and times."""

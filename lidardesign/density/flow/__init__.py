@@ -1,1 +1,0 @@
-"""The normalizing flow and its bridge to the target."""

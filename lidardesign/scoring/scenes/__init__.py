@@ -1,1 +1,0 @@
-"""What one set of rays is worth in one scene, and intervals over scenes."""
