@@ -75,7 +75,7 @@ class Bench:
         """The run's samples with the weights of some settings."""
         import numpy as np
 
-        from lidardesign.fitting.run_samples import RunTarget, Weighting, weighted_samples
+        from lidardesign.fitting.request import RunTarget, Weighting, weighted_samples
         from lidardesign.space import RANGE
         from lidardesign.task import random_generator
 

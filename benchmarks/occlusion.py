@@ -69,7 +69,7 @@ def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], see
     """Of a design fitted with a seed, and of its twin."""
     from lidardesign import open_run
     from lidardesign.constraints.document import Constraints
-    from lidardesign.fitting.run_samples import TWIN_NAME, Layouts, RunTarget, twin_without_visibility
+    from lidardesign.fitting.request import TWIN_NAME, Layouts, RunTarget, twin_without_visibility
     from lidardesign.mixture.fit import fit
     from lidardesign.samples import load_samples
     from lidardesign.scoring.evaluation.request import EvaluationRequest

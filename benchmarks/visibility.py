@@ -19,7 +19,7 @@ from common import face_scenes, interleaved, model_option, parser, report
 from lidardesign.config import DensitySettings
 from lidardesign.density.objective.visibility import NoVisibility
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
-from lidardesign.scoring.accuracy.visibility import VisibilityCase
+from lidardesign.scoring.accuracy.fields import VisibilityCase
 from lidardesign.space import DesignSpace
 
 PLATE_M = 0.005

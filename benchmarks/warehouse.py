@@ -79,7 +79,7 @@ def verdicts(found: dict[str, Any]) -> list[str]:
 def miss_rates(run_folder: Path, designs: list[Any], x_m: float, rays: int) -> dict[str, float]:
     """Mean miss rate [%] on the held-out shelves seen from one position, by design and baseline."""
     from lidardesign import open_run
-    from lidardesign.fitting.run_samples import Layouts
+    from lidardesign.fitting.request import Layouts
     from lidardesign.samples import load_samples
     from lidardesign.scoring.evaluation.request import EvaluationRequest
     from lidardesign.scoring.evaluation.score import evaluate
@@ -118,7 +118,7 @@ def divergence_nats(run_folder: Path, x_m: float, log_likelihood: float) -> floa
     import numpy as np
 
     from lidardesign import open_run
-    from lidardesign.fitting.run_samples import RunTarget
+    from lidardesign.fitting.request import RunTarget
     from lidardesign.mixture.support import MOVED_SAMPLES, at_condition
     from lidardesign.samples import load_samples
     from lidardesign.task import random_generator

@@ -20,8 +20,7 @@ from lidardesign.numerics import COARSE_SLACK
 from lidardesign.registry import UnknownTaskError, load_task, plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, verify, write_recorded
-from lidardesign.run.overrides import Override, apply_override, parse_override
-from lidardesign.run.validation import anchor_paths, check_model, is_name
+from lidardesign.run.validation import Override, anchor_paths, apply_override, check_model, is_name, parse_override
 from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml
 from lidardesign.space import DIMENSIONS, FARTHEST_M, SHORTEST_M, DesignSpace
 from lidardesign.task import Task, TaskConfig

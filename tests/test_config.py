@@ -22,7 +22,7 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.parts.statements import PartFile
 from lidardesign.registry import list_tasks, load_task
 from lidardesign.run.manifest import start_manifest, write_recorded
-from lidardesign.run.overrides import parse_override
+from lidardesign.run.validation import parse_override
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig

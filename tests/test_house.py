@@ -22,8 +22,8 @@ API = {"constrain", "evaluate", "evaluate_seeds", "fit", "learn"}
 # From the ground up: a room imports its own modules and those of rooms before it.
 ROOMS = (
     "errors", "numerics", "estimates", "run", "space", "scenes", "samples", "task", "registry", "config", "run_folder",
-    "density", "sensors", "parts", "constraints", "mixture", "layouts", "simulate", "rays", "scoring", "fitting",
-    "formats", "report", "contract", "api", "cli", "__main__",
+    "workers", "density", "sensors", "parts", "constraints", "mixture", "simulate", "rays", "formats", "scoring",
+    "fitting", "report", "contract", "api", "cli", "__main__",
 )  # fmt: skip
 
 # Where a library may be imported, by the beginnings of module names; nowhere else.
@@ -40,8 +40,8 @@ HOMES = {
     "rich": ("cli.",),
     "plotly": ("report.",),
     "matplotlib": (),
-    "distributed": ("scoring.evaluation.workers.",),
-    "dask": ("scoring.evaluation.workers.",),
+    "distributed": ("workers.",),
+    "dask": ("workers.",),
     # it can abort its process: only the one of its own imports it
     "mitsuba": ("simulate.light_transport.worker",),
     "mitransient": ("simulate.light_transport.worker",),
@@ -51,7 +51,8 @@ SLOW_AT_TOP = {
     "torch", "cma", "numba", "trimesh", "matplotlib", "plotly", "igl", "h5py", "scipy", "zuko", "embreex",
 }  # fmt: skip
 FAST_ROOMS = (
-    "run", "run_folder", "sensors", "parts", "constraints", "mixture", "fitting", "formats", "cli", "registry", "task", "api", "config", "samples",
+    "run", "run_folder", "workers", "sensors", "parts", "constraints", "mixture", "fitting", "formats", "cli", "registry",
+    "task", "api", "config", "samples",
 )  # fmt: skip
 
 # Words that say nothing of what a module, class or function holds.
@@ -139,6 +140,17 @@ def circles() -> list[list[str]]:
 
 def test_no_modules_import_each_other():
     assert not circles()
+
+
+def folder(name: str) -> str:
+    return name if (PACKAGE.parent / Path(*name.split("."))).is_dir() else name.rpartition(".")[0]
+
+
+def test_no_folders_import_each_other():
+    """Neither side by side nor a folder and what stands above it: the tree shows which way data flow."""
+    edges = {(folder(name), folder(target)) for name in package() for target in imports_of(name)}
+    between = {(one, other) for one, other in edges if one != other and "lidardesign" not in (one, other)}
+    assert not {pair for pair in between if pair[::-1] in between}
 
 
 def test_folders_are_small_enough_to_overlook():

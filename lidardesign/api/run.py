@@ -22,7 +22,7 @@ from lidardesign.run_folder import MANIFEST, Notes, RunFolder, log_note
 if TYPE_CHECKING:
     from lidardesign.api.scores import Scores
     from lidardesign.density.training.learned import LearnedDensity
-    from lidardesign.density.training.verdict import Verdict
+    from lidardesign.samples import Verdict
 
 FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
 
@@ -58,7 +58,7 @@ class LearnedQuality:
 
     @property
     def _verdict(self) -> Verdict:
-        from lidardesign.density.training.verdict import Verdict
+        from lidardesign.samples import Verdict
 
         return Verdict.of(self.misplaced, self.kl_nats, self.ess)
 

@@ -335,8 +335,8 @@ class Scores:
         if (request.config, request.seed) != (run.config.task, run.config.seed):
             request = replace(request, train=run.scenes("train", run.config.seed))
         with phase("accuracy"):
+            from lidardesign.scoring.accuracy.evaluation import measure_accuracy
             from lidardesign.scoring.accuracy.probes import AccuracyRequest
-            from lidardesign.scoring.accuracy.sweeps import measure_accuracy
 
             accuracy = measure_accuracy(
                 AccuracyRequest(run.config, run.folder, request, self.evaluation), progress=progress

@@ -120,13 +120,6 @@ def _without(
     return Boxes(corners[:, :3], -corners[:, 3:])
 
 
-def box_around(mean_m: np.ndarray, reach_m: np.ndarray, boxes: Boxes) -> tuple[np.ndarray, np.ndarray]:
-    """The box that holds an interval, mean -+ reach (3,) each, or lacks least of it: low and high, (3,) each [m]."""
-    lacking = np.maximum(boxes.low_m - (mean_m - reach_m), 0.0) + np.maximum(mean_m + reach_m - boxes.high_m, 0.0)
-    best = int(np.square(lacking).sum(axis=1).argmin())
-    return boxes.low_m[best], boxes.high_m[best]
-
-
 def nearest_in_boxes(origins_m: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """The nearest point of any of M boxes, given by corners (M, 3), to each of some origins (N, 3): shape (N, 3)."""
     clipped = np.clip(origins_m[:, None], low, high)

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from lidardesign import registry
 from lidardesign.config import RunConfig, resolve
-from lidardesign.contract import interface, scenes, scoring
+from lidardesign.contract import scenes, scoring
 from lidardesign.contract.law import (
     CALL_SECONDS,
     BrokenLawError,
@@ -59,7 +59,7 @@ CONDUCT_LAWS = (
 )
 
 
-LAWS: tuple[Law, ...] = (*interface.LAWS, *scenes.LAWS, *scoring.LAWS, *CONDUCT_LAWS)
+LAWS: tuple[Law, ...] = (*scenes.INTERFACE_LAWS, *scenes.SCENE_LAWS, *scoring.LAWS, *CONDUCT_LAWS)
 
 
 class Contract:

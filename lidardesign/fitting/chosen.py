@@ -1,8 +1,9 @@
 """Rays that are chosen on training scenes for fitted sensors: the second to the fifth step from a density to rays.
 
 The density proposes rays inside the sensors, scenes that nothing was learned from say what each of them tells, and
-those are chosen that are most informative together. Fields of view and gates then shrink to the rays that are fired. Along a
-condition, as a robot's position, rays are chosen at each of its values that the task judges at, and become a pattern.
+those are chosen that are most informative together. Fields of view and gates then shrink to the rays that are fired.
+Along a condition, as a robot's position, rays are chosen at each of its values that the task judges at, and become a
+pattern.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from lidardesign.mixture.fit import FittedSensors
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.gates import GateLimits
 from lidardesign.rays.information import FEW_SCENES, MOST_SCENES, MOST_SELECTED
-from lidardesign.rays.pool import Pool
+from lidardesign.rays.pool import CandidatePool
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, owners, rays_of_points
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
 from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
@@ -67,7 +68,7 @@ def choose_rays(
     *,
     level: float,
     gates: str,
-    pool: Pool | None,
+    pool: CandidatePool | None,
     certified: Sequence[int] = (),
     each_fires: bool = False,
     is_trial: bool = False,
@@ -149,7 +150,7 @@ def _drawn(proposals: Proposals, conditions: Sequence[dict[str, float]], count: 
 
 @phase("candidates")
 def _picked(
-    pool: Pool, proposals: Proposals, conditions: Sequence[dict[str, float]], count: int
+    pool: CandidatePool, proposals: Proposals, conditions: Sequence[dict[str, float]], count: int
 ) -> tuple[list[Rays], list[InformedScene], list[InformedScene]] | None:
     """The first so many rays of a pool inside the sensors at each condition, and what they tell; None of too few."""
     number, known, lists = np.full(len(pool.points), -1), 0, []

@@ -26,13 +26,12 @@ from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
 from lidardesign.fitting.chosen import choose_rays
-from lidardesign.fitting.request import BEST, COUNTS, FitRequest, FitResult
-from lidardesign.fitting.run_samples import KEY, RunTarget, Weighting
+from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
 from lidardesign.rays.information import checked_information
-from lidardesign.rays.pool import Pool, has_pool, pool_of
+from lidardesign.rays.pool import CandidatePool, has_pool, pool_of
 from lidardesign.rays.proposals import nearest_samples
 from lidardesign.rays.training import HELD_BACK, TrainingScenes
 from lidardesign.registry import plugin_guard
@@ -182,7 +181,7 @@ class Fitter:
         return moved
 
     @cached_property
-    def pool(self) -> Pool | None:
+    def pool(self) -> CandidatePool | None:
         """What is known of rays at the sensors' place; None where their origins are free."""
         if not self.is_pooled:
             return None

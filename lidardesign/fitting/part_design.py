@@ -38,8 +38,7 @@ from lidardesign.scenes.scene import Scene
 from lidardesign.sensors.bandwidth import split_budget
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import MOST_FILE_RAYS
-from lidardesign.sensors.even import low_discrepancy
-from lidardesign.sensors.pattern import Pattern
+from lidardesign.sensors.pattern import Pattern, low_discrepancy
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, interval_factor
 from lidardesign.space import angles, observed_point
 from lidardesign.task import Information, random_generator

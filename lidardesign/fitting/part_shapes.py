@@ -34,7 +34,7 @@ from lidardesign.rays.training import InformedScene, inform
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Scene
-from lidardesign.sensors.even import even_subset
+from lidardesign.sensors.pattern import even_subset
 from lidardesign.sensors.sensor import boresight_frame, boresight_of
 from lidardesign.space import RANGE, DesignSpace, angles
 from lidardesign.task import Information, random_generator

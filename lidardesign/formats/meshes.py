@@ -22,7 +22,7 @@ from lidardesign.numerics import unit_vectors
 from lidardesign.run.files import write_atomic
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.sensors.even import field_on_sphere
+from lidardesign.sensors.pattern import field_on_sphere
 from lidardesign.sensors.sensor import Sensor, tangent_directions
 
 RAYS, BEAMS, FRUSTA = "rays.ply", "beams.ply", "frusta.ply"

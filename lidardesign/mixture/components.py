@@ -19,13 +19,13 @@ angles scale by the cosine of the fixed elevation; where only the elevation is f
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from lidardesign.numerics import ROUNDING, SLACK, safe_divide, wrap_angle
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
+from lidardesign.numerics import ROUNDING, SLACK, wrap_angle
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
 # Samples per block: arrays of 10 components then stay inside a core's second-level cache (measured).
 BLOCK = 2048
@@ -73,10 +73,6 @@ class Mixture:
         rows = {name: getattr(self, name)[order] for name in self.__dataclass_fields__}
         rows["weights"] = rows["weights"] / rows["weights"].sum()
         return Mixture(**rows)
-
-    def with_weights(self, weights: np.ndarray) -> Mixture:
-        """The same components with other shares."""
-        return replace(self, weights=weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,9 +276,6 @@ def mean_directions(features: Features, labels: np.ndarray, count: int) -> tuple
 POLE_COSINE = SLACK
 # A free axis on which the data do not vary is scaled by this share of its bounds: nothing divides by 0.
 IDLE_AXIS_SHARE = 1e-3
-# The mean range of like rays is over so many of so many samples: one in three hundred of the density.
-NEIGHBOURS = 16
-NEIGHBOUR_POOL = 5000
 
 
 @dataclass(frozen=True)
@@ -409,26 +402,3 @@ class Features:
         """The points at an index or mask, with weights scaled to sum to 1 and the same units."""
         weights = self.weights[keep]
         return Features(self.points[keep], weights / weights.sum(), self.axes, self.centre, self.scale)
-
-
-def ray_features(features: Features) -> np.ndarray:
-    """What rays look at, however far their scene points are, shape (N, F): coordinates in which like rays are near.
-
-    Directions where origins are given, else points of the mean surface.
-    """
-    from scipy.spatial import cKDTree
-
-    aiming = features.embedding
-    if features.axes.range:
-        aiming = np.delete(aiming, len(features.axes.origin), axis=1)
-    if not features.axes.origin:
-        return np.ascontiguousarray(aiming)
-    tree = cKDTree(aiming[:NEIGHBOUR_POOL])
-    near = tree.query(aiming, k=min(NEIGHBOURS, len(aiming)))[1].reshape(len(aiming), -1)
-    share = features.weights[near]
-    points = features.points.copy()
-    # far from all of the density neighbours weigh nothing together, and there is no mean
-    total = share.sum(axis=1)
-    mean = safe_divide((share * points[near, RANGE]).sum(axis=1), total)
-    points[:, RANGE] = np.where(total > 0, mean, points[:, RANGE])
-    return observed_point(points)

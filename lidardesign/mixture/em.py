@@ -325,16 +325,6 @@ SEED_POOL = 16
 SMALLEST_WEIGHT = SQUARABLE
 
 
-# Cells need no more samples than this: their centres are then known to a tenth of their width.
-SAMPLES_PER_RAY = 64
-SMALLEST_SAMPLE = 2000
-
-
-def samples_for(count: int) -> int:
-    """The number of samples beyond which `count` cells do not become better."""
-    return max(SAMPLES_PER_RAY * count, SMALLEST_SAMPLE)
-
-
 def lloyd(
     features: np.ndarray,
     weights: np.ndarray,

@@ -299,15 +299,6 @@ def conditioned(samples: Samples, condition: Mapping[str, float], retarget: Reta
     return known[key]
 
 
-def fixed_conditions(space: DesignSpace) -> dict[str, float]:
-    """The conditions of a space that have one value, as {"x_m": 0.37}."""
-    return {
-        name: space.low[index]
-        for index, name in enumerate(DIMENSIONS)
-        if name in space.condition and index not in space.free
-    }
-
-
 def condition_text(condition: Mapping[str, float]) -> str:
     """Conditions for people, as `x_m=0.37, y_m=1`."""
     return ", ".join(f"{name}={value:g}" for name, value in condition.items())

@@ -26,8 +26,7 @@ from lidardesign.run.validation import check_model, suggest
 from lidardesign.run.yaml import load_yaml
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.design import DesignSpec
-from lidardesign.sensors.even import even_subset, grid_rows, grid_tangent
-from lidardesign.sensors.pattern import Pattern
+from lidardesign.sensors.pattern import Pattern, even_subset, grid_rows, grid_tangent
 from lidardesign.sensors.sensor import MOST_RAYS, Sensor, boresight_frame, boresight_of
 
 FOLDER = Path(__file__).parent / "files"

@@ -31,7 +31,7 @@ from lidardesign.parts.statements import (
     Zones,
     ray_count,
 )
-from lidardesign.sensors.even import grid_rows, low_discrepancy
+from lidardesign.sensors.pattern import grid_rows, low_discrepancy
 from lidardesign.space import direction
 
 Projection = Literal["tangent", "sphere", "plane"]

@@ -5,10 +5,11 @@ For thresholds t >= 0 of items and a price lambda >= 0 of bandwidth, every admis
     F(S) - harm(S) <= sum_u w_u t_u + lambda B
                       + max_R sum_{r in R} max_g [ sum_u w_u (a(r,g,u) - t_u)+ - lambda b(r,g) - h(r,g) ]+
 
-where R holds the best rays of each group of candidates, as many as may be chosen of it (Cornuejols, Fisher and Nemhauser
-1977): whatever the thresholds, an item counts at most its threshold and what single rays exceed it by. Subgradients
-lower the bound, each with a part of the one before, as else they zigzag (Camerini, Fratta and Maffioli 1975). For concave
-sums phi(z) <= phi(y) + slope(y) (z - y) takes the place of thresholds, and Frank and Wolfe (1956) choose y.
+where R holds the best rays of each group of candidates, as many as may be chosen of it (Cornuejols, Fisher and
+Nemhauser 1977): whatever the thresholds, an item counts at most its threshold and what single rays exceed it by.
+Subgradients lower the bound, each with a part of the one before, as else they zigzag (Camerini, Fratta and Maffioli
+1975). For concave sums phi(z) <= phi(y) + slope(y) (z - y) takes the place of thresholds, and Frank and Wolfe (1956)
+choose y.
 Without a budget lambda is the price that bandwidth was given, and lambda B is left out.
 """
 

@@ -49,7 +49,7 @@ MOST_BYTES = 300_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Pool:
+class CandidatePool:
     """Rays drawn from the whole density, and what they tell.
 
     Arguments:
@@ -72,7 +72,9 @@ def has_pool(run: RunFolder) -> bool:
 
 
 @phase("pool")
-def pool_of(run: RunFolder, samples: Samples, training: TrainingScenes, progress: Callable[[str], None]) -> Pool:
+def pool_of(
+    run: RunFolder, samples: Samples, training: TrainingScenes, progress: Callable[[str], None]
+) -> CandidatePool:
     """The pool of a run: as it is kept there, or found anew and kept if it can be written.
 
     Arguments:
@@ -99,7 +101,9 @@ def pool_of(run: RunFolder, samples: Samples, training: TrainingScenes, progress
     return _unpacked(arrays)
 
 
-def _found(run: RunFolder, samples: Samples, training: TrainingScenes, progress: Callable[[str], None]) -> Pool:
+def _found(
+    run: RunFolder, samples: Samples, training: TrainingScenes, progress: Callable[[str], None]
+) -> CandidatePool:
     conditions, counts = run.conditions(), sorted(run.task.defaults.rays)
     size = POOL_FACTOR * CANDIDATES_PER_RAY * min(counts[-1], MOST_SELECTED)
     parts = []
@@ -117,7 +121,9 @@ def _found(run: RunFolder, samples: Samples, training: TrainingScenes, progress:
     selection = Selection(rays, visits, gates, Bandwidth(), share=share)
     # each of a few values of a condition sees little of a scene
     most_scenes = MOST_SCENES * (1 + (len(conditions) > 1))
-    return Pool(points, visits, *inform_enough(selection, training, counts[len(counts) // 2], most_scenes, progress))
+    return CandidatePool(
+        points, visits, *inform_enough(selection, training, counts[len(counts) // 2], most_scenes, progress)
+    )
 
 
 def _key(run: RunFolder, seed: int) -> str:
@@ -143,7 +149,7 @@ def _stamp(path: Path) -> tuple[str, int, int]:
     return str(path), found.st_size, found.st_mtime_ns
 
 
-def _packed(pool: Pool) -> dict[str, np.ndarray]:
+def _packed(pool: CandidatePool) -> dict[str, np.ndarray]:
     """The arrays of a pool: those of all scenes one after the other, and where each begins."""
     scenes = [*pool.informed, *pool.held_back]
     small = np.uint16 if len(pool.points) <= np.iinfo(np.uint16).max else np.int32
@@ -168,7 +174,7 @@ def _packed(pool: Pool) -> dict[str, np.ndarray]:
     }
 
 
-def _unpacked(arrays: Mapping[str, np.ndarray]) -> Pool:
+def _unpacked(arrays: Mapping[str, np.ndarray]) -> CandidatePool:
     scenes, starts = [], arrays["starts"]
     shared = {
         "sums": arrays["sums"],
@@ -193,4 +199,4 @@ def _unpacked(arrays: Mapping[str, np.ndarray]) -> Pool:
         )
     chosen_on = int(arrays["chosen_on"])
     visits = [slice(int(start), int(stop)) for start, stop in arrays["visits"]]
-    return Pool(arrays["points"], visits, scenes[:chosen_on], scenes[chosen_on:])
+    return CandidatePool(arrays["points"], visits, scenes[:chosen_on], scenes[chosen_on:])

@@ -19,8 +19,7 @@ from lidardesign.numerics import ROUNDING, SLACK, TINY, angle_over_sine
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import split_budget
-from lidardesign.sensors.even import even_rays
-from lidardesign.sensors.pattern import with_coordinates
+from lidardesign.sensors.pattern import even_rays, with_coordinates
 from lidardesign.sensors.sensor import Sensor, interval_factor
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
 

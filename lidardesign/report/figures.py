@@ -15,7 +15,7 @@ import numpy as np
 
 from lidardesign.errors import check_choice
 from lidardesign.report.density_views import Marginal, PlaneDensity
-from lidardesign.report.drawing import frustum_lines
+from lidardesign.report.scene_figure import frustum_lines
 from lidardesign.report.series import Against, Series, axis_titles, log_ticks, logarithmic, position, series
 from lidardesign.report.view import encoded
 from lidardesign.scenes.rays import Rays

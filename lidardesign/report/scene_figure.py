@@ -1,6 +1,8 @@
 """Designs in a scene and what becomes of their rays, for the 3D view.
 
 As many rays, positions and frames are kept as a page can hold; `SceneFigure` says which are left out.
+
+Shapes, sensors and rays as plain float32 triangles and line segments, for the report's 3D view.
 """
 
 from __future__ import annotations
@@ -15,14 +17,18 @@ import numpy as np
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.slack import SPACE_MARK, ConstraintSlack, constraint_slack
+from lidardesign.numerics import TINY
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
-from lidardesign.scenes.scene import Scene
+from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Round, Scene
+from lidardesign.scenes.surface import grid_faces, round_triangles
 from lidardesign.scoring.evaluation.entries import ordered_conditions
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Evaluation
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
+from lidardesign.sensors.pattern import field_on_sphere
+from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
 from lidardesign.simulate.returns import build_casters, simulate_many
 from lidardesign.space import DesignSpace
 
@@ -185,3 +191,145 @@ def constraint_slack_of(design: DesignSpec, space: DesignSpace) -> list[Constrai
     checks = check_design(design_document(design), design.constraints, space)
     slacks = constraint_slack(checks, [sensor.name for sensor in design.sensors])
     return sorted(slacks, key=lambda one: one.name.startswith(SPACE_MARK))
+
+
+MOST_FACES = 40_000  # of a scene's meshes, and of its round bodies; more would make the page large and slow to open
+STEPS = 24  # round a round body
+FEWEST_STEPS = 4  # where a scene has very many of them
+SHELL_STEPS = 8  # along each side of a gate's shell
+SMALLEST_SPREAD_M = 1e-3  # of origins; less looks like one place
+PLANE_MARGIN = 0.1  # of the scene's extent, beyond which an infinite plane is not drawn
+
+
+def drawn_share(scene: Scene) -> float:
+    """The share of a scene's triangles that is drawn: all of them up to `MOST_FACES`."""
+    faces = sum(len(body.shape.faces) for body in scene.bodies if isinstance(body.shape, Mesh))
+    return min(1.0, MOST_FACES / max(faces, 1))
+
+
+def body_triangles(body: Body, frame: int, bounds_m: np.ndarray, share: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """World vertices (V, 3) float32 [m] and faces (F, 3) int32 of a body; planes are cut at bounds (2, 3).
+
+    Of a mesh about a share of its triangles is drawn.
+    """
+    pose = body.pose(frame)
+    vertices, faces = own_triangles(body, pose, bounds_m, share)
+    return (vertices @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32), faces
+
+
+def own_triangles(
+    body: Body, pose: np.ndarray, bounds_m: np.ndarray, share: float = 1.0, steps: int = STEPS
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same in the body's own frame, with so many steps round round bodies; the pose is for planes."""
+    shape = body.shape
+    if isinstance(shape, Mesh):
+        vertices, faces = thinned(shape.vertices, shape.faces, math.ceil(share * len(shape.faces)))
+    elif isinstance(shape, Round):
+        vertices, faces = round_triangles(shape, steps)
+    elif isinstance(shape, Box):
+        vertices, faces = _box(np.asarray(shape.half_extents_m))
+    else:
+        # the part of the plane z = 0 below a scene's bounds, in the plane's own frame
+        corners = np.array([[x, y, z] for x in bounds_m[:, 0] for y in bounds_m[:, 1] for z in bounds_m[:, 2]])
+        local = (corners - pose[:3, 3]) @ pose[:3, :3]
+        (x0, y0), (x1, y1) = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
+        vertices = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+        faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return vertices, faces.astype(np.int32)
+
+
+def round_steps(scene: Scene) -> int:
+    """Steps round round bodies: fewer where a scene has very many of them."""
+    count = sum(isinstance(body.shape, Round) for body in scene.bodies)
+    # a ball of n steps has about n (n + 2) triangles
+    most = math.sqrt(MOST_FACES / max(count, 1)) - 1
+    return int(np.clip(4 * (most // 4), FEWEST_STEPS, STEPS))
+
+
+def thinned(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """At most about `most` faces, by merging the vertices of each cell of a grid into their mean."""
+    cells = math.sqrt(max(most, 1))
+    while len(faces) > most:
+        low, extent = vertices.min(axis=0), np.ptp(vertices, axis=0).max()
+        cell = np.floor((vertices - low) / max(extent, TINY) * cells).astype(np.int64)
+        _, group = np.unique(cell, axis=0, return_inverse=True)
+        group = group.reshape(-1)
+        counts = np.bincount(group)
+        vertices = np.stack([np.bincount(group, column) / counts for column in vertices.T], axis=1)
+        faces = group[faces]
+        first, second, third = faces.T
+        faces = faces[(first != second) & (second != third) & (third != first)]
+        cells *= 0.7
+    return vertices, faces
+
+
+def scene_bounds(scene: Scene, frame: int, rays: list[Rays]) -> np.ndarray:
+    """Bounds of everything finite in a scene and of the rays' origins, with a margin, shape (2, 3) [m]."""
+    finite = [body for body in scene.bodies if not isinstance(body.shape, Plane)]
+    points = [ray.origin_m for ray in rays] + [body_triangles(body, frame, np.zeros((2, 3)))[0] for body in finite]
+    everything = np.concatenate([*points, np.zeros((0, 3))])
+    if not len(everything):
+        return np.array([[-1.0] * 3, [1.0] * 3])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    margin = PLANE_MARGIN * max(float((high - low).max()), PLANE_MARGIN)
+    return np.stack([low - margin, high + margin])
+
+
+def frustum_lines(sensor: Sensor) -> np.ndarray:
+    """A field of view up to its gate's end and the gate's outlines, NaN between lines, (K, 3) float32 [m]."""
+    start, end = sensor.gate_m
+    corners = _patch(sensor, np.array([-1.0, 1.0]), np.array([-1.0, 1.0]))
+    pieces = [np.stack([sensor.origin_m, sensor.origin_m + end * corner]) for corner in corners.reshape(-1, 3)]
+    side, one = np.linspace(-1.0, 1.0, SHELL_STEPS + 1), np.ones(1)
+    edges = ((side, -one), (one, side), (side[::-1], one), (-one, side[::-1]))
+    outline = np.concatenate([_patch(sensor, *edge).reshape(-1, 3) for edge in edges])
+    pieces += [sensor.origin_m + radius * outline for radius in (start, end)]
+    return separated(pieces)
+
+
+def origin_lines(sensor: Sensor, level: float) -> np.ndarray:
+    """Ellipses that hold `level` of a sensor's origins along their axes, NaN between them, (K, 3) float32 [m].
+
+    One in each plane of two principal axes; none where origins hardly spread.
+    """
+    variances, axes = np.linalg.eigh(sensor.covariance_m2)
+    reach = interval_factor(level) * np.sqrt(np.clip(variances, 0.0, None))
+    if reach.max() < SMALLEST_SPREAD_M:
+        return np.zeros((0, 3), dtype=np.float32)
+    turn = np.linspace(0.0, 2 * np.pi, STEPS + 1)
+    spread = (axes * reach).T
+    # eigenvalues grow: the first plane is that of the two largest, others only where there is a thickness
+    planes = [(2, 1)] + [(2, 0), (1, 0)] * bool(reach[0] >= SMALLEST_SPREAD_M)
+    return separated(
+        [sensor.origin_m + np.outer(np.cos(turn), spread[a]) + np.outer(np.sin(turn), spread[b]) for a, b in planes]
+    )
+
+
+def gate_shell(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """The two curved faces of a sensor's gate: vertices (V, 3) float32 [m] and faces (F, 3) int32."""
+    side = np.linspace(-1.0, 1.0, SHELL_STEPS + 1)
+    patch = _patch(sensor, side, side).reshape(-1, 3)
+    faces = grid_faces(SHELL_STEPS + 1, SHELL_STEPS + 1)
+    vertices = np.concatenate([sensor.origin_m + radius * patch for radius in sensor.gate_m])
+    return vertices.astype(np.float32), np.concatenate([faces, faces + len(patch)]).astype(np.int32)
+
+
+def separated(lines: list[np.ndarray]) -> np.ndarray:
+    """Polylines in one array with a row of NaN after each, (K, 3) float32."""
+    gap = np.full((1, 3), np.nan)
+    return np.concatenate([piece for line in lines for piece in (line, gap)]).astype(np.float32)
+
+
+def _patch(sensor: Sensor, across: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Unit vectors over the field of view at shares -1 to 1 of its halves, shape (U, A, 3)."""
+    horizontal, vertical = field_on_sphere(sensor)
+    u, v = np.meshgrid(across * horizontal / 2, up * vertical / 2)
+    return tangent_directions(sensor.frame, np.stack([u.ravel(), v.ravel()], axis=1)).reshape(*u.shape, 3)
+
+
+def _box(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    # corners of their own for every side keep the light from rounding the edges
+    faces = [(k, k + 1, k + 2) for k in range(0, 24, 4)] + [(k, k + 2, k + 3) for k in range(0, 24, 4)]
+    return (signs * half)[np.ravel(quads)], np.array(faces)

@@ -12,7 +12,7 @@ from lidardesign.constraints.slack import ConstraintSlack
 from lidardesign.report.markup import definitions, folded
 from lidardesign.report.series import VERDICT_WORDS
 from lidardesign.run.clock import INSIDE, OTHER
-from lidardesign.scoring.evaluation.effects import MILLIMETRES, EffectSummary
+from lidardesign.scoring.evaluation.entries import MILLIMETRES, EffectSummary
 from lidardesign.scoring.evaluation.results import (
     Audit,
     AuditRow,

@@ -18,9 +18,12 @@ from typing import Any
 import numpy as np
 
 from lidardesign.numerics import EPSILON_FLOAT32
-from lidardesign.report.drawing import (
+from lidardesign.report.markup import embedded, swatch, switch
+from lidardesign.report.scene_figure import (
     MOST_FACES,
     SMALLEST_SPREAD_M,
+    DrawnDesign,
+    SceneFigure,
     drawn_share,
     gate_shell,
     origin_lines,
@@ -28,12 +31,10 @@ from lidardesign.report.drawing import (
     round_steps,
     scene_bounds,
 )
-from lidardesign.report.markup import embedded, swatch, switch
-from lidardesign.report.scene_figure import DrawnDesign, SceneFigure
 from lidardesign.report.series import OUTCOME_WORDS, Series
 from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Body
-from lidardesign.sensors.even import field_on_sphere
+from lidardesign.sensors.pattern import field_on_sphere
 from lidardesign.sensors.sensor import Sensor, interval_factor
 
 MOST_SENSORS = 40  # drawn as frusta and switched one by one; a scan has hundreds, and its rays say it all

@@ -1,12 +1,13 @@
 """Values of files, checked: errors name file, line and column, what was found and what is allowed.
 
 Booleans and quoted text are no numbers, and names do not steer terminals.
+
+Single values that are given beside files, as `--set KEY=VALUE`: read, and set in a document.
 """
 
 from __future__ import annotations
 
 import difflib
-import math
 import os
 import typing
 import unicodedata
@@ -16,11 +17,10 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar
 
-import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from lidardesign.errors import ConfigError
-from lidardesign.run.yaml import KeyPath
+from lidardesign.errors import UNSET_HINT, ConfigError
+from lidardesign.run.yaml import MAX_DEPTH, KeyPath, parse_yaml, resolve_scalar
 
 LIKE_TEXT = (str, bytes, Path)
 
@@ -201,110 +201,78 @@ def _short(value: Any, limit: int = 60) -> str:
     return text if len(text) <= limit else f"{text[: limit - 3]}..."
 
 
-LocateKey = Callable[[KeyPath], str]
-LONGEST_QUOTE = 40
-
-
 @dataclass(frozen=True)
-class Node:
-    """One value of a document.
+class Override:
+    """One `--set`.
 
     Arguments:
-        value: Plain values: mappings, lists, text, numbers, booleans, None.
-        path: Keys and indices from the document's root.
-        locate: The position of a path, as `file:line:column`.
+        path: The dotted key, split.
+        value: The value, read as YAML.
+        where: The option as the user wrote it, for messages.
     """
 
-    value: Any
     path: KeyPath
-    locate: LocateKey
-
-    @property
-    def name(self) -> str:
-        """The key path for people, as `sensors[0].gate_m.end`."""
-        text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in self.path)
-        return text.lstrip(".") or "the document"
-
-    def error(self, message: str, *, allowed: str | None = None, hint: str | None = None) -> ConfigError:
-        """An error about this value."""
-        return ConfigError(f"{self.name} {message}", where=self.locate(self.path), allowed=allowed, hint=hint)
-
-    def wrong(self, allowed: str) -> ConfigError:
-        """The error that this value is not of the allowed kind."""
-        return self.error(f"is {_short(self.value, LONGEST_QUOTE)}", allowed=allowed)
-
-    def child(self, key: str | int) -> Node:
-        """The value under a key or index."""
-        return Node(self.value[key], (*self.path, key), self.locate)
-
-    def mapping(self, required: Iterable[str], optional: Iterable[str] = ()) -> dict[str, Node]:
-        """The values of a mapping by key; an optional key that is null counts as absent."""
-        required, optional = tuple(required), tuple(optional)
-        known = (*required, *optional)
-        if not isinstance(self.value, dict):
-            raise self.wrong(f"a mapping with the keys {', '.join(known)}")
-        for key in self.value:
-            if key not in known:
-                near = difflib.get_close_matches(str(key), known, 1)
-                raise self.child(key).error(
-                    "is an unknown key", allowed=", ".join(known), hint=f"{near[0]}" if near else None
-                )
-        for key in required:
-            if key not in self.value:
-                raise self.error(f"has no key `{key}`", allowed=", ".join(known))
-        return {key: self.child(key) for key in known if self.value.get(key) is not None or key in required}
-
-    def items(self) -> list[Node]:
-        """The values of a list."""
-        if not isinstance(self.value, list):
-            raise self.wrong("a list")
-        return [self.child(index) for index in range(len(self.value))]
-
-    def number(self, low: float = -math.inf, high: float = math.inf) -> float:
-        """A finite number from low to high, both included."""
-        value = self.value
-        plain = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (plain and math.isfinite(value) and low <= value <= high):
-            raise self.wrong(f"a number{_between(low, high)}")
-        return float(value)
-
-    def integer(self, low: int, high: int | None = None) -> int:
-        """A whole number of at least `low`."""
-        value = self.value
-        top = math.inf if high is None else high
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= top:
-            between = f" of at least {low}" if high is None else f" from {low} to {high}"
-            raise self.wrong(f"a whole number{between}")
-        return value
-
-    def text(self) -> str:
-        """Text that is not empty, without characters that steer a terminal."""
-        if not is_name(self.value):
-            raise self.wrong("text without control characters")
-        return self.value
-
-    def choice(self, options: Iterable[str]) -> str:
-        """One of several words."""
-        options = tuple(options)
-        if self.value not in options:
-            raise self.wrong(" or ".join(options))
-        return self.value
-
-    def numbers(self, count: int | None = None, low: float = -math.inf, high: float = math.inf) -> np.ndarray:
-        """A list of finite numbers, shape (count,)."""
-        values = [item.number(low, high) for item in self.items()]
-        if count is not None and len(values) != count:
-            raise self.error(f"has {len(values)} numbers", allowed=f"{count}")
-        return np.array(values, dtype=np.float64)
-
-    def plain(self) -> dict[str, Any]:
-        """A mapping of anything."""
-        if not isinstance(self.value, dict):
-            raise self.wrong("a mapping")
-        return self.value
+    value: Any
+    where: str
 
 
-def _between(low: float, high: float) -> str:
-    if math.isinf(high):
-        return "" if math.isinf(low) else f" of at least {low:g}"
-    return f" from {low:.6g} to {high:.6g}" if math.isfinite(low) else f" of at most {high:.6g}"
+def parse_override(text: str, option: str = "--set") -> Override:
+    """Read `KEY=VALUE`; the value is a YAML scalar, or a list or mapping in brackets, and else text.
+
+    Raises:
+        ConfigError: There is no key or no equals sign, or the brackets do not close.
+    """
+    key, equals, value = text.partition("=")
+    where = f"{option} {text}"
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise ConfigError(
+            "is not of the form KEY=VALUE", where=where, allowed="a dotted key, such as density.sigma_m=0.005"
+        )
+    if len(parts) > MAX_DEPTH:
+        raise ConfigError(f"the key has {len(parts)} parts", where=where, allowed=f"at most {MAX_DEPTH}")
+    value = value.strip()
+    if not value:
+        raise ConfigError(f"{key.strip()} has no value", where=where, allowed="a value", hint=UNSET_HINT)
+    if value.startswith(("[", "{", '"', "'")):
+        return Override(tuple(parts), parse_yaml(value, where=where).value, where)
+    try:
+        return Override(tuple(parts), resolve_scalar(value), where)
+    except ValueError as error:
+        raise ConfigError(str(error), where=where, allowed="a finite number") from None
+
+
+def apply_override(values: dict[str, Any], override: Override) -> KeyPath:
+    """Set a value in a document, in place; missing mappings are made, list items are named by their index.
+
+    Returns:
+        The path that was set, with list indices as numbers.
+
+    Raises:
+        ConfigError: The path goes through a value that holds nothing, or past the end of a list.
+    """
+    node: Any = values
+    done: list[str | int] = []
+    for part in override.path[:-1]:
+        done.append(_key(node, str(part), done, override))
+        if isinstance(node, dict) and node.get(done[-1]) is None:
+            node[done[-1]] = {}
+        node = node[done[-1]]
+    done.append(_key(node, str(override.path[-1]), done, override))
+    node[done[-1]] = override.value
+    return tuple(done)
+
+
+def _key(node: Any, part: str, done: list[str | int], override: Override) -> str | int:
+    parent = ".".join(map(str, done))
+    if isinstance(node, dict):
+        return part
+    if isinstance(node, list):
+        if part.isdecimal() and int(part) < len(node):
+            return int(part)
+        raise ConfigError(
+            f"{parent} has no item {part!r}",
+            where=override.where,
+            allowed=f"0 to {len(node) - 1}" if node else "nothing: the list is empty",
+        )
+    raise ConfigError(f"{parent} is {node!r} and holds no key {part!r}", where=override.where)

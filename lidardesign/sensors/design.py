@@ -16,8 +16,7 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays, fire_times
 from lidardesign.sensors.bandwidth import split_budget
-from lidardesign.sensors.even import even_rays, even_subset
-from lidardesign.sensors.pattern import TRAVELLED, Pattern, with_coordinates
+from lidardesign.sensors.pattern import TRAVELLED, Pattern, even_rays, even_subset, with_coordinates
 from lidardesign.sensors.sensor import DEFAULT_LEVEL, Sensor
 from lidardesign.space import DIMENSIONS
 

@@ -3,6 +3,8 @@
 Along a condition, as the position of a robot, a pattern is given at knots. Ray n is the same ray at all of them; in
 between its origin, its angles and its gate are linear. So it passes through the knots exactly, and keeps every bound
 on elevation, azimuth, start, end and width that both neighbouring knots keep: each is a convex set per ray.
+
+Even rays: a cell-centred grid of any number in a field of view, points that fill a cube, and subsets of points.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.scenes.rays import Rays
+from lidardesign.scenes.rays import DEFAULT_RATE_HZ, Rays, fire_times
+from lidardesign.sensors.sensor import Sensor, tangent_directions
 from lidardesign.space import DIMENSIONS
 
 # Conditions that a sensor can travel along: where a ray starts, not where it looks.
@@ -157,3 +160,126 @@ def _assigned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     from scipy.optimize import linear_sum_assignment
 
     return linear_sum_assignment(np.square(before[:, None] - after[None]).sum(axis=2))[1]
+
+
+RECURRENCE_AXES = 2
+PRIMES = (2, 3, 5, 7, 11, 13)
+
+
+def grid_rows(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:
+    """Rays per row of an even grid, int64 (rows,), summing to `count`.
+
+    The number of rows makes the cells as square as whole numbers allow; the rays are spread over the rows as
+    evenly as possible, so a budget of k * k in a square field is the regular k by k grid.
+    """
+    if count == 0:
+        return np.zeros(0, dtype=np.int64)
+    rows = _row_count(horizontal_rad, vertical_rad, count)
+    # floor((2 i n + rows) / (2 rows)) rounds i n / rows half up in whole numbers, without a rounding error
+    return np.diff((2 * np.arange(rows + 1, dtype=np.int64) * count + rows) // (2 * rows))
+
+
+def _row_count(horizontal_rad: float, vertical_rad: float, count: int) -> int:
+    """The number of rows whose cells are closest to square by ratio; a field without height is one row."""
+    if vertical_rad <= 0:
+        return 1
+    if horizontal_rad <= 0:
+        return count
+    ideal = math.sqrt(count * (vertical_rad / horizontal_rad))
+    if ideal >= count:
+        return count
+    fewer = max(math.floor(ideal), 1)
+    return fewer if ideal**2 <= fewer * (fewer + 1) else min(fewer + 1, count)
+
+
+def grid_tangent(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:
+    """Angles of an even grid in a field of view, row by row upwards, shape (count, 2) [rad].
+
+    Cell-centred: ray i of n in a row stands at -FoV/2 + FoV * (i + 1/2) / n, never on the field's edge.
+    """
+    rows = grid_rows(horizontal_rad, vertical_rad, count)
+    if not rows.size:
+        return np.zeros((0, 2))
+    across = np.concatenate([(np.arange(n) + 0.5) / n - 0.5 for n in rows])
+    up = np.repeat((np.arange(len(rows)) + 0.5) / len(rows) - 0.5, rows)
+    return np.stack([horizontal_rad * across, vertical_rad * up], axis=1)
+
+
+def low_discrepancy(count: int, axes: int) -> np.ndarray:
+    """Points that fill the unit cube evenly, shape (count, axes), axes <= 6.
+
+    Up to two axes the additive recurrence R_k (M. Roberts 2018): its generators are the powers of 1 / phi, with phi
+    the root of phi^(k+1) = phi + 1 above 1. Beyond, small multiples of two generators nearly add up to a whole number,
+    and points lie on a few lines of that pair of axes (of four axes the first and the third: 1000 points leave 30
+    of 100 cells of their square empty); there J. Halton's sequence (1960) in the first primes. The smallest ones are
+    the most even: they go to the last axes, which are those of directions.
+    """
+    if axes > RECURRENCE_AXES:
+        return np.stack([_radical_inverse(count, base) for base in PRIMES[axes - 1 :: -1]], axis=1)
+    phi = 1.5
+    for _ in range(64):  # a contraction by at least 3: 64 steps are far below rounding
+        phi = (1.0 + phi) ** (1.0 / (axes + 1))
+    generators = phi ** -np.arange(1.0, axes + 1)
+    return np.mod(0.5 + np.arange(1, count + 1)[:, None] * generators, 1.0)
+
+
+def _radical_inverse(count: int, base: int) -> np.ndarray:
+    """The digits of 1 to `count` in a base, mirrored at the point, shape (count,), inside (0, 1)."""
+    left, place, total = np.arange(1, count + 1), 1.0, np.zeros(count)
+    while left.any():
+        place /= base
+        left, digit = np.divmod(left, base)
+        total += place * digit
+    return total
+
+
+def field_on_sphere(sensor: Sensor) -> tuple[float, float]:
+    """The field of view, shrunk in proportion where its corner would lie beyond the antipode [rad].
+
+    Past the angle pi the tangent plane covers the sphere a second time, so rays there would point elsewhere.
+    """
+    horizontal, vertical = sensor.field_of_view_rad
+    corner = math.hypot(horizontal, vertical) / 2
+    scale = math.pi / corner if corner > math.pi else 1.0
+    return scale * horizontal, scale * vertical
+
+
+def even_rays(sensors: Sequence[Sensor], counts: Sequence[int]) -> Rays:
+    """A grid of so many rays in the field of view of each sensor, with its gate, from its place."""
+    tangents = [grid_tangent(*field_on_sphere(one), int(n)) for one, n in zip(sensors, counts, strict=True)]
+    sensor = np.repeat(np.arange(len(sensors)), counts)
+    looking = [tangent_directions(one.frame, tangent) for one, tangent in zip(sensors, tangents, strict=True)]
+    origin_m = np.array([one.origin_m for one in sensors], dtype=np.float64)[sensor]
+    gate_m = np.array([one.gate_m for one in sensors], dtype=np.float64)[sensor]
+    times = fire_times(len(sensor), DEFAULT_RATE_HZ)
+    return Rays(origin_m, np.concatenate(looking), gate_m, sensor, times)
+
+
+def even_subset(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices, ascending, of `count` of the points that lie evenly among them: (M, K) to int64 (count,).
+
+    The points are halved along their longest extent until as many groups as wanted are left, each with the same
+    number of points but for one; of each the point nearest to its centre stays. Deterministic, and O(M log M).
+
+    Raises:
+        ConfigError: More are wanted than there are.
+    """
+    if not 0 <= count <= len(points):
+        raise ConfigError(f"{count} of {len(points)} rays", where="rays", allowed=f"0 to {len(points)}")
+    if count == len(points):
+        return np.arange(count)
+    kept: list[int] = []
+    groups = [(np.arange(len(points)), count)] if count else []
+    while groups:
+        members, wanted = groups.pop()
+        inside = points[members]
+        if wanted == 1:
+            kept.append(int(members[np.square(inside - inside.mean(axis=0)).sum(axis=1).argmin()]))
+            continue
+        # to so many digits, so that rounding does not choose among equal extents and positions
+        axis = np.round(np.ptp(inside, axis=0), 9).argmax()
+        order = members[np.argsort(np.round(inside[:, axis], 9), kind="stable")]
+        first = wanted // 2
+        cut = int(np.clip(round(len(order) * first / wanted), first, len(order) - (wanted - first)))
+        groups += [(order[:cut], first), (order[cut:], wanted - first)]
+    return np.sort(np.array(kept, dtype=np.int64))

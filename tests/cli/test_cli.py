@@ -257,7 +257,7 @@ def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesi
 @pytest.mark.parametrize("decided", ["raycast", "off", None])
 def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on(flat, monkeypatch, decided):
     from lidardesign import open_run
-    from lidardesign.fitting.run_samples import RunTarget
+    from lidardesign.fitting.request import RunTarget
     from lidardesign.run.manifest import note
 
     asked = []

@@ -8,7 +8,7 @@ import sys
 
 from support.tables import each_row
 
-from lidardesign.cli.terminal import completion
+from lidardesign.cli.terminal import options as completion
 from lidardesign.simulate.detector.files import load_detector
 
 # The line so far, and some of what may stand at its end.

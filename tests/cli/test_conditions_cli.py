@@ -16,7 +16,7 @@ from lidardesign.formats.designs import load_design
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process; the target density is the planted one."""
-    monkeypatch.setattr("lidardesign.fitting.run_samples.RunTarget.__call__", lambda self, points: log_target(points))
+    monkeypatch.setattr("lidardesign.fitting.request.RunTarget.__call__", lambda self, points: log_target(points))
     return caller(capsys, tmp_path, monkeypatch)
 
 
@@ -198,7 +198,7 @@ def test_a_design_by_hand_without_a_number_of_rays_is_exported_at_the_one_that_i
 
 
 def test_a_design_is_exported_with_the_rays_that_it_is_evaluated_with(lidardesign, run, tmp_path):
-    from lidardesign.fitting.run_samples import Layouts
+    from lidardesign.fitting.request import Layouts
     from lidardesign.samples import load_samples
 
     for layout, gates in (("grid", "ray"), ("density", "ray"), ("distributed", "sensor"), ("distributed", "ray")):

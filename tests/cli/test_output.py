@@ -9,9 +9,9 @@ import pytest
 from support.command_line import caller
 from support.tables import each_row
 
-from lidardesign.cli.terminal import progress
+from lidardesign.cli.terminal import grids as progress
+from lidardesign.cli.terminal.grids import ProgressDisplay
 from lidardesign.cli.terminal.output import Output
-from lidardesign.cli.terminal.progress import ProgressDisplay
 from lidardesign.cli.terminal.score_tables import sentence
 from lidardesign.errors import BackgroundNote
 from lidardesign.scoring.evaluation.results import Paired

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 from support.tables import each_row
 
-from lidardesign.density.training.verdict import BOUNDS, Verdict
+from lidardesign.samples import BOUNDS, Verdict
 
 PERFECT = (0.0, 0.0, 1.0)
 ORDER = ("good", "usable", "poor")

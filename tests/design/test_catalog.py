@@ -36,7 +36,7 @@ from lidardesign.parts.statements import FIELDS, PartFile, Statement
 from lidardesign.run.validation import check_model
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.sensors.design_file import design_document, design_from_document, load_design, save_design
-from lidardesign.sensors.even import grid_rows
+from lidardesign.sensors.pattern import grid_rows
 from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import DesignSpace, direction
 

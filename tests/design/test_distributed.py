@@ -16,7 +16,7 @@ from support.tables import each_row
 
 from lidardesign.mixture.ensemble import coupling_of
 from lidardesign.mixture.fit import fit
-from lidardesign.sensors.even import low_discrepancy
+from lidardesign.sensors.pattern import low_discrepancy
 from lidardesign.sensors.sensor import Sensor, tangent_directions
 from lidardesign.space import angles, observed_point
 

@@ -16,7 +16,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.mixture.fit import rays_at, refitted
 from lidardesign.samples import Samples
 from lidardesign.sensors.bandwidth import split_budget
-from lidardesign.sensors.even import grid_rows, grid_tangent
+from lidardesign.sensors.pattern import grid_rows, grid_tangent
 from lidardesign.sensors.sensor import MOST_RAYS, DesignSpec, Track, interval_factor, tangent_coordinates
 from lidardesign.space import DesignSpace, angles, direction
 

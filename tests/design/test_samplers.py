@@ -34,7 +34,7 @@ from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Body, Box, Capsule, Mesh, Scene, Sphere
 from lidardesign.scenes.surface import sample_body
 from lidardesign.scoring.baselines.simple import OccupancyGrid
-from lidardesign.sensors.even import low_discrepancy
+from lidardesign.sensors.pattern import low_discrepancy
 from lidardesign.sensors.sensor import DesignSpec, tangent_coordinates, tangent_directions
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
 

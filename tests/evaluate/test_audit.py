@@ -13,7 +13,7 @@ from support.scoring import MissTask, design, make_request, scenes
 
 from lidardesign.report.tables import audit_section, effects_section
 from lidardesign.scenes.scene import Ambient, Scene
-from lidardesign.scoring.evaluation.effects import effect_notes, effect_summaries
+from lidardesign.scoring.evaluation.entries import effect_notes, effect_summaries
 from lidardesign.scoring.evaluation.results import Audit, AuditRow
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.simulate import plan as plan_module

@@ -34,11 +34,11 @@ from lidardesign.errors import NumericalError
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.scenes.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
-from lidardesign.scoring.accuracy import fields, visibility
+from lidardesign.scoring.accuracy import fields
+from lidardesign.scoring.accuracy import fields as visibility
 from lidardesign.scoring.accuracy import training as learning_steps
-from lidardesign.scoring.accuracy.fields import ExactField, fresh_table
+from lidardesign.scoring.accuracy.fields import LOG_OPAQUE, ExactField, fresh_table, opaque_target
 from lidardesign.scoring.accuracy.probes import AccuracyRequest, draw_probes, few_columns, with_frames
-from lidardesign.scoring.accuracy.visibility import LOG_OPAQUE, opaque_target
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.space import DesignSpace
 from lidardesign.task import scenes_of

@@ -23,10 +23,16 @@ from support.report_pages import (
 )
 from support.tables import each_row
 
-from lidardesign.report.drawing import (
+from lidardesign.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure, series
+from lidardesign.report.markup import asset
+from lidardesign.report.page import report_html
+from lidardesign.report.scene_figure import (
     FEWEST_STEPS,
     MOST_FACES,
+    MOST_RAY_STEPS,
+    MOST_STEPS,
     STEPS,
+    SceneFigure,
     body_triangles,
     drawn_share,
     frustum_lines,
@@ -35,10 +41,6 @@ from lidardesign.report.drawing import (
     round_steps,
     thinned,
 )
-from lidardesign.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure, series
-from lidardesign.report.markup import asset
-from lidardesign.report.page import report_html
-from lidardesign.report.scene_figure import MOST_RAY_STEPS, MOST_STEPS, SceneFigure
 from lidardesign.report.tables import (
     CommandTimes,
     constraints_table,

@@ -20,7 +20,7 @@ from lidardesign.density.training.trainer import Trainer
 from lidardesign.errors import DataError, NumericalError
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
-from lidardesign.scoring.accuracy import sweeps as accuracy
+from lidardesign.scoring.accuracy import evaluation as accuracy
 from lidardesign.scoring.accuracy import training
 from lidardesign.scoring.accuracy.probes import AccuracyRequest
 from lidardesign.scoring.evaluation.request import EvaluationRequest

@@ -18,7 +18,7 @@ from lidardesign.formats.names import (
     xml_text,
 )
 from lidardesign.scenes.rays import Rays, rotation_of_quaternion
-from lidardesign.sensors.even import grid_tangent
+from lidardesign.sensors.pattern import grid_tangent
 from lidardesign.sensors.sensor import DesignSpec, tangent_directions
 from lidardesign.space import angles, direction
 

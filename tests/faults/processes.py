@@ -18,7 +18,7 @@ from pathlib import Path
 
 # What learn, fit and evaluate import late; nothing of it may be run here, because threads do not survive a fork.
 LATE = (
-    "lidardesign.cli.main", "lidardesign.fitting.run_samples", "lidardesign.density.fields.body_kernels",
+    "lidardesign.cli.main", "lidardesign.fitting.request", "lidardesign.density.fields.body_kernels",
     "lidardesign.density.fields.body_kernels", "lidardesign.density.fields.table_kernels", "lidardesign.density.training.learn",
     "lidardesign.density.spline_kernels", "lidardesign.mixture.support", "lidardesign.mixture.fit",
     "lidardesign.scoring.metrics", "lidardesign.report.page", "lidardesign.scoring.evaluation.score",

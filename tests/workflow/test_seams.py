@@ -147,7 +147,7 @@ def test_rows_of_a_fitted_design_stay_when_the_world_turns_by_a_quarter(layout):
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process; the target density is the planted one."""
-    monkeypatch.setattr("lidardesign.fitting.run_samples.RunTarget.__call__", lambda self, points: log_shelf(points))
+    monkeypatch.setattr("lidardesign.fitting.request.RunTarget.__call__", lambda self, points: log_shelf(points))
     return caller(capsys, tmp_path, monkeypatch)
 
 

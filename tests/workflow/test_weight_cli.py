@@ -12,7 +12,7 @@ from support.command_line import make_run
 
 from lidardesign import open_run
 from lidardesign.config import resolve, save_run_config
-from lidardesign.fitting.run_samples import RunTarget, Weighting, weighted_samples
+from lidardesign.fitting.request import RunTarget, Weighting, weighted_samples
 from lidardesign.formats.designs import load_design
 from lidardesign.mixture.fit import fit
 from lidardesign.registry import load_task

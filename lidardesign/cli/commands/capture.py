@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli.terminal import options
-from lidardesign.cli.terminal.completion import words
 from lidardesign.cli.terminal.grids import RichConsole, number, print_table
+from lidardesign.cli.terminal.options import words
 from lidardesign.cli.terminal.output import Output, claim_outputs, command, keep_times
 from lidardesign.errors import ConfigError, DataError, check_choice
 from lidardesign.run.clock import phase

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli.terminal import completion, options
+from lidardesign.cli.terminal import options
+from lidardesign.cli.terminal import options as completion
 from lidardesign.cli.terminal.grids import RichConsole, number, text_table
 from lidardesign.cli.terminal.output import Output, command
 from lidardesign.errors import ConfigError, check_choice

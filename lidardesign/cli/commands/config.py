@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from lidardesign.cli.terminal import options
-from lidardesign.cli.terminal.completion import tasks, words
+from lidardesign.cli.terminal.options import tasks, words
 from lidardesign.cli.terminal.output import Output, announce, command
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase

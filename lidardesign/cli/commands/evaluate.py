@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli.terminal import options
-from lidardesign.cli.terminal.completion import detectors, words
 from lidardesign.cli.terminal.grids import RichConsole
+from lidardesign.cli.terminal.options import detectors, words
 from lidardesign.cli.terminal.output import Output, claim_outputs, command, keep_times
 from lidardesign.cli.terminal.score_tables import show_accuracy, show_evaluation
 from lidardesign.run.clock import phase
@@ -21,7 +21,7 @@ from lidardesign.run.outputs import check_outputs
 if TYPE_CHECKING:
     from lidardesign.api.scores import ScoreRequest, Scores
     from lidardesign.api.seeds import SeedsRequest
-    from lidardesign.cli.terminal.progress import ProgressDisplay
+    from lidardesign.cli.terminal.grids import ProgressDisplay
     from lidardesign.scoring.baselines.cma import Show
 
 BASELINE_HELP = (

@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from lidardesign.cli.terminal import options
-from lidardesign.cli.terminal.completion import formats
 from lidardesign.cli.terminal.grids import RichConsole, text_table
+from lidardesign.cli.terminal.options import formats
 from lidardesign.cli.terminal.output import Output, announce, command, keep_times, written_file
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli.terminal import options
-from lidardesign.cli.terminal.completion import constraint_keys
 from lidardesign.cli.terminal.design_tables import show_fit
 from lidardesign.cli.terminal.grids import RichConsole
+from lidardesign.cli.terminal.options import constraint_keys
 from lidardesign.cli.terminal.output import Output, command, keep_times
 from lidardesign.errors import LidardesignError
 from lidardesign.run.clock import WAIT_S, phase

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli.terminal import options
-from lidardesign.cli.terminal.completion import tasks, words
 from lidardesign.cli.terminal.grids import RichConsole, duration, text_table
+from lidardesign.cli.terminal.options import tasks, words
 from lidardesign.cli.terminal.output import command, keep_times
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
-    from lidardesign.cli.terminal.progress import ProgressDisplay
+    from lidardesign.cli.terminal.grids import ProgressDisplay
     from lidardesign.density.training.learn import LearnProgress, LearnResult
 
 BYTES_PER_MEGABYTE = 1e6

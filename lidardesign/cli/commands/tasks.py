@@ -9,7 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from lidardesign.cli.terminal import completion, options
+from lidardesign.cli.terminal import options
+from lidardesign.cli.terminal import options as completion
 from lidardesign.cli.terminal.grids import RichConsole, text_table
 from lidardesign.cli.terminal.output import command
 from lidardesign.run.clock import phase

@@ -24,8 +24,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from lidardesign.cli.terminal.grids import duration
-from lidardesign.cli.terminal.progress import ProgressDisplay
+from lidardesign.cli.terminal.grids import ProgressDisplay, duration
 from lidardesign.cli.terminal.score_tables import show_times
 from lidardesign.errors import BackgroundNote, ConfigError, DataError, LidardesignError
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running

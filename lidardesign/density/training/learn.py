@@ -32,13 +32,12 @@ from lidardesign.density.training.trainer import (
     Trainer,
     least_balancing_steps,
 )
-from lidardesign.density.training.verdict import Verdict
 from lidardesign.errors import BackgroundNote, ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import peak_memory_bytes, phase, running
 from lidardesign.run.manifest import note, record
-from lidardesign.samples import save_samples
+from lidardesign.samples import Verdict, save_samples
 from lidardesign.scenes.rays import in_view
 from lidardesign.scenes.scene import Scene
 from lidardesign.space import AZIMUTH, observed_point

@@ -1,4 +1,7 @@
-"""Accuracy and cost of an evaluation: rays that stand for a beam, effects of light, and held-out scenes."""
+"""Accuracy and cost of an evaluation: rays that stand for a beam, effects of light, and held-out scenes.
+
+What accuracy costs in time: sweeps over the settings of every numerical choice, for a task and a run, here.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,17 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.registry import plugin_guard
+from lidardesign.run.clock import Progress, phase
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import path_windows
 from lidardesign.scenes.scene import Scene
+from lidardesign.scoring.accuracy import fields, training
 from lidardesign.scoring.accuracy.probes import AccuracyRequest
 from lidardesign.scoring.evaluation.request import EvaluationRequest, numbers_fired
 from lidardesign.scoring.evaluation.results import Row
 from lidardesign.scoring.scene_scores import RaysPerCondition, score_lists
 from lidardesign.scoring.statistics import mean_interval
-from lidardesign.scoring.sweep import Measurement, Sweep, timed, with_memory
+from lidardesign.scoring.sweep import Accuracy, Measurement, Sweep, timed, with_memory
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.detector.physics import EFFECTS, Detector, Physics, check_windows
@@ -338,3 +343,37 @@ def relative_error_of_spread(values: np.ndarray) -> float:
     if second == 0:
         return 0.0
     return math.sqrt(max(float(np.mean(centred**4)) / second**2 - 1, 0.0) / (4 * len(values)))
+
+
+# In the order of the pipeline: the phase, its name for progress, and what gives the sweeps, none where the choice does
+# not arise.
+SWEEPS = (
+    ("visibility", "visibility", fields.visibility_sweeps),
+    ("fields", "distance fields", fields.field_sweeps),
+    ("precision", "arithmetic", training.dtype_sweeps),
+    ("scenes", "scenes per step", training.frames_sweeps),
+    ("training", "training", training.steps_sweeps),
+    ("physics", "effects of light", physics_sweeps),
+    ("held_out", "held-out scenes", scenes_sweeps),
+)
+
+
+def measure_accuracy(request: AccuracyRequest, progress: Progress | None = None) -> Accuracy:
+    """Measure every sweep that applies.
+
+    Arguments:
+        request: What to measure on.
+        progress: Called with the label of the next kind of sweeps, the kinds done, and all kinds.
+    """
+    measured: list[Sweep] = []
+    seconds: dict[str, float] = {}
+    for done, (name, label, sweeps) in enumerate(SWEEPS):
+        if progress:
+            progress(label, done, len(SWEEPS))
+        started = time.perf_counter()
+        with phase(name):
+            measured += sweeps(request)
+        seconds[name] = round(time.perf_counter() - started, 3)
+    if progress:
+        progress("", len(SWEEPS), len(SWEEPS))
+    return Accuracy(measured, seconds)

@@ -32,7 +32,7 @@ from lidardesign.numerics import TINY, unit_vectors
 from lidardesign.scoring.baselines.candidates import GatedLayout, LayoutSite, opened_gate
 from lidardesign.scoring.baselines.views import RAY_AXES, Observed, ReturnTable, TrainingViews, dense_rays
 from lidardesign.sensors.bandwidth import split_budget
-from lidardesign.sensors.even import grid_rows, grid_tangent, low_discrepancy
+from lidardesign.sensors.pattern import grid_rows, grid_tangent, low_discrepancy
 from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, angles, direction
 

@@ -28,7 +28,7 @@ from lidardesign.numerics import TINY, unit_vectors
 from lidardesign.scoring.baselines.candidates import GatedLayout, LayoutSite
 from lidardesign.scoring.baselines.even import SIXTH, SphereField, box_crop, even_placement, widened_angles
 from lidardesign.scoring.baselines.views import RAY_AXES, ReturnTable, TrainingViews, dense_rays
-from lidardesign.sensors.even import low_discrepancy
+from lidardesign.sensors.pattern import low_discrepancy
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
 
 LEAST_SHARE = 0.01

@@ -14,7 +14,7 @@ from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Scene
 from lidardesign.scoring.baselines.candidates import opened_gate, whole_range
 from lidardesign.scoring.scene_scores import RaysPerCondition, score_lists
-from lidardesign.sensors.even import low_discrepancy
+from lidardesign.sensors.pattern import low_discrepancy
 from lidardesign.simulate.detector.physics import Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import build_casters

@@ -19,7 +19,7 @@ import numpy as np
 
 from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
 from lidardesign.run.files import write_atomic
-from lidardesign.scoring.evaluation.effects import EffectSummary
+from lidardesign.scoring.evaluation.entries import EffectSummary
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.statistics import paired_difference
 from lidardesign.scoring.sweep import Accuracy

@@ -24,8 +24,7 @@ from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scenes.triangles import SecondCasts
 from lidardesign.scoring.baselines.cma import CMA
 from lidardesign.scoring.baselines.greedy import GREEDY, greedy_rays
-from lidardesign.scoring.evaluation.effects import effect_notes, effect_summaries
-from lidardesign.scoring.evaluation.entries import Entry, entries_of, strongest_rival
+from lidardesign.scoring.evaluation.entries import Entry, effect_notes, effect_summaries, entries_of, strongest_rival
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
 from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
