@@ -1,4 +1,4 @@
-"""Designs and samples that tests of layouts share."""
+"""Sensors, and samples that lie inside them."""
 
 from __future__ import annotations
 
@@ -8,22 +8,19 @@ import numpy as np
 
 from lidardesign.samples import Samples
 from lidardesign.sensors.bandwidth import split_budget
-from lidardesign.sensors.sensor import (
-    Sensor,
-    tangent_directions,
-)
+from lidardesign.sensors.sensor import interval_factor, tangent_directions
 from lidardesign.space import DesignSpace, aim, angles
+from support.sensors import normal_sensor
 
 SPACE = DesignSpace((-5, -5, -5, 0, -math.pi / 2, 0), (5, 5, 5, 2 * math.pi, math.pi / 2, 10))
 
 
 def sensor(name="s", weight=1.0, **changes):
     values = {
-        "origin_m": np.array([0.1, -0.2, 0.3]), "origin_covariance_m2": np.zeros((3, 3)),
-        "azimuth_rad": 1.0, "elevation_rad": -0.3, "roll_rad": 0.2, "spread_horizontal_rad": 0.12,
-        "spread_vertical_rad": 0.06, "range_m": 1.0, "spread_range_m": 0.1, **changes,
+        "origin_m": (0.1, -0.2, 0.3), "azimuth_rad": 1.0, "elevation_rad": -0.3, "roll_rad": 0.2,
+        "spread_rad": (0.12, 0.06), "range_m": 1.0, "spread_range_m": 0.1, **changes,
     }  # fmt: skip
-    return Sensor(name=name, weight=weight, **values)
+    return normal_sensor(name, weight, **values)
 
 
 def three_sensors(**changes):
@@ -41,7 +38,9 @@ def drawn_from(design, count=6000, seed=0):
     for component, n in zip(design.sensors, split_budget(design.weights, count), strict=True):
         tangent = generator.normal(0, [0.12, 0.06], (n, 2))
         azimuth, elevation = angles(tangent_directions(component.frame, tangent))
-        distance = np.abs(generator.normal(component.range_m, component.spread_range_m, n))
+        start, end = component.gate_m
+        spread_m = (end - start) / 2 / interval_factor(design.level)
+        distance = np.abs(generator.normal((start + end) / 2, spread_m, n))
         origin = np.tile(component.origin_m, (n, 1))
         parts.append(np.column_stack([origin, azimuth, elevation, distance]))
     points = np.concatenate(parts)

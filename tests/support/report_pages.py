@@ -17,9 +17,10 @@ from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scenes.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric
+from support.sensors import normal_sensor
 
 METRIC = Metric("Chamfer <distance>", "mm", "lower", worst=200.0, tolerance=0.1)
 NASTY = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&"
@@ -44,7 +45,7 @@ def make_evaluation(*names):
 
 
 def make_sensor(name="s0", azimuth=0.0, elevation=0.0):
-    return Sensor(name, 1.0, np.zeros(3), np.zeros((3, 3)), azimuth, elevation, 0.0, 0.1, 0.05, 2.7, 0.2)
+    return normal_sensor(name, 1.0, (0, 0, 0), azimuth, elevation, 0.0, (0.1, 0.05), 2.7, 0.2)
 
 
 def make_rays(count=9, sensors=1, lift=0.0):

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import angles, direction
+from support.sensors import normal_sensor
 
 NASTY = 'b</script> "&amp;" \\ ö\'{x}${y}'
 
 
 def sensor(name, origin_m, azimuth_rad, elevation_rad, roll_rad):
-    origin = np.array(origin_m, dtype=np.float64)
-    return Sensor(name, 0.25, origin, np.zeros((3, 3)), azimuth_rad, elevation_rad, roll_rad, 0.2, 0.1, 1.5, 0.3)
+    return normal_sensor(name, 0.25, origin_m, azimuth_rad, elevation_rad, roll_rad, (0.2, 0.1), 1.5, 0.3)
 
 
 def rig():
@@ -46,7 +47,8 @@ def rig():
     rays = Rays(origin, looking, gate, owner, np.arange(len(owner)) / (10.0 * len(owner)))
     # rays of different sensors take turns
     shuffled = generator.permutation(len(owner))
-    return DesignSpec("a rig", sensors, rays=len(owner)), rays.subset(shuffled)
+    rays = rays.subset(shuffled)
+    return DesignSpec("a rig", sensors, "fixed", (Pattern.of(rays),)), rays
 
 
 def even(columns, rows, azimuth_rad, elevation_rad):
@@ -65,7 +67,7 @@ def spinning(columns=36, rows=4):
         np.tile(one.origin_m, (count, 1)), local @ one.frame, np.tile((0.5, 9.0), (count, 1)), np.zeros(count),
         np.arange(count) / (10.0 * count),
     )  # fmt: skip
-    return DesignSpec("spinner", (one,), rays=count), rays
+    return DesignSpec("spinner", (one,), "fixed", (Pattern.of(rays),)), rays
 
 
 def farthest_nearest(wanted, fired):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from lidardesign.scoring.evaluation.request import EvaluationRequest
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
 from support.rivals import balls
+from support.sensors import normal_sensor
 
 SPACE = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
 
@@ -54,7 +55,7 @@ def scenes(seed, count=6, side=0.0):
 
 
 def design(name="aimed", azimuth=0.0, spread=0.03, range_m=2.65, weight=1.0):
-    sensor = Sensor("s0", weight, np.zeros(3), np.zeros((3, 3)), azimuth, 0.0, 0.0, spread, spread, range_m, 0.05)
+    sensor = normal_sensor("s0", weight, (0, 0, 0), azimuth, 0.0, 0.0, (spread, spread), range_m, 0.05)
     return DesignSpec(name, (sensor,))
 
 

@@ -9,7 +9,8 @@ from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask
 
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.evaluation.request import EvaluationRequest
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
+from support.sensors import normal_sensor
 
 SEED = 3
 
@@ -18,8 +19,7 @@ def make_request(**changes):
     """Flatland with six held-out scenes and one design."""
     task, config = FlatlandTask(), FlatlandConfig(train=3, test=6)
     space = task.space(config)
-    middle = np.array([0.5, 0.0, 0.0])
-    sensor = Sensor("s0", 1.0, middle, 0.01 * np.eye(3), math.pi / 2, 0.0, 0.0, 0.3, 0.01, 0.7, 0.1)
+    sensor = normal_sensor("s0", 1.0, (0.5, 0.0, 0.0), math.pi / 2, 0.0, 0.0, (0.3, 0.01), 0.7, 0.1)
     values = {
         "task": task,
         "config": config,
