@@ -208,7 +208,7 @@ class Fitter:
                 idle = [] if fired is None else np.flatnonzero(fired == 0).tolist()
                 why = f"{len(idle)} of {request.sensors} sensors would fire none of the rays"
             except InfeasibleError as error:
-                if request.sensors == 1 or error.conflicts != ["--sensors"]:
+                if request.sensors == 1 or error.conflicts != ("--sensors",):
                     raise
                 idle, why = [0], str(error.message)
             if not idle or request.sensors == 1:
