@@ -152,9 +152,9 @@ def test_numbers_of_sensors_that_nobody_fits_are_config_errors(sensors):
         fitted(FIXED, sensors=sensors)
 
 
-def effective_samples(sensors, samples, z=interval_factor(0.95)):
+def effective_samples(sensors, samples):
     """How many equal weights the share of the samples is worth that belongs to each sensor, by the naive sum."""
-    logs = []
+    logs, z = [], interval_factor(0.95)
     for sensor in sensors:
         start, end = sensor.gate_m
         tangent = tangent_coordinates(sensor.frame, direction(samples.points[:, 3], samples.points[:, 4]))
@@ -176,8 +176,8 @@ def test_every_sensor_rests_on_enough_effective_samples_or_the_fit_is_refused(ef
     try:
         found = fitted(few, sensors=sensors)
     except InfeasibleError as refused:
-        assert sensors > 1  # noqa: PT017
-        assert "effective samples" in refused.message  # noqa: PT017
+        assert sensors > 1
+        assert "effective samples" in refused.message
     else:
         assert effective_samples(found.sensors, few).min() >= LEAST_SAMPLES
 

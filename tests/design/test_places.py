@@ -11,8 +11,8 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import SAME_PLACE_M, snap_to_space
 from lidardesign.errors import InfeasibleError
-from lidardesign.formats.rig import rig_constraints
 from lidardesign.formats.designs import load_design
+from lidardesign.formats.rig import rig_constraints
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
 from lidardesign.space import DesignSpace
