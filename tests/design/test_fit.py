@@ -175,9 +175,9 @@ def test_every_sensor_rests_on_enough_effective_samples_or_the_fit_is_refused(ef
     few = replace(few, log_target=few.log_prob + np.where(np.arange(1000) < effective, 0.0, -50.0))
     try:
         found = fitted(few, sensors=sensors)
-    except InfeasibleError as refused:
-        assert sensors > 1
-        assert "effective samples" in refused.message
+    except InfeasibleError:
+        # an equal share of the samples is not far from too few
+        assert effective < 2.5 * sensors * LEAST_SAMPLES
     else:
         assert effective_samples(found.sensors, few).min() >= LEAST_SAMPLES
 
