@@ -130,7 +130,8 @@ def owners(
         if fixed:
             origins = points[:, :3].copy()
             origins[:, fixed] = np.asarray(sensor.origin_m)[fixed]
-            own = space.wrap(aim(origins, observed))
+            if (origins != points[:, :3]).any():  # else their angles keep every digit
+                own = space.wrap(aim(origins, observed))
         if len(spreads_m):
             away = (own[:, :3] - sensor.origin_m) @ axes / spreads_m
             score -= np.square(away).sum(axis=1) / 2 + np.log(spreads_m).sum()
