@@ -130,6 +130,21 @@ class TestCandidates:
         even = even_rays(sensors, split_budget(np.array([sensor.weight for sensor in sensors]), 30))
         assert rows(more.subset(np.arange(inside, inside + 30))) == rows(even)
 
+    @given(seed=seeds, count=st.integers(1, 20), least=st.lists(st.integers(0, 60), min_size=3, max_size=3))
+    def test_are_as_many_of_each_sensor_as_it_has_to_have_its_own_samples_first(self, kind, seed, count, least):
+        sensors, least = SENSORS[kind], np.array(least)
+        few = CEILING.subset(np.arange(80))
+        rules = Constraints.from_mapping(RULES[kind]).rules
+        proposals = Proposals(sensors, rules, LEVEL, few)
+        plain, rays = (proposals.draw(count, {}, np.random.default_rng(seed), one) for one in (None, least))
+        assert rows(plain) <= rows(rays)
+        own = np.bincount(rays.sensor, minlength=3)
+        np.testing.assert_array_equal(own, np.maximum(np.bincount(plain.sensor, minlength=3), least))
+        owned = np.bincount(owners(sensors, rules, LEVEL, few.points, few.space)[0] + 1, minlength=4)[1:]
+        even = rows(even_rays(sensors, np.maximum(least - owned, 0)))
+        assert rows(rays) & even == even
+        assert len(rows(rays) - even) == np.minimum(own, owned).sum()
+
     def test_are_as_frequent_as_samples_weigh_and_none_that_weighs_nothing(self, kind):
         heavy = np.arange(len(CEILING)) % 2 == 0
         samples = replace(CEILING, log_target=np.where(heavy, 2.0, 0.0), log_prob=np.zeros(len(CEILING)))

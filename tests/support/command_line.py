@@ -41,10 +41,10 @@ def caller(capsys, tmp_path, monkeypatch):
     return call
 
 
-def make_run(folder: Path, count: int = 4000, task: str = "flatland", seed: int = 3, overrides=()) -> Path:
+def make_run(folder: Path, count: int = 4000, task: str = "flatland", seed: int = 3) -> Path:
     """A run as `learn` leaves it, with samples around two spots of its space instead of a learned density."""
     task = load_task(task)
-    config = resolve(task, preset="draft", seed=seed, overrides=list(overrides))
+    config = resolve(task, preset="draft", seed=seed)
     generator = np.random.default_rng(0)
     points = config.space.sample(count, generator)
     low, high = np.array(config.space.low), np.array(config.space.high)
