@@ -204,7 +204,8 @@ class Fitter:
         while True:
             try:
                 result = self._fitted(request, may_idle=True)
-                idle = [index for index, rays in enumerate(result.design.rays_per_sensor() or ()) if not rays]
+                fired = result.design.rays_per_sensor()
+                idle = [] if fired is None else np.flatnonzero(fired == 0).tolist()
                 why = f"{len(idle)} of {request.sensors} sensors would fire none of the rays"
             except InfeasibleError as error:
                 if request.sensors == 1 or error.conflicts != ["--sensors"]:
