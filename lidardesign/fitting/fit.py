@@ -33,7 +33,7 @@ from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, 
 from lidardesign.rays.information import checked_information
 from lidardesign.rays.pool import CandidatePool, has_pool, pool_of
 from lidardesign.rays.proposals import nearest_samples
-from lidardesign.rays.training import HELD_BACK, TrainingScenes
+from lidardesign.rays.training import CHOICE, HELD_BACK, TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import versions
@@ -287,6 +287,9 @@ class Fitter:
         request, metric = self.request, self.request.run.metric
         check_feasible(request.constraints, request.run.config.space, rays=request.rays)
         scenes = self.training.first(HELD_BACK)
+        if not self.is_pooled:
+            # every trial casts its candidates into the same ones
+            self.training.first(CHOICE)
 
         def fit(trial: FitRequest) -> DesignSpec:
             self.progress(f"trying {trial.sensors} sensors")

@@ -97,8 +97,8 @@ def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[Informe
     alone = [part if len(part) >= FEWEST_RETURNS else group for part, group in zip(parts, shared, strict=True)]
     ends = []
     for source, levels in ((shared, LEVELS[:1]), (alone, LEVELS[1:])):
-        label = np.repeat(np.arange(count), [len(part) for part in source])
-        ends.append(central_intervals(np.concatenate(source), np.ones(len(label)), label, count, np.array(levels))[0])
+        cell = np.repeat(np.arange(count), [len(part) for part in source])
+        ends.append(central_intervals(np.concatenate(source), cell, count, levels))
     return _inside(rays, np.concatenate(ends, axis=1), LEVELS, margin_m)
 
 
@@ -106,7 +106,7 @@ def sensor_gates(rays: Rays, visits: Sequence[slice], informed: Sequence[Informe
     """A few gates of each ray's sensor, each narrower than the one before, (N, G, 2) [m]; as `gate_choices`."""
     ray, range_m = _informative_returns(informed)
     sensor, sensors = rays.sensor[ray], int(rays.sensor.max()) + 1
-    ends, _ = central_intervals(range_m, np.ones(len(ray)), sensor, sensors, np.array(SENSOR_LEVELS))
+    ends = central_intervals(range_m, sensor, sensors, SENSOR_LEVELS)
     narrow = _inside(rays, ends[rays.sensor], SENSOR_LEVELS, margin_m)
     return np.concatenate([rays.gate_m[:, None], narrow], axis=1)
 
@@ -125,35 +125,26 @@ def _informative_returns(informed: Sequence[InformedScene]) -> tuple[np.ndarray,
     return tuple(np.concatenate(column) for column in zip(*returns, strict=True))
 
 
-def central_intervals(
-    values: np.ndarray, weights: np.ndarray, labels: np.ndarray, count: int, level: float | np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The central `level` of weighted values in each cell, and how many equal weights each rests on.
+def central_intervals(values: np.ndarray, cell: np.ndarray, cells: int, levels: Sequence[float]) -> np.ndarray:
+    """The central shares of the values in each cell, (K, L, 2), linear between them; NaN for cells without values.
 
     Arguments:
         values: Shape (N,).
-        weights: Non-negative, shape (N,).
-        labels: The cell of each value, shape (N,).
-        count: Number of cells K.
-        level: The share that an interval holds, or several of any shape.
-
-    Returns:
-        Ends, shape (K, ..., 2), NaN for cells without weight; effective counts, shape (K,).
+        cell: The cell of each value, shape (N,).
+        cells: Their number K.
+        levels: The shares that intervals hold, L of them.
     """
-    shares = np.stack([(1 - np.asarray(level)) / 2, (1 + np.asarray(level)) / 2], axis=-1)
-    ends, effective = np.full((count, *shares.shape), np.nan), np.zeros(count)
-    order = np.lexsort((values, labels))
-    starts = np.searchsorted(labels[order], np.arange(count + 1))
-    for cell in np.flatnonzero(np.diff(starts)):
-        part = order[starts[cell] : starts[cell + 1]]
-        mass = weights[part].sum()
-        if mass <= 0:
-            continue
-        share = (np.cumsum(weights[part]) - weights[part] / 2) / mass
-        ends[cell] = np.interp(shares, share, values[part])
-        # shares first: squares of weights below 1e-160 are zero
-        effective[cell] = 1 / np.square(weights[part] / mass).sum()
-    return ends, effective
+    ordered = values[np.lexsort((values, cell))]
+    count = np.bincount(cell, minlength=cells)[:, None, None]
+    first = np.cumsum(count, axis=0) - count
+    share = np.stack([(1 - np.array(levels)) / 2, (1 + np.array(levels)) / 2], axis=-1)
+    # value i of n stands for the share (i + 1/2) / n
+    place = np.clip(share * count - 0.5, 0.0, np.maximum(count - 1, 0))
+    below = np.floor(place).astype(np.intp)
+    padded = np.append(ordered, np.nan)
+    low = padded[np.minimum(first + below, len(ordered))]
+    high = padded[np.minimum(first + np.minimum(below + 1, np.maximum(count - 1, 0)), len(ordered))]
+    return np.where(count > 0, low + (place - below) * (high - low), np.nan)
 
 
 def admissible_gates(wanted_m: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:

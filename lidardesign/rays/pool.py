@@ -117,8 +117,8 @@ def _found(
     gate_m = np.tile([run.config.space.low[RANGE], run.config.space.high[RANGE]], (len(points), 1))
     looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
     rays = Rays(points[:, :3], looking, gate_m, np.zeros(len(points)), np.zeros(len(points)))
-    gates, share = partial(gate_choices, margin_m=training.margin_m), CHOSEN_SHARE / POOL_FACTOR
-    selection = Selection(rays, visits, gates, Bandwidth(), share=share)
+    gates = partial(gate_choices, margin_m=training.margin_m)
+    selection = Selection(rays, visits, gates, Bandwidth(), share=CHOSEN_SHARE / POOL_FACTOR)
     # each of a few values of a condition sees little of a scene
     most_scenes = MOST_SCENES * (1 + (len(conditions) > 1))
     return CandidatePool(

@@ -291,17 +291,19 @@ def inform_enough(
         DataError: No candidate tells anything about the scenes.
     """
     rays, visits = selection.rays, selection.visits
+    # how many scenes are needed hardly depends on gates, and open ones may not fit
+    selection, open_gates = replace(selection, limit_mbps=np.inf), rays.gate_m[:, None]
     held_back = training.inform(HELD_BACK, rays, visits, 0, FEW_SCENES, selection.share)
+    judged = selection.coverage(held_back, open_gates)
     informed: list[InformedScene] = []
     wanted, loss = 2 * FEW_SCENES, np.inf
     while True:
         progress(f"finding out what {len(rays)} rays tell about {wanted} training scenes")
         informed += training.inform(CHOICE, rays, visits, len(informed), wanted, selection.share)
-        gates_m = selection.gates(rays, visits, informed)
-        coverage = selection.coverage(informed, gates_m)
+        coverage = selection.coverage(informed, open_gates)
         selection.check_informative(coverage, wanted)
         gate = _gate_of(selection.choices(coverage, count, passes=0))
-        before, loss = loss, selection.coverage(held_back, gates_m).loss_of(gate)
+        before, loss = loss, judged.loss_of(gate)
         is_large = 2 * wanted > most_scenes or 2 * len(coverage.item) > MOST_ENTRIES
         if is_large or are_enough(before, loss, coverage.loss_of(gate)):
             return informed, held_back

@@ -49,6 +49,8 @@ class TrainingScenes:
     ) -> None:
         self.run, self.seed, self._starmap, self._at = run, seed, starmap, at or {}
         self._first: dict[str, list[Scene]] = {}
+        # of every draw so far, by purpose: draws that are skipped need not be made again
+        self._sizes: dict[str, list[int]] = {}
 
     @property
     def margin_m(self) -> float:
@@ -57,15 +59,18 @@ class TrainingScenes:
 
     def scenes(self, purpose: str, start: int = 0) -> Iterator[Scene]:
         """Scenes without end from a number on, drawn with further seeds for each purpose."""
-        skipped = 0
+        sizes = self._sizes.setdefault(purpose, [])
         for draw in itertools.count():
-            label = random_generator(self.seed, "selection", purpose, draw)
-            scenes = self.run.scenes("train", int(label.integers(2**31)))
-            yield from scenes[max(start - skipped, 0) :]
-            skipped += len(scenes)
+            if draw == len(sizes) or start < sizes[draw]:
+                label = random_generator(self.seed, "selection", purpose, draw)
+                scenes = self.run.scenes("train", int(label.integers(2**31)))
+                if draw == len(sizes):
+                    sizes.append(len(scenes))
+                yield from scenes[start:]
+            start = max(start - sizes[draw], 0)
 
     def first(self, purpose: str) -> list[Scene]:
-        """The first few scenes; they are kept."""
+        """The first few scenes; they are kept, for whoever asks again."""
         if purpose not in self._first:
             self._first[purpose] = list(itertools.islice(self.scenes(purpose), FEW_SCENES))
         return self._first[purpose]
@@ -83,7 +88,8 @@ class TrainingScenes:
             start, stop: Numbers of scenes.
             share: The share of the candidates that will be chosen.
         """
-        scenes = itertools.islice(self.scenes(purpose, start), stop - start)
+        kept = self._first.get(purpose, [])
+        scenes = kept[start:stop] if stop <= len(kept) else itertools.islice(self.scenes(purpose, start), stop - start)
         if self._at:
             visits = self._at_nearest(visits[0])
         asked = ((scene, number) for number, scene in enumerate(scenes, start))

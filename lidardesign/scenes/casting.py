@@ -8,7 +8,7 @@ rays, cast once: vertices have no share of a density.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from typing import Literal
 from weakref import WeakKeyDictionary, WeakValueDictionary
 
@@ -18,13 +18,14 @@ from lidardesign.errors import ConfigError
 from lidardesign.numerics import COARSE_SLACK, SQUARABLE, unit_vectors
 from lidardesign.scenes.rays import Crossings, Hits
 from lidardesign.scenes.scene import Body, Mesh, Scene, inverse_rigid
-from lidardesign.scenes.surface import BALL_SLACK, KINDS, SIZES, bounding_radius_m
+from lidardesign.scenes.surface import KINDS, SIZES, bounding_radius_m
 from lidardesign.scenes.triangles import FARTHEST_M, SecondCasts, Triangles, advances_m, mesh_caster
 
 # After a triangle the next one is looked for this share of the scene's reach further on.
 STEP_SHARE = COARSE_SLACK
 MAXIMUM_LAYERS = 16
 CROSSINGS_PER_RAY = 2  # of primitives, that there is room for at first
+RAYS_AT_ONCE = 100_000  # over frames that are traced together
 
 Only = Literal["all", "targets", "occluders"]
 
@@ -44,15 +45,15 @@ class SceneCaster:
         meshes = [(i, body) for i, body in chosen if isinstance(body.shape, Mesh)]
         resting = [(i, body) for i, body in meshes if body.poses.ndim == 2]
         moving = [(i, body) for i, body in meshes if body.poses.ndim == 3]
-        self._resting = _shared_at_rest(resting) if resting else None
-        self._moving = _Moving(moving, frame) if moving else None
+        self.at_rest = _shared_at_rest(resting) if resting else None
+        self.moving = _Moving(moving, frame) if moving else None
         primitives = [(i, body) for i, body in chosen if not isinstance(body.shape, Mesh)]
-        self._primitives = Primitives(primitives, frame) if primitives else None
+        self.primitives = Primitives(primitives, frame) if primitives else None
 
     @property
     def resting(self) -> _AtRest | None:
         """Its meshes at rest, where it casts at nothing else."""
-        return None if self._primitives or self._moving else self._resting
+        return None if self.primitives or self.moving else self.at_rest
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """The nearest hit of every ray, shapes (N, 3) and (N, 3); directions are normalised here.
@@ -62,25 +63,11 @@ class SceneCaster:
         Raises:
             ConfigError: An origin or direction that is not finite, or a direction of zero length.
         """
-        return self.first_hit_of_checked(*checked_rays(origins, directions))
-
-    def first_hit_of_checked(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
-        """As `first_hit`, of what `checked_rays` returned: rays that are fired in many frames are checked once."""
-        self.second_casts.rays += len(origins)
-        return self._traced(origins, directions, np.full(len(origins), np.inf), self.second_casts)
+        return next(first_hits([self], *checked_rays(origins, directions)))
 
     def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
         """First hits of finite float64 rays of unit length, cast once; from its limit (N,) on, a hit is a miss."""
-        return self._traced(origins, directions, limit_m, None)
-
-    def _traced(
-        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
-    ) -> Hits:
-        hits = self._traced_meshes(origins, directions, limit_m, twice)
-        if self._primitives:
-            self._primitives.keep_nearer(hits, origins, directions, limit_m)
-        rows = np.flatnonzero(hits.body >= 0)
-        hits.normal[rows] = _facing(hits.normal[rows], directions[rows])
+        (hits,) = _traced([self], origins, directions, limit_m, None)
         return hits
 
     def crossings(
@@ -91,7 +78,7 @@ class SceneCaster:
         Up to `MAXIMUM_LAYERS` triangles per ray are found; triangles closer than the step between them count once.
         """
         parts = [Crossings(np.empty(0, int), np.empty(0), np.empty(0))]
-        meshes = [part for part in (self._resting, self._moving) if part]
+        meshes = [part for part in (self.at_rest, self.moving) if part]
         if meshes:
             reach_m = float(limit_m[np.isfinite(limit_m)].max(initial=0.0))
             step_m = STEP_SHARE * max(reach_m, *(part.radius_m for part in meshes))
@@ -99,7 +86,7 @@ class SceneCaster:
             for _ in range(MAXIMUM_LAYERS):
                 ahead, toward = start[alive], directions[alive]
                 places, left_m = origins[alive] + ahead[:, None] * toward, limit_m[alive] - ahead
-                hits = self._traced_meshes(places, toward, left_m, None)
+                (hits,) = _traced_meshes([self], places, toward, left_m, None)
                 hit = hits.body >= 0
                 alive = alive[hit]
                 if not len(alive):
@@ -108,17 +95,57 @@ class SceneCaster:
                 cosine = np.abs(np.einsum("nk,nk->n", hits.normal[hit], toward[hit]))
                 parts.append(Crossings(alive, reached, cosine))
                 start[alive] = reached + step_m
-        if self._primitives:
-            parts.append(self._primitives.crossings(origins, directions, start_m, limit_m))
+        if self.primitives:
+            parts.append(self.primitives.crossings(origins, directions, start_m, limit_m))
         return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
-    def _traced_meshes(
-        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
-    ) -> Hits:
-        hits = self._resting.trace(origins, directions, limit_m, twice) if self._resting else Hits.none(len(origins))
-        if self._moving:
-            self._moving.keep_nearer(hits, origins, directions, limit_m, twice)
-        return hits
+
+def first_hits(casters: Sequence[SceneCaster], origins: np.ndarray, directions: np.ndarray) -> Iterator[Hits]:
+    """The first hits of the same rays in each of several frames of a scene.
+
+    Arguments:
+        casters: One per frame, with the same bodies.
+        origins, directions: As `checked_rays` returned them, shapes (N, 3).
+    """
+    at_once = max(RAYS_AT_ONCE // max(len(origins), 1), 1)
+    for start in range(0, len(casters), at_once):
+        some = casters[start : start + at_once]
+        for caster in some:
+            caster.second_casts.rays += len(origins)
+        yield from _traced(some, origins, directions, np.full(len(origins), np.inf), some[0].second_casts)
+
+
+def _traced(
+    casters: Sequence[SceneCaster],
+    origins: np.ndarray,
+    directions: np.ndarray,
+    limit_m: np.ndarray,
+    twice: SecondCasts | None,
+) -> list[Hits]:
+    found = _traced_meshes(casters, origins, directions, limit_m, twice)
+    for caster, hits in zip(casters, found, strict=True):
+        if caster.primitives:
+            caster.primitives.keep_nearer(hits, origins, directions, limit_m)
+        rows = np.flatnonzero(hits.body >= 0)
+        hits.normal[rows] = _facing(hits.normal[rows], directions[rows])
+    return found
+
+
+def _traced_meshes(
+    casters: Sequence[SceneCaster],
+    origins: np.ndarray,
+    directions: np.ndarray,
+    limit_m: np.ndarray,
+    twice: SecondCasts | None,
+) -> list[Hits]:
+    found = [
+        caster.at_rest.trace(origins, directions, limit_m, twice) if caster.at_rest else Hits.none(len(origins))
+        for caster in casters
+    ]
+    moving = [caster.moving for caster in casters if caster.moving]
+    if moving:
+        _keep_nearer(moving, found, origins, directions, limit_m, twice)
+    return found
 
 
 def trace_each(
@@ -279,44 +306,54 @@ def _shared_at_rest(bodies: Sequence[tuple[int, Body]]) -> _AtRest:
 class _Moving:
     def __init__(self, bodies: Sequence[tuple[int, Body]], frame: int) -> None:
         self._body = [index for index, _ in bodies]
-        self._casters = [mesh_caster(body.shape) for _, body in bodies]
-        poses = np.stack([body.pose(frame) for _, body in bodies])
-        self._rotation, self._translation = poses[:, :3, :3], poses[:, :3, 3]
-        centres = np.stack([caster.centre_m for caster in self._casters])
-        self._centres = np.einsum("bij,bj->bi", self._rotation, centres) + self._translation
-        self._radii_m = np.array([caster.radius_m for caster in self._casters])
+        self.casters = [mesh_caster(body.shape) for _, body in bodies]
+        self._poses = np.stack([body.pose(frame) for _, body in bodies])
+        centres = np.stack([caster.centre_m for caster in self.casters])
+        self._centres = np.einsum("bij,bj->bi", self._poses[:, :3, :3], centres) + self._poses[:, :3, 3]
+        self._radii_m = np.array([caster.radius_m for caster in self.casters])
         self.radius_m = float(self._radii_m.max())
 
-    def keep_nearer(
-        self,
-        hits: Hits,
-        origins: np.ndarray,
-        directions: np.ndarray,
-        limit_m: np.ndarray,
-        twice: SecondCasts | None,
-    ) -> None:
-        """Enter the hits that are nearer than what `hits` holds."""
-        for number, caster in enumerate(self._casters):
-            bound = np.minimum(hits.range_m, limit_m)
-            # Which rays pass a mesh's ball before their limit, shape (N,)
-            offset = self._centres[number] - origins
-            along = np.einsum("nk,nk->n", offset, directions)
-            squared = np.einsum("nk,nk->n", offset, offset)
-            slack = BALL_SLACK * squared
-            radius_m = self._radii_m[number]
-            reach = radius_m + np.sqrt(slack)
-            rows = np.flatnonzero(
-                (squared - along**2 <= radius_m**2 + slack) & (along >= -reach) & (along - reach <= bound)
-            )
-            if not len(rows):
-                continue
-            rotation = self._rotation[number]
-            local = _turned(origins[rows] - self._translation[number], rotation.T)
-            range_m, normal = caster.first_hits(local, _turned(directions[rows], rotation.T), bound[rows], twice)
-            hit = np.isfinite(range_m)
-            won = rows[hit]
-            hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
-            hits.normal[won] = _turned(normal[hit], rotation)
+    def passing(
+        self, number: int, origins: np.ndarray, directions: np.ndarray, bound_m: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The rays that pass the ball of a mesh before a bound (N,), (K,), and these in its own frame, (K, 3) each."""
+        from lidardesign.scenes import primitive_kernels
+
+        rows, local, toward = np.empty(len(origins), np.intp), np.empty(origins.shape), np.empty(origins.shape)
+        ball = (self._centres[number], self._radii_m[number])
+        found = primitive_kernels.passing(*ball, self._poses[number], origins, directions, bound_m, rows, local, toward)
+        return rows[:found], local[:found], toward[:found]
+
+    def enter(self, number: int, hits: Hits, rows: np.ndarray, range_m: np.ndarray, normal: np.ndarray) -> None:
+        """Enter what some rays (K,) hit of a mesh, with normals in its own frame."""
+        hit = np.isfinite(range_m)
+        won = rows[hit]
+        hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
+        hits.normal[won] = _turned(normal[hit], self._poses[number, :3, :3])
+
+
+def _keep_nearer(
+    moving: Sequence[_Moving],
+    found: Sequence[Hits],
+    origins: np.ndarray,
+    directions: np.ndarray,
+    limit_m: np.ndarray,
+    twice: SecondCasts | None,
+) -> None:
+    """Enter the hits of the same moving meshes in several frames that are nearer than what is found there so far.
+
+    Each mesh is asked once for the rays of all frames: most of the time of few rays goes into the calls.
+    """
+    for number, caster in enumerate(moving[0].casters):
+        bounds = [np.minimum(hits.range_m, limit_m) for hits in found]
+        asked = [part.passing(number, origins, directions, bound) for part, bound in zip(moving, bounds, strict=True)]
+        rows, local, toward = zip(*asked, strict=True)
+        bound = np.concatenate([bound[some] for bound, some in zip(bounds, rows, strict=True)])
+        range_m, normal = caster.first_hits(np.concatenate(local), np.concatenate(toward), bound, twice)
+        ends = np.cumsum([len(some) for some in rows])
+        for part, hits, some, end in zip(moving, found, rows, ends, strict=True):
+            mine = slice(end - len(some), end)
+            part.enter(number, hits, some, range_m[mine], normal[mine])
 
 
 def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:

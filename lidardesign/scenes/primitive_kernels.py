@@ -234,6 +234,35 @@ def keep_nearer(shapes, origins, directions, limits, ranges, bodies, normals):  
 
 
 @njit(cache=True, nogil=True)
+def passing(centre, radius, pose, origins, directions, bounds, rows, local, toward):  # noqa: ANN001, ANN201
+    """Enter the rays that pass a ball before their bounds, and these in the frame of the body that it is around.
+
+    Arguments:
+        centre, radius: Of the ball in the world, shape (3,), and [m].
+        pose: Of the body, shape (4, 4).
+        origins, directions: Of rays, directions of unit length, shape (N, 3).
+        bounds: Shape (N,) [m].
+        rows, local, toward: Out: which they are, where they start and where they look, shapes (N,), (N, 3) and (N, 3).
+
+    Returns:
+        How many they are.
+    """
+    found, ball = 0, (centre[0], centre[1], centre[2])
+    for n in range(origins.shape[0]):
+        origin, direction = row(origins, n), row(directions, n)
+        if _passes(ball, radius, origin, direction, bounds[n]):
+            x, y, z = origin[0] - pose[0, 3], origin[1] - pose[1, 3], origin[2] - pose[2, 3]
+            for axis in range(3):
+                local[found, axis] = x * pose[0, axis] + y * pose[1, axis] + z * pose[2, axis]
+                toward[found, axis] = (
+                    direction[0] * pose[0, axis] + direction[1] * pose[1, axis] + direction[2] * pose[2, axis]
+                )
+            rows[found] = n
+            found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
 def crossings(shapes, origins, directions, starts, limits, rows, ranges, cosines):  # noqa: ANN001, ANN201
     """Every crossing of rays with primitives from a start up to a limit, by ray; as many as there is room for.
 

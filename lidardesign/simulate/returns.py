@@ -19,7 +19,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
-from lidardesign.scenes.casting import SceneCaster, checked_rays
+from lidardesign.scenes.casting import SceneCaster, checked_rays, first_hits
 from lidardesign.scenes.rays import Hits, Outcome, Rays, Returns, gate_outcomes, path_windows, range_of_path
 from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.detector.light import Background, Beams, Echoes, direct_echoes
@@ -96,8 +96,7 @@ def simulate_many(
     )
     found: list[list[Returns]] = [[] for _ in lists]
     origins, directions = checked_rays(origins, directions)
-    for frame, caster in enumerate(casters):
-        hits = caster.first_hit_of_checked(origins, directions)
+    for frame, hits in enumerate(first_hits(casters, origins, directions)):
         outcome = gate_outcomes(hits.range_m, gate_m)
         returned = outcome == Outcome.RETURN
         columns = (outcome, np.where(returned, hits.range_m, np.nan), np.where(returned, hits.body, -1))

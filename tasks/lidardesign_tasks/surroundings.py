@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lidardesign.scenes.scene import Ambient, Medium, Scene
+from lidardesign.scenes.scene import Ambient, Body, Medium, Scene
 from lidardesign.space import FARTHEST_M
 from lidardesign.task import TaskConfig
 
@@ -50,13 +50,18 @@ class Surroundings(TaskConfig):
         # what is mirrored is missing from what is matt
         changed: dict[str, Any] = {"reflectance": (1 - self.gloss) * self.reflectance, "specular": self.gloss}
         if velocity_m_s is not None:
-            changed["velocity_m_s"] = velocity_m_s
+            changed["velocity_m_s"] = tuple(map(float, velocity_m_s))
         return replace(
             scene,
-            bodies=tuple(replace(body, **changed) for body in scene.bodies),
+            bodies=tuple(_changed(body, changed) for body in scene.bodies),
             ambient=Ambient(self.illuminance_lux, self.light) if self.illuminance_lux else None,
             medium=None if self.visibility_m is None else fog(self.visibility_m),
         )
+
+
+def _changed(body: Body, values: dict[str, Any]) -> Body:
+    """The body with these values; itself where it has them, as bodies check what they are made of."""
+    return body if all(getattr(body, name) == value for name, value in values.items()) else replace(body, **values)
 
 
 class MovingSurroundings(Surroundings):
