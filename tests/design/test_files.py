@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.strategies import conditions, length, patterns, sensors
-from support.tables import each_row
 
 from lidardesign.api.config_reference import schema_of
 from lidardesign.errors import ConfigError, DataError, NumericalError
@@ -276,7 +275,7 @@ BAD = [
 ]
 
 
-@each_row(("old", "new", "position", "says"), BAD)
+@pytest.mark.parametrize(("old", "new", "position", "says"), BAD)
 def test_a_bad_file_is_refused_with_its_position_and_what_is_allowed(tmp_path, old, new, position, says):
     path = tmp_path / "bad.yaml"
     assert GOOD.count(old) == 1

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.sensors import normal_sensor
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.galvo import (
@@ -59,7 +58,7 @@ def through_two_mirrors(x_deg, y_deg):
     return mirrored(mirrored(sideways, x_mirror), y_mirror)
 
 
-@each_row(("x", "y"), [*itertools.product((-20.0, -3.0, 0.0, 11.0, 20.0), repeat=2)])
+@pytest.mark.parametrize(("x", "y"), [*itertools.product((-20.0, -3.0, 0.0, 11.0, 20.0), repeat=2)])
 def test_a_scan_angle_is_twice_the_angle_of_a_real_mirror(x, y):
     found = scan_directions(np.eye(3), np.array([[x, y]]))[0]
     np.testing.assert_allclose(found, through_two_mirrors(x, y), atol=1e-15)
@@ -218,7 +217,7 @@ BROKEN = {
 }
 
 
-@each_row("name", BROKEN)
+@pytest.mark.parametrize("name", BROKEN)
 def test_a_damaged_file_is_refused_where_it_is_damaged(tmp_path, name):
     damage, message = BROKEN[name]
     write_galvo(design(), design().rays(), tmp_path / "f.csv")

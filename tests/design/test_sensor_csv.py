@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.sensors import normal_sensor
 from support.strategies import sensors
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.designs import load_design
@@ -132,7 +131,7 @@ def test_a_quarter_turn_of_roll_swaps_the_spreads_and_is_noted(tmp_path):
     assert spreads_of(loaded) == pytest.approx((0.1, 0.2))
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("text", "position", "says"),
     [
         (ROW.replace("3.14", "abc"), ":1:4", "azimuth_mean is 'abc'"),
@@ -175,7 +174,7 @@ def test_an_empty_file_and_bytes_that_are_no_text_are_refused(tmp_path):
         load_design(path)
 
 
-@each_row("text", ["schema_version: 2\nsensors: [1, 2]\n", "a: 1, 2", "{a: 1, b: 2}", "[1, 2]", "- 1"])
+@pytest.mark.parametrize("text", ["schema_version: 2\nsensors: [1, 2]\n", "a: 1, 2", "{a: 1, b: 2}", "[1, 2]", "- 1"])
 def test_yaml_is_not_taken_for_a_table(tmp_path, text):
     assert not begins_as_sensor_csv(text.encode())
     path = tmp_path / "a.csv"
