@@ -9,14 +9,15 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 from support.rigs import even, farthest_nearest, sensor
+from support.sensors import normal_sensor
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
 
-ONE = DesignSpec("one", (Sensor("one", 1.0, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.1),))
+ONE = DesignSpec("one", (normal_sensor("one"),))
 
 
 def rays_with_gates(gates_m):

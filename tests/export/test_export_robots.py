@@ -10,7 +10,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from lidardesign.layouts.rays import lay_out
 from support.rigs import NASTY, even, farthest_nearest, read_sdf, rig, sdf_reader, spinning
 from support.tables import each_row
 
@@ -23,7 +22,7 @@ from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.mujoco_models import RobotFile, bodies_from_mujoco, load_model
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 
 ROBOTS = ("mjcf", "sdf", "urdf", "xacro", "carla", "isaac-usd")
 GRIDS = ("sdf", "urdf", "xacro", "carla")
@@ -181,7 +180,7 @@ def test_sensors_on_a_robot_measure_our_distances_wherever_it_is(tmp_path, robot
 
 def test_a_mounted_design_goes_into_the_model_of_its_run(tmp_path):
     config = SimpleNamespace(task=SimpleNamespace(model=own_robot(tmp_path), folder=tmp_path))
-    fixed = replace(DESIGN, mount="torso", layout="fixed", rays=len(RAYS), ray_table=RAYS)
+    fixed = replace(DESIGN, mount="torso")
     source = DesignSource(fixed, SimpleNamespace(config=config, folder=tmp_path))
     exported = ExportRequest(source, EXPORTERS["mjcf"], tmp_path / "with.xml").write()
     assert exported.rays == len(RAYS)
@@ -220,9 +219,9 @@ def test_a_ray_along_any_axis_is_a_site_that_looks_there(tmp_path):
 
 
 def test_two_sensors_of_one_name_are_two_bodies(tmp_path):
-    twins = DesignSpec("twins", (DESIGN.sensors[0], DESIGN.sensors[0]), rays=2)
+    twins = DesignSpec("twins", (DESIGN.sensors[0], DESIGN.sensors[0]))
     path = tmp_path / "twins.xml"
-    EXPORTERS["mjcf"].write(twins, lay_out(twins, 2), path)
+    EXPORTERS["mjcf"].write(twins, twins.rays(2), path)
     model, _ = simulated(path)
     assert {model.body(index).name for index in (1, 2)} == {"front left", "front left 2"}
 
@@ -244,7 +243,7 @@ def test_what_is_written_for_a_simulator_is_a_design_again(tmp_path, name):
     design, rays = spinning()
     path = tmp_path / f"spin{EXPORTERS[name].suffix}"
     EXPORTERS[name].write(design, rays, path)
-    found = lay_out(load_design(path))
+    found = load_design(path).rays()
     assert len(found) == len(rays)
     assert farthest_nearest(rays.direction, found.direction) < 1e-7
     np.testing.assert_allclose(found.origin_m, rays.origin_m, atol=1e-12)

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.sensors import normal_sensor
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.mounts import mounts
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
 
 SCHEMAS = Path(__file__).parents[1] / "schemas"
 MINE = ("helios", "osi", "rgl", "mitsuba", "ply", "stl")
@@ -36,7 +37,7 @@ def design(names=NASTY, roll=True):
         elevation = (-np.pi / 2, np.pi / 2)[number] if number < 2 else elevation
         origin, spreads = generator.uniform(-3, 3, 3), generator.uniform(0.05, 0.2, 2)
         pose = (azimuth, elevation, turn if roll else 0.0)
-        sensors.append(Sensor(name, 1 / len(names), origin, np.zeros((3, 3)), *pose, *spreads, 4.0, 0.5))
+        sensors.append(normal_sensor(name, 1 / len(names), origin, *pose, spreads, 4.0, 0.5))
     return DesignSpec("a <design> & 'more'", tuple(sensors), constraints={"gate": {"width_m": {"max": 9.0}}})
 
 
@@ -368,8 +369,7 @@ def rendered(tmp_path_factory):
     names = ("left & <right>", "other")
     at = (np.array([0.3, -0.2, 0.0]), np.array([-2.0, 0.5, 0.1]))
     sensors = tuple(
-        Sensor(name, 0.5, place, np.zeros((3, 3)), 1.0, -1.2, 0.4, 0.1, 0.1, 1.25, 0.1)
-        for name, place in zip(names, at, strict=True)
+        normal_sensor(name, 0.5, place, 1.0, -1.2, 0.4, (0.1, 0.1), 1.25) for name, place in zip(names, at, strict=True)
     )
     some = DesignSpec("floor", sensors)
     rays = rays_of(some, count=40)
@@ -502,8 +502,7 @@ def test_ply_frusta_hold_what_lies_in_the_field_of_view_and_gate(written):
 
 
 def test_ply_leaves_out_frusta_that_have_no_width(tmp_path):
-    thin = Sensor("thin", 1.0, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.1)
-    some = DesignSpec("scan", (thin,), layout="scan")
+    some = DesignSpec("ray", (normal_sensor("thin", spread_rad=(0.0, 0.0)),))
     notes = EXPORTERS["ply"].write(some, rays_of(some, count=1), tmp_path / "out")
     assert "1 of 1 sensors have no width, so no frustum" in notes
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["beams.ply", "rays.ply"]
@@ -541,7 +540,6 @@ def test_names_that_look_like_the_format_do_not_become_part_of_it(tmp_path):
 
 @each_row(("name", "what"), [("stl", "solids"), ("ply", "frusta")])
 def test_shapes_of_sensors_that_are_regions_stand_in_their_middles_and_say_so(tmp_path, name, what):
-    wide = Sensor("wide", 1.0, np.zeros(3), np.diag([1.0, 0, 0]), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.1)
-    some = DesignSpec("region", (wide,))
+    some = DesignSpec("region", (normal_sensor("wide", origin_covariance_m2=np.diag([1.0, 0, 0])),))
     notes = EXPORTERS[name].write(some, rays_of(some), tmp_path / "out")
     assert f"1 sensors are regions of up to 3.92 m: {what} stand in their middles" in notes

@@ -18,8 +18,9 @@ from lidardesign.formats.names import (
     xml_text,
 )
 from lidardesign.scenes.rays import Rays, rotation_of_quaternion
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import grid_tangent
-from lidardesign.sensors.sensor import DesignSpec, tangent_directions
+from lidardesign.sensors.sensor import tangent_directions
 from lidardesign.space import angles, direction
 
 angle = st.floats(-1.2, 1.2)
