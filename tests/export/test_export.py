@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.sensors import normal_sensor
-from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.formats.designs import load_design
@@ -37,8 +36,8 @@ def read_npz(path):
         return dict(arrays)
 
 
-@each_row(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
-@each_row("count", [0, 1, 37])
+@pytest.mark.parametrize(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
+@pytest.mark.parametrize("count", [0, 1, 37])
 def test_a_ray_list_comes_back_to_the_last_bit(tmp_path, name, read, count):
     rays = design().rays(count)
     path = tmp_path / "out"
@@ -68,7 +67,7 @@ def contents(path):
     return {str(file.relative_to(path)): file.read_bytes() for file in files}
 
 
-@each_row("name", EXPORTERS)
+@pytest.mark.parametrize("name", EXPORTERS)
 def test_every_format_is_written_whole_or_not_at_all(tmp_path, name):
     exporter = EXPORTERS[name]
     assert exporter.name == name
@@ -82,7 +81,7 @@ def test_every_format_is_written_whole_or_not_at_all(tmp_path, name):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@each_row("name", EXPORTERS)
+@pytest.mark.parametrize("name", EXPORTERS)
 def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(tmp_path, name):
     exporter, path = EXPORTERS[name], tmp_path / "taken"
     if exporter.folder:
@@ -117,7 +116,7 @@ def test_a_scanners_gates_are_off_by_less_than_a_picosecond(tmp_path):
     assert any("whole picoseconds" in note for note in notes)
 
 
-@each_row(("roll", "spread_rad"), [(0.0, 0.05), (np.pi / 2, 0.02)])
+@pytest.mark.parametrize(("roll", "spread_rad"), [(0.0, 0.05), (np.pi / 2, 0.02)])
 def test_a_roll_that_a_table_cannot_hold_is_told_and_stays_in_its_spreads(tmp_path, roll, spread_rad):
     path = tmp_path / "two.csv"
     notes = EXPORTERS["sensors-csv"].write(plain_design(roll), RAYS, path)
