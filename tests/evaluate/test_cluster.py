@@ -12,10 +12,12 @@ import warnings
 from dataclasses import replace
 
 import pytest
+from support.plugins import GOOD, install_plugins
 from support.workers import make_request, results
 
 from lidardesign import workers
 from lidardesign.errors import ConfigError
+from lidardesign.registry import load_task
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.workers import opened_workers
 
@@ -141,6 +143,14 @@ def test_a_cluster_of_another_version_is_refused(scheduler, monkeypatch):
     monkeypatch.setattr(workers, "__version__", "9.9")
     with pytest.raises(ConfigError, match=r"the cluster has lidardesign [^9].*\n  allowed: lidardesign 9\.9"):
         score_by(scheduler.address)
+
+
+def test_a_plugin_that_workers_lack_is_named(scheduler, tmp_path, monkeypatch):
+    install_plugins(tmp_path / "site", {"ball": GOOD})
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    scheduler.add_worker()
+    with pytest.raises(ConfigError, match="plugins_ball"), opened_workers(scheduler.address, load_task("ball"), 6):
+        pass
 
 
 def test_a_cluster_that_lost_its_last_worker_is_given_up(scheduler, monkeypatch):

@@ -13,6 +13,7 @@ from multiprocessing.context import SpawnProcess
 
 import pytest
 from support.command_line import make_run, program
+from support.plugins import install_plugins
 from support.workers import make_request, results, without_times
 
 from lidardesign.errors import ConfigError, NumericalError, PluginError
@@ -73,8 +74,8 @@ def test_a_script_is_not_run_again_by_its_workers(tmp_path):
 BROKEN = """
 from lidardesign_tasks.flatland import FlatlandTask
 
-class BrokenTask(FlatlandTask):
-    name = "broken"
+class Task(FlatlandTask):
+    name = "NAME"
 
     def score(self, scene, returns):
         if scene.name == "test 1":
@@ -88,18 +89,12 @@ def install(tmp_path, monkeypatch):
     """Installs a task by its source."""
 
     def installed(source):
-        folder = tmp_path / "site"
-        (folder / "broken-1.0.dist-info").mkdir(parents=True)
-        (folder / "broken_task.py").write_text(source)
-        (folder / "broken-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
-        (folder / "broken-1.0.dist-info" / "entry_points.txt").write_text(
-            "[lidardesign.tasks]\nbroken = broken_task:BrokenTask\n"
-        )
-        monkeypatch.syspath_prepend(folder)
+        install_plugins(tmp_path / "site", {"broken": source})
+        monkeypatch.syspath_prepend(tmp_path / "site")
         return load_task("broken")
 
     yield installed
-    sys.modules.pop("broken_task", None)
+    sys.modules.pop("plugins_broken", None)
 
 
 @pytest.fixture
@@ -118,7 +113,7 @@ def test_what_a_plugin_raises_in_a_worker_arrives_whole(broken):
             evaluate(replace(request, starmap=starmap))
         said.append(raised.value.as_dict())
     assert said[0] == said[1]
-    assert "broken_task.py" in str(raised.value.__cause__)
+    assert "plugins_broken.py" in str(raised.value.__cause__)
 
 
 @pytest.fixture
