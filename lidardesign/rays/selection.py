@@ -291,8 +291,8 @@ def inform_enough(
         DataError: No candidate tells anything about the scenes.
     """
     rays, visits = selection.rays, selection.visits
-    # how many scenes are needed hardly depends on gates
-    open_gates = rays.gate_m[:, None]
+    # how many scenes are needed hardly depends on gates, and open ones may not fit
+    selection, open_gates = replace(selection, limit_mbps=np.inf), rays.gate_m[:, None]
     held_back = training.inform(HELD_BACK, rays, visits, 0, FEW_SCENES, selection.share)
     judged = selection.coverage(held_back, open_gates)
     informed: list[InformedScene] = []

@@ -52,15 +52,41 @@ def independent_points(target: Target, count: int, generator: np.random.Generato
     Empty where no ray of the space comes near a target.
     """
     space, sigma_m = target.space, target.optics.sigma_m
-    if RANGE not in space.free:
+    if _are_resampled(space):
         return resampled_proposals(target, count, generator)
-    if AZIMUTH in space.free and ELEVATION in space.free:
-        if target.surfaces.can_propose:
-            return target.surfaces.propose(target.scenes, space, count, sigma_m, generator)
-    elif len(space.free) <= RESAMPLED_DIMENSIONS:
-        return resampled_proposals(target, count, generator)
+    if _are_drawn_by_surfaces(target):
+        points = target.surfaces.propose(target.scenes, space, count, sigma_m, generator)
+        return points, target.surfaces.log_proposal(target.scenes, space, points, sigma_m)
     proposals = propose(target.scenes, space, count, sigma_m, generator)
     return proposals.points, proposals.log_density
+
+
+def log_proposal(target: Target, points: np.ndarray) -> np.ndarray | None:
+    """log of the density of `independent_points` at points of the space, (N, 6) to (N,), up to the same constant.
+
+    None where these are found by tracing rays, which says their density at no other point.
+    """
+    if _are_resampled(target.space):
+        log_proximity = target.log_proximity(points)
+        return np.where(_is_near(target, log_proximity), log_proximity, -np.inf)
+    if _are_drawn_by_surfaces(target):
+        return target.surfaces.log_proposal(target.scenes, target.space, points, target.optics.sigma_m)
+    return None
+
+
+def _are_resampled(space: DesignSpace) -> bool:
+    both_angles = AZIMUTH in space.free and ELEVATION in space.free
+    return RANGE not in space.free or (not both_angles and len(space.free) <= RESAMPLED_DIMENSIONS)
+
+
+def _are_drawn_by_surfaces(target: Target) -> bool:
+    free = target.space.free
+    return RANGE in free and AZIMUTH in free and ELEVATION in free and target.surfaces.can_propose
+
+
+def _is_near(target: Target, log_proximity: np.ndarray) -> np.ndarray:
+    """The points that come within `FARTHEST_SIGMAS` of a surface, as a mask (N,)."""
+    return log_proximity > target.surfaces.log_peak - FARTHEST_SIGMAS**2 / 2
 
 
 def resampled_proposals(target: Target, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +97,7 @@ def resampled_proposals(target: Target, count: int, generator: np.random.Generat
     for _ in range(CANDIDATE_ROUNDS):
         candidates = target.space.sample(CANDIDATES, generator)
         log_proximity = target.log_proximity(candidates)
-        near = log_proximity > target.surfaces.log_peak - FARTHEST_SIGMAS**2 / 2
+        near = _is_near(target, log_proximity)
         if near.any():
             break
     candidates, log_proximity = candidates[near], log_proximity[near]

@@ -98,8 +98,13 @@ class Surfaces:
 
     def propose(
         self, scenes: Sequence[Scene], space: DesignSpace, count: int, sigma_m: float, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Points (N, 6) inside the space, at most `count`, and their log density per chart volume up to a constant."""
+    ) -> np.ndarray:
+        """Points (N, 6) inside the space, at most `count`."""
+
+    def log_proposal(
+        self, scenes: Sequence[Scene], space: DesignSpace, points: np.ndarray, sigma_m: float
+    ) -> np.ndarray:
+        """log of the density of `propose` at points (N, 6) of the space, per chart volume up to a constant, (N,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +186,7 @@ class SceneTable(Surfaces):
 
     def propose(
         self, scenes: Sequence[Scene], space: DesignSpace, count: int, sigma_m: float, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> np.ndarray:
         """See `Surfaces`."""
         columns = scene_columns(scenes)
         column = np.sort(generator.integers(len(columns), size=count))
@@ -194,11 +199,17 @@ class SceneTable(Surfaces):
             surface[rows], normal[rows] = drawn.points, self._normals(drawn.points, drawn.triangles, number)
         surface += generator.normal(scale=sigma_m, size=(count, 1)) * normal
         points = space.wrap(aim(space.sample(count, generator)[:, :3], surface))
-        points = points[space.contains(points) & (points[:, RANGE] > 0)]
+        return points[space.contains(points) & (points[:, RANGE] > 0)]
+
+    def log_proposal(
+        self, scenes: Sequence[Scene], space: DesignSpace, points: np.ndarray, sigma_m: float
+    ) -> np.ndarray:
+        """See `Surfaces`."""
+        columns = scene_columns(scenes)
         area_m2 = np.array([target_area_m2(scene, space) for scene in scenes])[[index for index, _ in columns]]
         distances = self.field.distances(observed_point(points)).astype(np.float64)
         log_density = logsumexp(-np.square(distances / sigma_m) / 2, axis=1, weights=1.0 / area_m2)
-        return points, log_density + 2 * np.log(points[:, RANGE]) + log_chart_factor(space, points)
+        return log_density + 2 * np.log(points[:, RANGE]) + log_chart_factor(space, points)
 
     def _normals(self, points: np.ndarray, triangles: np.ndarray, column: int) -> np.ndarray:
         """Unit normals of triangles, and of primitives, whose triangles are points, from the field's gradient."""
@@ -297,7 +308,7 @@ class MovingFrames(Surfaces):
 
     def propose(
         self, scenes: Sequence[Scene], space: DesignSpace, count: int, sigma_m: float, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> np.ndarray:
         """See `Surfaces`."""
         parts, missing = [], count
         reach_m = np.array(space.low[:3]) - space.high[RANGE], np.array(space.high[:3]) + space.high[RANGE]
@@ -311,7 +322,12 @@ class MovingFrames(Surfaces):
             missing -= len(parts[-1])
             if missing <= 0 or exhausted:
                 break
-        points = np.concatenate(parts)[:count]
+        return np.concatenate(parts)[:count]
+
+    def log_proposal(
+        self, scenes: Sequence[Scene], space: DesignSpace, points: np.ndarray, sigma_m: float
+    ) -> np.ndarray:
+        """See `Surfaces`."""
         # each body has a term of its own, also where several are in one column
         bodies, weights = self.bodies.apart(), self.log_column_weights[self.bodies.column]
         observed, log_density = observed_point(points), np.empty(len(points))
@@ -320,7 +336,7 @@ class MovingFrames(Surfaces):
             pairs = near_pairs(bodies, observed[rows], weights, sigma_m, TERM_TOLERANCE_NATS)
             terms = weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2
             log_density[rows] = row_log_sums(terms, pairs)[0]
-        return points, log_density + 2 * np.log(points[:, RANGE]) + log_chart_factor(space, points)
+        return log_density + 2 * np.log(points[:, RANGE]) + log_chart_factor(space, points)
 
     def draw_near(
         self,

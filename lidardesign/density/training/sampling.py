@@ -11,14 +11,20 @@ and weights of max(w, Z) A. Nothing is lost: what is left out weighs little. Whe
 and A are those of a condition's group, and of every group as many are kept as of the one that keeps fewest. So that a
 group which was learned badly takes no samples from the others, it is thinned at less than Z, to a quarter at most.
 
+Beside the samples that are kept stand points that know nothing of the flow, where both densities p and q are known at
+all points. What is drawn from either has the density m = (1 - s) p + s q, with their shares as they are, and weights
+p* / m (Veach and Guibas 1995). q is known up to a constant, which is estimated by the optimal bridge between p and q.
+
 References:
     Rejection control and sequential importance sampling, Liu, Chen and Wong 1998.
+    Simulating ratios of normalizing constants via a simple identity, Meng and Wong 1996.
+    Optimally combining sampling techniques for Monte Carlo rendering, Veach and Guibas 1995.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import numpy as np
@@ -28,12 +34,17 @@ from scipy.optimize import brentq
 from lidardesign.density.coordinates import Coordinates
 from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.target import Target
-from lidardesign.numerics import logsumexp
+from lidardesign.estimates import Estimate, log_mean_error
+from lidardesign.numerics import SLACK, logsumexp
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 
 POINTS_AT_ONCE = 16384
 CONDITION_GROUPS = 32
+# Of the independent points that there are: what is tried beside the flow's samples.
+MIXED_SHARES = (0.0, 0.25, 0.5, 1.0)
+# Beyond so many nats two densities have next to nothing in common.
+LARGEST_NATS = 300.0
 # Of the samples of a condition group: what thinning leaves at least.
 LEAST_GROUP_SHARE = 0.25
 
@@ -171,3 +182,127 @@ def log_prob_of_unit(flow: DesignFlow, coordinates: Coordinates, unit: torch.Ten
         for rows in torch.arange(len(unit)).split(POINTS_AT_ONCE)
     ]
     return torch.cat(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPoints:
+    """Points of either density, with both densities there.
+
+    Arguments:
+        points: Design points, shape (N, 6).
+        log_flow: log of the density of a flow's samples, shape (N,).
+        log_proposal: log of that of independent points, up to a constant; -inf where there are none, shape (N,).
+        log_target: log p*, shape (N,).
+    """
+
+    points: np.ndarray
+    log_flow: np.ndarray
+    log_proposal: np.ndarray
+    log_target: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def subset(self, keep: slice) -> KnownPoints:
+        """Some of them."""
+        return KnownPoints(*(getattr(self, one.name)[keep] for one in fields(self)))
+
+    def log_weights(self, share: float, log_constant: float) -> np.ndarray:
+        """log p* / m at the points where a share of all is independent, shape (N,)."""
+        log_mixed = self.log_flow
+        if share > 0:
+            log_proposal = math.log(share) + self.log_proposal - log_constant
+            log_mixed = np.logaddexp(math.log1p(-share) + self.log_flow, log_proposal)
+        return self.log_target - log_mixed
+
+
+def log_constant(flow: KnownPoints, independent: KnownPoints) -> Estimate:
+    """log of the factor by which the density of independent points is known too large, by the optimal bridge [nats].
+
+    Raises:
+        ValueError: The two have nothing in common.
+    """
+    share = len(independent) / (len(flow) + len(independent))
+    ratios = [np.clip(one.log_proposal - one.log_flow, -LARGEST_NATS, LARGEST_NATS) for one in (flow, independent)]
+
+    def bridged(constant: float) -> tuple[np.ndarray, np.ndarray]:
+        """q / m at points of the flow and p / m at independent ones."""
+        mine, theirs = (ratio - constant for ratio in ratios)
+        return 1 / (share + (1 - share) * np.exp(-mine)), 1 / ((1 - share) + share * np.exp(theirs))
+
+    def excess(constant: float) -> float:
+        mine, theirs = bridged(constant)
+        return float(mine.mean() - theirs.mean())
+
+    found = brentq(excess, -2 * LARGEST_NATS, 2 * LARGEST_NATS, xtol=SLACK)
+    mine, theirs = bridged(found)
+    return Estimate(found, math.hypot(log_mean_error(mine), log_mean_error(theirs)), "nats")
+
+
+def effective_count_of_mixture(
+    flow: KnownPoints, independent: KnownPoints, counts: tuple[int, int], constant: float, space: DesignSpace
+) -> float:
+    """How many samples of equal weight so many of a flow and so many independent ones are worth, by other draws.
+
+    Arguments:
+        flow, independent: Draws of both.
+        counts: How many there will be of each.
+        constant: See `log_constant`.
+        space: Along a condition every part of it counts for itself.
+    """
+    total = sum(counts)
+    drawn, worth = [flow, independent] if counts[1] else [flow], 0.0
+    log_weights = np.concatenate([one.log_weights(counts[1] / total, constant) for one in drawn])
+    stands_for = np.repeat([count / len(one) for count, one in zip(counts, drawn, strict=False)], [*map(len, drawn)])
+    groups = condition_groups(space, np.concatenate([one.points for one in drawn]))
+    for group in [None] if groups is None else np.unique(groups):
+        mine = slice(None) if group is None else groups == group
+        weights = np.exp(log_weights[mine] - log_weights[mine].max())
+        worth += float((stands_for[mine] @ weights) ** 2 / (stands_for[mine] @ np.square(weights)))
+    return worth
+
+
+@dataclass(frozen=True, eq=False)
+class MixedSamples:
+    """Samples of a flow and independent points together.
+
+    Arguments:
+        samples: All of them, with the density that they were drawn from together.
+        independent: How many of them are independent points.
+        effective: How many distinct samples of equal weight they are worth; `of_flow`: those of the flow alone.
+        constant: log of the constant of the independent points' density, with its standard error [nats]; None where
+            no independent point can be used.
+    """
+
+    samples: Samples
+    independent: int
+    effective: float
+    of_flow: float
+    constant: Estimate | None
+
+
+def mixed(
+    samples: Samples, kept: KnownPoints, pool: KnownPoints, pilots: tuple[KnownPoints, KnownPoints]
+) -> MixedSamples:
+    """Samples of a flow with as many independent points as make them worth most; none where the flow is best alone.
+
+    Arguments:
+        samples: Of the flow; `kept` says both densities there.
+        pool: Independent points.
+        pilots: Other draws of both, by which the share is chosen.
+    """
+    alone, space = samples.independent, samples.space
+    constant = log_constant(kept, pool)
+    numbers = [round(share * len(pool)) for share in MIXED_SHARES]
+    worth = [effective_count_of_mixture(*pilots, (len(kept), number), constant.value, space) for number in numbers]
+    number = numbers[int(np.argmax(worth))]
+    if number:
+        both = [kept, pool.subset(slice(number))]
+        log_target = np.concatenate([one.log_target for one in both])
+        share = number / (len(kept) + number)
+        log_mixed = log_target - np.concatenate([one.log_weights(share, constant.value) for one in both])
+        together = Samples(np.concatenate([one.points for one in both]), log_mixed, log_target, space)
+        # the same point may be drawn again and again, which counts once
+        if together.independent > alone:
+            return MixedSamples(together, number, together.independent, alone, constant)
+    return MixedSamples(samples, 0, alone, alone, constant)
