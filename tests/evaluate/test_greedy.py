@@ -15,12 +15,12 @@ from lidardesign.rays import information
 from lidardesign.rays.certificate import CERTIFIED
 from lidardesign.rays.training import TrainingScenes
 from lidardesign.scoring.baselines import greedy as greedy_module
-from lidardesign.scoring.baselines.candidates import mean_mbps, whole_range
+from lidardesign.scoring.baselines.candidates import whole_range
 from lidardesign.scoring.baselines.greedy import Fired, GreedyCandidate, greedy_rays
 from lidardesign.scoring.baselines.views import TrainingViews
 from lidardesign.scoring.evaluation.entries import entries_of
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace, angles
