@@ -9,11 +9,13 @@ from scipy.spatial.transform import Rotation
 from support.scoring import MissTask, make_request
 from support.sensors import normal_sensor
 
+from lidardesign.errors import ConfigError
 from lidardesign.scenes.scene import Body, Box, Capsule, Scene, Sphere, rigid
 from lidardesign.scoring.evaluation.entries import entries_of
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.pattern import Pattern
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace, angles
 from lidardesign.task import Metric, Score
@@ -79,8 +81,9 @@ BUILT = ("uniform", "random", "bounding", "occupancy")
 
 def aisle_request(task, **changes):
     scenes = {"train": shelves(4, 1), "test": shelves(3, 2)}
-    values = {"task": task, "space": AISLE, "rays": (6, 10), "baselines": BUILT, **scenes}
-    return make_request([DesignSpec("cart", (upward(),))], **{**values, **changes})
+    designs = [DesignSpec("cart", (upward(),))]
+    values = {"task": task, "space": AISLE, "rays": (6, 10), "baselines": BUILT, "designs": designs, **scenes}
+    return make_request(**{**values, **changes})
 
 
 def test_returns_come_condition_by_condition_and_within_each_frame_by_frame():
@@ -181,3 +184,12 @@ def test_a_twin_is_fitted_for_each_number_of_rays_alone_and_in_the_bandwidth_of_
     assert asked == [(40, None), (80, None), *own]
     evaluate(replace(request, baselines=("uniform",)))
     assert len(asked) == 4
+
+
+def test_a_design_whose_rays_end_before_where_it_is_evaluated_is_refused():
+    rays = DesignSpec("cart", (upward(),)).rays(6)
+    pattern = Pattern.along("x_m", (0.0, 2.0), [rays, rays], (0.0, 2.0))
+    designs = [DesignSpec("cart", (upward(),), "chosen", (pattern,))]
+    assert entries_of(aisle_request(SeenTask((0.25, 1.5)), designs=designs, rays=(6,)))
+    with pytest.raises(ConfigError, match="design cart"):
+        entries_of(aisle_request(SeenTask(PLACES), designs=designs, rays=(6,)))
