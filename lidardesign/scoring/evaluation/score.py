@@ -233,7 +233,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
         counted = f"rays and bandwidth count per position; every scene is seen from {positions} positions"
         notes.append(BackgroundNote(counted))
     notes += group_notes(request.test)
-    if GREEDY in request.baselines and request.greedy is not None:
+    if GREEDY in request.baselines and request.training is not None:
         notes += greedy_rays(request.task, positions, set(request.rays).difference(request.alone))[1]
     with plugin_guard(request.task.name):
         notes += notes_of(request.task, request.config, request.space)
