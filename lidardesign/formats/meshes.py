@@ -56,7 +56,7 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     files = {RAYS: _file(comments, vertex=_ray_points(rays)), BEAMS: _beams(rays, comments)}
     if seen:
         files[FRUSTA] = _frusta(seen, comments)
-    notes = [*write_folder(path, files), "weights, spreads and origin covariances of the sensors are lost"]
+    notes = [*write_folder(path, files), "weights and origin covariances of the sensors are lost"]
     if len(seen) < len(design.sensors):
         notes.append(f"{len(design.sensors) - len(seen)} of {len(design.sensors)} sensors have no width, so no frustum")
     regions = [sensor.region_m for _, sensor in seen if sensor.region_m > 0]
