@@ -12,10 +12,10 @@ import torch
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from lidardesign.layouts.rays import lay_out
 from scipy.spatial.transform import Rotation
 from support import references
 from support.designs import from_the_ceiling
+from support.fits import fitted
 from support.hard_cases import hard_case
 from support.learning import SMALL, BallTask
 from support.tables import each_row
@@ -30,6 +30,7 @@ from lidardesign.config import (
     RunConfig,
     resolve,
 )
+from lidardesign.constraints.document import Constraints
 from lidardesign.density.coordinates import Coordinates
 from lidardesign.density.fields.distance import build_field
 from lidardesign.density.network import DesignFlow
@@ -41,11 +42,12 @@ from lidardesign.density.objective.visibility import MINIMUM_COSINE, Optics, Ray
 from lidardesign.density.training.learn import learn
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.errors import ConfigError
-from lidardesign.mixture.fit import fit
+from lidardesign.rays.proposals import Proposals
 from lidardesign.registry import load_task
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.sensors.pattern import even_rays
 from lidardesign.space import ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
 from lidardesign.task import TaskConfig
 
@@ -130,6 +132,11 @@ def moved_samples(samples, scale, offset):
         place = [value * scale + offset for value in side[:3]]
         bounds.append((*place, *side[3:5], side[RANGE] * scale))
     return Samples(points, samples.log_prob, samples.log_target, DesignSpace(*bounds))
+
+
+def alike(points):
+    """The same log p* everywhere."""
+    return np.zeros(len(points))
 
 
 def in_order(rays, scale=1.0, offset=0.0):
@@ -226,18 +233,18 @@ class TestScenesOfAnyScale:
         np.testing.assert_allclose(unit, home, atol=atol)
         assert found == pytest.approx(ess, rel=10 * atol)
 
-    @each_row("layout", ["grid", "density", "distributed", "scan"])
-    @each_row(("scale", "offset", "atol"), [(1e-4, 0.0, 1e-12), (1e5, 0.0, 1e-12), (1.0, 1e7, 1e-7)])
-    def test_a_fitted_design_has_the_same_rays(self, layout, scale, offset, atol):
-        rows = []
-        for samples, factor, shift in (
-            (from_the_ceiling(2000), 1.0, 0.0),
-            (moved_samples(from_the_ceiling(2000), scale, offset), scale, offset),
-        ):
-            sensors = None if layout == "scan" else 2
-            design = fit(samples, sensors=sensors, layout=layout, rays=20, em_samples=1000, restarts=1).design
-            rows.append(in_order(lay_out(design), factor, shift))
-        np.testing.assert_allclose(rows[1], rows[0], atol=atol)
+    @pytest.mark.parametrize("rules", [{}, {"origin": {"spread_m": {"max": 1e9}}}], ids=["places", "regions"])
+    @pytest.mark.parametrize(("scale", "offset", "atol"), [(1e-4, 0.0, 1e-12), (1e5, 0.0, 1e-12), (1.0, 1e7, 1e-6)])
+    def test_fitted_sensors_have_the_same_even_rays_and_candidates(self, rules, scale, offset, atol):
+        even, candidates = [], []
+        for factor, shift in ((1.0, 0.0), (scale, offset)):
+            samples = moved_samples(from_the_ceiling(2000), factor, shift)
+            found = fitted(samples, rules, sensors=2, em_samples=1000, restarts=1, retarget=alike)
+            proposals = Proposals(found.sensors, Constraints.from_mapping(rules).rules, 0.95, samples)
+            even.append(in_order(even_rays(found.sensors, [12, 8]), factor, shift))
+            candidates.append(in_order(proposals.draw(20, {}, np.random.default_rng(0)), factor, shift))
+        np.testing.assert_allclose(even[1], even[0], atol=atol)
+        np.testing.assert_allclose(candidates[1], candidates[0], atol=atol)
 
 
 def flow_of(coordinates, dtype):
