@@ -18,7 +18,6 @@ from support.designs import from_the_ceiling
 from support.fits import fitted
 from support.hard_cases import hard_case
 from support.learning import SMALL, BallTask
-from support.tables import each_row
 from support.visibility import along_axis, both_ways, config_of, plate, transmittance_on, wall
 
 from lidardesign.config import (
@@ -179,8 +178,8 @@ def learned_at_home(tmp_path_factory):
     "designs are those of the same scene at home in metres, and turn with it",
 )
 class TestScenesOfAnyScale:
-    @each_row("way", WAYS)
-    @each_row(("scale", "offset"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e7)])
+    @pytest.mark.parametrize("way", WAYS)
+    @pytest.mark.parametrize(("scale", "offset"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e7)])
     def test_densities_over_meshes_scale_and_shift_with_the_scene(self, way, scale, offset):
         mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
 
@@ -200,7 +199,7 @@ class TestScenesOfAnyScale:
         # vertices at 1e7 m are rounded to 2e-9 m; distances are float32 relative to the scene
         np.testing.assert_allclose(values(scale, offset), values(1.0, 0.0), atol=references.SCALED_NATS)
 
-    @each_row(
+    @pytest.mark.parametrize(
         ("scale", "offset", "atol"),
         [
             # rounding of distances, 1e-16 of the scene, times distance / sigma^2 of up to 30 sigma
@@ -269,8 +268,8 @@ FAR_AWAY = {
     "scene",
 )
 class TestScenesFarAway:
-    @each_row("way", WAYS)
-    @each_row("kind", FAR_AWAY)
+    @pytest.mark.parametrize("way", WAYS)
+    @pytest.mark.parametrize("kind", FAR_AWAY)
     def test_values_are_finite_and_the_gradient_leads_to_the_scene(self, kind, way):
         target = build_target(FAR_AWAY[kind], SPACE, DensitySettings(field_resolution=16), way)
         values, gradient = target.log_density_and_gradient(points_near())
@@ -355,8 +354,8 @@ class TestSigmaAtBothEnds:
         assert caught.value.where == "density.sigma_m"
         assert "density.field_resolution" in caught.value.hint
 
-    @each_row("kind", MESHES)
-    @each_row(("share", "noted"), [(2 * UNRESOLVED_SHARE, True), (0.4, True), (0.8, False)])
+    @pytest.mark.parametrize("kind", MESHES)
+    @pytest.mark.parametrize(("share", "noted"), [(2 * UNRESOLVED_SHARE, True), (0.4, True), (0.8, False)])
     def test_sigma_below_half_a_step_is_noted(self, kind, share, noted):
         _, notes = prepared(kind, share * 0.02)
         assert any("below half the field's grid step" in note for note in notes) == noted
@@ -393,7 +392,7 @@ class TestSigmaAtBothEnds:
         point = DesignSpace((0, 0, 0, 0, 0, 1), (0, 0, 0, 0, 0, 1))
         assert prepared("ball", 100.0, point)[1] == []
 
-    @each_row(("key", "value"), [(key, value) for key, values in LIMITS.items() for value in values])
+    @pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in LIMITS.items() for value in values])
     def test_what_would_overflow_is_refused_by_name(self, key, value):
         with pytest.raises(ConfigError, match=key.replace(".", r"\.")) as caught:
             resolve(load_task("flatland"), overrides=[f"{key}={value}"])
@@ -459,7 +458,7 @@ class TestThinOccludersAndAnyBeta:
         assert "density.visibility=raycast" in warning
         assert target.visibility.points == 1024
 
-    @each_row("beta", [1e-9, 1e-3, 1.0, 1e3, 1e6, FASTEST_PER_M])
+    @pytest.mark.parametrize("beta", [1e-9, 1e-3, 1.0, 1e3, 1e6, FASTEST_PER_M])
     def test_ray_casting_follows_the_closed_form_for_every_beta(self, beta):
         optics = Optics(0.01, beta, 1000.0, 0.01)
         scene = Scene((plate(0.2),))
@@ -481,8 +480,8 @@ class TestThinOccludersAndAnyBeta:
         assert ((found >= 0) & (found <= 1)).all()
         assert (np.diff(found) <= 0).all()
 
-    @each_row("beta", [1e-6, 1.0, 1e3, 1e9])
-    @each_row("thing", ["thin", "thick", "mesh"])
+    @pytest.mark.parametrize("beta", [1e-6, 1.0, 1e3, 1e9])
+    @pytest.mark.parametrize("thing", ["thin", "thick", "mesh"])
     def test_integrated_transmittance_is_a_share_that_rises_by_no_more_than_its_own_step(self, beta, thing):
         mesh = ball_of_triangles((1.0, 0.1, 0), 0.6)
         body = {"thin": plate(0.002), "thick": plate(0.3), "mesh": Body(mesh)}[thing]
@@ -545,8 +544,8 @@ class TestRaysThatStartInsideOrGraze:
         assert found[0] == 1.0
         assert found[-1] < 1e-100
 
-    @each_row("name", ["ball", "box", "capsule"])
-    @each_row("inward", [True, False])
+    @pytest.mark.parametrize("name", ["ball", "box", "capsule"])
+    @pytest.mark.parametrize("inward", [True, False])
     def test_on_a_surface_it_is_met_at_once(self, name, inward):
         ranges = np.linspace(0, 1, 101)
         found = cast(Scene((Body(SOLIDS[name]),)), rays_from((0.5, 0, 0), (-1.0 if inward else 1.0, 0, 0), ranges))
@@ -567,8 +566,8 @@ class TestRaysThatStartInsideOrGraze:
         )
         np.testing.assert_allclose(found, np.exp(-1000.0 * np.maximum(rays.ranges - 0.005, 0)), atol=0.01)
 
-    @each_row("way", WAYS)
-    @each_row("name", [*SOLIDS, "plane"])
+    @pytest.mark.parametrize("way", WAYS)
+    @pytest.mark.parametrize("name", [*SOLIDS, "plane"])
     def test_no_start_gives_a_value_or_gradient_that_is_no_number(self, name, way):
         shape = SOLIDS.get(name, Plane())
         starts = [(0, 0, 0), (0.5, 0, 0), (0.5, 0.5, 0.5), (0, 0, 0.5), (0.5, -1, 0), (0.2, 0.1, 0)]
@@ -594,7 +593,7 @@ class TestRaysThatStartInsideOrGraze:
         # d hit / d dip = h / sin^2, at most range^2 / h before the limit
         assert np.abs(np.diff(found)).max() <= (3.0 * 2.0**2 / 0.1 * np.diff(dip)).max()
 
-    @each_row("dip", [0.0, 1e-300, 1e-12, 1e-6, 0.01])
+    @pytest.mark.parametrize("dip", [0.0, 1e-300, 1e-12, 1e-6, 0.01])
     def test_the_derivative_of_a_grazing_hit_is_capped(self, dip):
         scene = Scene((Body(Plane(), "floor", "occluder"), Body(Sphere(0.1), poses=rigid(translation_m=(3.0, 0, 0.1)))))
         space = DesignSpace((0, 0, 0, -1, -0.5, 0), (0, 0, 0.1, 1, 0.5, 4))

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import references
 from support.hard_cases import hard_case
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.scenes.casting import SceneCaster
@@ -84,8 +83,8 @@ class TestRaysThroughEdgesAndVertices:
         alone = (triangles.run(np.zeros_like(vertices), vertices, limit)["primID"] < 0).mean()
         assert 0 < alone < 0.01
 
-    @each_row("start", STARTS)
-    @each_row("name", SOLIDS)
+    @pytest.mark.parametrize("start", STARTS)
+    @pytest.mark.parametrize("name", SOLIDS)
     def test_none_is_lost_and_all_are_met_where_they_aim(self, name, start):
         origins, directions, reach = aimed(SOLIDS[name], STARTS[start])
         found = SceneCaster(Scene((Body(mesh_of(SOLIDS[name])),))).first_hit(origins, directions)
@@ -199,8 +198,8 @@ def document(**boresight):
     "ray lists take unit vectors only",
 )
 class TestDirectionsThatAreNone:
-    @each_row("case", BAD_DIRECTIONS)
-    @each_row("shape", ONE_OF_EACH)
+    @pytest.mark.parametrize("case", BAD_DIRECTIONS)
+    @pytest.mark.parametrize("shape", ONE_OF_EACH)
     def test_it_is_an_error_and_never_a_silent_miss(self, case, shape):
         caster = SceneCaster(Scene((Body(ONE_OF_EACH[shape]),)))
         with pytest.raises(ConfigError, match=r"rays.*not finite, or a direction has zero length"):
