@@ -156,7 +156,7 @@ class Fitter:
                 config = with_task_settings(run.task, run.config, settings, option=request.weighting.origin)
                 run = replace(run, config=config)
             self.samples = self._at(loaded)
-        self.training = TrainingScenes(run, request.seed, starmap, request.at)
+        self.training = TrainingScenes(run, request.seed, starmap, request.at, keeps=samples is None)
         self.is_pooled = samples is None and not settings and not request.at and has_pool(run)
 
     def _check_effective(self, samples: Samples, hint: str) -> None:

@@ -44,15 +44,22 @@ class TrainingScenes:
         seed: Root of the random streams.
         starmap: How scenes are informed: `itertools.starmap`, or by workers.
         at: The one value of its conditions that rays are at; none where they are at all of them.
+        keeps: Whether what is found may be kept in the run.
     """
 
     def __init__(
-        self, run: RunFolder, seed: int, starmap: Starmap = itertools.starmap, at: Mapping[str, float] | None = None
+        self,
+        run: RunFolder,
+        seed: int,
+        starmap: Starmap = itertools.starmap,
+        at: Mapping[str, float] | None = None,
+        keeps: bool = False,
     ) -> None:
-        self.run, self.seed, self._starmap, self._at = run, seed, starmap, at or {}
+        self.run, self.seed, self._starmap, self.at, self.keeps = run, seed, starmap, dict(at or {}), keeps
         self._first: dict[str, list[Scene]] = {}
-        # of every draw so far, by purpose: draws that are skipped need not be made again
+        # of every draw so far, by purpose, and the last draw: what is skipped need not be made again
         self._sizes: dict[str, list[int]] = {}
+        self._last: dict[str, tuple[int, list[Scene]]] = {}
 
     @property
     def margin_m(self) -> float:
@@ -64,8 +71,11 @@ class TrainingScenes:
         sizes = self._sizes.setdefault(purpose, [])
         for draw in itertools.count():
             if draw == len(sizes) or start < sizes[draw]:
-                label = random_generator(self.seed, "selection", purpose, draw)
-                scenes = self.run.scenes("train", int(label.integers(2**31)))
+                number, scenes = self._last.get(purpose, (-1, []))
+                if number != draw:
+                    label = random_generator(self.seed, "selection", purpose, draw)
+                    scenes = self.run.scenes("train", int(label.integers(2**31)))
+                    self._last[purpose] = draw, scenes
                 if draw == len(sizes):
                     sizes.append(len(scenes))
                 yield from scenes[start:]
@@ -92,8 +102,8 @@ class TrainingScenes:
         """
         kept = self._first.get(purpose, [])
         scenes = kept[start:stop] if stop <= len(kept) else itertools.islice(self.scenes(purpose, start), stop - start)
-        if self._at:
-            rays, visits = self._at_nearest(rays, visits[0])
+        if self.at:
+            rays, visits = self.at_nearest(rays, visits[0])
         asked = ((scene, number) for number, scene in enumerate(scenes, start))
         work = partial(informed_scene, self.run.task, rays, visits, share, self.seed, purpose)
         return list(self._starmap(work, asked))
@@ -101,7 +111,7 @@ class TrainingScenes:
     def _at_nearest(self, rays: Rays, visit: slice) -> tuple[Rays, list[slice]]:
         """Rays carried to the nearest condition that the task judges at, and when they fire: at no other."""
         conditions = self.run.conditions()
-        away = [sum(abs(one[name] - value) for name, value in self._at.items()) for one in conditions]
+        away = [sum(abs(one[name] - value) for name, value in self.at.items()) for one in conditions]
         nearest = away.index(min(away))
         moves = {DIMENSIONS.index(name): value for name, value in conditions[nearest].items() if name in TRAVELLED}
         visits = [visit if number == nearest else slice(0, 0) for number in range(len(conditions))]
