@@ -195,25 +195,28 @@ class Fitter:
         if request.layout == "spinning":
             return self._rings()
         if request.sensors == BEST:
-            request = replace(request, sensors=self._best_count())
-            return self._without_idle(request)
+            return self._without_idle(self._best_count())
         return self._fitted(request)
 
-    def _without_idle(self, request: FitRequest) -> FitResult:
-        """The design of as many sensors as all have something to do; says which were left out."""
-        while True:
+    def _without_idle(self, count: int) -> FitResult:
+        """The design of at most so many sensors that all have something to do, no fewer than constraints ask for."""
+        bounds = self.request.constraints
+        least = max(bounds.sensors.min or 1, len(bounds.each))
+        while count > least:
             try:
-                result = self._fitted(request, may_idle=True)
-                idle = [index for index, rays in enumerate(result.design.rays_per_sensor() or ()) if not rays]
-                why = f"{len(idle)} of {request.sensors} sensors would fire none of the rays"
+                result = self._fitted(replace(self.request, sensors=count), may_idle=True)
+                fired = result.design.rays_per_sensor()
+                idle = 0 if fired is None else int((fired == 0).sum())
+                why = f"{idle} of {count} sensors would fire none of the rays"
             except InfeasibleError as error:
-                if request.sensors == 1 or error.conflicts != ["--sensors"]:
+                if error.conflicts != ("--sensors",):
                     raise
-                idle, why = [0], str(error.message)
-            if not idle or request.sensors == 1:
+                idle, why = 1, str(error.message)
+            if not idle:
                 return result
-            request = replace(request, sensors=max(int(request.sensors) - len(idle), 1))
-            self.notes(f"{why}: fitted again with {request.sensors}")
+            count = max(count - idle, least)
+            self.notes(f"{why}: fitted again with {count}")
+        return self._fitted(replace(self.request, sensors=count))
 
     @phase("fitting")
     def _sensors(self, request: FitRequest, constraints: Constraints, rays: int | None) -> FittedSensors:
@@ -361,7 +364,8 @@ def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRe
 
     run, bounds = request.run, request.constraints
     rays = request.counts[len(request.counts) // 2]
-    conditions = [request.at] if request.at else run.conditions()
+    # as in an evaluation: a design for one condition is carried to all of them
+    conditions = run.conditions()
     casters = [build_casters(scene) for scene in scenes]
     sign = 1.0 if run.metric.better == "lower" else -1.0
     low = max(bounds.sensors.min or 1, len(bounds.each))

@@ -197,7 +197,7 @@ def plan(design: DesignSpec, rays: Rays) -> list[Position]:
                 f"the rays of sensor {sensor.name!r} start at {places} places, and a steering mirror stands at one",
                 where=design.name,
                 allowed="one origin per sensor",
-                hint="lidardesign constrain RUN --layout grid, or with origin.fixed_m in the constraints",
+                hint="lidardesign constrain RUN without origin.spread_m, or with origin.fixed_m in the constraints",
             )
     positions = []
     for here in np.argsort(first):

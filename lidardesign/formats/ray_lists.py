@@ -248,7 +248,11 @@ def read_ray_npz(path: Path) -> Rig:
 
 
 # Of sensors, in every list of rays.
-LOST = ["names, weights, spreads and origin covariances of the sensors are lost: rows have their numbers"]
+<<<<<<< HEAD
+LOST = ["names, weights, fields of view and origin covariances of the sensors are lost: rows have their numbers"]
+=======
+LOST = ["names, weights and origin covariances of the sensors are lost: rows have their numbers"]
+>>>>>>> t5
 
 
 def ray_columns(rays: Rays) -> dict[str, np.ndarray]:

@@ -131,7 +131,7 @@ def _explain(
     detail = details[0]
     path = _real_path(detail["loc"], values)
     prefix = (section,) if section else ()
-    name = ".".join(map(str, (*prefix, *path))) or section or model.__name__
+    name = ".".join(map(str, (*prefix, *path))) or section
     where = locate((*prefix, *path), key=detail["type"] == "extra_forbidden")
     if detail["type"] == "extra_forbidden":
         allowed = _fields_at(model, path[:-1])
@@ -146,13 +146,17 @@ def _explain(
             length = 1 + max(other["loc"][-1] for other in details if other["loc"][:-1] == detail["loc"][:-1])
             found = _short(detail["input"])
             return ConfigError(f"{name}: found {found}", where=where, allowed=f"a list of {length} values")
-        return ConfigError(f"{name} is missing", where=where, hint=f"--set {name.removeprefix('task.')}=VALUE")
+        # sections are those of runs, whose values can be set beside files
+        hint = f"--set {name.removeprefix('task.')}=VALUE" if section else None
+        return ConfigError(f"{name} is missing", where=where, hint=hint)
     text = detail["msg"].removeprefix("Value error, ")
-    found = "" if detail["type"] == "value_error" and not path else f": found {_short(detail['input'])}"
+    found = f": found {_short(detail['input'])}"
     more = f" (and {len(details) - 1} more)" if len(details) > 1 and len(detail["loc"]) == len(path) else ""
     if detail["type"] in ("value_error", "assertion_error"):
-        return ConfigError(f"{name}: {text}{found if path else ''}{more}", where=where)
-    return ConfigError(f"{name}{found}{more}", where=where, allowed=_allowed(detail["type"], text))
+        # a mapping says nothing that the text does not
+        found = "" if not path or isinstance(detail["input"], Mapping) else found
+        return ConfigError(f"{name}: {text}{found}{more}" if name else f"{text}{more}", where=where)
+    return ConfigError(f"{name}{found}{more}".removeprefix(": "), where=where, allowed=_allowed(detail["type"], text))
 
 
 def _allowed(kind: str, text: str) -> str:

@@ -144,7 +144,7 @@ def show(
     with command(json=json, quiet=quiet) as output:
         with phase("libraries"):
             from lidardesign.parts.catalogue import find_part
-            from lidardesign.sensors.design_file import MOST_TABLE_RAYS, save_design
+            from lidardesign.sensors.design_file import MOST_FILE_RAYS, save_design
 
         _check_conditions(reflectance, klux)
         part = _under(find_part(name, own or ()), reflectance, klux)
@@ -155,12 +155,12 @@ def show(
         }  # fmt: skip
         if out is not None:
             design = _placed(part, given, out.stem, output)
-            document |= {"design": str(out), "design_rays": design.rays, "sensors": len(design.sensors)}
-            if (design.rays or 0) > MOST_TABLE_RAYS:
+            document |= {"design": str(out), "design_rays": design.count, "sensors": len(design.sensors)}
+            if (design.count or 0) > MOST_FILE_RAYS:
                 raise ConfigError(
-                    f"{design.rays} rays are too many for a design file",
+                    f"{design.count} rays are too many for a design file",
                     where=str(out),
-                    allowed=f"at most {MOST_TABLE_RAYS:,}",
+                    allowed=f"at most {MOST_FILE_RAYS:,}",
                     hint="--rays N takes an evenly spread subset",
                 )
             with phase("writing"):
