@@ -156,7 +156,9 @@ class Fitter:
                 config = with_task_settings(run.task, run.config, settings, option=request.weighting.origin)
                 run = replace(run, config=config)
             self.samples = self._at(loaded)
-        self.training = TrainingScenes(run, request.seed, starmap, request.at)
+        # scenes are judged from where the design is
+        here = replace(run.config, space=run.config.space.at(request.at))
+        self.training = TrainingScenes(replace(run, config=here), request.seed, starmap)
         self.is_pooled = samples is None and not settings and not request.at and has_pool(run)
 
     def _check_effective(self, samples: Samples, hint: str) -> None:

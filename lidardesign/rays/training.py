@@ -6,7 +6,7 @@ What the returns of candidate rays tell about training scenes, scene by scene.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -41,13 +41,10 @@ class TrainingScenes:
         run: The run, whose task says what returns tell.
         seed: Root of the random streams.
         starmap: How scenes are informed: `itertools.starmap`, or by workers.
-        at: The one value of its conditions that rays are at; none where they are at all of them.
     """
 
-    def __init__(
-        self, run: RunFolder, seed: int, starmap: Starmap = itertools.starmap, at: Mapping[str, float] | None = None
-    ) -> None:
-        self.run, self.seed, self._starmap, self._at = run, seed, starmap, at or {}
+    def __init__(self, run: RunFolder, seed: int, starmap: Starmap = itertools.starmap) -> None:
+        self.run, self.seed, self._starmap = run, seed, starmap
         self._first: dict[str, list[Scene]] = {}
         # of every draw so far, by purpose: draws that are skipped need not be made again
         self._sizes: dict[str, list[int]] = {}
@@ -90,18 +87,9 @@ class TrainingScenes:
         """
         kept = self._first.get(purpose, [])
         scenes = kept[start:stop] if stop <= len(kept) else itertools.islice(self.scenes(purpose, start), stop - start)
-        if self._at:
-            visits = self._at_nearest(visits[0])
         asked = ((scene, number) for number, scene in enumerate(scenes, start))
         work = partial(informed_scene, self.run.task, rays, visits, share, self.seed, purpose)
         return list(self._starmap(work, asked))
-
-    def _at_nearest(self, visit: slice) -> list[slice]:
-        """Rays at one value among the conditions that the task judges at: those of the nearest; elsewhere none fire."""
-        conditions = self.run.conditions()
-        away = [sum(abs(one[name] - value) for name, value in self._at.items()) for one in conditions]
-        nearest = away.index(min(away))
-        return [visit if number == nearest else slice(0, 0) for number in range(len(conditions))]
 
 
 def informed_scene(
