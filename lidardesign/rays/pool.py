@@ -138,7 +138,7 @@ def _key(selection: Selection, training: TrainingScenes, count: int) -> str:
             hashlib.sha256(column.tobytes()).hexdigest() for column in (rays.origin_m, rays.direction, rays.gate_m)
         ],
         "visits": [(visit.start, visit.stop) for visit in selection.visits],
-        "asked": [count, selection.share, training.at],
+        "asked": [count, selection.share],
         "seed": training.seed,
         "versions": versions(),
         "task": [distribution_of(run.task.name), task.__module__, task.__qualname__],
