@@ -42,14 +42,22 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: order.get(item.path.name, len(LONGEST)))
 
 
+# Numbers of scenes, and numbers of sensors that are tried, with the modules that read them.
+SMALL = {
+    "FEW_SCENES": (5, "rays.information rays.training rays.selection fitting.chosen"),
+    "MOST_SCENES": (10, "rays.information rays.pool fitting.chosen"),
+    "USUAL_SCENES": (10, "scoring.evaluation.entries"),
+    "COUNTS": ((1, 2), "fitting.fit"),
+}
+
+
 @pytest.fixture(autouse=True, scope="session")
 def choices_look_at_few_scenes():
     """Rays and sensors are chosen as users choose them, but on fewer scenes: those take half a minute."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lidardesign.rays.information.FEW_SCENES", 5)
-        patch.setattr("lidardesign.rays.information.MOST_SCENES", 10)
-        patch.setattr("lidardesign.scoring.evaluation.entries.USUAL_SCENES", 10)
-        patch.setattr("lidardesign.fitting.request.COUNTS", (1, 2))
+        for name, (number, modules) in SMALL.items():
+            for module in modules.split():
+                patch.setattr(f"lidardesign.{module}.{name}", number)
         yield
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from lidardesign_tasks.robot.arm_robot import load_robot
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.designs import load_design
@@ -75,14 +74,14 @@ READS_NO_FILE = {"lidardesign/contract/scenes.py": "imports pickle"}
 
 
 @pytest.mark.hard_case("P4")
-@each_row("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_module_runs_no_code_of_files(path):
     known = READS_NO_FILE.get(path.relative_to(ROOT).as_posix())
     found = [words.partition(": ")[2] for words in unsafe(ast.parse(path.read_text(encoding="utf-8")))]
     assert found == ([known] if known else [])
 
 
-@each_row(
+@pytest.mark.parametrize(
     "code",
     [
         "import pickle", "from pickle import loads", "import torch\ntorch.load(p)", "np.load(p)", "eval(text)",
@@ -94,7 +93,7 @@ def test_what_could_run_code_is_found(code):
     assert len(list(unsafe(ast.parse(code)))) == 1
 
 
-@each_row("mark", ["\\e[31m", "\\e]0;title\\a", "\\r", "\\b", "\\x9b2J", "\\n"])
+@pytest.mark.parametrize("mark", ["\\e[31m", "\\e]0;title\\a", "\\r", "\\b", "\\x9b2J", "\\n"])
 def test_a_name_that_would_steer_the_terminal_is_refused(tmp_path, mark):
     path = tmp_path / "d.yaml"
     sensor = "origin_m: {mean: [0, 0, 0]}\n  boresight: {azimuth_rad: 0, elevation_rad: 0}\n"
@@ -102,9 +101,10 @@ def test_a_name_that_would_steer_the_terminal_is_refused(tmp_path, mark):
     for text, read in (
         (f'name: "a{mark}b"\nsensors:\n- {sensor}', load_design),
         (f'sensors:\n- name: "a{mark}b"\n  {sensor}', load_design),
+        (f'mount: {{body: "a{mark}b"}}\nsensors:\n- {sensor}', load_design),
         (f'name: "a{mark}b"\npulse_fwhm_ps: 100\n', load_detector),
     ):
-        path.write_text("schema_version: 1\n" + text if read is load_design else text)
+        path.write_text("schema_version: 2\n" + text if read is load_design else text)
         with pytest.raises(ConfigError, match="control characters") as refused:
             read(path)
         assert all(letter.isprintable() or letter == "\n" for letter in str(refused.value))

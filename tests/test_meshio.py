@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 from support.meshes import BOX_FACES, BOX_VERTICES, write_box
-from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.scenes.mesh_files import (
@@ -20,7 +19,7 @@ from lidardesign.scenes.mesh_files import (
 )
 
 
-@each_row("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_closed_box_comes_back_from_every_format_as_a_solid(tmp_path, suffix):
     mesh = load_mesh(write_box(tmp_path / f"box{suffix}"))
     assert mesh.sign == "solid"

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from support.tables import each_row
 
 from lidardesign.density.fields.distance import build_field
 from lidardesign.errors import DataError
@@ -73,7 +72,7 @@ def assert_same_ranges(found, expected):
     assert (np.isclose(found, expected, rtol=0, atol=1e-5) | same).mean() > 0.998
 
 
-@each_row("kind", GEOMS)
+@pytest.mark.parametrize("kind", GEOMS)
 @pytest.mark.parametrize("seed", range(3))
 def test_rays_meet_a_geom_where_those_of_mujoco_do(kind, seed):
     generator = np.random.default_rng(seed)
@@ -89,7 +88,7 @@ def test_rays_meet_a_geom_where_those_of_mujoco_do(kind, seed):
     assert_same_ranges(hits.range_m, mujoco_ranges(model, qpos, origins, directions))
 
 
-@each_row("kind", GEOMS)
+@pytest.mark.parametrize("kind", GEOMS)
 def test_the_signed_distance_of_a_geom_is_that_to_the_nearest_of_many_points_on_it(kind):
     generator = np.random.default_rng(4)
     model = model_of(f"<geom {GEOMS[kind]} {turned(generator)}/>")
@@ -271,7 +270,7 @@ BAD = {
 }
 
 
-@each_row("case", BAD)
+@pytest.mark.parametrize("case", BAD)
 def test_a_file_that_is_no_model_is_refused_with_its_name(tmp_path, case):
     text, message = BAD[case]
     path = tmp_path / "robot.xml"

@@ -9,7 +9,6 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from support import references
-from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.scenes.scene import (
@@ -48,7 +47,7 @@ BAD_BODIES = {
 }
 
 
-@each_row("case", BAD_BODIES)
+@pytest.mark.parametrize("case", BAD_BODIES)
 def test_poses_that_are_not_rigid_are_refused_with_the_body(case):
     poses, message = BAD_BODIES[case]
     with pytest.raises(DataError, match=f"(?s)'lamp'.*{message}"):
@@ -107,7 +106,7 @@ SHAPES = {
 }
 
 
-@each_row("name", SHAPES)
+@pytest.mark.parametrize("name", SHAPES)
 def test_surface_points_lie_on_the_surface_and_areas_are_right(name):
     shape, area = SHAPES[name]
     body = Body(shape, poses=rigid(Rotation.from_rotvec([0.4, 1.0, -0.2]).as_matrix(), (0.1, 0.2, 0.3)))
@@ -128,7 +127,7 @@ BANDS = {
 }
 
 
-@each_row("name", BANDS)
+@pytest.mark.parametrize("name", BANDS)
 def test_surface_points_are_even_in_area(name):
     (shape, area), (height, band) = SHAPES[name], BANDS[name]
     z = sample_body([Body(shape)], SPACE, 20_000, np.random.default_rng(1)).points[:, 2]

@@ -14,6 +14,7 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.errors import DataError, LidardesignError, names_arguments
 from lidardesign.fitting.request import FitOptions, FitRequest
 from lidardesign.formats.designs import folder_of, reach_of, read_design
+from lidardesign.rays.pool import FILE_NAME as CACHE
 from lidardesign.run.clock import Progress
 from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
@@ -186,6 +187,8 @@ class Run(RunFolder):
     def summary(self) -> dict[str, Any]:
         """The quality of the density, the designs with their last scores, and commands that go on from here.
 
+        Also how large the cache is of what training scenes show of rays, where fits have left one.
+
         Raises:
             DataError: The manifest is damaged.
         """
@@ -193,6 +196,7 @@ class Run(RunFolder):
         learned = manifest.get("learn")
         quality = None if learned is None else self.quality
         designs = [_design_entry(path, manifest) for path in self.design_paths()]
+        cache = self.folder / CACHE
         return {
             "run": str(self.folder),
             "task": config.task_name,
@@ -204,6 +208,7 @@ class Run(RunFolder):
             "advice": None if quality is None else quality.advice(config.preset),
             **{name: _figure(learned, name) for name in ("seconds", "steps")},
             "designs": designs,
+            "cache": {"path": str(cache), "bytes": cache.stat().st_size} if cache.is_file() else None,
             "writer": at_work,
             "next": [] if learned is None and at_work else self._next_commands(designs, finished=learned is not None),
         }

@@ -23,13 +23,13 @@ from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.gates import GateLimits
 from lidardesign.rays.information import FEW_SCENES, MOST_SCENES, MOST_SELECTED
 from lidardesign.rays.pool import CandidatePool
-from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, owners, rays_of_points
+from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, first_candidates, owners, rays_of_points
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
 from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.sensors.sensor import Sensor, tangent_directions
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, angles, direction
@@ -98,9 +98,13 @@ def choose_rays(
     check_number(counts[-1], "--rays", 1, MOST_SELECTED)
     budget, conditions = constraints.budget, training.run.conditions(samples.space)
     proposals = Proposals(fitted.sensors, constraints.rules, level, samples)
-    wanted = CANDIDATES_PER_RAY * counts[-1]
-    picked = None if pool is None else _picked(pool, proposals, conditions, wanted)
-    lists = picked[0] if picked else _drawn(proposals, conditions, wanted, training.seed)
+    wanted, weights = CANDIDATES_PER_RAY * counts[-1], np.array([sensor.weight for sensor in fitted.sensors])
+    least = np.full(len(weights), CANDIDATES_PER_RAY if each_fires else 0)
+    if len(conditions) > 1:
+        # so that patterns along a condition fire as many rays of each sensor everywhere
+        least = np.maximum(least, split_budget(weights, counts[-1], each=each_fires))
+    picked = None if pool is None else _picked(pool, proposals, conditions, wanted, least)
+    lists = picked[0] if picked else _drawn(proposals, conditions, wanted, least, training.seed)
     ends = np.cumsum([0, *map(len, lists)]).tolist()
     limits = GateLimits(
         fitted.sensors, constraints.rules, level, samples.space, training.margin_m, is_shared=gates != "ray"
@@ -111,7 +115,7 @@ def choose_rays(
         gates=limits.choices,
         bandwidth=Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz),
         limit_mbps=np.inf if budget.bandwidth_mbps is None else budget.bandwidth_mbps,
-        shares=np.array([sensor.weight for sensor in fitted.sensors]) if len(lists) > 1 else None,
+        shares=weights if len(lists) > 1 else None,
         is_shared=gates != "ray",
         each_fires=each_fires,
     )
@@ -131,9 +135,9 @@ def choose_rays(
         _around_rays(sensor, index, patterns, rules_of(constraints.rules, index), samples)
         for index, sensor in enumerate(fitted.sensors)
     )
-    weights = per_sensor / per_sensor.sum()
+    shares = per_sensor / per_sensor.sum()
     return ChosenRays(
-        tuple(replace(sensor, weight=float(weight)) for sensor, weight in zip(sensors, weights, strict=True)),
+        tuple(replace(sensor, weight=float(share)) for sensor, share in zip(sensors, shares, strict=True)),
         patterns,
         tuple(one.certificate for one in selected if one.certificate is not None),
         tuple(np.flatnonzero(per_sensor == 0).tolist()),
@@ -142,26 +146,30 @@ def choose_rays(
 
 
 @phase("candidates")
-def _drawn(proposals: Proposals, conditions: Sequence[dict[str, float]], count: int, seed: int) -> list[Rays]:
+def _drawn(
+    proposals: Proposals, conditions: Sequence[dict[str, float]], count: int, least: np.ndarray, seed: int
+) -> list[Rays]:
     return [
-        proposals.draw(count, at, random_generator(seed, "candidates", number)) for number, at in enumerate(conditions)
+        proposals.draw(count, at, random_generator(seed, "candidates", number), least)
+        for number, at in enumerate(conditions)
     ]
 
 
 @phase("candidates")
 def _picked(
-    pool: CandidatePool, proposals: Proposals, conditions: Sequence[dict[str, float]], count: int
+    pool: CandidatePool, proposals: Proposals, conditions: Sequence[dict[str, float]], count: int, least: np.ndarray
 ) -> tuple[list[Rays], list[InformedScene], list[InformedScene]] | None:
     """The first so many rays of a pool inside the sensors at each condition, and what they tell; None of too few."""
     number, known, lists = np.full(len(pool.points), -1), 0, []
     for visit, at in zip(pool.visits, conditions, strict=True):
         sensors, points = proposals.sensors_at(at), pool.points[visit]
         owner, fired = owners(sensors, proposals.rules, proposals.level, points, proposals.samples.space.at(at))
-        chosen = np.flatnonzero(owner >= 0)[:count]
-        if len(chosen) < count:
+        inside = np.flatnonzero(owner >= 0)
+        chosen = inside[first_candidates(owner[inside], count, least)]
+        if len(chosen) < count or (np.bincount(owner[chosen], minlength=len(least)) < least).any():
             return None
-        number[visit.start + chosen] = known + np.arange(count)
-        known += count
+        number[visit.start + chosen] = known + np.arange(len(chosen))
+        known += len(chosen)
         lists.append(rays_of_points(fired[chosen], owner[chosen], sensors))
     informed, held_back = ([scene.of_rays(number) for scene in part] for part in (pool.informed, pool.held_back))
     return lists, informed, held_back

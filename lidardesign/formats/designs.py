@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.formats.mjcf import read_mjcf
 from lidardesign.formats.ray_lists import (
@@ -30,7 +31,7 @@ from lidardesign.run.clock import phase
 from lidardesign.run.inputs import DESIGN, RAY_TABLE, read_head
 from lidardesign.run.manifest import changed_since_recorded
 from lidardesign.run.xml import read_xml
-from lidardesign.run.yaml import load_yaml
+from lidardesign.run.yaml import KeyPath, load_yaml
 from lidardesign.run_folder import DESIGN_FOLDER, MANIFEST, Notes, RunFolder, log_note
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_from_document
@@ -81,7 +82,13 @@ def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
     if begins_as_sensor_csv(head):
         return read_sensor_csv(path)
     document = load_yaml(path, DESIGN)
-    return replace(design_from_document(document.value, str(path), document.locate), name=path.stem)
+    design = design_from_document(document.value, str(path), document.locate)
+
+    def locate(keys: KeyPath, *, key: bool = False) -> str:
+        return document.locate(("constraints", *keys), key=key)
+
+    Constraints.from_mapping(design.constraints, where=str(path), locate=locate)
+    return replace(design, name=path.stem)
 
 
 def read_rig(path: Path, head: bytes) -> Rig | None:

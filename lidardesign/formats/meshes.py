@@ -61,7 +61,8 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         notes.append(f"{len(design.sensors) - len(seen)} of {len(design.sensors)} sensors have no width, so no frustum")
     regions = [sensor.region_m for _, sensor in seen if sensor.region_m > 0]
     if regions:
-        notes.append(f"{len(regions)} sensors are regions of up to {max(regions):.3g} m: frusta stand in their middles")
+        wide = f"regions with a standard deviation of up to {max(regions):.3g} m"
+        notes.append(f"{len(regions)} sensors are {wide}: frusta stand in their middles")
     return notes
 
 
@@ -147,11 +148,12 @@ def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     write_atomic(path, "".join(_solid(index, sensor) for index, sensor in enumerate(design.sensors)))
     notes = [
         "numbers are millimetres: STL has no units, and CAD programs take that one",
-        "sensors only: rays, fields of view, gates, weights and spreads are lost",
+        "sensors only: rays, fields of view, gates and weights are lost",
     ]
     regions = [sensor.region_m for sensor in design.sensors if sensor.region_m > 0]
     if regions:
-        notes.append(f"{len(regions)} sensors are regions of up to {max(regions):.3g} m: solids stand in their middles")
+        wide = f"regions with a standard deviation of up to {max(regions):.3g} m"
+        notes.append(f"{len(regions)} sensors are {wide}: solids stand in their middles")
     return notes
 
 

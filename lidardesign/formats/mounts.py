@@ -122,7 +122,7 @@ def fire_times_s(rays: Rays, rate_hz: float) -> np.ndarray:
 
 def design_losses(design: DesignSpec, mounted: Sequence[Mount]) -> list[str]:
     """What no format of mounted sensors holds of a design, and sensors that fire nothing."""
-    notes = ["weights and origin covariances of the sensors are lost"]
+    notes = ["weights, fields of view and origin covariances of the sensors are lost"]
     silent = len(design.sensors) - len(mounted)
     if silent:
         notes.append(f"{silent} of {len(design.sensors)} sensors fire no ray and are left out")

@@ -248,7 +248,7 @@ def read_ray_npz(path: Path) -> Rig:
 
 
 # Of sensors, in every list of rays.
-LOST = ["names, weights and origin covariances of the sensors are lost: rows have their numbers"]
+LOST = ["names, weights, fields of view and origin covariances of the sensors are lost: rows have their numbers"]
 
 
 def ray_columns(rays: Rays) -> dict[str, np.ndarray]:

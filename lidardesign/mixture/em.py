@@ -332,7 +332,6 @@ def lloyd(
     generator: np.random.Generator,
     *,
     iterations: int = 50,
-    start: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     r"""Centres that minimise $\sum_n w_n \min_k |f_n - c_k|^2$ locally.
 
@@ -347,8 +346,6 @@ def lloyd(
         count: Number of centres K, at least 1.
         generator: Source of the seeding.
         iterations: At most this many steps.
-        start: Centres to begin with instead of seeds, shape (K, F); centre k of the result is the one that came
-            from centre k.
 
     Returns:
         Centres, shape (K, F), and the centre of each point, shape (N,).
@@ -364,7 +361,7 @@ def lloyd(
     offset = distinct.mean(axis=0)
     points = distinct - offset
     tolerance = MOVEMENT_TOLERANCE * np.ptp(points, axis=0).max()
-    centres = _seed(points, merged, count, generator) if start is None else _started(start, count, offset)
+    centres = _seed(points, merged, count, generator)
     nearest = Nearest(points)
     for _ in range(iterations):
         labels, _ = _assign(nearest, merged, centres)
@@ -391,14 +388,6 @@ def _checked(features: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.
     if count < 1:
         raise ConfigError(f"{count} centres", where="quantisation", allowed="1 or more")
     return features, weights
-
-
-def _started(start: np.ndarray, count: int, offset: np.ndarray) -> np.ndarray:
-    start = np.asarray(start, dtype=np.float64)
-    if start.shape != (count, len(offset)) or not np.isfinite(start).all():
-        allowed = f"{(count, len(offset))}, finite"
-        raise ConfigError(f"a start of shape {start.shape}", where="quantisation", allowed=allowed)
-    return start - offset
 
 
 def _distinct(features: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -281,7 +281,7 @@ def _check_effective(ensemble: Ensemble, supports: Sequence[Support]) -> None:
                 raise InfeasibleError(
                     f"sensor {sensor} of {len(ensemble.order)} would rest on {found:.0f} effective samples",
                     conflicts=["--sensors"],
-                    allowed=f"at least {LEAST_SAMPLES}",
+                    allowed=f"at least {LEAST_SAMPLES:g}",
                     hint="fewer sensors, or learn longer (--preset standard or fine)",
                 )
 

@@ -50,20 +50,33 @@ class Proposals:
     level: float
     samples: Samples
 
-    def draw(self, count: int, at: Mapping[str, float], generator: np.random.Generator) -> Rays:
-        """So many candidates at a value of the condition; even ones where too few samples are inside the sensors."""
-        samples = nearest_samples(self.samples, at)
+    def draw(
+        self, count: int, at: Mapping[str, float], generator: np.random.Generator, least: np.ndarray | None = None
+    ) -> Rays:
+        """So many candidates at a value of the condition; even ones where too few samples are inside the sensors.
+
+        Arguments:
+            count: How many.
+            at: The value, by the condition's name.
+            generator: Decides which samples are drawn.
+            least: How many each sensor has at least, (S,), whatever their number then is; None leaves it open.
+        """
+        samples, least = nearest_samples(self.samples, at), np.zeros(len(self.sensors)) if least is None else least
         sensors = self.sensors_at(at)
         owner, fired = owners(sensors, self.rules, self.level, samples.points, samples.space)
         inside = np.flatnonzero((owner >= 0) & (samples.weights > 0))
         # the same ray at another range is the same candidate
         _, first, same = np.unique(fired[inside, :RANGE], axis=0, return_index=True, return_inverse=True)
         weights = np.bincount(same.reshape(-1), samples.weights[inside])
-        chosen = inside[first[np.sort(draw_order(weights, generator)[:count])]]
+        order = draw_order(weights, generator)
+        order = order[first_candidates(owner[inside[first[order]]], count, least)]
+        chosen = inside[first[np.sort(order)]]
         rays = rays_of_points(fired[chosen], owner[chosen], sensors)
-        if len(chosen) < count:
-            shares = split_budget(np.array([sensor.weight for sensor in sensors]), count - len(chosen))
-            rays = Rays.joined([rays, even_rays(sensors, shares)])
+        lacking = max(count - len(chosen), 0)
+        even = split_budget(np.array([sensor.weight for sensor in sensors]), lacking)
+        even = np.maximum(even, least - np.bincount(owner[chosen], minlength=len(sensors))).astype(np.int64)
+        if even.any():
+            rays = Rays.joined([rays, even_rays(sensors, even)])
         return replace(rays, time_s=np.zeros(len(rays)))
 
     def sensors_at(self, at: Mapping[str, float]) -> list[Sensor]:
@@ -80,6 +93,24 @@ def draw_order(weights: np.ndarray, generator: np.random.Generator) -> np.ndarra
     """
     keys = np.log(np.maximum(weights, TINY)) + generator.gumbel(size=len(weights))
     return np.argsort(-keys, kind="stable")
+
+
+def first_candidates(owner: np.ndarray, count: int, least: np.ndarray) -> np.ndarray:
+    """The first so many of candidates in their order, and further ones of sensors that have too few among them.
+
+    Arguments:
+        owner: The sensor of each, (N,).
+        count: How many.
+        least: How many each sensor has at least, where there are as many, (S,).
+
+    Returns:
+        Their indices, ascending.
+    """
+    taken = np.arange(len(owner)) < count
+    for sensor in np.flatnonzero(np.bincount(owner[taken], minlength=len(least)) < least):
+        own = np.flatnonzero(owner == sensor)
+        taken[own[: int(least[sensor])]] = True
+    return np.flatnonzero(taken)
 
 
 def rays_of_points(points: np.ndarray, sensor: np.ndarray, sensors: Sequence[Sensor]) -> Rays:
@@ -130,7 +161,8 @@ def owners(
         if fixed:
             origins = points[:, :3].copy()
             origins[:, fixed] = np.asarray(sensor.origin_m)[fixed]
-            own = space.wrap(aim(origins, observed))
+            if (origins != points[:, :3]).any():  # else their angles keep every digit
+                own = space.wrap(aim(origins, observed))
         if len(spreads_m):
             away = (own[:, :3] - sensor.origin_m) @ axes / spreads_m
             score -= np.square(away).sum(axis=1) / 2 + np.log(spreads_m).sum()

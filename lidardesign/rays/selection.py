@@ -64,7 +64,7 @@ class Selection:
         if self.shares is None:
             owner = self.rays.sensor[visit] if self.each_fires else None
             return RayCounts(place, np.full(len(self.visits), count), owner)
-        most = np.tile(split_budget(self.shares, count), len(self.visits))
+        most = np.tile(split_budget(self.shares, count, each=self.each_fires), len(self.visits))
         return RayCounts(place * len(self.shares) + self.rays.sensor[visit], most)
 
     def coverage(self, informed: Sequence[InformedScene], gates_m: np.ndarray) -> Coverage:

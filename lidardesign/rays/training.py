@@ -6,7 +6,7 @@ What the returns of candidate rays tell about training scenes, scene by scene.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -25,7 +25,9 @@ from lidardesign.run.clock import phase
 from lidardesign.run_folder import RunFolder
 from lidardesign.scenes.rays import Outcome, Rays, Returns
 from lidardesign.scenes.scene import Scene
+from lidardesign.sensors.pattern import TRAVELLED, with_coordinates
 from lidardesign.simulate.returns import simulate_many
+from lidardesign.space import DIMENSIONS
 from lidardesign.task import Information, Task, random_generator
 from lidardesign.workers import Starmap
 
@@ -41,10 +43,13 @@ class TrainingScenes:
         run: The run, whose task says what returns tell.
         seed: Root of the random streams.
         starmap: How scenes are informed: `itertools.starmap`, or by workers.
+        at: The one value of its conditions that rays are at; none where they are at all of them.
     """
 
-    def __init__(self, run: RunFolder, seed: int, starmap: Starmap = itertools.starmap) -> None:
-        self.run, self.seed, self._starmap = run, seed, starmap
+    def __init__(
+        self, run: RunFolder, seed: int, starmap: Starmap = itertools.starmap, at: Mapping[str, float] | None = None
+    ) -> None:
+        self.run, self.seed, self._starmap, self._at = run, seed, starmap, at or {}
         self._first: dict[str, list[Scene]] = {}
         # of every draw so far, by purpose: draws that are skipped need not be made again
         self._sizes: dict[str, list[int]] = {}
@@ -87,9 +92,20 @@ class TrainingScenes:
         """
         kept = self._first.get(purpose, [])
         scenes = kept[start:stop] if stop <= len(kept) else itertools.islice(self.scenes(purpose, start), stop - start)
+        if self._at:
+            rays, visits = self._at_nearest(rays, visits[0])
         asked = ((scene, number) for number, scene in enumerate(scenes, start))
         work = partial(informed_scene, self.run.task, rays, visits, share, self.seed, purpose)
         return list(self._starmap(work, asked))
+
+    def _at_nearest(self, rays: Rays, visit: slice) -> tuple[Rays, list[slice]]:
+        """Rays carried to the nearest condition that the task judges at, and when they fire: at no other."""
+        conditions = self.run.conditions()
+        away = [sum(abs(one[name] - value) for name, value in self._at.items()) for one in conditions]
+        nearest = away.index(min(away))
+        moves = {DIMENSIONS.index(name): value for name, value in conditions[nearest].items() if name in TRAVELLED}
+        visits = [visit if number == nearest else slice(0, 0) for number in range(len(conditions))]
+        return replace(rays, origin_m=with_coordinates(rays.origin_m, moves)), visits
 
 
 def informed_scene(
@@ -217,7 +233,17 @@ def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) 
     """
     fired = simulate_many(scene, [rays.subset(visit) for visit in visits])
     returns = [pad_returns(rays, visit, frame) for visit, frames in zip(visits, fired, strict=True) for frame in frames]
-    return InformedScene.of(informs(scene, returns), returns)
+    fires = np.repeat([visit.stop > visit.start for visit in visits], [len(frames) for frames in fired])
+    return InformedScene.of(_of_frames(informs(scene, returns), fires), returns)
+
+
+def _of_frames(information: Information, counts: np.ndarray) -> Information:
+    """The same, but only items of frames that count (F,) have a weight; of all frames where those have no items."""
+    if counts.all():
+        return information
+    weight = np.ones(len(information.frame)) if information.weight is None else np.asarray(information.weight)
+    weight = np.where(counts[information.frame], weight, 0.0)
+    return replace(information, weight=weight) if weight.sum() > 0 else information
 
 
 def pad_returns(rays: Rays, fired: slice, returns: Returns) -> Returns:

@@ -27,8 +27,7 @@ LEFT_PX = 78  # small losses have long labels
 EXPLAINED = (
     "Loss is what the chosen rays leave unknown of training scenes, by what the task says that returns tell: a proxy, "
     "not the score. No choice of as many of these candidates, through their gates and for no more bandwidth, has a "
-    "loss that is less by more than the certificate says; the next column is the same against choices among twice as "
-    "many candidates, on fewer scenes."
+    "loss that is less by more than the certificate says."
 )
 Points = Sequence[tuple[float, float]]
 
@@ -96,21 +95,16 @@ def correlation_sentence(pairs: Points, evaluation: Evaluation) -> str:
 
 
 def _table(chosen: Mapping[str, Sequence[Mapping[str, Any]]], axis: str) -> str:
-    headings = ["design", "rays", axis, "on other scenes", "less by at most", "of twice the candidates"]
-    headings += ["candidates", "gates", "scenes"]
+    headings = ["design", "rays", axis, "on other scenes", "less by at most", "candidates", "gates", "scenes"]
     lines = []
     for name, entries in chosen.items():
         for index, entry in enumerate(entries):
             cells = [name, str(entry["rays"]), four_digits(entry["value"]), four_digits(entry["held_back_value"])]
-            cells += [_percent(entry["gap"]), _percent(entry.get("gap_doubled"))]
+            cells.append(f"{100 * entry['gap']:.1f} %")
             cells += [str(entry[column]) for column in ("candidates", "gates", "scenes")]
             lines.append((cells, "", bool(index == 0 and lines)))
     caption = "Rays chosen on training scenes, and how far from the best choice they are at most."
     return folded("All certificates", table(headings, lines, text_columns=1, caption=caption), len(lines))
-
-
-def _percent(share: Any) -> str:
-    return f"{100 * share:.1f} %" if isinstance(share, int | float) else "-"
 
 
 def _curve(entries: Sequence[Mapping[str, Any]]) -> Points:

@@ -78,11 +78,12 @@ class Bandwidth:
         return total * self.bits_per_bin * self.rate_hz / BITS_PER_MEGABIT
 
 
-def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
+def split_budget(weights: np.ndarray, count: int, *, each: bool = False) -> np.ndarray:
     """Whole numbers of rays in proportion to weights: (G,) to int64 (G,) with the sum `count` exactly.
 
     Largest remainder (Hamilton): every sensor gets the whole part of its quota, the rays left over go to the
-    largest fractional parts, the lower index first where they tie. Too few rays leave some sensors without.
+    largest fractional parts, the lower index first where they tie. Too few rays leave some sensors without; with
+    `each` those get one of the sensors with most, as far as there are rays for all.
 
     Raises:
         ConfigError: Weights that are negative, not finite or all zero; a negative count.
@@ -101,6 +102,8 @@ def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
     shares = np.floor(quotas).astype(np.int64)
     order = np.argsort(-np.round(quotas - shares, REMAINDER_DECIMALS), kind="stable")
     shares[order[: int(count) - int(shares.sum())]] += 1
+    while each and shares.min() == 0 and shares.max() > 1:
+        shares[[shares.argmax(), shares.argmin()]] += [-1, 1]
     return shares
 
 

@@ -103,7 +103,14 @@ class DesignSpec:
         if count is None:
             return None
         pattern = self.pattern(count)
-        return split_budget(self.weights, count) if pattern is None else pattern.per_sensor(len(self.sensors))
+        if pattern is not None:
+            return pattern.per_sensor(len(self.sensors))
+        return split_budget(self.weights if self.size is None else self._own_counts, count)
+
+    @property
+    def _own_counts(self) -> np.ndarray:
+        """How many rays of its largest pattern are each sensor's, shape (S,)."""
+        return self.patterns[-1].per_sensor(len(self.sensors))
 
     def rays(
         self,
@@ -136,7 +143,7 @@ class DesignSpec:
             return even_rays(self.sensors, split_budget(self.weights, count))
         if self.size is not None and count <= self.size:
             table = self.patterns[-1].at()
-            shares = split_budget(self.patterns[-1].per_sensor(len(self.sensors)), count)
+            shares = split_budget(self._own_counts, count)
             own = [np.flatnonzero(table.sensor == index) for index in range(len(shares))]
             chosen = [rows[even_subset(table.direction[rows], int(n))] for rows, n in zip(own, shares, strict=True)]
             return replace(table.subset(np.sort(np.concatenate(chosen))), time_s=fire_times(count, DEFAULT_RATE_HZ))

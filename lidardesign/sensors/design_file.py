@@ -178,7 +178,7 @@ class DesignFile(_Keys):
         weights = [sensor.weight for sensor in self.sensors]
         if any(weight is None for weight in weights) and any(weight is not None for weight in weights):
             raise ValueError("a sensor has a weight and another has none: give all weights or none")
-        if None not in weights and not 0 < math.fsum(weights) < math.inf:
+        if None not in weights and not 0 < sum(weights) < math.inf:
             raise ValueError("the weights of the sensors are all zero, or too large to sum")
         if (self.layout == "even") != (not self.patterns):
             raise ValueError(

@@ -45,9 +45,11 @@ TEXTS = {
     "upside_down.yaml": "space: {range_m: [1.0, 0.5]}\n",
     "alias.yaml": "task:\n  targets: *hand\n",
     "garbage.yaml": "\x00\x01\x02",
-    "design.yaml": "schema_version: 1\nsensors: 3\n",
+    "design.yaml": "schema_version: 2\nsensors: 3\n",
     "gate.yaml": "gate: {width_m: {max: -1}}\n",
     "contradiction.yaml": "gate: {start_m: {min: 0.8}, end_m: {max: 0.5}}\n",
+    "earlier.yaml": "schema_version: 1\nlayout: grid\nrays: 9\nsensors: []\n",
+    "rays.yaml": GOOD.replace("rays: 100", "rays: many"),
     "notes.txt": "not a design at all",
     "rows.csv": "a,b,c\n1,2,3\n",
 }
@@ -133,15 +135,15 @@ CASES = [
     ("fit run --weight train=many", 2, "--weight train=many"),
     ("fit run --rays 6000", 2, "1 to 5000"),
     ("fit run --layout spinning --channels 16 --rays 8", 2, "16 channels"),
-    ("fit equal --layout grid --sensors 2", 3, "its 1000 samples count as only 1"),
-    ("fit elsewhere --layout grid --sensors 2", 3, "belong to another design space: range_m"),
-    ("fit millimetres --layout grid --sensors 2", 3, "1000 of 1000 points outside"),
+    ("fit equal --layout even --sensors 2", 3, "its 1000 samples count as only 1"),
+    ("fit elsewhere --layout even --sensors 2", 3, "belong to another design space: range_m"),
+    ("fit millimetres --layout even --sensors 2", 3, "1000 of 1000 points outside"),
     ("fit run --parts , --sensors 1", 2, "has an empty part name"),
     ("learn mujoco --set model=robot.xml --set targets=[*hand]", 2, 'in it, such as "*hand"'),
     ("learn mujoco --config alias.yaml", 2, 'in it, such as "*hand"'),
     ("learn arm --set frames=1000 --set train=10000", 2, "allowed: 200000 frames in all"),
     ("learn mujoco --set frames=1000 --set test=10000", 2, "test: 10000 scenes of 1000 frames"),
-    ("fit run --layout spiral", 2, "grid, density, scan"),
+    ("fit run --layout spiral", 2, "chosen, even, spinning"),
     ("fit run --gates one", 2, "sensor, ray"),
     ("fit run --name ../elsewhere", 2, "not a name for a design"),
     ("fit run --sensors 5 --rays 3", 4, "3 rays for 5 sensors"),
@@ -170,6 +172,17 @@ CASES = [
     ("show notes.txt", 2, "notes.txt"),
     ("evaluate design.yaml", 2, "design.yaml:2:10"),
     ("export design.yaml --format csv", 2, "design.yaml"),
+    *(
+        (f"{command} earlier.yaml{further}", 2, "earlier.yaml:1:17: this design was written by an earlier version")
+        for command, further in {
+            "show": "",
+            "evaluate": " --in run",
+            "constrain": "",
+            "fit run --like": "",
+            "export": " --format csv",
+        }.items()
+    ),
+    ("export rays.yaml --format csv", 2, "rays.yaml:2:30: budget.rays"),
     ("show rows.csv", 3, "rows.csv:1"),
     ("show garbage.yaml", 2, "garbage.yaml"),
     ("evaluate good.yaml --in run --baseline best", 2, "uniform"),
@@ -255,8 +268,8 @@ def test_bad_input_gets_one_message_its_exit_code_and_writes_nothing(
 
 
 COMMANDS = {
-    "fit": ("fit", "run", "--layout", "grid", "--sensors", "1"),
-    "constrain": ("constrain", "run", "--layout", "grid", "--set", "budget.rays=20"),
+    "fit": ("fit", "run", "--layout", "even", "--sensors", "1"),
+    "constrain": ("constrain", "run", "--layout", "even", "--set", "budget.rays=20"),
     "export": ("export", "good.yaml", "--format", "npz", "--out", "rays.npz"),
     "learn": ("learn", "flatland", "--preset", "draft", "--out", "new/run"),
 }

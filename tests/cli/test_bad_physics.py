@@ -28,8 +28,8 @@ TEXTS = {
     "fixed.yaml": "origin: {fixed_m: [0.3, 0, 0], exclude: [{low_m: [0.2, -1, -1], high_m: [0.4, 1, 1]}]}\n",
     "far.yaml": GOOD.replace("end: 0.4", "end: 1e300"),
     "wide.yaml": GOOD.replace("horizontal: 0.2", "horizontal: 1.2"),
-    "open.yaml": GOOD.replace("rays: 100\n", "rays: null\n"),
-    "none.yaml": GOOD.replace("rays: 100\n", "rays: 0\n"),
+    "open.yaml": GOOD.replace("budget: {rays: 100}", ""),
+    "none.yaml": GOOD.replace("rays: 100", "rays: 0"),
     "elsewhere.yaml": GOOD.replace("[0.4, 0.0, 0.0]", "[1.4, 0.0, 0.0]"),
 }
 
@@ -59,7 +59,7 @@ CASES = [
         for option in ("--range-tolerance-mm", "--return-tolerance")
         for value in ("0", "-1", "nan", "inf")
     ),
-    ("evaluate good.yaml far.yaml --in run --rays 8", 2, "sensors[0].gate_m.end is 1e+300"),
+    ("evaluate good.yaml far.yaml --in run --rays 8", 2, "gate_m.end: found 1e+300"),
     ("evaluate bare --effects audit", 3, "no designs yet"),
     *(
         (f"learn flatland --set {key}={value}", 2, f"--set {key}={value}")
@@ -83,11 +83,11 @@ CASES = [
     ("constrain run --constraints all.yaml", 4, "origin.exclude[0]"),
     ("constrain run --constraints fixed.yaml", 4, "origin.fixed_m"),
     ("export wide.yaml --format galvo", 2, "beyond the mirrors' reach"),
-    ("export far.yaml --format galvo", 2, "a number from 0 to 1e+09"),
+    ("export far.yaml --format galvo", 2, "less than or equal to"),
     ("export open.yaml --format galvo", 2, "give --rays N"),
     ("capture broken.npz good.yaml", 3, "cut short"),
     ("capture far.npz good.yaml", 3, "origin_m"),
-    ("capture scan.npz none.yaml", 2, "none.yaml:3:7: rays is 0"),
+    ("capture scan.npz none.yaml", 2, "none.yaml:2:30: budget.rays"),
     ("capture scan.npz header.galvo.csv", 3, "header.galvo.csv: fires no ray"),
     ("capture scan.npz good.yaml elsewhere.yaml", 3, "elsewhere: none of the 100 rays was captured"),
     ("capture scan.npz long.galvo.csv", 3, "long.galvo.csv:2: "),
@@ -123,7 +123,7 @@ def ready(mistakes, lidardesign, monkeypatch):
     """The program in the folder of mistakes, whose run has a design and whose scanner file is there."""
     monkeypatch.chdir(mistakes)
     if not (mistakes / "header.galvo.csv").exists():
-        assert lidardesign("fit", "run", "--layout", "grid", "--sensors", 1).code == 0
+        assert lidardesign("fit", "run", "--layout", "even", "--sensors", 1).code == 0
         assert lidardesign("export", "good.yaml", "--format", "galvo").code == 0
         header, *rows = (mistakes / "good.galvo.csv").read_text().splitlines(keepends=True)
         (mistakes / "header.galvo.csv").write_text(header)

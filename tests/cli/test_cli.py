@@ -67,7 +67,7 @@ def test_a_task_shows_what_is_designed_what_is_given_and_how_it_is_fitted(lidard
 
 
 def test_the_chain_works_from_a_run_to_exported_rays(lidardesign, flat, tmp_path):
-    fitted = lidardesign("fit", flat, "--layout", "grid", "--sensors", 2, "--json").json
+    fitted = lidardesign("fit", flat, "--layout", "even", "--sensors", 2, "--json").json
     keys = {"design", "sensors", "log_likelihood", "admissible_mass", "ess", "satisfied", "constraints", "seconds"}
     assert keys <= {*fitted}
     assert Path(fitted["design"]) == flat / "designs" / "fit.yaml"
@@ -86,7 +86,7 @@ def test_the_chain_works_from_a_run_to_exported_rays(lidardesign, flat, tmp_path
 
 
 def test_evaluate_scores_designs_and_baselines_and_holds_a_threshold(lidardesign, flat):
-    lidardesign("fit", flat, "--layout", "grid", "--sensors", 2)
+    lidardesign("fit", flat, "--layout", "even", "--sensors", 2)
     arguments = ("evaluate", flat, "--rays", 16, "--csv", "rows.csv", "--json")
     result = lidardesign(*arguments, "--fail-above", 1e-9)
     assert result.code == 1
@@ -100,7 +100,7 @@ def test_evaluate_scores_designs_and_baselines_and_holds_a_threshold(lidardesign
 
 def test_evaluate_fails_unless_designs_are_better_than_a_rival(lidardesign, flat):
     for sensors in (1, 2):
-        lidardesign("fit", flat, "--layout", "grid", "--sensors", sensors, "--rays", 16, "--name", f"s{sensors}")
+        lidardesign("fit", flat, "--layout", "even", "--sensors", sensors, "--rays", 16, "--name", f"s{sensors}")
     both = [flat / "designs" / f"s{sensors}.yaml" for sensors in (1, 2)]
     arguments = ("evaluate", both[1], "--rays", 16, "--set", "test=10")
     passed = lidardesign(*arguments, "--fail-unless-better", "uniform")
@@ -127,7 +127,7 @@ def test_evaluate_fails_unless_designs_are_better_than_a_rival(lidardesign, flat
 
 
 def test_no_visibility_needs_a_design_whose_run_is_there(lidardesign, flat):
-    lidardesign("fit", flat, "--layout", "grid", "--sensors", 2)
+    lidardesign("fit", flat, "--layout", "even", "--sensors", 2)
     away = Path("away.yaml")
     away.write_text((flat / "designs" / "fit.yaml").read_text())
     (flat / "designs" / "fit.yaml").unlink()
@@ -141,7 +141,7 @@ def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, m
         raise InfeasibleError("broken", conflicts=["gate.width_m.max"])
 
     monkeypatch.setattr("lidardesign.fitting.fit.check_written", refuse)
-    result = lidardesign("constrain", flat, "--layout", "grid", "--set", "gate.width_m.max=0.3", "--json")
+    result = lidardesign("constrain", flat, "--layout", "even", "--set", "gate.width_m.max=0.3", "--json")
     assert result.code == 4
     assert result.json["error"]["conflicts"] == ["gate.width_m.max"]
     assert not (flat / "designs").exists()
@@ -233,7 +233,7 @@ def test_wherever_a_sensor_looks_its_roll_part_and_frame_are_said(lidardesign, t
 
 def test_every_pinned_place_gets_a_sensor(lidardesign, flat):
     each = "each=[{}, {}, {}, {}, {gate: {width_m: {max: 0.3}}}]"
-    made = lidardesign("constrain", flat, "--layout", "grid", "--set", each, "--json").json
+    made = lidardesign("constrain", flat, "--layout", "even", "--set", each, "--json").json
     assert len(made["sensors"]) == 5
 
 

@@ -230,7 +230,7 @@ def evaluation(tmp_path_factory):
         assert not ended.value.code
         return json.loads(out.getvalue())
 
-    printed("fit", flat, "--layout", "grid", "--sensors", 1, "--json")
+    printed("fit", flat, "--layout", "even", "--sensors", 1, "--json")
     search = ("--baseline", "cma", "--cma-seconds", 0.1, "--set", "test=2")
     audited = ("--effects", "audit", "--mount-error", "5mm")
     return printed("evaluate", flat, "--rays", 9, *search, *audited, "--json", "--quiet")

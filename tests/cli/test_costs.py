@@ -63,7 +63,7 @@ def test_learning_says_what_it_cost_and_how_far_its_figures_may_be_off(lidardesi
 def test_fits_say_what_they_cost_and_write_the_same_bytes_whatever_the_time(lidardesign, flat):
     designs = []
     for name in ("one", "one"):
-        done = lidardesign(f"fit run --layout grid --rays 30 --name {name} --json")
+        done = lidardesign(f"fit run --layout even --rays 30 --name {name} --json")
         designs.append((flat / "designs" / "one.yaml").read_bytes())
         document = done.json
         assert adds_up(document) >= document["seconds"] - 0.01
@@ -74,12 +74,12 @@ def test_fits_say_what_they_cost_and_write_the_same_bytes_whatever_the_time(lida
     for name in ("log_likelihood", "ess", "admissible_mass"):
         assert estimates[name]["value"] == pytest.approx(document[name])
     assert estimates["rays"]["kind"] == "rounding"
-    lidardesign("constrain run --layout grid --set gate.width_m.max=0.4 --name two")
+    lidardesign("constrain run --layout even --set gate.width_m.max=0.4 --name two")
     assert set(read_manifest(flat)["timings"]) == {"fit", "constrain"}
 
 
 def test_reading_commands_keep_their_times_in_the_run_and_change_nothing_else_there(lidardesign, flat, tmp_path):
-    lidardesign("fit run --layout grid --sensors 2 --rays 20 --name one")
+    lidardesign("fit run --layout even --sensors 2 --rays 20 --name one")
     before = files_under(flat)
     evaluated = lidardesign("evaluate run --rays 20 --set test=3 --json").json
     adds_up(evaluated)
@@ -97,7 +97,7 @@ def test_reading_commands_keep_their_times_in_the_run_and_change_nothing_else_th
 
 
 def test_a_run_that_cannot_be_written_is_still_read(lidardesign, flat, tmp_path):
-    lidardesign("fit run --layout grid --sensors 2 --rays 20 --name one")
+    lidardesign("fit run --layout even --sensors 2 --rays 20 --name one")
     with run_lock(flat):
         done = lidardesign("export run/designs/one.yaml --format csv --out rays.csv")
     assert done.code == 0

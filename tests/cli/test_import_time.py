@@ -49,7 +49,7 @@ def test_lists_import_nothing_heavy(arguments):
 def test_a_fitted_mixture_is_constrained_shown_and_exported_without_heavy_libraries(tmp_path):
     run, rays = make_run(tmp_path / "run"), tmp_path / "rays.csv"
     commands = (
-        ["constrain", run, "--layout", "grid", "--sensors", 2, "--set", "gate.width_m.max=0.2", "--name", "narrow"],
+        ["constrain", run, "--layout", "even", "--sensors", 2, "--set", "gate.width_m.max=0.2", "--name", "narrow"],
         ["show", run],
         ["show", run / "designs" / "narrow.yaml"],
         ["export", run / "designs" / "narrow.yaml", "--rays", 100, "--format", "csv", "--out", rays],

@@ -29,7 +29,7 @@ def call(capsys, work, monkeypatch):
     call = caller(capsys, work, monkeypatch)
     if not (work / "run").exists():
         make_run(work / "run", count=1000)
-        assert call("fit", "run", "--layout", "grid", "--sensors", 1).code == 0
+        assert call("fit", "run", "--layout", "even", "--sensors", 1).code == 0
         (work / "folder").mkdir()
         (work / "file").touch()
         (work / "mine.yaml").write_bytes((work / "run/designs/fit.yaml").read_bytes())
@@ -205,7 +205,7 @@ def test_a_design_that_its_run_does_not_take_is_kept(call, work, tmp_path, monke
     def refuse(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    fitting = ("fit", "run", "--layout", "grid", "--sensors", 1, "--name", "other")
+    fitting = ("fit", "run", "--layout", "even", "--sensors", 1, "--name", "other")
     with monkeypatch.context() as broken:
         broken.setattr("lidardesign.run.files.os.replace", refuse)
         result = call(*fitting)
@@ -218,7 +218,7 @@ def test_a_design_that_its_run_does_not_take_is_kept(call, work, tmp_path, monke
 
 def test_a_fit_is_refused_before_it_begins_where_its_run_takes_nothing(call, work, idle):
     (work / "run" / "designs" / "taken.yaml").mkdir()
-    result = call("fit", "run", "--layout", "grid", "--name", "taken")
+    result = call("fit", "run", "--layout", "even", "--name", "taken")
     (work / "run" / "designs" / "taken.yaml").rmdir()
     assert result.code == 3
     assert "is a folder" in result.err

@@ -17,7 +17,7 @@ def work(tmp_path_factory):
 def call(capsys, work, monkeypatch):
     call = caller(capsys, work, monkeypatch)
     if not (work / "run" / "designs").exists():
-        assert call("fit", "run", "--layout", "grid", "--sensors", 1).code == 0
+        assert call("fit", "run", "--layout", "even", "--sensors", 1).code == 0
     return call
 
 

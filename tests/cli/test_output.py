@@ -36,7 +36,7 @@ def test_what_nobody_can_act_on_is_said_to_those_who_ask(quiet, verbose, said, c
 
 
 def test_a_fit_prints_a_line_per_sensor_and_what_limits_it(lidardesign, flat):
-    fit = "constrain run --layout grid --sensors 3 --rays 30 --set gate.width_m.max=0.2 --name thin"
+    fit = "constrain run --layout even --sensors 3 --rays 30 --set gate.width_m.max=0.2 --name thin"
     lines = lidardesign(fit).out.splitlines()
     assert lines[0] == "thin: 3 sensors, 30 rays per frame (layout grid)"
     assert lines[1] == "in the world's frame"
@@ -98,7 +98,7 @@ def test_quiet_work_says_nothing(capsys):
 
 
 def test_an_export_says_in_one_line_what_the_format_cannot_hold(lidardesign, flat):
-    lidardesign("fit run --layout grid --sensors 2 --rays 12 --name one")
+    lidardesign("fit run --layout even --sensors 2 --rays 12 --name one")
     export = "export run/designs/one.yaml --format sdf --out one.sdf"
     notes = json.loads(lidardesign(f"{export} --json").out)["notes"]
     short, loud = lidardesign(export), lidardesign(f"{export} -v")

@@ -220,7 +220,7 @@ def test_a_run_says_what_it_has_and_what_can_be_done_next(lidardesign, finished)
     assert "the density is good: 10 % misplaced, KL 0.1 nats, ESS 0.8" in shown
     assert "no designs yet" in shown
     assert follow(lidardesign, shown) == ["fit"]
-    lidardesign("fit", finished, "--layout", "grid", "--sensors", 1)
+    lidardesign("fit", finished, "--layout", "even", "--sensors", 1)
     shown = lidardesign("show", finished).out
     assert "no scores are kept yet" in shown
     assert follow(lidardesign, shown) == ["evaluate"]
@@ -241,10 +241,10 @@ def test_a_run_says_what_it_has_and_what_can_be_done_next(lidardesign, finished)
 
 
 def test_a_score_is_of_the_design_as_it_was_scored(lidardesign, finished):
-    lidardesign("fit", finished, "--layout", "grid", "--sensors", 1)
+    lidardesign("fit", finished, "--layout", "even", "--sensors", 1)
     lidardesign("evaluate", finished, "--rays", 9, "--quiet")
     assert lidardesign("show", finished, "--json").json["designs"][0]["score"] is not None
-    lidardesign("fit", finished, "--layout", "grid", "--sensors", 2)
+    lidardesign("fit", finished, "--layout", "even", "--sensors", 2)
     assert lidardesign("show", finished, "--json").json["designs"][0]["score"] is None
 
 
@@ -255,7 +255,7 @@ def test_a_rough_density_says_what_would_make_it_better(lidardesign, finished):
 
 
 def test_what_cannot_be_read_is_said_beside_what_can(lidardesign, finished):
-    lidardesign("fit", finished, "--layout", "grid", "--sensors", 1)
+    lidardesign("fit", finished, "--layout", "even", "--sensors", 1)
     (finished / "designs" / "cut.yaml").write_text("name: [")
     shown = lidardesign("show", finished)
     assert shown.code == 0

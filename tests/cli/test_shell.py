@@ -33,7 +33,7 @@ def fitted(tmp_path_factory):
 
     folder = make_run(tmp_path_factory.mktemp("runs") / "flat")
     with pytest.raises(SystemExit):
-        run(["fit", str(folder), "--layout", "grid", "--sensors", "2", "--rays", "9", "--quiet", "--json"])
+        run(["fit", str(folder), "--layout", "even", "--sensors", "2", "--rays", "9", "--quiet", "--json"])
     return folder
 
 

@@ -26,6 +26,7 @@ from lidardesign.density.training.checkpoint import (
     stored_snapshots,
 )
 from lidardesign.density.training.learn import learn, prepare_training_data
+from lidardesign.density.training.quality import IndependentProbes
 from lidardesign.density.training.sampling import log_density_of
 from lidardesign.density.training.trainer import AVERAGING, BETAS, Adam
 from lidardesign.errors import ConfigError, DataError, PluginError
@@ -66,7 +67,8 @@ def test_a_resumed_run_is_an_uninterrupted_run_bit_for_bit(finished, tmp_path, s
 def test_proposals_on_the_faces_of_the_space_are_inside_the_flows_box(monkeypatch):
     # the space counts what is outside by rounding as inside; the flow's density would be 0 there
     points = np.array([[0, 0, 0, 0.4 + 1e-10, 0, 1.0], [0, 0, 0, 0.1, 0, 0.2 - 1e-10]])
-    monkeypatch.setattr(learning, "independent_points", lambda *_: (points, np.zeros(2)))
+    probes = IndependentProbes(points, np.zeros(2), np.zeros(2))
+    monkeypatch.setattr(learning, "draw_probes", lambda *_: probes)
     pool = prepare_training_data(BallTask(), config_of()).pool
     assert SPACE.contains(points).all()
     assert float(pool.unit.abs().max()) == 1.0
@@ -143,7 +145,7 @@ def test_samples_carry_the_density_that_the_flow_has_there(tmp_path, monkeypatch
 
     monkeypatch.setattr(learning, "measure", keep)
     learn(BallTask(), config_of(dtype=dtype), tmp_path)
-    samples = load_samples(tmp_path).subset(np.arange(500))
+    samples = kept["measured"].samples.subset(np.arange(500))
     again = log_density_of(kept["flow"], samples.points)
     thinned = kept["measured"].thinning.log_prob(again, samples.log_target)
     np.testing.assert_allclose(thinned, samples.log_prob, atol=1e-6)

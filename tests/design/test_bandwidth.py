@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import Rays
@@ -70,8 +69,8 @@ def test_an_impossible_width_is_refused(width):
         Bandwidth().bins(width)
 
 
-@each_row("name", ["bin_ps", "bits_per_bin", "rate_hz"])
-@each_row("value", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("name", ["bin_ps", "bits_per_bin", "rate_hz"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_an_impossible_read_out_is_refused_by_name(name, value):
     with pytest.raises(ConfigError, match=name):
         Bandwidth(**{name: value})

@@ -11,17 +11,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lidardesign.layouts.rays import LAYOUTS, lay_out
 from support.command_line import make_run
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.fitting.part_shapes import PartShape, gate_inside, shapes_of
+from lidardesign.formats.designs import load_design
 from lidardesign.mixture.components import Axes
 from lidardesign.parts.catalogue import (
     FOLDER,
     Pose,
-    boresight_of,
     find_part,
     interleaved,
     load_library,
@@ -31,13 +29,13 @@ from lidardesign.parts.catalogue import (
     parts_for,
     side_by_side,
 )
-from lidardesign.parts.part import Part, conditions_of, disagreements, even_subset, to_angles, to_directions
+from lidardesign.parts.part import Part, conditions_of, disagreements, to_angles, to_directions
 from lidardesign.parts.statements import FIELDS, PartFile, Statement
 from lidardesign.run.validation import check_model
 from lidardesign.run.yaml import parse_yaml
-from lidardesign.sensors.design_file import design_document, design_from_document, load_design, save_design
-from lidardesign.sensors.pattern import grid_rows
-from lidardesign.sensors.sensor import boresight_frame
+from lidardesign.sensors.design_file import design_document, design_from_document, save_design
+from lidardesign.sensors.pattern import even_subset, grid_rows
+from lidardesign.sensors.sensor import boresight_frame, boresight_of
 from lidardesign.space import DesignSpace, direction
 
 LIBRARY = load_library()
@@ -93,7 +91,7 @@ def in_field(part, directions):
     return (away <= (high - low) / 2 + 1e-9).all(axis=1)
 
 
-@each_row("name", LIBRARY.names)
+@pytest.mark.parametrize("name", LIBRARY.names)
 def test_every_source_of_a_part_is_used_and_every_statement_has_one(name):
     file = LIBRARY.files[name]
     modes = list(file.modes) or [None]
@@ -101,7 +99,7 @@ def test_every_source_of_a_part_is_used_and_every_statement_has_one(name):
     assert used == set(file.sources)
 
 
-@each_row("name", PARTS)
+@pytest.mark.parametrize("name", PARTS)
 def test_the_rays_of_a_part_are_unit_vectors_inside_its_field_and_as_many_as_it_says(name):
     part = PARTS[name]
     assert np.allclose(np.linalg.norm(part.directions, axis=1), 1, atol=1e-12)
@@ -112,13 +110,13 @@ def test_the_rays_of_a_part_are_unit_vectors_inside_its_field_and_as_many_as_it_
     assert columns * rows >= part.rays > (columns - 1) * (rows - 1)
 
 
-@each_row("name", [name for name, part in PARTS.items() if part.value("points_per_s")])
+@pytest.mark.parametrize("name", [name for name, part in PARTS.items() if part.value("points_per_s")])
 def test_rays_and_frames_make_the_points_per_second_that_the_maker_states(name):
     part = PARTS[name]
     assert part.rays * part.rate_hz == pytest.approx(part.value("points_per_s"), rel=0.001)
 
 
-@each_row("name", PARTS)
+@pytest.mark.parametrize("name", PARTS)
 def test_a_part_fills_its_field_up_to_one_cell(name):
     part = PARTS[name]
     if part.rays == 1:
@@ -268,18 +266,18 @@ def test_a_frame_gives_back_its_boresight(azimuth, elevation, roll):
     assert np.allclose(boresight_frame(*boresight_of(frame)), frame, atol=1e-9)
 
 
-@each_row("name", ZONES)
+@pytest.mark.parametrize("name", ZONES)
 def test_zones_are_the_even_grid_of_their_field_where_that_has_their_rows(name):
     part = PARTS[name]
     design = part_design(part, some_pose())
-    even = lay_out(replace(design, layout="grid", ray_table=None), part.rays)
-    own_rays = lay_out(design)
+    even = replace(design, layout="even", patterns=()).rays(part.rays)
+    own_rays = design.rays()
     assert np.allclose(own_rays.gate_m, even.gate_m, atol=1e-12)
     if part.grid[1] == len(grid_rows(*part.field_of_view_rad, part.rays)):
         assert np.allclose(own_rays.direction, even.direction, atol=1e-12)
 
 
-@each_row("name", SOME)
+@pytest.mark.parametrize("name", SOME)
 def test_a_pose_moves_a_part_as_a_rigid_body(name):
     part, pose = PARTS[name], some_pose()
     here = part_rays(part, Pose(), min(part.rays, 60))
@@ -293,7 +291,7 @@ def test_a_pose_moves_a_part_as_a_rigid_body(name):
     assert len(np.unique(np.round(local, 9), axis=0)) == len(there) == len(here)
 
 
-@each_row("name", PARTS)
+@pytest.mark.parametrize("name", PARTS)
 def test_the_sensor_of_a_part_has_its_field_its_range_and_looks_at_its_centre(name):
     part, pose = PARTS[name], some_pose(3)
     sensor = part_sensor(part, pose)
@@ -302,7 +300,8 @@ def test_the_sensor_of_a_part_has_its_field_its_range_and_looks_at_its_centre(na
     centre = direction(*part.centre_rad) @ pose.frame
     assert np.allclose(sensor.boresight, centre, atol=1e-9)
     assert np.allclose(sensor.frame, boresight_frame(*part.centre_rad) @ pose.frame, atol=1e-9)
-    assert not sensor.origin_covariance_m2.any()
+    assert sensor.origin_covariance_m2 is None
+    assert sensor.part == name
 
 
 def test_rays_of_one_part_fire_over_its_own_frame():
@@ -379,25 +378,16 @@ def test_spinning_scanners_stand_above_each_other_and_line_scanners_are_rolled()
 # designs
 
 
-def test_a_fixed_layout_needs_its_rays_and_is_fitted_anew_as_a_grid():
-    document = design_document(part_design(PARTS["vl53l8cx"], Pose()))
-    del document["ray_table"]
-    with pytest.raises(ConfigError, match="is fixed, but there is no ray_table"):
-        design_from_document(document)
-    others = {name: layout.fitted_as for name, layout in LAYOUTS.items() if name != layout.fitted_as}
-    assert others == {"fixed": "grid", "selected": "density", "spinning": "grid"}
-
-
-def test_a_part_in_a_run_is_constrained_as_a_grid_of_its_sensors_and_cannot_be_fitted(call, tmp_path):
+def test_a_part_in_a_run_is_fitted_anew_with_chosen_rays_and_no_fit_has_its_layout(call, tmp_path):
     run = make_run(tmp_path / "run")
     design = run / "designs" / "bought.yaml"
     design.parent.mkdir()
     save_design(replace(part_design(PARTS["vl53l8cx"], Pose()), provenance={"run": ".."}), design)
     result = call("constrain", design, "--name", "like", "--json")
     assert result.code == 0, result.err
-    assert load_design(run / "designs" / "like.yaml").layout == "grid"
-    refused = call("fit", run, "--layout", "fixed")
-    assert refused.code == 2
+    again = load_design(run / "designs" / "like.yaml")
+    assert (again.layout, again.counts, len(again.sensors)) == ("chosen", [64], 1)
+    assert call("fit", run, "--layout", "fixed").code == 2
 
 
 # the library
@@ -434,7 +424,7 @@ def test_two_own_parts_of_one_name_are_refused(tmp_path):
         load_library([tmp_path / "a", tmp_path / "b"])
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("name", "message"),
     [
         ("vlp16", "there is no part 'vlp16'"),
@@ -560,7 +550,7 @@ def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
     part = PARTS["vl53l8cx"]
     pose = Pose(np.array([-1, 0, 0.5]), math.radians(-20), math.radians(10))
     wanted = part_rays(part, interleaved(part, pose, 4), 196)
-    assert np.allclose(lay_out(design).direction, wanted.direction, atol=1e-12)
+    assert np.allclose(design.rays().direction, wanted.direction, atol=1e-12)
     beside = call("catalog", "show", "vl53l8cx", "--out", "wide.yaml", "--parts", "2", "--arrange", "beside")
     assert beside.code == 0, beside.err
     one, other = load_design(tmp_path / "wide.yaml").sensors

@@ -7,22 +7,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lidardesign.layouts.rays import lay_out
 from support.command_line import make_run
+from support.sensors import normal_sensor
 
 from lidardesign.formats.designs import load_design
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.compare import angle_between, paired_sensors, readout_of
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import direction
 
 
 def sensors(seed, count, named="s"):
     generator = np.random.default_rng(seed)
     return tuple(
-        Sensor(
-            f"{named}{index}", 1 / count, generator.normal(size=3), np.zeros((3, 3)), *generator.uniform(-1, 1, 3),
-            *generator.uniform(0.01, 0.4, 2), *generator.uniform(0.5, 2, 2),
+        normal_sensor(
+            f"{named}{index}", 1 / count, generator.normal(size=3), *generator.uniform(-1, 1, 3),
+            generator.uniform(0.01, 0.4, 2), *generator.uniform(0.5, 2, 2),
         )
         for index in range(count)
     )  # fmt: skip
@@ -67,23 +68,34 @@ def test_an_angle_is_exact_for_the_smallest_and_the_largest():
         assert found == pytest.approx(angle, rel=1e-7, abs=1e-15)
 
 
-def test_what_a_design_costs_is_what_its_rays_cost():
-    for seed in range(5):
-        design = DesignSpec("d", sensors(seed, 4), rays=101)
-        assert readout_of(design).high_mbps == pytest.approx(Bandwidth().mbps(lay_out(design)))
-        slow = replace(design, constraints={"budget": {"rate_hz": 2.0, "bin_ps": 250.0}})
+@pytest.mark.parametrize("seed", range(5))
+def test_what_a_design_costs_is_what_its_rays_cost(seed):
+    even = DesignSpec("d", sensors(seed, 4), constraints={"budget": {"rays": 101}})
+    fixed = replace(even, layout="fixed", patterns=(Pattern.of(even.rays(50)),))
+    for design in (even, fixed):
+        assert readout_of(design).high_mbps == pytest.approx(Bandwidth().mbps(design.rays()))
+        assert readout_of(design).rays == len(design.rays())
+        slow = replace(design, constraints={"budget": {"rays": 101, "rate_hz": 2.0, "bin_ps": 250.0}})
         model = Bandwidth(bin_ps=250.0, rate_hz=2.0)
-        assert readout_of(slow).high_mbps == pytest.approx(model.mbps(lay_out(design)))
-        many = 4_000
-        open_cost = readout_of(replace(design, rays=None))
-        assert open_cost.rays is None
-        assert many * open_cost.low_mbps == pytest.approx(Bandwidth().mbps(lay_out(design, many)), rel=1e-9)
+        assert readout_of(slow).high_mbps == pytest.approx(model.mbps(design.rays()))
+    many, open_cost = 4_000, readout_of(replace(even, constraints={}))
+    assert open_cost.rays is None
+    assert many * open_cost.low_mbps == pytest.approx(Bandwidth().mbps(even.rays(many)), rel=1e-9)
+
+
+def test_what_a_design_costs_along_a_condition_is_from_its_cheapest_to_its_dearest_knot():
+    lists = [DesignSpec("d", sensors(0, 1)).rays(5), DesignSpec("d", sensors(1, 1)).rays(5)]
+    pattern = Pattern.along("x_m", [0.0, 1.0], lists, (0.0, 1.0))
+    found = readout_of(DesignSpec("d", sensors(0, 1), "chosen", (pattern,)))
+    costs = sorted(Bandwidth().mbps(pattern.at(knot)) for knot in pattern.knots)
+    assert (found.low_mbps, found.high_mbps) == tuple(costs)
+    assert costs[0] < costs[1]
 
 
 # ------------------------------------------------------------------- commands
 
 
-GRID = ("--layout", "grid", "--sensors", "2")
+EVEN = ("--layout", "even", "--sensors", "2")
 
 
 @pytest.fixture(scope="module")
@@ -93,13 +105,13 @@ def run(tmp_path_factory):
 
     for name, rays in (("few", 8), ("more", 12)):
         with pytest.raises(SystemExit) as ended:
-            program(["fit", str(folder), *GRID, "--rays", str(rays), "--name", name, "--quiet"])
+            program(["fit", str(folder), *EVEN, "--rays", str(rays), "--name", name, "--quiet"])
         assert not ended.value.code
     return folder
 
 
 def test_two_designs_differ_in_what_is_shown(call, run):
-    constrained = call("constrain", run, *GRID, "--rays", "8", "--set", "gate.width_m.max=0.2", "--name", "tight")
+    constrained = call("constrain", run, *EVEN, "--rays", "8", "--set", "gate.width_m.max=0.2", "--name", "tight")
     assert constrained.code == 0, constrained.err
     few, more, tight = (run / "designs" / f"{name}.yaml" for name in ("few", "more", "tight"))
     found = call("show", few, tight, "--json").json
@@ -128,7 +140,7 @@ def test_what_rounding_leaves_of_no_difference_is_shown_as_none(call, run, tmp_p
 
 def test_a_shown_design_says_how_tight_its_constraints_are(call, run):
     result = call(
-        "constrain", run, *GRID, "--set", "gate.width_m.max=0.2", "--set", "budget.bandwidth_mbps=900", "--rays", "8"
+        "constrain", run, *EVEN, "--set", "gate.width_m.max=0.2", "--set", "budget.bandwidth_mbps=900", "--rays", "8"
     )
     assert result.code == 0, result.err
     path = run / "designs" / "constrained.yaml"
@@ -145,4 +157,6 @@ def test_a_shown_design_says_how_tight_its_constraints_are(call, run):
     text = call("show", path).out
     assert "yes, tight" in text
     assert "Mbit/s for 8 rays per frame" in text
-    assert call("show", run / "designs" / "few.yaml", "--json").json["checks"] == []
+    # nothing was asked of this one but its number of rays
+    plain = call("show", run / "designs" / "few.yaml", "--json").json["checks"]
+    assert [check["name"] for check in plain if ".space." not in check["name"]] == ["budget.rays"]

@@ -7,7 +7,6 @@ import math
 import pytest
 from pydantic import ValidationError
 from support.constraints import CONTRADICTIONS, FACE
-from support.tables import each_row
 
 from lidardesign.constraints.document import Constraints, DistanceRange, Gate, rules_of
 from lidardesign.constraints.feasibility import check_feasible
@@ -16,7 +15,7 @@ from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import DesignSpace
 
 
-@each_row("name", CONTRADICTIONS)
+@pytest.mark.parametrize("name", CONTRADICTIONS)
 def test_a_contradiction_names_the_smallest_conflicting_set(name):
     values, conflicts = CONTRADICTIONS[name]
     with pytest.raises(InfeasibleError) as caught:
@@ -32,7 +31,7 @@ def test_a_fixed_angle_admits_no_field_of_view_along_it():
     assert "space.elevation_rad" in caught.value.conflicts
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("values", "text"),
     [
         ({"gates": {}}, "unknown key 'gates'"),
@@ -83,7 +82,7 @@ LIMITS = {
 }
 
 
-@each_row("key", LIMITS)
+@pytest.mark.parametrize("key", LIMITS)
 def test_every_number_is_taken_up_to_its_limit_and_not_beyond(key):
     taken, refused = LIMITS[key]
 
@@ -131,7 +130,7 @@ def test_constraints_that_were_read_cannot_be_changed():
         constraints.gate.width_m.max = 0.6
 
 
-@each_row("values", [[], "gate", 3, False, ()])
+@pytest.mark.parametrize("values", [[], "gate", 3, False, ()])
 def test_what_is_no_mapping_is_named(values):
     with pytest.raises(ConfigError, match=f"found one {type(values).__name__}"):
         Constraints.from_mapping(values)
@@ -174,7 +173,7 @@ def test_a_document_holds_what_was_given_and_no_more():
     assert Constraints().as_document() == {}
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("values", "name"),
     [
         ({"gate": None}, "gate"),

@@ -5,23 +5,23 @@ from __future__ import annotations
 import copy
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lidardesign.layouts.rays import lay_out
-from support.aisles import AISLE
-from support.command_line import caller, make_run
-from support.tables import each_row
+from support import fits
+from support.command_line import make_run
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
+from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import ConfigError, InfeasibleError
-from lidardesign.mixture.fit import fit
+from lidardesign.rays.proposals import Proposals
 from lidardesign.samples import Samples
-from lidardesign.sensors.design_file import design_document, load_design, save_design
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design_file import design_document
+from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import DesignSpace, aim, observed_point
 
 ROOM = DesignSpace((-1, -1, 0, 0.0, -math.pi / 2, 0.05), (1, 1, 2, 2 * math.pi, math.pi / 2, 6.0))
@@ -49,59 +49,67 @@ def room(count=12_000, seed=0, space=ROOM):
 SAMPLES = room()
 
 
-def fitted(samples=SAMPLES, count=None, layout="grid", rays=None, **values):
-    constraints = Constraints.from_mapping(values)
-    return fit(
-        samples, sensors=count, layout=layout, rays=rays, constraints=constraints, retarget=log_target,
-        em_samples=2000, restarts=2,
-    )  # fmt: skip
+REGION = {"spread_m": {"max": 9.0}}
+
+
+def fitted(samples=SAMPLES, count=None, rays=None, **values):
+    return fits.fitted(samples, values, sensors=count, rays=rays, retarget=log_target)
+
+
+def broken(found, **values):
+    return fits.broken(found, values, ROOM)
 
 
 def interval(sensor):
     """Lowest and highest origin along each axis at the level 0.95, by a factor of its own."""
-    reach = 1.959963984540054 * np.sqrt(np.diag(sensor.origin_covariance_m2))
+    reach = 1.959963984540054 * np.sqrt(np.diag(sensor.covariance_m2))
     return sensor.origin_m - reach, sensor.origin_m + reach
 
 
-def assert_outside(design, boxes):
-    for sensor in design.sensors:
+def assert_outside(found, boxes):
+    for sensor in found.sensors:
         low, high = interval(sensor)
         for box in boxes:
             into = (high > np.array(box["low_m"]) + 1e-9) & (low < np.array(box["high_m"]) - 1e-9)
             into &= np.array(box["low_m"]) < np.array(box["high_m"])
             assert not into.all(), (sensor.origin_m, low, high, box)
-    if design.ray_table is not None:
-        assert not any(starting_in(box, design.ray_table) for box in boxes)
+
+
+def candidates(found, count, **values):
+    """Rays that are proposed for fitted sensors."""
+    rules = Constraints.from_mapping(values).rules
+    return Proposals(found.sensors, rules, 0.95, SAMPLES).draw(count, {}, np.random.default_rng(0))
 
 
 def starting_in(box, rays):
     return ((rays.origin_m > box["low_m"]) & (rays.origin_m < box["high_m"])).all(axis=1).any()
 
 
-def places(result):
-    return [(*sensor.origin_m, *sensor.origin_covariance_m2.ravel()) for sensor in result.design.sensors]
+def places(found):
+    return [(*sensor.origin_m, *sensor.covariance_m2.ravel()) for sensor in found.sensors]
 
 
-@each_row("layout", ["grid", "density", "distributed", "scan"])
-@each_row("box", [SLAB, PILLAR], ids=["slab", "pillar"])
-def test_no_sensor_and_no_ray_is_in_an_excluded_box(layout, box):
-    result = fitted(layout=layout, rays=40, origin={"exclude": [box]})
-    assert_outside(result.design, [box])
-    assert result.satisfied
-    rows = [check for check in result.constraints if "exclude" in check.name]
-    assert len(rows) == len(result.design.sensors)
-    assert rows[0].name == "s0.origin.exclude[0]"
+@pytest.mark.parametrize("region", [{}, REGION], ids=["places", "regions"])
+@pytest.mark.parametrize("box", [SLAB, PILLAR], ids=["slab", "pillar"])
+def test_no_sensor_and_no_ray_is_in_an_excluded_box(region, box):
+    origin = {"exclude": [box], **region}
+    found = fitted(origin=origin)
+    assert_outside(found, [box])
+    assert not starting_in(box, candidates(found, 200, origin=origin))
+    checks = fits.checks(found, {"origin": origin}, ROOM)
+    assert all(check.satisfied for check in checks)
+    assert [check.name for check in checks if "exclude" in check.name] == [f"s{i}.origin.exclude[0]" for i in range(4)]
 
 
 def test_the_admissible_mass_is_the_density_outside():
-    result = fitted(origin={"exclude": [SLAB]})
+    found = fitted(origin={"exclude": [SLAB], **REGION})
     outside = (SAMPLES.points[:, 0] <= -0.3) | (SAMPLES.points[:, 0] >= 0.2)
-    assert result.admissible_mass == pytest.approx(SAMPLES.weights[outside].sum())
+    assert found.admissible_mass == pytest.approx(SAMPLES.weights[outside].sum())
 
 
 def test_boxes_beyond_the_space_change_nothing():
-    free = fitted(count=2)
-    far = fitted(count=2, origin={"exclude": [{"low_m": [3, -9, -9], "high_m": [5, 9, 9]}]})
+    free = fitted(count=2, origin=REGION)
+    far = fitted(count=2, origin={"exclude": [{"low_m": [3, -9, -9], "high_m": [5, 9, 9]}], **REGION})
     assert places(far) == places(free)
     assert far.log_likelihood == free.log_likelihood
 
@@ -110,49 +118,55 @@ def test_boxes_beyond_the_space_change_nothing():
 def test_flat_boxes_exclude_nothing_and_it_is_said(axis):
     box = {"low_m": [-0.5, -0.5, 0.5], "high_m": [0.5, 0.5, 1.5]}
     box["high_m"][axis] = box["low_m"][axis]
-    flat = fitted(count=2, origin={"exclude": [box]})
-    assert places(flat) == places(fitted(count=2))
-    assert flat.satisfied
-    assert flat.notes[0] == "origin.exclude[0] has no volume and excludes nothing"
+    values = {"origin": {"exclude": [box], **REGION}}
+    flat = fitted(count=2, **values)
+    assert places(flat) == places(fitted(count=2, origin=REGION))
+    assert broken(flat, **values) == []
+    notes = placement_notes(Constraints.from_mapping(values).rules)
+    assert notes == ("origin.exclude[0] has no volume and excludes nothing",)
 
 
 def test_each_sensor_may_have_boxes_of_its_own():
     left, right = {"low_m": [-2, -2, -1], "high_m": [0, 2, 3]}, {"low_m": [0, -2, -1], "high_m": [2, 2, 3]}
-    result = fitted(each=[{"origin": {"exclude": [left]}}, {"origin": {"exclude": [right]}}])
-    first, second = result.design.sensors
+    values = {"origin": REGION, "each": [{"origin": {"exclude": [left]}}, {"origin": {"exclude": [right]}}]}
+    found = fitted(**values)
+    first, second = found.sensors
     assert interval(first)[0][0] >= -1e-9
     assert interval(second)[1][0] <= 1e-9
-    assert result.satisfied
+    assert broken(found, **values) == []
 
 
 def test_an_entry_of_each_replaces_the_common_boxes():
-    result = fitted(origin={"exclude": [SLAB]}, each=[{"origin": {"exclude": []}}, {}])
-    names = [check.name for check in result.constraints if "exclude" in check.name]
-    assert names == ["s1.origin.exclude[0]"]
+    values = {"origin": {"exclude": [SLAB]}, "each": [{"origin": {"exclude": []}}, {}]}
+    names = [check.name for check in fits.checks(fitted(**values), values, ROOM)]
+    assert [name for name in names if "exclude" in name] == ["s1.origin.exclude[0]"]
 
 
 def test_boxes_hold_together_with_spreads():
     origin = {"exclude": [PILLAR], "spread_m": {"max": 0.3}, "thickness_m": {"max": 0.02}}
-    result = fitted(count=4, origin=origin)
-    assert_outside(result.design, [PILLAR])
-    assert result.satisfied
+    found = fitted(count=4, origin=origin)
+    assert_outside(found, [PILLAR])
+    assert broken(found, origin=origin) == []
 
 
 def test_mounts_in_an_excluded_box_are_dropped_and_it_is_said():
     mounts = [[0.0, 0.0, 0.1], [0.8, 0.0, 0.1], [-0.8, 0.0, 0.1]]
-    result = fitted(origin={"exclude": [PILLAR], "mounts_m": mounts})
-    assert sorted(sensor.origin_m[0] for sensor in result.design.sensors) == [-0.8, 0.8]
-    assert result.satisfied
-    assert "1 of 3 origin.mounts_m left out, inside origin.exclude: [0.0, 0.0, 0.1]" in result.notes
+    values = {"origin": {"exclude": [PILLAR], "mounts_m": mounts}}
+    found = fitted(**values)
+    assert sorted(sensor.origin_m[0] for sensor in found.sensors) == [-0.8, 0.8]
+    assert broken(found, **values) == []
+    notes = placement_notes(Constraints.from_mapping(values).rules)
+    assert notes == ("1 of 3 origin.mounts_m left out, inside origin.exclude: [0.0, 0.0, 0.1]",)
 
 
 def test_a_sensor_may_sit_on_the_surface_of_a_box():
-    result = fitted(count=1, origin={"exclude": [PILLAR], "fixed_m": [0.5, 0.0, 1.0]})
-    assert list(result.design.sensors[0].origin_m) == [0.5, 0.0, 1.0]
-    assert result.satisfied
+    origin = {"exclude": [PILLAR], "fixed_m": [0.5, 0.0, 1.0]}
+    found = fitted(count=1, origin=origin)
+    assert list(found.sensors[0].origin_m) == [0.5, 0.0, 1.0]
+    assert broken(found, origin=origin) == []
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("values", "conflicts"),
     [
         ({"origin": {"exclude": [PILLAR], "fixed_m": [0, 0, 1]}}, ["origin.exclude[0]", "origin.fixed_m"]),
@@ -192,7 +206,7 @@ def test_boxes_that_leave_no_place_are_refused_by_name(values, conflicts):
     assert list(caught.value.conflicts) == conflicts
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("boxes", "message"),
     [
         ([{"low_m": [0, 0, 1], "high_m": [1, 1, 0]}], "low_m is above high_m along z"),
@@ -211,47 +225,45 @@ def test_boxes_that_are_none_and_too_many_are_refused(boxes, message):
         Constraints.from_mapping({"origin": {"exclude": boxes}})
 
 
-@pytest.mark.parametrize("count", [40, 90])
-def test_rays_of_another_number_keep_out_with_and_without_samples(count, tmp_path):
-    result = fitted(layout="distributed", rays=40, count=3, origin={"exclude": [PILLAR]})
-    path = tmp_path / "design.yaml"
-    save_design(result.design, path)
-    design = load_design(path)
-    assert design.constraints == {"origin": {"exclude": [PILLAR]}}
-    for samples in (SAMPLES, None):
-        for one in (design, replace(design, ray_table=None)):
-            assert not starting_in(PILLAR, lay_out(one, count, samples))
-
-
-def test_a_pinned_coordinate_is_in_a_box_or_not():
-    origin = {"low_m": [-1, -1, 0.4], "high_m": [1, 1, 0.4], "exclude": [PILLAR]}
-    result = fitted(count=2, origin=origin)
-    assert result.satisfied
-    assert_outside(result.design, [PILLAR])
-    origin = {"low_m": [-1, -1, 1.8], "high_m": [1, 1, 1.8]}
+@pytest.mark.parametrize("region", [{}, REGION], ids=["places", "regions"])
+def test_a_pinned_coordinate_is_in_a_box_or_not(region):
+    origin = {"low_m": [-1, -1, 0.4], "high_m": [1, 1, 0.4], "exclude": [PILLAR], **region}
+    found = fitted(count=2, origin=origin)
+    assert broken(found, origin=origin) == []
+    assert_outside(found, [PILLAR])
+    origin = {"low_m": [-1, -1, 1.8], "high_m": [1, 1, 1.8], **region}
     above = fitted(count=2, origin=origin | {"exclude": [PILLAR]})
     assert places(above) == places(fitted(count=2, origin=origin))
 
 
-def test_a_narrow_gap_between_boxes_is_a_place():
+@pytest.mark.parametrize("region", [{}, REGION], ids=["places", "regions"])
+def test_a_narrow_gap_between_boxes_is_a_place(region):
     walls = [{"low_m": [-2, -2, -1], "high_m": [0.6, 2, 3]}, {"low_m": [0.61, -2, -1], "high_m": [2, 2, 3]}]
-    result = fitted(room(60_000), count=1, origin={"exclude": walls})
-    assert result.satisfied
-    (sensor,) = result.design.sensors
-    assert 0.6 <= interval(sensor)[0][0] < interval(sensor)[1][0] <= 0.61
+    found = fitted(room(60_000), count=1, origin={"exclude": walls, **region})
+    assert broken(found, origin={"exclude": walls, **region}) == []
+    (sensor,) = found.sensors
+    low, high = interval(sensor)
+    assert 0.6 <= low[0] <= high[0] <= 0.61
+    assert (low[0] < high[0]) == bool(region)
 
 
-def test_far_from_the_origin_of_coordinates_nothing_changes():
+@pytest.mark.parametrize("region", [{}, REGION], ids=["places", "regions"])
+def test_far_from_the_origin_of_coordinates_nothing_changes(region):
     """Boxes ten kilometres away are kept as those around the origin are."""
     shift = np.array([10_000.0, -20_000.0, 500.0])
     space = DesignSpace((*(ROOM.low[:3] + shift), *ROOM.low[3:]), (*(ROOM.high[:3] + shift), *ROOM.high[3:]))
     points = SAMPLES.points.copy()
     points[:, :3] += shift
     box = {key: (np.array(value) + shift).tolist() for key, value in PILLAR.items()}
-    moved = fitted(Samples(points, SAMPLES.log_prob, SAMPLES.log_target, space), count=3, origin={"exclude": [box]})
-    here = fitted(count=3, origin={"exclude": [PILLAR]})
-    assert moved.satisfied
-    for one, other in zip(moved.design.sensors, here.design.sensors, strict=True):
+    away = Samples(points, SAMPLES.log_prob, SAMPLES.log_target, space)
+    moved, here = (
+        fits.fitted(samples, {"origin": {"exclude": [one], **region}}, sensors=3, retarget=retarget)
+        for samples, one, retarget in (
+            (away, box, lambda points: log_target(points - np.append(shift, [0, 0, 0]))),
+            (SAMPLES, PILLAR, log_target),
+        )
+    )
+    for one, other in zip(moved.sensors, here.sensors, strict=True):
         np.testing.assert_allclose(one.origin_m - shift, other.origin_m, atol=1e-3)
 
 
@@ -260,106 +272,74 @@ def test_far_from_the_origin_of_coordinates_nothing_changes():
 
 @pytest.fixture(scope="module")
 def document():
-    return design_document(fitted(layout="distributed", rays=20, count=2, origin={"exclude": [PILLAR]}).design)
+    origin = {"exclude": [PILLAR], **REGION}
+    found = fitted(count=2, origin=origin)
+    patterns = (Pattern.of(candidates(found, 20, origin=origin)),)
+    return design_document(DesignSpec("d", found.sensors, "fixed", patterns, {"origin": origin}))
 
 
-def broken(document):
+def broken_boxes(document):
     checks = check_design(document, document["constraints"], ROOM)
     return [check.name for check in checks if not check.satisfied and "exclude" in check.name]
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("mean_x", "spread_x", "names"),
     [(0.0, 0.0, ["s1.origin.exclude[0]"]), (0.7, 0.1, []), (0.7, 0.11, ["s1.origin.exclude[0]"])],
 )
 def test_a_mean_in_a_box_and_an_interval_that_reaches_into_it_are_seen(document, mean_x, spread_x, names):
     moved = copy.deepcopy(document)
     moved["sensors"][1]["origin_m"] = {"mean": [mean_x, 0.0, 1.0], "covariance": np.diag([spread_x**2, 0, 0]).tolist()}
-    assert broken(moved) == names
+    assert broken_boxes(moved) == names
 
 
 def test_a_ray_that_starts_in_a_box_is_seen(document):
-    assert broken(document) == []
+    assert broken_boxes(document) == []
     moved = copy.deepcopy(document)
+    (pattern,) = moved["patterns"]
     for key in ("origin_x_m", "origin_y_m"):
-        moved["ray_table"][key][7] = 0.0
-    moved["ray_table"]["origin_z_m"][7] = 1.4999
-    assert broken(moved) == ["ray7.origin.exclude[0]"]
-    moved["ray_table"]["origin_z_m"][7] = 1.5
-    assert broken(moved) == []
+        pattern[key][0][7] = 0.0
+    pattern["origin_z_m"][0][7] = 1.4999
+    assert broken_boxes(moved) == ["ray7.origin.exclude[0]"]
+    pattern["origin_z_m"][0][7] = 1.5
+    assert broken_boxes(moved) == []
 
 
-# --- tracks
-
-
-def shelf(count=6000):
-    """A wall along an aisle."""
-    generator = np.random.default_rng(0)
-    points = np.zeros((count, 6))
-    points[:, 0] = generator.uniform(-0.5, 4.0, count)
-    points[:, 3] = -math.pi / 2
-    height = generator.uniform(0.2, 0.8, count)
-    points[:, 4], points[:, 5] = np.arctan2(height, 1.2), np.hypot(height, 1.2)
-    return Samples(points, np.zeros(count), np.zeros(count), AISLE)
-
-
-def tracked(box, **origin):
-    rules = Constraints.from_mapping({"origin": {"exclude": [box], **origin}})
-    return fit(shelf(), layout="scan", rays=4, constraints=rules)
-
-
-def test_a_track_ends_at_a_box():
-    result = tracked({"low_m": [3.0, -1, -1], "high_m": [9, 1, 1]})
-    assert (result.design.track.knots[0], result.design.track.knots[-1]) == (-0.5, 3.0)
-    assert result.satisfied
-    written = design_document(result.design)
-    written["track"]["knots_m"][-1] = 3.1
-    checks = check_design(written, written["constraints"])
-    assert "track.origin.exclude[0]" in [check.name for check in checks if not check.satisfied]
-
-
-def test_a_box_beside_a_track_is_in_nobodys_way():
-    result = tracked({"low_m": [1.0, 0.0, -1], "high_m": [2.0, 1, 1]})
-    assert (result.design.track.knots[0], result.design.track.knots[-1]) == (-0.5, 4.0)
-    assert result.satisfied
-
-
-def test_a_box_that_cuts_a_track_is_refused_with_the_pieces():
-    cut = {"low_m": [1.0, -1, -1], "high_m": [2.0, 1, 1]}
-    with pytest.raises(InfeasibleError, match="2 pieces") as caught:
-        tracked(cut)
-    assert list(caught.value.conflicts) == ["origin.exclude", "--layout scan"]
-    assert "up to 1 or from 2" in caught.value.hint
-    assert tracked(cut, low_m=[2, -1, -1]).design.track.knots[0] == 2
+def test_a_ray_that_passes_through_a_box_on_its_way_along_a_condition_is_seen(document):
+    moved = copy.deepcopy(document)
+    (pattern,) = moved["patterns"]
+    for key, column in pattern.items():
+        if key != "sensor":
+            pattern[key] = column * 2
+    pattern |= {"dimension": "x_m", "knots_m": [-1.0, 1.0]}
+    pattern["origin_x_m"], count = [[-1.0] * 20, [1.0] * 20], 20
+    for y_m, expected in ((0.6, []), (0.0, [f"ray{ray}.origin.exclude[0]" for ray in range(count)])):
+        pattern["origin_y_m"], pattern["origin_z_m"] = [[y_m] * count] * 2, [[1.0] * count] * 2
+        assert broken_boxes(moved) == expected
 
 
 # --- the command line
 
 
-@pytest.fixture
-def call(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
-
-
-GRID = ("--layout", "grid", "--sensors", 2)
+EVEN = ("--layout", "even", "--sensors", 2)
 
 
 def test_boxes_are_given_by_option_and_by_file(call, tmp_path):
     make_run(tmp_path / "run")
     box = "[{low_m: [-9, -9, -9], high_m: [0.5, 9, 9]}]"
-    result = call("constrain", "run", *GRID, "--set", f"origin.exclude={box}", "--json", "--name", "right")
+    result = call("constrain", "run", *EVEN, "--set", f"origin.exclude={box}", "--json", "--name", "right")
     assert result.code == 0, result.err
     rows = [row for row in result.json["constraints"] if "exclude" in row["name"]]
     assert rows
     assert all(row["satisfied"] and row["value"]["low_m"][0] >= 0.5 for row in rows)
     (tmp_path / "rules.yaml").write_text(f"origin:\n  exclude: {box}\n")
     options = ["--constraints", "rules.yaml", "--set", "origin.exclude.0.high_m=[0.6, 9, 9]"]
-    result = call("constrain", "run", *GRID, *options, "--json")
+    result = call("constrain", "run", *EVEN, *options, "--json")
     assert result.code == 0, result.err
     rows = [row for row in json.loads(result.out)["constraints"] if "exclude" in row["name"]]
     assert rows[0]["bound"]["high_m"] == [0.6, 9, 9]
     shown = call(
-        "constrain", "run", "--layout", "grid", "--constraints", "rules.yaml", "--set", "sensors.count=1", "-v"
+        "constrain", "run", "--layout", "even", "--constraints", "rules.yaml", "--set", "sensors.count=1", "-v"
     )
     assert "s0.origin.exclude[0]" in shown.out
     assert "low_m [-9, -9, -9], high_m [0.5, 9, 9]" in shown.out
@@ -375,11 +355,13 @@ box = st.tuples(corner, corner).map(
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.lists(box, min_size=1, max_size=4), st.integers(1, 3), st.sampled_from(["grid", "distributed", "scan"]))
-def test_whatever_the_boxes_nothing_is_inside_one(boxes, sensors, layout):
+@given(st.lists(box, min_size=1, max_size=4), st.integers(1, 3), st.sampled_from([{}, REGION]))
+def test_whatever_the_boxes_nothing_is_inside_one(boxes, sensors, region):
+    origin = {"exclude": boxes, **region}
     try:
-        result = fitted(layout=layout, count=None if layout == "scan" else sensors, rays=12, origin={"exclude": boxes})
+        found = fitted(count=sensors, origin=origin)
     except InfeasibleError:
         return
-    assert result.satisfied
-    assert_outside(result.design, boxes)
+    assert broken(found, origin=origin) == []
+    assert_outside(found, boxes)
+    assert not any(starting_in(one, candidates(found, 40, origin=origin)) for one in boxes)

@@ -12,7 +12,8 @@ from support.fits import CENTRE, FACE, FIXED, FREE, MOVING, blob, broken, checks
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.mixture.em import LEAST_SAMPLES
 from lidardesign.sensors.bandwidth import split_budget
-from lidardesign.space import aim, observed_point
+from lidardesign.sensors.sensor import interval_factor, tangent_coordinates
+from lidardesign.space import aim, direction, observed_point
 
 PLACE = [0.04, -0.03, 0.02]
 
@@ -151,29 +152,41 @@ def test_numbers_of_sensors_that_nobody_fits_are_config_errors(sensors):
         fitted(FIXED, sensors=sensors)
 
 
-@pytest.mark.parametrize("effective", [60, 90, 300])
-@pytest.mark.parametrize("sensors", [1, 2, 5, 12])
+def effective_samples(sensors, samples):
+    """How many equal weights the share of the samples is worth that belongs to each sensor, by the naive sum."""
+    logs, z = [], interval_factor(0.95)
+    for sensor in sensors:
+        start, end = sensor.gate_m
+        tangent = tangent_coordinates(sensor.frame, direction(samples.points[:, 3], samples.points[:, 4]))
+        away = np.column_stack([tangent, samples.points[:, 5] - (start + end) / 2])
+        spread = np.array([*sensor.field_of_view_rad, end - start]) / (2 * z)
+        angle = np.hypot(*tangent.T)
+        logs.append(math.log(sensor.weight) - 0.5 * np.square(away / spread).sum(axis=1) - np.log(spread).sum())
+        logs[-1] += np.log(angle / np.sin(angle))
+    shares = np.exp(np.array(logs) - np.logaddexp.reduce(logs)) * samples.weights
+    return np.square(shares.sum(axis=1)) / np.square(shares).sum(axis=1)
+
+
+@pytest.mark.parametrize("effective", [60, 120, 250])
+@pytest.mark.parametrize("sensors", [1, 2, 4])
 def test_every_sensor_rests_on_enough_effective_samples_or_the_fit_is_refused(effective, sensors):
-    # half of the samples count for as much as so many equal ones
-    weights = np.where(np.arange(len(FIXED)) < effective, 0.0, -50.0)
-    few = replace(FIXED, log_target=FIXED.log_prob + weights)
-    assert few.effective_sample_size * len(few) == pytest.approx(effective, rel=0.01)
+    # a few of the samples count, the others next to nothing
+    few = FIXED.subset(np.arange(1000))
+    few = replace(few, log_target=few.log_prob + np.where(np.arange(1000) < effective, 0.0, -50.0))
     try:
-        found = fitted(few, sensors=sensors, em_samples=20_000)
-    except InfeasibleError as refused:
-        # even shares of the samples would be too few, or nearly
-        assert effective / sensors < 2.5 * LEAST_SAMPLES  # noqa: PT017
+        found = fitted(few, sensors=sensors)
+    except InfeasibleError:
+        # an equal share of the samples is not far from too few
+        assert effective < 2.5 * sensors * LEAST_SAMPLES
     else:
-        # shares of effective samples, by weights that nearly say how many samples each sensor rests on
-        assert min(sensor.weight for sensor in found.sensors) * effective > 0.5 * LEAST_SAMPLES
+        assert effective_samples(found.sensors, few).min() >= LEAST_SAMPLES
 
 
 def test_a_sensor_that_would_rest_on_too_few_samples_is_named_with_how_many_there_are():
-    narrow = FIXED.subset(np.arange(150))
-    with pytest.raises(InfeasibleError, match=r"sensor \d+ of 12 would rest on \d+ effective samples") as refused:
-        fitted(narrow, sensors=12)
-    assert refused.value.conflicts == ["--sensors"]
-    assert refused.value.allowed == f"at least {LEAST_SAMPLES}"
+    with pytest.raises(InfeasibleError, match=r"sensor \d+ of 12 would rest on 1?\d effective samples") as refused:
+        fitted(FIXED.subset(np.arange(150)), sensors=12)
+    assert refused.value.conflicts == ("--sensors",)
+    assert refused.value.allowed == f"at least {LEAST_SAMPLES:g}"
 
 
 def test_errors_of_a_fit_are_its_spread_over_other_samples():

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lidardesign.layouts.rays import lay_out
-from support.tables import each_row
+from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.galvo import (
@@ -24,19 +23,19 @@ from lidardesign.formats.galvo import (
     write_galvo,
 )
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
 
 C_M_PER_PS = 299_792_458e-12
 HERE = (0.4, 0.0, 0.0)
 
 
-def sensor(name, azimuth, elevation, *, origin=HERE, spread=0.05, covariance=None):
-    covariance = np.zeros((3, 3)) if covariance is None else covariance
-    return Sensor(name, 0.5, np.array(origin), covariance, azimuth, elevation, 0.0, spread, spread, 0.4, 0.02)
+def sensor(name, azimuth, elevation, *, origin=HERE):
+    return normal_sensor(name, 0.5, origin, azimuth, elevation, 0.0, (0.05, 0.05), 0.4, 0.02)
 
 
 def design(*sensors, rays=60):
-    return DesignSpec("faces", sensors or (sensor("left", 3.05, 0.02), sensor("right", 3.3, -0.04)), rays=rays)
+    chosen = sensors or (sensor("left", 3.05, 0.02), sensor("right", 3.3, -0.04))
+    return DesignSpec("faces", chosen, constraints={"budget": {"rays": rays}})
 
 
 def mirrored(beam, normal):
@@ -59,7 +58,7 @@ def through_two_mirrors(x_deg, y_deg):
     return mirrored(mirrored(sideways, x_mirror), y_mirror)
 
 
-@each_row(("x", "y"), [*itertools.product((-20.0, -3.0, 0.0, 11.0, 20.0), repeat=2)])
+@pytest.mark.parametrize(("x", "y"), [*itertools.product((-20.0, -3.0, 0.0, 11.0, 20.0), repeat=2)])
 def test_a_scan_angle_is_twice_the_angle_of_a_real_mirror(x, y):
     found = scan_directions(np.eye(3), np.array([[x, y]]))[0]
     np.testing.assert_allclose(found, through_two_mirrors(x, y), atol=1e-15)
@@ -145,7 +144,7 @@ def test_stops_in_a_column_or_a_row_are_toured_along_it():
 
 
 def test_rays_come_back_in_their_order_with_gates_that_hold_theirs(tmp_path):
-    rays = lay_out(design())
+    rays = design().rays()
     notes = write_galvo(design(), rays, tmp_path / "f.csv")
     back = read_galvo(tmp_path / "f.csv")
     np.testing.assert_allclose(back.direction, rays.direction, atol=1e-14)
@@ -164,7 +163,7 @@ def test_rays_come_back_in_their_order_with_gates_that_hold_theirs(tmp_path):
 
 def test_sensors_at_other_places_are_positions_of_their_own(tmp_path):
     own = design(sensor("a", 3.0, 0.0), sensor("b", 0.5, -0.9, origin=(0.0, 1.0, 2.0)))
-    rays = lay_out(own)
+    rays = own.rays()
     notes = write_galvo(own, rays, tmp_path / "f.csv")
     assert any("2 places" in note for note in notes)
     table = np.genfromtxt(tmp_path / "f.csv", delimiter=",", names=True)
@@ -174,7 +173,7 @@ def test_sensors_at_other_places_are_positions_of_their_own(tmp_path):
 
 
 def test_rays_of_a_sensor_that_start_at_many_places_are_refused(tmp_path):
-    base = lay_out(design())
+    base = design().rays()
     moved = base.origin_m.copy()
     moved[:7, 1] += np.arange(7) * 0.01
     rays = Rays(moved, base.direction, base.gate_m, base.sensor, base.time_s)
@@ -187,7 +186,7 @@ def test_rays_of_a_sensor_that_start_at_many_places_are_refused(tmp_path):
 def test_rays_out_of_reach_are_refused_with_their_number_and_the_worst(tmp_path):
     wide = design(sensor("a", 2.6, 0.0), sensor("b", 3.6, 0.0))
     with pytest.raises(ConfigError, match=r"\d+ of 60 rays are beyond the mirrors' reach, the farthest at x = -?3\d\."):
-        write_galvo(wide, lay_out(wide), tmp_path / "f.csv")
+        write_galvo(wide, wide.rays(), tmp_path / "f.csv")
     assert not list(tmp_path.iterdir())
 
 
@@ -218,10 +217,10 @@ BROKEN = {
 }
 
 
-@each_row("name", BROKEN)
+@pytest.mark.parametrize("name", BROKEN)
 def test_a_damaged_file_is_refused_where_it_is_damaged(tmp_path, name):
     damage, message = BROKEN[name]
-    write_galvo(design(), lay_out(design()), tmp_path / "f.csv")
+    write_galvo(design(), design().rays(), tmp_path / "f.csv")
     (tmp_path / "f.csv").write_text(damage((tmp_path / "f.csv").read_text()))
     with pytest.raises(DataError, match=message):
         read_galvo(tmp_path / "f.csv")

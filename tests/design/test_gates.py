@@ -1,33 +1,33 @@
-"""Gates of single rays: weighted intervals against a naive twin, and gates moved into their bounds."""
+"""Gates of single rays: intervals against a naive twin, and gates moved into their bounds."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from lidardesign.layouts.gates import admissible_gates, central_intervals
+from support.sensors import normal_sensor
 
 from lidardesign.mixture.bounds import Bounds
+from lidardesign.rays.gates import admissible_gates, bounded_gates, central_intervals
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, interval_factor
 
 LEVEL_FACTOR = 1.96
 
 
-def test_intervals_are_the_naive_weighted_quantiles_of_each_cell():
-    generator = np.random.default_rng(0)
-    values, labels = generator.normal(size=500), generator.integers(0, 7, 500)
-    weights = generator.uniform(0, 2, 500)
-    ends, effective = central_intervals(values, weights, labels, 9, 0.8)
-    for cell in range(7):
-        inside, w = values[labels == cell], weights[labels == cell]
-        order = inside.argsort()
-        share = (w[order].cumsum() - w[order] / 2) / w.sum()
-        np.testing.assert_allclose(ends[cell], np.interp([0.1, 0.9], share, inside[order]))
-        assert effective[cell] == pytest.approx(w.sum() ** 2 / (w**2).sum())
-    assert np.isnan(ends[7:]).all()
-    assert (effective[7:] == 0).all()
+@given(st.integers(0, 1000), st.integers(0, 40))
+def test_intervals_are_the_naive_quantiles_of_each_cell(seed, count):
+    generator, levels = np.random.default_rng(seed), (1.0, 0.8, 0.5)
+    values, cell = generator.normal(size=count), generator.integers(0, 5, count)
+    ends = central_intervals(values, cell, 6, levels)
+    for index in range(6):
+        own = values[cell == index]
+        if len(own):
+            shares = [[(1 - level) / 2, (1 + level) / 2] for level in levels]
+            np.testing.assert_allclose(ends[index], np.quantile(own, shares, method="hazen"))
+        else:
+            assert np.isnan(ends[index]).all()
 
 
 def test_a_gate_that_keeps_its_bounds_stays_as_it_is():
@@ -37,7 +37,6 @@ def test_a_gate_that_keeps_its_bounds_stays_as_it_is():
     np.testing.assert_allclose(np.stack([centre - half, centre + half], 1), wanted, rtol=1e-12)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.floats(0.1, 1.0), st.floats(0, 0.5), st.floats(0.05, 0.6), st.floats(0, 0.3), st.floats(0, 0.6))
 def test_any_gate_is_moved_inside_its_bounds(start, width, start_high, width_low, width_more):
     bounds = replace(
@@ -53,3 +52,18 @@ def test_any_gate_is_moved_inside_its_bounds(start, width, start_high, width_low
     assert 0.05 - 1e-9 <= centre[0] - half <= start_high + 1e-9
     assert centre[0] + half <= 1.5 + 1e-9
     assert width_low - 1e-9 <= 2 * half <= width_low + width_more + 1e-3 + 1e-9
+
+
+@given(st.floats(0.1, 1.0), st.floats(0.05, 0.5), st.floats(0.1, 1.2), st.floats(0.0, 0.25))
+def test_gates_that_break_a_bound_are_replaced_inside_their_sensors_and_others_stay(start, width, start_high, least):
+    one = normal_sensor(range_m=0.8, spread_range_m=0.7 / interval_factor(DEFAULT_LEVEL))
+    bounds = replace(Bounds.unbounded(2, LEVEL_FACTOR), start_high=np.full(2, start_high), width_low=np.full(2, least))
+    wanted = np.array([[start, start + width], [0.1, 0.4]])
+    found = bounded_gates(wanted, one, bounds)
+    np.testing.assert_array_equal(found[1], wanted[1])
+    if start <= start_high and np.ptp(wanted[0]) >= least:
+        np.testing.assert_array_equal(found[0], wanted[0])
+    assert (found >= one.gate_m[0] - 1e-9).all()
+    assert (found <= one.gate_m[1] + 1e-9).all()
+    assert found[0, 0] <= start_high + 1e-9
+    assert np.ptp(found[0]) >= least - 1e-9

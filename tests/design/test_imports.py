@@ -9,24 +9,19 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from lidardesign.layouts.rays import lay_out
 from support.command_line import make_run
-from support.tables import each_row
 
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import DataError, LidardesignError
-from lidardesign.formats.designs import load_design, save_design
+from lidardesign.formats.designs import load_design
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.formats.rig import aim_of, rig_constraints
 from lidardesign.run.xml import _Builder
 from lidardesign.scenes.rays import Rays, rotation_of_quaternion, rotation_of_rpy
-from lidardesign.sensors.sensor import (
-    DesignSpec,
-    Sensor,
-    boresight_frame,
-    interval_factor,
-    tangent_coordinates,
-)
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design_file import save_design
+from lidardesign.sensors.pattern import Pattern
+from lidardesign.sensors.sensor import Sensor, boresight_frame, tangent_coordinates
 from lidardesign.space import DesignSpace, angles, direction
 
 NASTY = ('front "left"', "a,b\u00e9</script>", "{x} [bold]")
@@ -48,10 +43,15 @@ def rig(seed=0, counts=(7, 1, 4), names=NASTY):
         sensor,
     )
     sensors = tuple(
-        Sensor(name, n / total, origin, np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.2, rays=n)
+        Sensor(name, n / total, origin, 0.0, 0.0, 0.0, (0.4, 0.4), (0.6, 1.4))
         for name, n, origin in zip(names, counts, origins, strict=True)
     )
-    return DesignSpec("rig", sensors, layout="fixed", rays=total, ray_table=table)
+    return DesignSpec("rig", sensors, "fixed", (Pattern.of(table),))
+
+
+def counted(design):
+    """Each sensor's name and how many rays it fires."""
+    return [(one.name, int(rays)) for one, rays in zip(design.sensors, design.rays_per_sensor(), strict=True)]
 
 
 def assert_same_rays(found, expected, tolerance=EXACT):
@@ -64,13 +64,13 @@ def assert_same_rays(found, expected, tolerance=EXACT):
 @pytest.mark.parametrize("name", ["csv", "npz", "mjcf"])
 def test_an_exported_rig_comes_back_ray_by_ray(tmp_path, name):
     design = rig()
-    rays = lay_out(design)
+    rays = design.rays()
     path = tmp_path / f"rig{EXPORTERS[name].suffix}"
     EXPORTERS[name].write(design, rays, path)
     found = load_design(path)
     # the exchange format of MuJoCo lists sensors in the order in which they first fire
     order = {one: index for index, one in enumerate(dict.fromkeys(rays.sensor.tolist()))}
-    again = lay_out(found)
+    again = found.rays()
     expected = rays
     if name == "mjcf":
         kept = np.array([order[index] for index in rays.sensor.tolist()])
@@ -81,7 +81,7 @@ def test_an_exported_rig_comes_back_ray_by_ray(tmp_path, name):
         assert [sensor.name for sensor in found.sensors] == list(NASTY)
     # and as a design file of ours
     save_design(found, tmp_path / "kept.yaml")
-    assert_same_rays(lay_out(load_design(tmp_path / "kept.yaml")), again, 0)
+    assert_same_rays(load_design(tmp_path / "kept.yaml").rays(), again, 0)
 
 
 def test_a_sensor_looks_along_the_middle_of_its_rays_and_holds_them_all():
@@ -124,7 +124,7 @@ def test_the_same_directions_in_radians_degrees_and_vectors_are_the_same_rays(tm
         {"azimuth_deg": np.degrees(azimuth), "elevation_deg": np.degrees(elevation)},
         {f"direction_{axis}": looking[:, index] for index, axis in enumerate("xyz")},
     ]
-    found = [lay_out(load_design(write_rays(tmp_path / "rays.csv", {**form, **end}))) for form in forms]
+    found = [load_design(write_rays(tmp_path / "rays.csv", {**form, **end})).rays() for form in forms]
     for one in found:
         np.testing.assert_allclose(one.direction, direction(azimuth, elevation), atol=1e-12)
 
@@ -139,7 +139,7 @@ def test_what_a_ray_list_leaves_out_is_told_and_not_made_up(tmp_path):
     assert "world's origin" in notes
     assert "gates start" in notes
     assert "1.5 m" in notes
-    np.testing.assert_array_equal(lay_out(design).gate_m, [[0, 1.5]] * 2)
+    np.testing.assert_array_equal(design.rays().gate_m, [[0, 1.5]] * 2)
     whole = {"origin_x_m": [1, 1], "origin_y_m": [0, 0], "origin_z_m": [0, 0], "gate_start_m": [0.1, 0.2]}
     path = write_rays(path, {"azimuth_deg": [0, 10], "elevation_deg": [0, 5], "gate_end_m": [1, 2], **whole})
     assert load_design(path, reach_m=1.5).provenance["notes"] == []
@@ -148,10 +148,10 @@ def test_what_a_ray_list_leaves_out_is_told_and_not_made_up(tmp_path):
 def test_sensors_are_numbers_or_names(tmp_path):
     looks = {"azimuth_deg": [0, 10, 20], "elevation_deg": [0, 0, 0], "gate_end_m": [1, 1, 1]}
     numbered = load_design(write_rays(tmp_path / "n.csv", {**looks, "sensor": [7, 2, 7]}))
-    assert [(sensor.name, sensor.rays) for sensor in numbered.sensors] == [("sensor_3", 1), ("sensor_8", 2)]
-    np.testing.assert_array_equal(numbered.ray_table.sensor, [1, 0, 1])
+    assert counted(numbered) == [("sensor_3", 1), ("sensor_8", 2)]
+    np.testing.assert_array_equal(numbered.rays().sensor, [1, 0, 1])
     named = load_design(write_rays(tmp_path / "n.csv", {**looks, "sensor": ["left", "2", "left"]}))
-    assert [(sensor.name, sensor.rays) for sensor in named.sensors] == [("left", 2), ("2", 1)]
+    assert counted(named) == [("left", 2), ("2", 1)]
 
 
 def test_names_keep_the_line_ends_of_other_scripts(tmp_path):
@@ -194,7 +194,7 @@ BAD_LISTS = {
 }
 
 
-@each_row("case", BAD_LISTS)
+@pytest.mark.parametrize("case", BAD_LISTS)
 def test_a_ray_list_that_cannot_be_used_is_refused_at_its_cell(tmp_path, monkeypatch, case):
     content, where, message = BAD_LISTS[case]
     monkeypatch.chdir(tmp_path)
@@ -205,7 +205,7 @@ def test_a_ray_list_that_cannot_be_used_is_refused_at_its_cell(tmp_path, monkeyp
     assert message in refused.value.message
 
 
-@each_row(
+@pytest.mark.parametrize(
     "arrays",
     [
         {"azimuth_rad": np.zeros(3), "elevation_rad": np.zeros(2), "gate_end_m": np.ones(3)},
@@ -275,7 +275,7 @@ def test_rangefinders_look_from_where_mujoco_says_they_are(tmp_path, seed):
     path = tmp_path / "robot.xml"
     path.write_bytes(ElementTree.tostring(root))
     design = load_design(path)
-    rays = lay_out(design)
+    rays = design.rays()
     np.testing.assert_allclose(rays.origin_m, data.site_xpos, atol=1e-9)
     np.testing.assert_allclose(rays.direction, data.site_xmat.reshape(-1, 3, 3)[:, :, 2], atol=1e-9)
     np.testing.assert_array_equal(rays.gate_m[:, 1], np.arange(1, 9))
@@ -296,8 +296,7 @@ def test_rangefinders_of_one_place_are_one_sensor_by_the_name_they_share(tmp_pat
     path = tmp_path / "m.xml"
     path.write_text(model_of("".join(f'<rangefinder site="{name}" cutoff="3"/>' for name in names), body))
     design = load_design(path)
-    found = sorted((sensor.name, sensor.rays) for sensor in design.sensors)
-    assert found == [("eye", 2), ("fan", 5), ("sonar_0", 1), ("sonar_1", 1), ("sonar_2", 1)]
+    assert sorted(counted(design)) == [("eye", 2), ("fan", 5), ("sonar_0", 1), ("sonar_1", 1), ("sonar_2", 1)]
 
 
 def test_a_model_may_include_files_of_its_own_folder_alone(tmp_path):
@@ -306,7 +305,7 @@ def test_a_model_may_include_files_of_its_own_folder_alone(tmp_path):
     (tmp_path / "in" / "part.xml").write_text(model_of('<rangefinder site="a" cutoff="2"/>', top="mujocoinclude"))
     path = tmp_path / "in" / "m.xml"
     path.write_text('<mujoco><include file="part.xml"/></mujoco>')
-    assert len(lay_out(load_design(path))) == 1
+    assert len(load_design(path).rays()) == 1
     for name in ("../outside.xml", str(tmp_path / "outside.xml"), ""):
         path.write_text(f'<mujoco><include file="{name}"/></mujoco>')
         with pytest.raises(DataError, match=r"m\.xml:1.*outside the model's folder"):
@@ -343,7 +342,7 @@ BAD_XML = {
 }
 
 
-@each_row("case", BAD_XML)
+@pytest.mark.parametrize("case", BAD_XML)
 def test_xml_that_cannot_be_used_is_refused_by_what_is_wrong(tmp_path, case):
     content, message = BAD_XML[case]
     path = tmp_path / "m.xml"
@@ -380,7 +379,7 @@ def test_includes_do_not_nest_deeper_than_one_file_may(tmp_path):
             with pytest.raises(DataError, match="nested too deep, with what it includes"):
                 load_design(path)
         else:
-            assert load_design(path).rays == 1
+            assert load_design(path).count == 1
 
 
 # ------------------------------------------------------------------- SDF
@@ -411,7 +410,7 @@ def load_sdf(tmp_path, inside, **options):
 
 def test_a_scan_fires_every_angle_of_its_rows_both_ends_included(tmp_path):
     design = load_sdf(tmp_path, f'<model name="m"><link name="l">{lidar()}</link></model>')
-    rays = lay_out(design)
+    rays = design.rays()
     expected = [direction(a, e) for e in np.linspace(-0.2, 0.1, 3) for a in np.linspace(-0.4, 0.6, 5)]
     np.testing.assert_allclose(rays.direction, expected, atol=EXACT)
     np.testing.assert_array_equal(rays.gate_m, [[0.2, 4]] * 15)
@@ -446,7 +445,7 @@ def test_poses_multiply_along_links_frames_joints_and_nested_models(tmp_path, se
     local = np.array([direction(a, b) for b in np.linspace(-0.2, 0.1, 3) for a in np.linspace(-0.4, 0.6, 5)])
     of_two = m @ i @ k @ f @ s @ j @ e
     of_one = m @ i @ k @ e
-    rays = lay_out(design)
+    rays = design.rays()
     assert [sensor.name for sensor in design.sensors] == ["two", "one"]
     for index, pose in enumerate((of_two, of_one)):
         own = rays.sensor == index
@@ -472,12 +471,12 @@ def test_degrees_and_quaternions_are_the_same_poses(tmp_path):
         f"<pose>1 2 3 {' '.join(map(str, np.radians(turn)))}</pose>",
     ]  # fmt: skip
     models = [f'<model name="m"><link name="l">{lidar(pose=one)}</link></model>' for one in forms]
-    found = [lay_out(load_sdf(tmp_path, model)) for model in models]
+    found = [load_sdf(tmp_path, model).rays() for model in models]
     for one in found[1:]:
         assert_same_rays(one, found[0], 1e-9)
 
 
-@each_row(("turn", "outer"), [(1, '<world name="w">{}</world>'), (0, "{}")])
+@pytest.mark.parametrize(("turn", "outer"), [(1, '<world name="w">{}</world>'), (0, "{}")])
 def test_a_model_stands_by_its_placement_frame_in_a_world_and_topmost(tmp_path, turn, outer):
     inner = f'<frame name="foot"><pose>0 0 -1 0 0 {turn}</pose></frame>'
     model = f'<pose>5 0 0 0 0 {turn}</pose>{inner}<link name="l">{lidar()}</link>'
@@ -502,7 +501,7 @@ def test_poses_of_nested_models_are_worked_out_once(tmp_path):
     for number in range(deepest - 1, -1, -1):
         by = f' placement_frame="m{number + 1}::m{number + 2}"' if number + 2 <= deepest else ""
         text = f'<model name="m{number}"{by}>{text}<link name="l"/></model>'
-    assert load_sdf(tmp_path, text).rays == 15
+    assert load_sdf(tmp_path, text).count == 15
 
 
 def test_more_lidars_than_a_design_has_are_refused_at_the_first_too_many(tmp_path, monkeypatch):
@@ -527,7 +526,7 @@ def test_what_an_sdf_file_says_beyond_a_design_is_told(tmp_path):
         assert said in notes
     # one ray along min_angle, and names that say where each is
     assert [sensor.name for sensor in design.sensors] == ["m::a::eye", "m::b::eye"]
-    np.testing.assert_allclose(lay_out(design).direction[0], direction(-0.5, 0.0), atol=EXACT)
+    np.testing.assert_allclose(design.rays().direction[0], direction(-0.5, 0.0), atol=EXACT)
 
 
 CHAIN = "".join(f'<frame name="f{one}" attached_to="f{one + 1}"/>' for one in range(400)) + '<frame name="f400"/>'
@@ -563,7 +562,7 @@ BAD_SDF = {
 }  # fmt: skip
 
 
-@each_row("case", BAD_SDF)
+@pytest.mark.parametrize("case", BAD_SDF)
 def test_poses_that_cannot_be_found_are_refused_with_their_line(tmp_path, case):
     text, message = BAD_SDF[case]
     with pytest.raises(DataError) as refused:
@@ -572,7 +571,7 @@ def test_poses_that_cannot_be_found_are_refused_with_their_line(tmp_path, case):
     assert refused.value.where == f"{tmp_path / 'robot.sdf'}:3"
 
 
-@each_row(
+@pytest.mark.parametrize(
     "options",
     [
         {"columns": (0, 0, 1)}, {"columns": (2.5, 0, 1)}, {"columns": (5, 1, 0)}, {"columns": (5, -9, 9)},
@@ -594,7 +593,7 @@ def originals(tmp_path_factory):
     folder = tmp_path_factory.mktemp("originals")
     design = rig()
     for name in ("csv", "npz", "mjcf", "sdf"):
-        EXPORTERS[name].write(design, lay_out(design), folder / f"rig{EXPORTERS[name].suffix}")
+        EXPORTERS[name].write(design, design.rays(), folder / f"rig{EXPORTERS[name].suffix}")
     return sorted(folder.iterdir())
 
 
@@ -616,7 +615,7 @@ def test_damaged_files_are_read_or_refused_and_nothing_else(tmp_path, originals)
         path = tmp_path / source.name
         path.write_bytes(bytes(content))
         try:
-            rays = lay_out(load_design(path, reach_m=2.0))
+            rays = load_design(path, reach_m=2.0).rays()
         except LidardesignError as error:
             outcomes.append(error.exit_code)
         else:
@@ -685,7 +684,7 @@ def test_fits_like_a_rig_are_no_more_than_it(call, run, tmp_path):
     assert result.code == 0, result.err
     assert result.json["satisfied"]
     found = load_design(run / "designs" / "alike.yaml")
-    assert sum(sensor.rays for sensor in found.sensors) == 16
+    assert found.count == 16
     for one, theirs in itertools.zip_longest(found.sensors, like.sensors):
         np.testing.assert_allclose(one.origin_m, theirs.origin_m)
         assert np.all(np.array(one.field_of_view_rad) <= np.array(theirs.field_of_view_rad) + 1e-6)
@@ -695,7 +694,6 @@ def test_fits_like_a_rig_are_no_more_than_it(call, run, tmp_path):
 
 def test_sensors_like_a_planar_scanner_stay_planar():
     """A field of view of no height is one: only a single ray has none that could be a bound."""
-    wide = 2 * interval_factor(0.95)
     fields = {
         "fan": (1.0, 0.0),
         "wall": (0.0, 0.5),
@@ -703,10 +701,7 @@ def test_sensors_like_a_planar_scanner_stay_planar():
         "ball": (2 * math.pi, 7.0),
         "ray": (0, 0),
     }
-    sensors = tuple(
-        Sensor(name, 0.2, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, across / wide, up / wide, 1.0, 0.2)
-        for name, (across, up) in fields.items()
-    )
+    sensors = tuple(Sensor(name, 0.2, np.zeros(3), 0.0, 0.0, 0.0, field, (0.6, 1.4)) for name, field in fields.items())
     space = DesignSpace((0,) * 3 + (0, -1.5, 0), (0,) * 3 + (6, 1.5, 9))
     found = rig_constraints(DesignSpec("rig", sensors), space, Constraints(), rays=None).as_document()["each"]
     narrow = pytest.approx(1e-3)
@@ -725,11 +720,10 @@ def test_what_a_user_asks_for_goes_before_what_the_rig_has(call, run, tmp_path):
     result = call("constrain", run, "--like", path, *asked, "--rays", "24", "--name", "mine", "--json")
     assert result.code == 0, result.err
     found = load_design(run / "designs" / "mine.yaml")
-    assert sum(sensor.rays for sensor in found.sensors) == 24
+    assert found.count == 24
     for sensor in found.sensors:
         assert 0.4 <= sensor.origin_m[0] <= 0.6
         assert sensor.gate_m[1] - sensor.gate_m[0] <= 0.3 + 1e-9
     refused = call("constrain", run, "--like", path, "--sensors", "3")
     assert refused.code == 4
     assert "--sensors" in refused.err
-    assert call("constrain", run, "--like", path, "--layout", "scan").code == 2

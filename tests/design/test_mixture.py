@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.mixtures import POINT, WHOLE, Z, drawn, features_of, random_mixture
-from support.tables import each_row
 
 from lidardesign.mixture.bounds import Bounds, Floors
 from lidardesign.mixture.components import (
@@ -325,7 +325,7 @@ FIXED = {
 }
 
 
-@each_row("name", FIXED)
+@pytest.mark.parametrize("name", FIXED)
 def test_fixed_dimensions_leave_the_density(name):
     space = DesignSpace(*FIXED[name])
     generator = np.random.default_rng(14)
@@ -375,8 +375,8 @@ def case_of(name, count=70):
 
 
 @pytest.mark.hard_case("30")
-@each_row("block", [7, 2048])
-@each_row("name", SPACES)
+@pytest.mark.parametrize("block", [7, 2048])
+@pytest.mark.parametrize("name", SPACES)
 def test_density_and_shares_are_those_of_the_free_dimensions_alone_in_blocks_of_any_length(name, block, monkeypatch):
     monkeypatch.setattr("lidardesign.mixture.components.BLOCK", block)
     mixture, features = case_of(name)
@@ -386,8 +386,8 @@ def test_density_and_shares_are_those_of_the_free_dimensions_alone_in_blocks_of_
     np.testing.assert_allclose(responsibilities(mixture, features), np.exp(terms - whole[:, None]), atol=1e-9)
 
 
-@each_row("block", [1, 7, 70, 1000])
-@each_row("name", SPACES)
+@pytest.mark.parametrize("block", [1, 7, 70, 1000])
+@pytest.mark.parametrize("name", SPACES)
 def test_statistics_are_sums_over_the_shares_in_blocks_of_any_length(name, block, monkeypatch):
     monkeypatch.setattr("lidardesign.mixture.components.BLOCK", block)
     mixture, features = case_of(name)
@@ -411,7 +411,7 @@ def tangent_sums(mixture, features, shares):
     return sums
 
 
-@each_row("name", SPACES)
+@pytest.mark.parametrize("name", SPACES)
 def test_hard_statistics_are_sums_over_the_samples_of_a_label(name):
     mixture, features = case_of(name)
     labels = np.random.default_rng(22).choice([0, 2], size=len(features))
@@ -423,7 +423,7 @@ def test_hard_statistics_are_sums_over_the_samples_of_a_label(name):
     np.testing.assert_allclose(found.tangent, tangent_sums(mixture, features, shares), rtol=1e-9, atol=1e-13)
 
 
-@each_row("name", SPACES)
+@pytest.mark.parametrize("name", SPACES)
 def test_the_mean_direction_of_a_cell_is_that_of_its_mean_unit_vector(name):
     _, features = case_of(name)
     labels = np.random.default_rng(23).choice([0, 1, 3], size=len(features))
@@ -440,7 +440,7 @@ def test_the_mean_direction_of_a_cell_is_that_of_its_mean_unit_vector(name):
 
 def test_a_component_without_weight_changes_nothing_and_its_logarithm_stays_finite():
     generator = np.random.default_rng(25)
-    without = random_mixture(generator, 3, width=0.8).with_weights(np.array([0.4, 0.0, 0.6]))
+    without = replace(random_mixture(generator, 3, width=0.8), weights=np.array([0.4, 0.0, 0.6]))
     left = without.take(np.array([0, 2]))
     features = features_of(drawn(left, 100, generator))
     assert np.isfinite(linear_coefficients(without, features)).all()
@@ -450,7 +450,7 @@ def test_a_component_without_weight_changes_nothing_and_its_logarithm_stays_fini
 
 
 def test_components_that_are_taken_share_what_they_had_in_proportion():
-    mixture = random_mixture(np.random.default_rng(24), 4).with_weights(np.array([0.1, 0.2, 0.3, 0.4]))
+    mixture = replace(random_mixture(np.random.default_rng(24), 4), weights=np.array([0.1, 0.2, 0.3, 0.4]))
     part = mixture.take(np.array([3, 0]))
     np.testing.assert_allclose(part.weights, [0.8, 0.2])
     np.testing.assert_array_equal(part.origin_m, mixture.origin_m[[3, 0]])

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
-from support.command_line import caller, make_run
+from support.command_line import make_run
+from support.sensors import normal_sensor
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import SAME_PLACE_M, snap_to_space
 from lidardesign.errors import InfeasibleError
+from lidardesign.formats.designs import load_design
 from lidardesign.formats.rig import rig_constraints
-from lidardesign.sensors.design_file import design_document, load_design
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design_file import design_document
 from lidardesign.space import DesignSpace
 
 PLACE_M = 0.4510446472167969
@@ -22,7 +23,7 @@ SPACE = DesignSpace((PLACE_M, 0.0, 0.0, 2.0, -1.0, 0.1), (PLACE_M, 1.0, 0.0, 4.0
 
 def rig(*origins_m):
     sensors = tuple(
-        Sensor(f"lidar {i}", 1 / len(origins_m), np.array(origin), np.zeros((3, 3)), 3.0, 0, 0, 0.1, 0.1, 0.5, 0.1)
+        normal_sensor(f"lidar {i}", 1 / len(origins_m), origin, azimuth_rad=3.0, spread_rad=(0.1, 0.1), range_m=0.5)
         for i, origin in enumerate(origins_m)
     )
     return DesignSpec("rig", sensors)
@@ -67,11 +68,6 @@ def run(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("runs") / "flat", count=1000)
 
 
-@pytest.fixture
-def call(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
-
-
 def rays_file(tmp_path, y_m):
     lines = ["sensor,origin_x_m,origin_y_m,origin_z_m,azimuth_deg,elevation_deg,gate_start_m,gate_end_m"]
     lines += [
@@ -109,7 +105,7 @@ def test_a_rig_elsewhere_is_refused_with_what_to_learn(call, run, tmp_path):
 
 
 def test_an_origin_that_is_set_counts_as_the_place_next_to_it(call, run):
-    setting = ["--set", "origin.fixed_m=[0.5, 0.0008, 0]", "--layout", "grid", "--sensors", 1]
+    setting = ["--set", "origin.fixed_m=[0.5, 0.0008, 0]", "--layout", "even", "--sensors", 1]
     result = call("constrain", run, *setting, "--name", "set", "--json")
     assert result.code == 0, result.err
     assert "origin.fixed_m is 0.8 mm from where the run's sensors stand: treated as being there" in result.err

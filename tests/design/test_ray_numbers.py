@@ -1,4 +1,4 @@
-"""Designs of fixed patterns beside designs that can be laid out at any number of rays."""
+"""Designs of fixed patterns beside designs that can fire any number of rays."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ from support.command_line import make_run
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.evaluation.request import fired_numbers, left_out, numbers_alone, numbers_fired, usual_numbers
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import save_design
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.pattern import Pattern
+from lidardesign.sensors.sensor import Sensor
 
 FAR_M = 0.9
 
 
 def pattern(name, count, layout="fixed"):
-    """A fan of flatland, of so many rays; an open grid where the layout is one."""
-    sensor = Sensor("fan", 1.0, np.array([0.5, 0, 0]), np.zeros((3, 3)), 1.5, 0.0, 0.0, 0.3, 0.0, FAR_M / 2, FAR_M / 4)
+    """A fan of flatland, of so many rays; of any number where the layout is even."""
+    sensor = Sensor("fan", 1.0, np.array([0.5, 0, 0]), 1.5, 0.0, 0.0, (1.2, 0.0), (0.0, FAR_M))
     azimuth, zeros = np.linspace(1.0, 2.0, count), np.zeros(count)
     gates = np.tile([0.0, FAR_M], (count, 1))
-    table = Rays.from_angles(np.tile([0.5, 0, 0], (count, 1)), azimuth, zeros, gates, zeros.astype(int))
-    return DesignSpec(
-        name, (sensor,), layout=layout, ray_table=table if layout == "fixed" else None, provenance={"run": ".."}
-    )
+    rays = Rays.from_angles(np.tile([0.5, 0, 0], (count, 1)), azimuth, zeros, gates, zeros)
+    patterns = (Pattern.of(rays),) if layout == "fixed" else ()
+    return DesignSpec(name, (sensor,), layout, patterns, provenance={"run": ".."})
 
 
 def test_a_pattern_is_left_out_beyond_its_rays_and_the_others_are_not():
-    designs = [pattern("few", 7), pattern("more", 20), pattern("any", 1, "grid")]
+    designs = [pattern("few", 7), pattern("more", 20), pattern("any", 1, "even")]
     assert usual_numbers(designs, (10, 30)) == [7, 10, 20, 30]
     assert usual_numbers(designs[2:], (10, 30)) == [10, 30]
     assert usual_numbers([pattern("large", 500)], (10, 30)) == [500]
@@ -56,8 +57,8 @@ def test_a_pattern_is_left_out_beyond_its_rays_and_the_others_are_not():
         (7, "fixed", (5, 6, 10), [5, 6]),
         (7, "fixed", (8, 10), []),
         (3000, "fixed", (5, 3000), [3000]),
-        (1, "grid", (5, 7, 10), [5, 7, 10]),
-        (1, "grid", (5, 3000), [5]),
+        (1, "even", (5, 7, 10), [5, 7, 10]),
+        (1, "even", (5, 3000), [5]),
     ],
 )
 def test_a_pattern_fires_all_its_rays_and_a_huge_one_nobody_elses(count, layout, asked, fired):
@@ -72,7 +73,7 @@ def test_a_pattern_fires_all_its_rays_and_a_huge_one_nobody_elses(count, layout,
 def run(tmp_path_factory):
     folder = make_run(tmp_path_factory.mktemp("runs") / "flat", count=500)
     (folder / "designs").mkdir()
-    for design in (pattern("any", 1, "grid"), pattern("few", 7)):
+    for design in (pattern("any", 1, "even"), pattern("few", 7)):
         save_design(design, folder / "designs" / f"{design.name}.yaml")
     return folder
 

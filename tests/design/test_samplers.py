@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from lidardesign.layouts.rays import lay_out
 from scipy.stats import chi2, norm
 from support.chi_square import UNLIKELY, counts_of_cells, mass_of_cells, p_value
 from support.designs import sensor
@@ -17,7 +16,6 @@ from support.flows import FLOWS, draw, flow_of
 from support.mixtures import POINT, features_of, random_mixture
 from support.mixtures import drawn as drawn_from_mixture
 from support.rivals import Rivals
-from support.tables import each_row
 
 from lidardesign.constraints.document import Constraints
 from lidardesign.density.coordinates import Coordinates
@@ -27,15 +25,15 @@ from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.sampling import draw_samples, log_density_of, log_prob_of_unit
 from lidardesign.mixture.bounds import sensor_groups
 from lidardesign.mixture.components import log_density
-from lidardesign.mixture.fit import fit
 from lidardesign.mixture.support import pin_samples, restrict_samples
 from lidardesign.numerics import systematic_draw
+from lidardesign.rays.proposals import draw_order
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Body, Box, Capsule, Mesh, Scene, Sphere
 from lidardesign.scenes.surface import sample_body
 from lidardesign.scoring.baselines.simple import OccupancyGrid
-from lidardesign.sensors.pattern import low_discrepancy
-from lidardesign.sensors.sensor import DesignSpec, tangent_coordinates, tangent_directions
+from lidardesign.sensors.pattern import even_rays, low_discrepancy
+from lidardesign.sensors.sensor import tangent_coordinates
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
 
 DRAWS = 20_000
@@ -94,8 +92,8 @@ def of_flow(flow, context):
     return density
 
 
-@each_row("dtype", [torch.float64, torch.float32])
-@each_row("name", GRIDS)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("name", GRIDS)
 def test_samples_of_a_flow_have_its_integrated_density(name, dtype):
     sizes, inside, scale = GRIDS[name]
     flow = flow_of(name, layers=2, scale=scale)
@@ -107,7 +105,7 @@ def test_samples_of_a_flow_have_its_integrated_density(name, dtype):
     assert_drawn(values.double().numpy(), edges_of(*sizes), of_flow(flow, context), inside)
 
 
-@each_row("name", FLOWS)
+@pytest.mark.parametrize("name", FLOWS)
 def test_samples_weighted_by_their_inverse_density_measure_the_volume_of_every_part_of_the_box(name):
     # in all dimensions together, where no grid reaches: the mean of 1 / p over samples inside a part is its volume
     flow = flow_of(name, layers=2, scale=1.0)
@@ -336,11 +334,7 @@ def test_draws_from_a_pinned_origin_have_the_density_at_that_origin():
     assert_drawn(chart, edges, of_directions(lambda p: np.exp(log_p_star(p)), (0.04, 0, 0)), 8, whole=False)
 
 
-# --- layouts of rays
-
-
-def one_sensor(layout, rays, **changes):
-    return DesignSpec(name="d", sensors=(sensor(**changes),), layout=layout, rays=rays)
+# --- rays
 
 
 def field_mass(one, edges, density):
@@ -365,11 +359,10 @@ def on_chart(rays):
 CHART_EDGES = [np.linspace(0, 2 * math.pi, 33), np.linspace(-1, 1, 17)]
 
 
-def test_a_grid_is_even_over_a_wide_field_of_view_on_the_sphere():
-    design = one_sensor("grid", DRAWS, spread_horizontal_rad=0.5, spread_vertical_rad=0.3, azimuth_rad=2.0)
-    (one,) = design.sensors
+def test_even_rays_are_even_over_a_wide_field_of_view_on_the_sphere():
+    one = sensor(spread_rad=(0.5, 0.3), azimuth_rad=2.0)
     mass = field_mass(one, CHART_EDGES, lambda tangent: np.ones(len(tangent)))
-    counts = counts_of_cells(on_chart(lay_out(design)), CHART_EDGES)
+    counts = counts_of_cells(on_chart(even_rays([one], [DRAWS])), CHART_EDGES)
     # the field's edge cuts cells, which midpoints know to a part in a few hundred
     filled = DRAWS * mass > 5
     assert p_value(counts[filled], counts[filled].sum() * mass[filled] / mass[filled].sum()) > UNLIKELY
@@ -379,64 +372,19 @@ def test_a_grid_is_even_over_a_wide_field_of_view_on_the_sphere():
     assert p_value(counts_of_cells(crooked, CHART_EDGES), np.maximum(DRAWS * mass, 1e-3)) < UNLIKELY
 
 
-RAYS = 1000
-
-
-def hill(tangent):
-    """A steep density over a tangent plane."""
-    return np.exp(-np.square(tangent / [0.10, 0.07]).sum(axis=1) / 2)
-
-
-def samples_of_hill(one, count=60_000, seed=14):
-    generator = np.random.default_rng(seed)
-    tangent = generator.uniform(-0.5, 0.5, (count, 2)) * one.field_of_view_rad
-    azimuth, elevation = angles(tangent_directions(one.frame, tangent))
-    reach = generator.normal(1.0, 0.02, count)
-    points = np.column_stack([np.tile(one.origin_m, (count, 1)), azimuth, elevation, reach])
-    angle = np.hypot(*tangent.T)
-    low, high = (*one.origin_m, 0, -math.pi / 2, 0.0), (*one.origin_m, 2 * math.pi, math.pi / 2, 9.0)
-    log_prob = -np.log(np.sinc(angle / math.pi))
-    return Samples(points, log_prob, np.log(hill(tangent)) + log_prob, DesignSpace(low, high))
-
-
-@pytest.mark.parametrize("layout", ["density", "scan"])
-def test_rays_by_the_density_follow_its_square_root(layout):
-    # centres of optimal cells in two dimensions (Zador 1982)
-    design = one_sensor(layout, RAYS, origin_m=np.zeros(3))
-    (one,) = design.sensors
-    samples = samples_of_hill(one)
-    if layout == "scan":
-        rays = lay_out(fit(samples, layout="scan", rays=RAYS).design)
-    else:
-        rays = lay_out(design, RAYS, samples)
-    tangent = tangent_coordinates(one.frame, rays.direction)
-    half = np.array(one.field_of_view_rad) / 2
-    edges = [np.linspace(-h, h, 9) for h in half]
-    counts = counts_of_cells(np.clip(tangent, -half, half), edges)
-    root = mass_of_cells(lambda u: np.sqrt(hill(u)), edges, 8)
-    whole = mass_of_cells(hill, edges, 8)
-    assert p_value(counts, RAYS * root / root.sum()) > UNLIKELY
-    assert p_value(counts, RAYS * whole / whole.sum()) < UNLIKELY
-
-
-def test_distributed_rays_without_samples_fill_their_sensors_own_gaussian():
-    covariance = np.array([[0.04, 0.01, 0], [0.01, 0.09, 0.0], [0, 0, 0.01]])
-    design = one_sensor("distributed", DRAWS, origin_covariance_m2=covariance, origin_m=np.zeros(3))
-    rays = lay_out(design)
-    (one,) = design.sensors
-    away = rays.origin_m @ np.linalg.cholesky(np.linalg.inv(covariance))
-    squares = np.square(away).sum(axis=1)
-    inside = chi2.cdf(squares, 3) / one.level
-    assert inside.max() <= 1 + 1e-9
-    height = away[:, 2] / np.sqrt(squares)
-    spread = np.array([one.spread_horizontal_rad, one.spread_vertical_rad])
-    tangent = tangent_coordinates(one.frame, rays.direction)
-    across = (norm.cdf(tangent / spread) - (1 - one.level) / 2) / one.level
-    unit = np.clip(np.column_stack([inside, (height + 1) / 2, across]), 0, 1)
-    for first in range(4):
-        for second in range(first):
-            edges = edges_of(20, 20, low=0.0)
-            assert p_value(counts_of_cells(unit[:, [second, first]], edges), np.full(400, DRAWS / 400)) > UNLIKELY
+def test_candidates_are_drawn_by_weight_one_after_the_other_and_none_twice():
+    generator, weights = np.random.default_rng(14), np.array([0.5, 0.0, 3.0, 1.0, 0.1])
+    orders = np.array([draw_order(weights, generator) for _ in range(DRAWS)])
+    assert (np.sort(orders, axis=1) == np.arange(5)).all()
+    assert (orders[:, -1] == 1).all()
+    share = weights / weights.sum()
+    # the second is drawn by weight from those that the first left
+    pairs = np.outer(share, share) / (1 - share)[:, None]
+    np.fill_diagonal(pairs, 0.0)
+    drawn = pairs > 0
+    counts = np.zeros((5, 5))
+    np.add.at(counts, tuple(orders[:, :2].T), 1)
+    assert p_value(counts[drawn], DRAWS * pairs[drawn]) > UNLIKELY
 
 
 @pytest.mark.parametrize("measure", ["solid_angle", "angles"])
@@ -464,8 +412,8 @@ def test_points_of_an_occupancy_grid_are_drawn_by_its_probabilities():
     assert p_value(counts_of_cells(points, edges), expected) > UNLIKELY
 
 
-@each_row("count", [400, 1000, 20_000])
-@each_row("axes", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("count", [400, 1000, 20_000])
+@pytest.mark.parametrize("axes", [2, 3, 4, 5, 6])
 def test_even_points_are_more_even_than_draws_in_every_pair_of_their_axes(axes, count):
     points = low_discrepancy(count, axes)
     edges = edges_of(10, 10, low=0.0)

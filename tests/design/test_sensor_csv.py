@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.sensors import normal_sensor
 from support.strategies import sensors
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.designs import load_design
 from lidardesign.formats.ray_lists import SENSOR_COLUMNS, begins_as_sensor_csv, read_sensor_csv, write_sensor_csv
-from lidardesign.sensors.sensor import DesignSpec, Sensor, tangent_coordinates
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.sensor import DEFAULT_LEVEL, interval_factor, tangent_coordinates
 from lidardesign.space import direction
 
 ROW = "3,0,0,3.14,0.1,1.2,0.04,0.01,0,0.09,0.02,0.05,0.2,0.1,0.3,1"
@@ -27,13 +28,21 @@ def designs(draw):
         draw(sensors(f"sensor_{index + 1}", float(weight), steepest=1.3, widest=1.5))
         for index, weight in enumerate(raw / raw.sum())
     ]
-    return DesignSpec("table", tuple(replace(sensor, roll_rad=0.0, coupling=None) for sensor in drawn))
+    return DesignSpec("table", tuple(replace(sensor, roll_rad=0.0) for sensor in drawn))
 
 
 FIELDS = (
-    "weight", "origin_m", "origin_covariance_m2", "azimuth_rad", "elevation_rad", "roll_rad",
-    "spread_horizontal_rad", "spread_vertical_rad", "range_m", "spread_range_m", "level",
+    "weight", "origin_m", "covariance_m2", "azimuth_rad", "elevation_rad", "roll_rad", "field_of_view_rad", "gate_m",
 )  # fmt: skip
+Z = interval_factor(DEFAULT_LEVEL)
+
+
+def spreads_of(sensor):
+    return tuple(angle / (2 * Z) for angle in sensor.field_of_view_rad)
+
+
+def normal_gate(mean, spread):
+    return (max(mean - Z * spread, 0.0), mean + Z * spread)
 
 
 @settings(max_examples=60, deadline=None)
@@ -45,7 +54,7 @@ def test_sensors_come_back_from_the_table(design, tmp_path_factory):
     assert loaded.name == "table"
     for before, after in zip(design.sensors, loaded.sensors, strict=True):
         for field in FIELDS:
-            np.testing.assert_allclose(getattr(after, field), getattr(before, field), rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(getattr(after, field), getattr(before, field), rtol=1e-12, atol=1e-9)
 
 
 @pytest.mark.parametrize("elevation", [-1.2, 0.0, 0.9])
@@ -57,7 +66,8 @@ def test_an_azimuth_sigma_is_the_angle_that_it_spans_on_the_sphere(tmp_path, ele
     path.write_text(",".join(cells))
     sensor = read_sensor_csv(path).sensors[0]
     beside = tangent_coordinates(sensor.frame, direction(np.array([3.14 + sigma]), np.array([elevation])))
-    assert sensor.spread_horizontal_rad == pytest.approx(beside[0, 0], rel=1e-6)
+    assert spreads_of(sensor)[0] == pytest.approx(beside[0, 0], rel=1e-6)
+    assert sensor.gate_m == pytest.approx(normal_gate(1.2, 0.3))
 
 
 def test_the_header_the_order_of_named_columns_and_a_byte_order_mark_do_not_matter(tmp_path):
@@ -104,32 +114,24 @@ def test_the_moving_robots_variant_is_read_at_one_position_and_refused_at_severa
 
 
 def test_straight_down_is_written_with_the_azimuth_spread_cut_at_a_turn(tmp_path):
-    sensor = Sensor("down", 1.0, np.zeros(3), np.zeros((3, 3)), 0.5, -math.pi / 2, 0.0, 0.2, 0.1, 1.0, 0.1)
+    sensor = normal_sensor("down", azimuth_rad=0.5, elevation_rad=-math.pi / 2, spread_rad=(0.2, 0.1))
     notes = write_sensor_csv(DesignSpec("d", (sensor,)), tmp_path / "d.csv")
     assert any("pole" in note for note in notes)
     loaded = load_design(tmp_path / "d.csv").sensors[0]
-    assert np.isfinite(loaded.spread_horizontal_rad)
-    assert loaded.spread_vertical_rad == 0.1
+    assert np.isfinite(loaded.field_of_view_rad[0])
+    assert loaded.field_of_view_rad[1] == pytest.approx(sensor.field_of_view_rad[1])
     assert loaded.elevation_rad == -math.pi / 2
 
 
 def test_a_quarter_turn_of_roll_swaps_the_spreads_and_is_noted(tmp_path):
-    sensor = Sensor("r", 1.0, np.zeros(3), np.zeros((3, 3)), 0.5, 0.0, math.pi / 2, 0.2, 0.1, 1.0, 0.1)
+    sensor = normal_sensor("r", roll_rad=math.pi / 2, spread_rad=(0.2, 0.1))
     notes = write_sensor_csv(DesignSpec("d", (sensor,)), tmp_path / "d.csv")
     assert any("roll" in note for note in notes)
     loaded = load_design(tmp_path / "d.csv").sensors[0]
-    assert (loaded.spread_horizontal_rad, loaded.spread_vertical_rad) == pytest.approx((0.1, 0.2))
+    assert spreads_of(loaded) == pytest.approx((0.1, 0.2))
 
 
-def test_another_level_is_noted(tmp_path):
-    sensor = Sensor("r", 1.0, np.zeros(3), np.zeros((3, 3)), 0.5, 0.0, 0.0, 0.2, 0.1, 1.0, 0.1, level=0.9)
-    design = DesignSpec("d", (sensor,), level=0.9)
-    assert any("0.9 is lost" in note for note in write_sensor_csv(design, tmp_path / "d.csv"))
-    plain = replace(design, level=0.95)
-    assert not any("is lost: intervals" in note for note in write_sensor_csv(plain, tmp_path / "d.csv"))
-
-
-@each_row(
+@pytest.mark.parametrize(
     ("text", "position", "says"),
     [
         (ROW.replace("3.14", "abc"), ":1:4", "azimuth_mean is 'abc'"),
@@ -142,6 +144,7 @@ def test_another_level_is_noted(tmp_path):
         (ROW.replace("0.1,1.2", "1.7,1.2"), ":1", "elevation_mean"),
         (ROW.replace("0.04,0.01", "0.04,0.9"), ":1", "eigenvalue"),
         (ROW[:-1] + "0", "", "sum to 0"),
+        (ROW.replace(",0.3,1", ",0,1"), ":1", "no width"),
         (HEADER, "", "no sensor"),
         (
             f"{HEADER.replace('weight', 'wieght')}\n{ROW}",
@@ -171,7 +174,7 @@ def test_an_empty_file_and_bytes_that_are_no_text_are_refused(tmp_path):
         load_design(path)
 
 
-@each_row("text", ["schema_version: 1\nsensors: [1, 2]\n", "a: 1, 2", "{a: 1, b: 2}", "[1, 2]", "- 1"])
+@pytest.mark.parametrize("text", ["schema_version: 2\nsensors: [1, 2]\n", "a: 1, 2", "{a: 1, b: 2}", "[1, 2]", "- 1"])
 def test_yaml_is_not_taken_for_a_table(tmp_path, text):
     assert not begins_as_sensor_csv(text.encode())
     path = tmp_path / "a.csv"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from support.tables import each_row
 
 from lidardesign.constraints.check import ConstraintCheck
 from lidardesign.constraints.slack import constraint_slack, room_of
@@ -13,7 +12,7 @@ def check(name, bound, value, satisfied=True):
     return ConstraintCheck(name, bound, value, satisfied)
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("found", "room", "share"),
     [
         (check("a.gate.width_m.max", 0.2, 0.15), 0.05, 0.25),

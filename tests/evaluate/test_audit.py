@@ -113,7 +113,7 @@ def test_both_sides_of_an_audit_draw_the_same_random_numbers():
 
 
 def test_what_cannot_be_simulated_is_noted_where_it_may_matter():
-    decision = Planner(SINGLE).plan(sunny(1)[0], [make_request().lay_out(design(), 9, None)])
+    decision = Planner(SINGLE).plan(sunny(1)[0], [design().rays(9)])
     found = [
         replace(effect, range_m=0.5, missing="not installed: mitsuba") if effect.name == "multipath" else effect
         for effect in effect_summaries([decision])
@@ -162,7 +162,7 @@ def run(tmp_path_factory):
 @pytest.fixture
 def fitted(lidardesign, run):
     if not (run / "designs" / "fit.yaml").exists():
-        assert lidardesign("fit", run, "--layout", "grid", "--sensors", 2).code == 0
+        assert lidardesign("fit", run, "--layout", "even", "--sensors", 2).code == 0
     return run
 
 

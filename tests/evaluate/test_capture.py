@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lidardesign.layouts.rays import lay_out
 from support.captures import BALL_AT, BALL_M, BIN_PS, C_M_PER_PS, START_PS, ball_range_m, make_capture
 from support.command_line import caller
-from support.tables import each_row
+from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.galvo import degree_frame, read_galvo, scan_directions, write_galvo
@@ -27,8 +26,8 @@ from lidardesign.scoring.captures.scan import (
     whole_window,
 )
 from lidardesign.scoring.captures.score import CaptureSettings, evaluate_capture
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import save_design
-from lidardesign.sensors.sensor import DesignSpec, Sensor
 
 BIN_M = BIN_PS * C_M_PER_PS / 2
 ESTIMATIONS = [Estimation("peak"), Estimation("matched")]
@@ -54,8 +53,8 @@ def noisy(files):
 
 
 def ball_design(rays=150):
-    numbers = (0.0, 0.0, 0.0, 0.1, 0.1, 0.52, 0.042)
-    return DesignSpec("ball", (Sensor("ball", 1.0, np.zeros(3), np.zeros((3, 3)), *numbers),), rays=rays)
+    ahead = normal_sensor("ball", spread_rad=(0.1, 0.1), range_m=0.52, spread_range_m=0.042)
+    return DesignSpec("ball", (ahead,), constraints={"budget": {"rays": rays}})
 
 
 def rays_along(directions, gate=(0.3, 2.0), origin=(0.0, 0.0, 0.0)):
@@ -92,7 +91,7 @@ def test_rays_beside_the_pixels_take_the_nearest_and_say_how_far_it_is(clean):
     assert np.degrees(found.away_rad[0]) == pytest.approx(0.5, rel=1e-4)
 
 
-@each_row("gate", [(0.3, 2.0), (0.5, 0.55), (0.4501, 0.4502), (0.0, 0.1), (1.9, 50.0)])
+@pytest.mark.parametrize("gate", [(0.3, 2.0), (0.5, 0.55), (0.4501, 0.4502), (0.0, 0.1), (1.9, 50.0)])
 def test_a_gate_hears_the_bins_whose_middles_lie_in_it(clean, gate):
     first, last = gate_bins(clean, np.zeros(1, dtype=int), np.array([gate]))
     middles = (START_PS + (np.arange(clean.bins) + 0.5) * BIN_PS) * C_M_PER_PS / 2
@@ -102,7 +101,7 @@ def test_a_gate_hears_the_bins_whose_middles_lie_in_it(clean, gate):
 
 @pytest.mark.parametrize("estimation", ESTIMATIONS, ids=lambda one: one.estimator)
 def test_what_lies_outside_a_gate_changes_nothing(noisy, estimation):
-    rays = lay_out(ball_design())
+    rays = ball_design().rays()
     within = default_within_rad(noisy)
     found = scan(noisy, rays, within, estimation)
     middles = noisy.start_m[0] + (np.arange(noisy.bins) + 0.5) * noisy.bin_m
@@ -130,7 +129,7 @@ def test_clean_histograms_give_the_true_range_to_a_bin(clean, estimation):
 
 @pytest.mark.parametrize("estimation", ESTIMATIONS, ids=lambda one: one.estimator)
 def test_ranges_do_not_depend_on_how_many_are_worked_on_at_once(noisy, estimation, monkeypatch):
-    rays = lay_out(ball_design())
+    rays = ball_design().rays()
     found = scan(noisy, rays, 0.1, estimation)
     monkeypatch.setattr(capture_ranges, "CHUNK_BINS", 100)
     again = scan(noisy, rays, 0.1, estimation)
@@ -249,13 +248,13 @@ def test_uniform_rays_are_as_many_as_asked_for_and_all_captured(clean, count):
 
 def test_a_gated_capture_knows_nothing_of_rays_without_gates(clean):
     gated = replace(clean, start_ps=clean.start_ps + 20.0 * (np.arange(len(clean)) % 2))
-    found = evaluate_capture(gated, [("ball", lay_out(ball_design()))], settings(gated))
+    found = evaluate_capture(gated, [("ball", ball_design().rays())], settings(gated))
     assert [(row.design, row.gate) for row in found.rows] == [("ball", "own")]
     assert any("gated" in note for note in found.notes)
 
 
 def test_gates_remove_the_false_peaks_that_lie_outside_them(noisy):
-    rays = lay_out(ball_design())
+    rays = ball_design().rays()
     own, whole, uniform = evaluate_capture(noisy, [("ball", rays)], settings(noisy)).rows
     assert (own.gate, whole.gate, uniform.gate, uniform.baseline) == ("own", "whole", "whole", True)
     figures = [row.as_dict() for row in (own, whole, uniform)]
@@ -270,7 +269,7 @@ def test_gates_remove_the_false_peaks_that_lie_outside_them(noisy):
 
 def test_medians_of_neighbours_stand_in_for_true_ranges(files, noisy):
     untrue = load_capture(files / "untrue.npz")
-    rays = lay_out(ball_design())
+    rays = ball_design().rays()
     found = evaluate_capture(untrue, [("ball", rays)], settings(untrue))
     assert "median" in found.ranges_from
     assert found.surface_from is None
@@ -308,7 +307,7 @@ def test_a_reference_mesh_is_what_the_surface_is_held_against(clean, tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=4, radius=BALL_M)
     ball.apply_translation(BALL_AT)
     ball.export(tmp_path / "ball.ply")
-    rays = lay_out(ball_design(400))
+    rays = ball_design(400).rays()
     found = evaluate_capture(clean, [("ball", rays)], settings(clean, reference=tmp_path / "ball.ply"))
     own, _, uniform = found.rows
     # the scanner sees more of the ball than the design looks at
@@ -339,7 +338,7 @@ def test_fields_across_azimuth_zero_and_behind_are_one_field(tmp_path):
 
 
 def test_a_capture_of_the_exported_rays_alone_is_enough(tmp_path):
-    write_galvo(ball_design(), lay_out(ball_design()), tmp_path / "ball.galvo.csv")
+    write_galvo(ball_design(), ball_design().rays(), tmp_path / "ball.galvo.csv")
     rays = read_galvo(tmp_path / "ball.galvo.csv")
     counts = np.zeros((len(rays), 600), np.uint8)
     known = ball_range_m(rays.direction)
@@ -357,7 +356,7 @@ def test_a_capture_of_the_exported_rays_alone_is_enough(tmp_path):
 def call(capsys, tmp_path, monkeypatch, files):
     run = caller(capsys, tmp_path, monkeypatch)
     save_design(ball_design(), tmp_path / "ball.yaml")
-    write_galvo(ball_design(), lay_out(ball_design()), tmp_path / "ball.galvo.csv")
+    write_galvo(ball_design(), ball_design().rays(), tmp_path / "ball.galvo.csv")
     for path in files.iterdir():
         (tmp_path / path.name).symlink_to(path)
     return run

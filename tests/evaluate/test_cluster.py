@@ -12,12 +12,14 @@ import warnings
 from dataclasses import replace
 
 import pytest
-from lidardesign.scoring.evaluation.workers import scorer_of
+from support.plugins import GOOD, install_plugins
 from support.workers import make_request, results
 
+from lidardesign import workers
 from lidardesign.errors import ConfigError
-from lidardesign.scoring.evaluation import workers
+from lidardesign.registry import load_task
 from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.workers import opened_workers
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -72,8 +74,8 @@ def after_one_scene(kill):
 
 def score_by(address):
     request = make_request()
-    with scorer_of(address, request.task, 6) as scorer:
-        evaluate(replace(request, scorer=scorer))
+    with opened_workers(address, request.task, 6) as starmap:
+        evaluate(replace(request, starmap=starmap))
 
 
 @pytest.fixture
@@ -91,10 +93,10 @@ def test_a_cluster_scores_as_this_process_does_though_a_worker_is_lost(scheduler
     expected = results(evaluate(request))
     lost = scheduler.add_worker()
     scheduler.add_worker()
-    with scorer_of(scheduler.address, request.task, 6) as scorer:
-        assert results(evaluate(replace(request, scorer=scorer), progress=after_one_scene(lost.kill))) == expected
+    with opened_workers(scheduler.address, request.task, 6) as starmap:
+        assert results(evaluate(replace(request, starmap=starmap), progress=after_one_scene(lost.kill))) == expected
         assert lost.wait(PATIENCE_S) == -signal.SIGKILL
-        assert results(evaluate(replace(request, scorer=scorer))) == expected
+        assert results(evaluate(replace(request, starmap=starmap))) == expected
 
 
 def test_a_scheduler_that_is_lost_ends_the_evaluation_with_its_address(scheduler):
@@ -102,9 +104,9 @@ def test_a_scheduler_that_is_lost_ends_the_evaluation_with_its_address(scheduler
     scheduler.add_worker()
     with (
         pytest.raises(ConfigError, match=f"the scheduler at {scheduler.address} was lost"),
-        scorer_of(scheduler.address, request.task, 6) as scorer,
+        opened_workers(scheduler.address, request.task, 6) as starmap,
     ):
-        evaluate(replace(request, scorer=scorer), progress=after_one_scene(scheduler.scheduler.kill))
+        evaluate(replace(request, starmap=starmap), progress=after_one_scene(scheduler.scheduler.kill))
 
 
 def test_a_scheduler_without_workers_is_refused(scheduler, monkeypatch):
@@ -143,6 +145,14 @@ def test_a_cluster_of_another_version_is_refused(scheduler, monkeypatch):
         score_by(scheduler.address)
 
 
+def test_a_plugin_that_workers_lack_is_named(scheduler, tmp_path, monkeypatch):
+    install_plugins(tmp_path / "site", {"ball": GOOD})
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    scheduler.add_worker()
+    with pytest.raises(ConfigError, match="plugins_ball"), opened_workers(scheduler.address, load_task("ball"), 6):
+        pass
+
+
 def test_a_cluster_that_lost_its_last_worker_is_given_up(scheduler, monkeypatch):
     request = make_request()
     only = scheduler.add_worker()
@@ -153,6 +163,6 @@ def test_a_cluster_that_lost_its_last_worker_is_given_up(scheduler, monkeypatch)
 
     with (
         pytest.raises(ConfigError, match="no worker within 1 s"),
-        scorer_of(scheduler.address, request.task, 6) as scorer,
+        opened_workers(scheduler.address, request.task, 6) as starmap,
     ):
-        evaluate(replace(request, scorer=scorer), progress=after_one_scene(kill))
+        evaluate(replace(request, starmap=starmap), progress=after_one_scene(kill))

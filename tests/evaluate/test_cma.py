@@ -1,4 +1,4 @@
-"""Direct optimisation as a rival: it starts at the design, keeps its constraints, and is never worse in its scenes."""
+"""Direct optimisation as a baseline: it starts at the design, keeps constraints, and is never worse in its scenes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from lidardesign.layouts.rays import lay_out
 from support.rivals import balls
 from support.scoring import HitTask, MissTask
-from support.tables import each_row
+from support.sensors import normal_sensor
 
 from lidardesign.api.scores import ScoreOptions
 from lidardesign.cli.commands.evaluate import search_display
@@ -21,14 +20,15 @@ from lidardesign.errors import ConfigError
 from lidardesign.numerics import wrap_angle
 from lidardesign.parts.catalogue import Pose, find_part, part_design
 from lidardesign.scoring.baselines import cma
-from lidardesign.scoring.baselines.candidates import mean_mbps, rays_at
+from lidardesign.scoring.baselines.candidates import rays_at
 from lidardesign.scoring.baselines.cma import CmaCandidate, CmaSettings, MovableSensors
 from lidardesign.scoring.baselines.views import TrainingObjective
 from lidardesign.scoring.evaluation.entries import entries_of
 from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.score import evaluate
-from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import DesignSpec, Sensor, Track
+from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.pattern import Pattern, even_rays
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace, angles
 from lidardesign.task import TaskConfig
@@ -49,56 +49,61 @@ class AnyMissTask(MissTask):
     fewest_returns = 0
 
 
-def sensors(count, space=FIXED, azimuth=0.1, elevation=-0.1, spread=(0.03, 0.02), roll=0.3, apart=0.0):
+def sensors(count, space=FIXED, azimuth=0.1, elevation=-0.1, spread=(0.03, 0.02), roll=0.3, apart=(0.0, 0.0)):
     origin = (np.array(space.low[:3]) + space.high[:3]) / 2
     return tuple(
-        Sensor(f"s{i}", 1 / count, origin, np.zeros((3, 3)), azimuth + i * apart, elevation, roll, *spread, 2.7, 0.3)
+        normal_sensor(
+            f"s{i}", 1 / count, origin, azimuth + i * apart[0], elevation + i * apart[1], roll, spread, 2.7, 0.3
+        )
         for i in range(count)
-    )  # fmt: skip
+    )
 
 
-def track(count=3):
-    knots = np.array([0.0, 0.5, 1.0])
-    aimed = np.tile(np.linspace(-0.2, 0.2, count), (3, 1))
-    gate = np.tile([2.0, 3.5], (3, count, 1))
-    followed = Track("x_m", knots, np.zeros((3, count)), aimed, gate, np.arange(count))
-    return DesignSpec("mine", sensors(count, AISLE, 0.0), layout="scan", rays=count, track=followed)
+def along(sensor):
+    """Three rays along an aisle, of these sensors."""
+    elevation = np.tile([-0.2, 0.0, 0.2], (3, 1))
+    columns = np.zeros((3, 3, 3)), np.zeros((3, 3)), elevation, np.tile([2.0, 3.5], (3, 3, 1))
+    knots = (0.0, 0.5, 1.0)
+    columns[0][..., 0] = np.array(knots)[:, None]
+    pattern = Pattern(*columns, np.array(sensor), "x_m", knots)
+    count = max(sensor) + 1
+    aimed = sensors(count, AISLE, 0.0, -0.2 if count > 1 else 0.0, apart=(0.0, 0.2))
+    return DesignSpec("mine", aimed, "chosen", (pattern,))
 
 
 def chosen():
     """A design whose nine rays were chosen, each with a gate of its own."""
     points = np.column_stack([np.zeros((9, 3)), np.linspace(0.1, 0.3, 9), np.full(9, -0.2)])
-    table = replace(rays_at(points, np.linspace((1.5, 1.7), (1.9, 2.3), 9)), sensor=np.arange(9) % 2)
-    return DesignSpec("mine", sensors(2, azimuth=0.2), layout="selected", gates="ray", rays=9, ray_table=table)
+    rays = replace(rays_at(points, np.linspace((1.5, 1.7), (1.9, 2.3), 9)), sensor=np.arange(9) % 2)
+    return DesignSpec("mine", sensors(2, azimuth=0.2), "chosen", (Pattern.of(rays),))
 
 
-def chosen_along():
-    """The rays of a track that one sensor fires, as they are chosen along a condition."""
-    of_each = track()
-    of_one = replace(of_each.track, sensor=np.zeros(3, dtype=np.int64))
-    return replace(of_each, sensors=sensors(1, AISLE, 0.0), layout="selected", gates="ray", track=of_one)
+def ray_per_sensor():
+    each = sensors(6, apart=(0.02, 0.0))
+    return DesignSpec("mine", each, "chosen", (Pattern.of(even_rays(each, [1] * 6)),))
 
 
 FOLLOWED = {
-    "selected": (chosen(), FIXED),
-    "grid": (DesignSpec("mine", sensors(2)), FIXED),
-    "scan": (DesignSpec("mine", sensors(6, apart=0.02), layout="scan", rays=6), FIXED),
+    "chosen": (chosen(), FIXED),
+    "even": (DesignSpec("mine", sensors(2)), FIXED),
+    "a ray per sensor": (ray_per_sensor(), FIXED),
     "free": (DesignSpec("mine", sensors(2, FREE)), FREE),
     "plane": (DesignSpec("mine", sensors(2, FLAT, elevation=0.2, spread=(0.1, 0.0), roll=0.0)), FLAT),
-    "track": (track(), AISLE),
-    "chosen along": (chosen_along(), AISLE),
+    "along": (along([0, 0, 0]), AISLE),
+    "along, a ray per sensor": (along([0, 1, 2]), AISLE),
     "part": (part_design(find_part("vl53l5cx"), Pose(np.zeros(3), 0.3, -0.1, 0.2), 9, name="mine"), FIXED),
 }
+RAY_PER_SENSOR = ("a ray per sensor", "along, a ray per sensor")
 
 
 def conditions_of(design):
-    return [{"x_m": 0.25}, {"x_m": 0.75}] if design.track is not None else [{}]
+    return [{"x_m": 0.25}, {"x_m": 0.75}] if design.condition else [{}]
 
 
 def movable(name, rules=None):
     design, space = FOLLOWED[name]
     design = replace(design, constraints=rules or {})
-    start = tuple(lay_out(design, design.rays or 12, at=at) for at in conditions_of(design))
+    start = tuple(design.rays(design.count or 12, at or None) for at in conditions_of(design))
     return MovableSensors(design, start, space.at({"x_m": 0.5}) if space.conditioned else space, Bandwidth())
 
 
@@ -109,7 +114,7 @@ def vectors(model, steps):
         yield np.clip(step * generator.standard_normal(len(low)), low, high)
 
 
-@each_row("name", list(FOLLOWED))
+@pytest.mark.parametrize("name", list(FOLLOWED))
 def test_the_vector_zero_is_the_design_and_rays_move_little_by_little(name):
     model = movable(name)
     low, high = model.vector_bounds
@@ -135,7 +140,7 @@ RULES = {
 }
 
 
-@each_row(("name", "rules"), [*itertools.product(("free", "scan", "track", "selected"), RULES)])
+@pytest.mark.parametrize(("name", "rules"), [*itertools.product(("free", "chosen", *RAY_PER_SENSOR), RULES)])
 def test_however_far_a_vector_is_rays_keep_the_constraints(name, rules):
     asked, (_, space) = RULES[rules], FOLLOWED[name]
     model = movable(name, asked)
@@ -161,7 +166,7 @@ def test_however_far_a_vector_is_rays_keep_the_constraints(name, rules):
             aimed, raised = (wrap_angle(angle) for angle in angles(own.mean(axis=0)))
             assert rules != "field" or wide <= math.hypot(9, 6) + 1e-6
             assert rules != "boresight" or (-8 <= math.degrees(aimed) <= 14 and -20 <= math.degrees(raised) <= 14)
-        if rules == "boresight" and name in ("scan", "track"):
+        if rules == "boresight" and name in RAY_PER_SENSOR:
             assert azimuth.min() >= -8 - 1e-9
             assert azimuth.max() <= 14 + 1e-9
             assert elevation.min() >= -20 - 1e-9
@@ -185,7 +190,7 @@ def test_of_a_real_part_the_pose_alone_is_varied():
 
 
 def test_wider_gates_take_more_bandwidth_than_the_design_has():
-    model = movable("grid")
+    model = movable("even")
     excess = [model.excess(model.rays(vector)) for vector in vectors(model, (0.5, 1.0, 2.0, 4.0))]
     spent = [mean_mbps(model.rays(vector), Bandwidth()) for vector in vectors(model, (0.5, 1.0, 2.0, 4.0))]
     limit = mean_mbps(model.start, Bandwidth())
@@ -201,7 +206,7 @@ def request_of(name, task=None, **changes):
         "space": space,
         "seed": 3,
         "designs": [design],
-        "rays": [design.rays or 12],
+        "rays": [design.count or 12],
         "baselines": ("bounding", "cma"),
         "train": AHEAD,
         "test": AHEAD,
@@ -210,7 +215,7 @@ def request_of(name, task=None, **changes):
     return EvaluationRequest(**{**values, **changes})
 
 
-@each_row("name", list(FOLLOWED))
+@pytest.mark.parametrize("name", list(FOLLOWED))
 def test_every_kind_of_design_is_followed_to_no_worse_a_score_in_no_more_bandwidth(name):
     evaluation = evaluate(request_of(name))
     (record,) = evaluation.searches
@@ -230,12 +235,12 @@ def test_every_kind_of_design_is_followed_to_no_worse_a_score_in_no_more_bandwid
 
 @pytest.mark.parametrize("task", [AnyMissTask(), HitTask()])
 def test_the_search_gains_in_the_direction_of_the_metric(task):
-    (record,) = evaluate(request_of("grid", task, cma=CmaSettings(math.inf, 1500))).searches
+    (record,) = evaluate(request_of("even", task, cma=CmaSettings(math.inf, 1500))).searches
     sign = 1.0 if task.metric.better == "lower" else -1.0
     assert sign * record.value < sign * record.start_value - 10
 
 
-@each_row("name", ["track", "chosen along"])
+@pytest.mark.parametrize("name", ["along", "along, a ray per sensor"])
 def test_along_a_condition_rays_stay_where_the_condition_is(name):
     task = AnyMissTask()
     task.conditions = lambda config: [{"x_m": 0.25}, {"x_m": 0.75}]
@@ -245,8 +250,8 @@ def test_along_a_condition_rays_stay_where_the_condition_is(name):
 
 
 def test_a_design_that_does_not_fire_a_number_of_rays_is_not_followed_there():
-    other = replace(FOLLOWED["grid"][0], name="other")
-    evaluation = evaluate(request_of("selected", designs=[FOLLOWED["selected"][0], other], rays=[9, 12]))
+    other = replace(FOLLOWED["even"][0], name="other")
+    evaluation = evaluate(request_of("chosen", designs=[FOLLOWED["chosen"][0], other], rays=[9, 12]))
     assert {row.rays for row in evaluation.rows if row.design == "cma"} == {9}
 
 
@@ -267,20 +272,20 @@ def test_the_same_seed_and_number_of_evaluations_give_the_same_bytes():
 def test_a_search_ends_when_its_time_is_up(monkeypatch):
     now = itertools.count()
     monkeypatch.setattr(cma, "time", SimpleNamespace(perf_counter=lambda: float(next(now))))
-    candidate = candidate_of("grid", CmaSettings(60.0))
+    candidate = candidate_of("even", CmaSettings(60.0))
     record = candidate.record_of(candidate.positions([], 12))
     assert 60 <= record.seconds <= 70
     assert record.candidates > 1
 
 
 def test_where_nothing_is_gained_the_design_itself_is_the_answer():
-    candidate = candidate_of("grid", scenes=balls(np.array([-3.0, 0, 0])))
+    candidate = candidate_of("even", scenes=balls(np.array([-3.0, 0, 0])))
     assert candidate.positions([], 12) is candidate.starts[12]
 
 
 def test_without_a_design_there_is_nothing_to_vary():
     with pytest.raises(ConfigError, match="no design"):
-        evaluate(request_of("grid", designs=[], rays=[9]))
+        evaluate(request_of("even", designs=[], rays=[9]))
 
 
 @pytest.mark.parametrize(
@@ -324,7 +329,7 @@ def shown_settings(bar):
 def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():
     bar = Bar()
     settings = shown_settings(bar)
-    candidate_of("grid", settings).positions([], 12)
+    candidate_of("even", settings).positions([], 12)
     assert bar.lines == ["cma, 12 rays"]
     shares = [fields["share"] for _, fields in bar.updates]
     assert shares == sorted(shares)

@@ -13,7 +13,6 @@ import trimesh
 from scipy.stats import norm
 from support.meshes import icosphere
 from support.references import shape_distance
-from support.tables import each_row
 
 from lidardesign.config import DensitySettings, LearningSettings, resolve, save_run_config
 from lidardesign.density.coordinates import Coordinates
@@ -35,7 +34,6 @@ from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.scenes.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.scoring.accuracy import fields
-from lidardesign.scoring.accuracy import fields as visibility
 from lidardesign.scoring.accuracy import training as learning_steps
 from lidardesign.scoring.accuracy.fields import LOG_OPAQUE, ExactField, fresh_table, opaque_target
 from lidardesign.scoring.accuracy.probes import AccuracyRequest, draw_probes, few_columns, with_frames
@@ -111,7 +109,7 @@ class TestMisplacedShare:
         once = misplaced_share(first, second, proposal - math.log(2))
         assert twice[0] == pytest.approx(once[0])
 
-    @each_row("bad", [np.nan, np.inf])
+    @pytest.mark.parametrize("bad", [np.nan, np.inf])
     def test_what_is_no_density_is_refused(self, bad):
         with pytest.raises(NumericalError, match="no finite mass"):
             misplaced_share(np.array([0.0, bad]), np.zeros(2), np.zeros(2))
@@ -174,16 +172,16 @@ class TestVisibilitySweep:
         places = [(1.2, 0.1, 0.0), (1.8, -0.1, 0.1)]
         made = {}
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(visibility, "PROBES", 4096)
-            patch.setattr(visibility, "TABLE_PROBES", 1024)
+            patch.setattr(fields, "VISIBILITY_PROBES", 4096)
+            patch.setattr(fields, "TABLE_PROBES", 1024)
             for kind in (Box, Mesh):
                 few = [hidden_wall(place, kind) for place in places]
-                made[kind] = visibility.VisibilityCase.of(few, SPACE, SETTINGS, seed=0, batch=64)
+                made[kind] = fields.VisibilityCase.of(few, SPACE, SETTINGS, seed=0, batch=64)
         return made
 
     @pytest.mark.parametrize("kind", [Box, Mesh])
     def test_ray_casting_is_chosen_where_thin_plates_hide_things(self, cases, kind):
-        sweep = visibility.visibility_sweep(cases[kind], 64, "raycast")
+        sweep = fields.visibility_sweep(cases[kind], 64, "raycast")
         off, quadrature, cast = sweep.measurements
         assert sweep.falls
         assert sweep.chosen is cast is sweep.default
@@ -191,17 +189,17 @@ class TestVisibilitySweep:
         assert cast.error < 0.02
 
     def test_where_nothing_is_seen_there_is_nothing_to_choose(self, monkeypatch):
-        monkeypatch.setattr(visibility, "PROBES", 512)
+        monkeypatch.setattr(fields, "VISIBILITY_PROBES", 512)
         wall, _ = hidden_wall((1.5, 0, 0)).bodies
         screen = Body(Box((0.01, 5.0, 5.0)), "screen", "occluder", rigid(translation_m=(1.0, 0, 0)))
-        assert visibility.VisibilityCase.of([Scene((wall, screen))], SPACE, SETTINGS, 0).is_blind
-        assert not visibility.VisibilityCase.of([hidden_wall((1.5, 0, 0))], SPACE, SETTINGS, 0).is_blind
+        assert fields.VisibilityCase.of([Scene((wall, screen))], SPACE, SETTINGS, 0).is_blind
+        assert not fields.VisibilityCase.of([hidden_wall((1.5, 0, 0))], SPACE, SETTINGS, 0).is_blind
 
     def test_bodies_one_by_one_are_measured_on_few_scenes(self):
         every = [hidden_wall((1.5, 0, 0)) for _ in range(100)]
-        assert len(visibility.affordable_scenes(every)) == visibility.MOST_BODIES // 2
+        assert len(fields.affordable_scenes(every)) == fields.MOST_BODIES // 2
         meshes = [hidden_wall((1.5, 0, 0), Mesh) for _ in range(100)]
-        assert visibility.affordable_scenes(meshes) is meshes
+        assert fields.affordable_scenes(meshes) is meshes
 
 
 class TestComparedFields:
@@ -276,7 +274,7 @@ class TestFieldSweeps:
 
     def test_primitives_need_no_field(self):
         request = SimpleNamespace(config=None, request=SimpleNamespace(train=[hidden_wall((1.5, 0, 0))]))
-        assert fields.sweeps(request) == []
+        assert fields.field_sweeps(request) == []
 
 
 class TestDrawnScenes:
@@ -412,15 +410,15 @@ class TestRuns:
     @pytest.mark.parametrize(
         ("sweeps", "count"),
         [
-            (visibility.sweeps, 1),
-            (fields.sweeps, 0),
+            (fields.visibility_sweeps, 1),
+            (fields.field_sweeps, 0),
             (learning_steps.dtype_sweeps, 1),
             (learning_steps.frames_sweeps, 1),
         ],
     )
     def test_have_sweeps_whose_errors_fall(self, request_of, sweeps, count, monkeypatch):
-        monkeypatch.setattr(visibility, "PROBES", 2048)
-        monkeypatch.setattr(visibility, "BODY_PROBES", 256)
+        monkeypatch.setattr(fields, "VISIBILITY_PROBES", 2048)
+        monkeypatch.setattr(fields, "BODY_PROBES", 256)
         monkeypatch.setattr(learning_steps, "DTYPE_BATCHES", 4)
         monkeypatch.setattr(learning_steps, "FRAMES_BATCHES", 4)
         found = sweeps(request_of)

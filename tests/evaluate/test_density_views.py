@@ -1,11 +1,11 @@
 """Views of a density: what is drawn holds all of it, in the right places and units, and the designs' own beside it."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from support.sensors import normal_sensor
 
 from lidardesign.report.density_views import (
     PERCENT,
@@ -18,7 +18,8 @@ from lidardesign.report.density_views import (
 )
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Body, Box, Plane, Scene, Sphere, rigid
-from lidardesign.sensors.sensor import Coupling, DesignSpec, Sensor, Track
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import AZIMUTH, RANGE, DesignSpace, observed_point
 
 BALL = Scene((Body(Sphere(0.5), "ball", "target", rigid(translation_m=(3.0, 0.0, 0.0))),), "ball")
@@ -36,8 +37,11 @@ def even(space, count=20_000, seed=0):
 
 
 def make_sensor(**changes):
-    origin_m, covariance_m2 = np.array([0.1, -0.2, 0.5]), np.diag([0.04, 0.01, 0.0])
-    return replace(Sensor("s", 1.0, origin_m, covariance_m2, 0.3, -0.4, 0.2, 0.1, 0.05, 1.7, 0.2), **changes)
+    values = {
+        "origin_m": (0.1, -0.2, 0.5), "origin_covariance_m2": np.diag([0.04, 0.01, 0.0]), "azimuth_rad": 0.3,
+        "elevation_rad": -0.4, "roll_rad": 0.2, "spread_rad": (0.1, 0.05), "range_m": 1.7, "spread_range_m": 0.2,
+    }  # fmt: skip
+    return normal_sensor(**{**values, **changes})
 
 
 def held(marginal, heights):
@@ -113,22 +117,15 @@ def test_sensors_count_by_their_weights():
     assert weights[points[:, RANGE] < 1.75].sum() == pytest.approx(0.75, abs=0.002)
 
 
-def test_rays_follow_their_origins_where_a_sensor_says_how():
-    coupling = Coupling(
-        np.array([[0.5, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([1.0, 0, 0]), np.zeros(2), np.array([0.01, 0.02]), 0.03
+def test_a_pattern_along_a_condition_counts_along_its_whole_way():
+    way = np.tile([[0.0], [1.0]], (1, 3))
+    origin_m = np.stack([way, 0 * way, 0 * way], axis=2)
+    pattern = Pattern(origin_m, 0 * way, 0 * way, np.tile([1.0, 2.0], (2, 3, 1)), np.zeros(3, int), "x_m", (0.0, 1.0))
+    points, weights = mixture_points(
+        DesignSpec("moving", (make_sensor(origin_covariance_m2=None),), "chosen", (pattern,))
     )
-    points, _ = mixture_points(DesignSpec("bent", (make_sensor(coupling=coupling),)))
-    slope = np.polyfit(points[:, 0], points[:, RANGE], 1)
-    assert slope[0] == pytest.approx(1.0, abs=0.01)
-    rest = points[:, RANGE] - np.polyval(slope, points[:, 0])
-    assert rest.std() == pytest.approx(0.03, rel=0.03)
-
-
-def test_a_track_counts_along_its_whole_way():
-    knots = np.array([0.0, 1.0])
-    track = Track("x_m", knots, np.zeros((2, 3)), np.zeros((2, 3)), np.tile([1.0, 2.0], (2, 3, 1)), np.zeros(3, int))
-    points, _ = mixture_points(DesignSpec("moving", (make_sensor(),), track=track))
     assert set(np.round(points[:, 0], 6)) == {0.0, 1.0}
+    assert weights[points[:, 0] > 0.5].sum() == pytest.approx(0.5)
 
 
 def test_planes_hold_the_density_where_it_looks():
@@ -167,7 +164,7 @@ def test_one_heavy_sample_is_drawn_without_a_number_that_is_none():
 
 
 def test_what_stands_out_far_beyond_the_density_is_cut_off():
-    pinned = make_sensor(origin_covariance_m2=np.zeros((3, 3)))
+    pinned = make_sensor(origin_covariance_m2=None)
     one = marginals(even(ANYWHERE), [DesignSpec("pinned", (pinned,))])[0]
     assert one.designs["pinned"].max() > one.top
     assert one.heights.max() < one.top

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.scoring import MissTask, make_request
+from support.sensors import normal_sensor
 
-from lidardesign.samples import Samples
+from lidardesign.errors import ConfigError
 from lidardesign.scenes.scene import Body, Box, Capsule, Scene, Sphere, rigid
 from lidardesign.scoring.evaluation.entries import entries_of
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.sensors.bandwidth import Bandwidth
-from lidardesign.sensors.sensor import Coupling, DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.pattern import Pattern
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace, angles
 from lidardesign.task import Metric, Score
@@ -70,9 +72,8 @@ def carried(count, frames, seed):
     return scenes
 
 
-def upward(name="up", elevation=0.6, weight=1.0, range_m=1.2):
-    origin = np.array([2.0, 0.0, 0.0])
-    return Sensor(name, weight, origin, np.zeros((3, 3)), -math.pi / 2, elevation, 0.0, 1e-3, 0.2, range_m, 0.1)
+def upward():
+    return normal_sensor("up", 1.0, (2.0, 0.0, 0.0), -math.pi / 2, 0.6, 0.0, (1e-3, 0.2), 1.2, 0.1)
 
 
 BUILT = ("uniform", "random", "bounding", "occupancy")
@@ -80,13 +81,9 @@ BUILT = ("uniform", "random", "bounding", "occupancy")
 
 def aisle_request(task, **changes):
     scenes = {"train": shelves(4, 1), "test": shelves(3, 2)}
-    values = {"task": task, "space": AISLE, "rays": (6, 10), "baselines": BUILT, **scenes}
-    return make_request([DesignSpec("cart", (upward(),))], **{**values, **changes})
-
-
-def ceiling_request(designs=None, **changes):
-    values = {"task": SeenTask(), "space": CEILING, "seed": 0, "test": carried(2, 4, 2)}
-    return make_request(designs or [DesignSpec("d", ceiling_sensors())], **{**values, **changes})
+    designs = [DesignSpec("cart", (upward(),))]
+    values = {"task": task, "space": AISLE, "rays": (6, 10), "baselines": BUILT, "designs": designs, **scenes}
+    return make_request(**{**values, **changes})
 
 
 def test_returns_come_condition_by_condition_and_within_each_frame_by_frame():
@@ -163,41 +160,36 @@ def test_conditions_that_a_task_does_not_name_are_even():
     assert len(places) == 9
 
 
-def ceiling_sensors():
-    """One that looks straight down, two about azimuth 0, one that is coupled to where its rays start."""
-    flat = np.diag([0.04, 0.02, 0.0])
-    slopes = np.array([[0.1, 0.3, 0.0], [-0.2, 0.1, 0.0]])
-    coupling = Coupling(slopes, np.array([0.1, -0.1, 0.0]), np.array([0.1, 0.2]), (0.1, 0.1), 0.05)
-    places = [(0.1, 0.2, 1.0), (-0.6, 0.0, 1.0), (-0.5, 0.1, 1.0), (0.3, -0.4, 1.0)]
-    looks = [(0.4, -math.pi / 2), (math.radians(359), -1.0), (math.radians(1), -1.1), (2.0, -1.2)]
-    return tuple(
-        Sensor(
-            f"s{i}", 0.25, np.array(place), flat, *look, 0.2, 0.15, 0.1, 0.9, 0.2, coupling=coupling if i == 3 else None
-        )
-        for i, (place, look) in enumerate(zip(places, looks, strict=True))
-    )
+def test_a_twin_is_fitted_for_each_number_of_rays_alone_and_in_the_bandwidth_of_the_design():
+    asked = []
+    looks = [(0.4, -math.pi / 2), (math.radians(359), -1.0), (2.0, -1.2)]
+    down = tuple(normal_sensor(f"s{i}", 1 / 3, (0.1 * i, 0.2, 1.0), *look, 0.2) for i, look in enumerate(looks))
 
+    def twin(count, limit_mbps):
+        asked.append((count, limit_mbps))
+        return DesignSpec("no-visibility", down[:2])
 
-def test_a_twin_stands_for_no_visibility_with_as_many_rays():
-    made = []
-
-    def twin():
-        made.append(1)
-        points = np.tile([0.0, 0, 1, 0, -1.2, 1], (3, 1))
-        return DesignSpec("no-visibility", ceiling_sensors()[:2]), Samples(points, np.zeros(3), np.zeros(3), CEILING)
-
-    request = ceiling_request(
-        rays=(40, 80), baselines=("no-visibility",), train=carried(1, 4, 1), without_visibility=twin
-    )
+    request = make_request(
+        [DesignSpec("d", down)], task=SeenTask(), space=CEILING, rays=(40, 80), baselines=("no-visibility",),
+        train=carried(1, 4, 1), test=carried(2, 4, 2), without_visibility=twin,
+    )  # fmt: skip
     evaluation = evaluate(request)
     assert [(row.design, row.rays, row.baseline) for row in evaluation.rows] == [
         ("d", 40, False), ("d", 80, False), ("no-visibility", 40, True), ("no-visibility", 80, True)
     ]  # fmt: skip
-    assert len(made) == 1
-    own = {row.rays: row.bandwidth_mbps for row in evaluation.rows if row.design == "d"}
-    for row in evaluation.equal_bandwidth:
-        assert 0 < row.bandwidth_mbps <= own[row.matched_rays]
-        # the most that fit: one ray more costs about one share more
-        assert row.bandwidth_mbps * (row.rays + 2) / row.rays > own[row.matched_rays]
+    assert [(row.design, row.rays, row.matched_rays) for row in evaluation.equal_bandwidth] == [
+        ("no-visibility", 40, 40), ("no-visibility", 80, 80)
+    ]  # fmt: skip
+    own = [(row.rays, row.bandwidth_mbps) for row in evaluation.rows if row.design == "d"]
+    assert asked == [(40, None), (80, None), *own]
     evaluate(replace(request, baselines=("uniform",)))
-    assert len(made) == 1
+    assert len(asked) == 4
+
+
+def test_a_design_whose_rays_end_before_where_it_is_evaluated_is_refused():
+    rays = DesignSpec("cart", (upward(),)).rays(6)
+    pattern = Pattern.along("x_m", (0.0, 2.0), [rays, rays], (0.0, 2.0))
+    designs = [DesignSpec("cart", (upward(),), "chosen", (pattern,))]
+    assert entries_of(aisle_request(SeenTask((0.25, 1.5)), designs=designs, rays=(6,)))
+    with pytest.raises(ConfigError, match="design cart"):
+        entries_of(aisle_request(SeenTask(PLACES), designs=designs, rays=(6,)))

@@ -145,7 +145,7 @@ def test_over_seeds_rows_and_costs_are_means():
 
 def test_the_command_shows_what_careless_mounting_costs(lidardesign, tmp_path):
     run = make_run(tmp_path / "run", count=1000)
-    lidardesign("fit", run, "--layout", "grid", "--sensors", 2, "--name", "two")
+    lidardesign("fit", run, "--layout", "even", "--sensors", 2, "--name", "two")
     found = lidardesign("evaluate", run, "--rays", 16, "--set", "test=2", "--mount-error", "5mm,0.5deg", "--json")
     mounting = json.loads(found.out)["mounting"]
     assert (mounting["place_m"], mounting["angle_rad"]) == pytest.approx((0.005, 0.5 * DEGREE))

@@ -21,9 +21,8 @@ from support.report_pages import (
     make_shown,
     ray_segments,
 )
-from support.tables import each_row
 
-from lidardesign.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure, series
+from lidardesign.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure
 from lidardesign.report.markup import asset
 from lidardesign.report.page import report_html
 from lidardesign.report.scene_figure import (
@@ -41,6 +40,7 @@ from lidardesign.report.scene_figure import (
     round_steps,
     thinned,
 )
+from lidardesign.report.series import series
 from lidardesign.report.tables import (
     CommandTimes,
     constraints_table,
@@ -60,7 +60,7 @@ from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.scoring.evaluation.entries import StrongestRival
 from lidardesign.scoring.evaluation.results import Evaluation, leading_detail, verdict
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
 
 
@@ -204,7 +204,7 @@ def test_a_verdict_needs_an_interval_that_excludes_zero_and_the_metrics_directio
     assert [verdict(higher, pair) for pair in higher.paired] == ["worse", "open"]
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("better", "strongest", "far"),
     [("lower", "close", {"awful"}), ("lower", "awful", set()), ("higher", "close", set())],
 )
@@ -221,7 +221,9 @@ def test_rivals_are_hidden_at_first_where_they_are_far_worse_than_all_designs(be
 EGG = Ellipsoid((0.1, 0.2, 0.3))
 
 
-@each_row("shape", [Sphere(0.4), Box((0.1, 0.2, 0.3)), Capsule(0.1, 0.3), Cylinder(0.1, 0.3), EGG, Plane()])
+@pytest.mark.parametrize(
+    "shape", [Sphere(0.4), Box((0.1, 0.2, 0.3)), Capsule(0.1, 0.3), Cylinder(0.1, 0.3), EGG, Plane()]
+)
 def test_drawn_primitives_have_their_vertices_on_the_surface(shape):
     bounds = np.array([[-1.0, -1, -1], [1, 1, 1]])
     vertices, faces = body_triangles(Body(shape), 0, bounds)
@@ -300,7 +302,7 @@ def test_long_scenes_and_many_rays_are_thinned_evenly_and_the_page_says_so():
 
 
 def test_a_scan_of_hundreds_of_sensors_is_drawn_by_its_rays_alone():
-    design = DesignSpec("scan", tuple(make_sensor(f"s{i}") for i in range(MOST_SENSORS + 1)), layout="scan")
+    design = DesignSpec("scan", tuple(make_sensor(f"s{i}") for i in range(MOST_SENSORS + 1)))
     shown = make_shown(designs=1)
     one = replace(shown.designs[0], design=design, placed=(design,) * len(PLACES))
     document = view_document(replace(shown, designs=(one,)), series(make_evaluation("plain"))[:1])

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import pytest
 from support.report_pages import NASTY, make_evaluation, make_row, make_sensor
-from support.tables import each_row
 
 from lidardesign.report.page import headline, result_section
 from lidardesign.scoring.evaluation.entries import StrongestRival
 from lidardesign.scoring.evaluation.results import Evaluation, Paired
-from lidardesign.sensors.sensor import CERTIFICATES, DesignSpec
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
 
 RIVAL = StrongestRival("greedy", 25, 20, {"greedy": 5.5, "uniform": 20.0})
@@ -28,7 +27,7 @@ def pair(difference, low, high, rays=25, name="f"):
     return Paired(name, "greedy", rays, difference, low, high)
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("better", "found", "sentence"),
     [
         ("lower", (-0.6, -0.9, -0.3), "f is better than greedy by 0.60 mm (0.30 to 0.90) at 25 rays."),
@@ -72,7 +71,7 @@ def test_many_designs_are_told_by_the_table_alone_and_many_notes_are_folded():
 @pytest.mark.parametrize("rays", [25, 9])
 def test_the_certificate_of_the_rays_that_are_told_about_is_told(rays):
     entry = {"value": 0.8, "bound": 0.76, "gap": 0.05, "held_back_value": 0.9, "candidates": 125, "gates": 5}
-    design = DesignSpec("f", (make_sensor(),), provenance={CERTIFICATES: [{**entry, "rays": rays, "scenes": 50}]})
+    design = DesignSpec("f", (make_sensor(),), certificates=({**entry, "rays": rays, "scenes": 50},))
     text = result_section(evaluation_of(pair(-0.6, -0.9, -0.3)), [design])
     assert ("by more than 5.0 % (f)." in text) == (rays == 25)
 

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from support.evaluations import make_row
 from support.scoring import HitTask, MissTask, design, make_request, scenes
-from support.tables import each_row
 
 from lidardesign.scenes.casting import SceneCaster
-from lidardesign.scoring.baselines.greedy import GreedySource
 from lidardesign.scoring.evaluation.entries import (
     FEWEST_RIVAL_SCENES,
     LARGEST_RIVAL_SHARE,
@@ -26,16 +24,19 @@ from lidardesign.scoring.evaluation.seeds import over_seeds
 HELD_BACK = scenes(31, 40, side=0.3)
 
 
-def held_back_alone(purpose):
-    assert purpose == "held back"
-    return iter(HELD_BACK)
+class HeldBackAlone:
+    """Training scenes of a run, of which none may be asked for but those that no choice was made on."""
+
+    def scenes(self, purpose):
+        assert purpose == "held back"
+        return iter(HELD_BACK)
 
 
 def with_held_back(**changes):
-    return make_request(greedy=GreedySource(held_back_alone, 0.1), **changes)
+    return make_request(training=HeldBackAlone(), **changes)
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("counts", "middle"),
     [
         ({"a": [9]}, 9),
@@ -82,7 +83,7 @@ def test_held_out_scenes_have_no_say():
     assert [row.value for row in first.rows] != [row.value for row in second.rows]
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("tests", "rays", "scenes_used"),
     [(1, (9,), FEWEST_RIVAL_SCENES), (100, (25,), 12), (40, (9, 100), MOST_RIVAL_SCENES)],
 )

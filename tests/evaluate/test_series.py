@@ -3,28 +3,25 @@
 import csv
 import io
 
-import numpy as np
 import pytest
 from support.evaluations import make_evaluation
-from support.tables import each_row
+from support.sensors import normal_sensor
 
-from lidardesign.report.figures import COLOURS, axis_titles, log_ticks, logarithmic, series
 from lidardesign.report.scene_figure import constraint_slack_of
+from lidardesign.report.series import COLOURS, axis_titles, log_ticks, logarithmic, series
 from lidardesign.scoring.evaluation.results import csv_text, write_csv
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, -0.3, -0.3, 1.0), (0, 0, 0, 0.3, 0.3, 5.0))
 
 
-def make_sensor(name="s0"):
-    return Sensor(name, 1.0, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.1, 0.05, 3.0, 0.2)
-
-
 def test_a_design_without_constraints_has_no_bounds_but_those_of_its_space():
-    free = constraint_slack_of(DesignSpec("free", (make_sensor(),)), SPACE)
+    free = constraint_slack_of(DesignSpec("free", (normal_sensor(range_m=3.0, spread_range_m=0.2),)), SPACE)
     assert {one.name.split(".")[0] for one in free} == {"space"}
-    bound = DesignSpec("bound", (make_sensor(),), constraints={"gate": {"width_m": {"max": 1.0}}})
+    bound = DesignSpec(
+        "bound", (normal_sensor(range_m=3.0, spread_range_m=0.2),), constraints={"gate": {"width_m": {"max": 1.0}}}
+    )
     (row,) = [one for one in constraint_slack_of(bound, SPACE) if one.name == "gate.width_m.max"]
     assert row.room == pytest.approx(1.0 - 2 * 1.959964 * 0.2, abs=1e-5)
 
@@ -63,8 +60,8 @@ def test_the_table_holds_every_row_with_units_in_its_header(tmp_path):
     assert lines[-1][header.index("matched_to")] == "with, comma"
 
 
-@each_row("span", [4.1, 20.0, 29.0, 31.0, 1e5])
-@each_row("low", [0.037, 1.0, 5.7])
+@pytest.mark.parametrize("span", [4.1, 20.0, 29.0, 31.0, 1e5])
+@pytest.mark.parametrize("low", [0.037, 1.0, 5.7])
 def test_a_logarithmic_axis_has_at_least_three_labels_at_round_places_inside_it(low, span):
     ticks = log_ticks([low * span, low])
     assert ticks == sorted(set(ticks))

@@ -115,7 +115,7 @@ def test_seconds_of_steps_between_rows_of_the_progress_are_interpolated(runs, sw
 def fitted(runs, lidardesign, tmp_path):
     """A copy of a run, with a design, in the current folder."""
     shutil.copytree(runs, tmp_path / "run")
-    assert lidardesign("fit", "run", "--layout", "grid", "--sensors", "1", "--name", "one").code == 0
+    assert lidardesign("fit", "run", "--layout", "even", "--sensors", "1", "--name", "one").code == 0
     return tmp_path / "run"
 
 
@@ -156,7 +156,7 @@ def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_r
     assert document["steps"] == 8
     assert f"{document['misplaced']:.3g}" in done.err
     assert "--tolerance" in done.err
-    assert lidardesign("fit", "run", "--layout", "grid", "--sensors", "2").code == 0
+    assert lidardesign("fit", "run", "--layout", "even", "--sensors", "2").code == 0
     again = lidardesign("learn", "flatland", "--out", "run", "--resume", "--tolerance", "0.3")
     assert again.code == 2
     assert "learning.misplaced = 0.0001, not 0.3" in again.err

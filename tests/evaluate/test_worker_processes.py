@@ -12,19 +12,20 @@ from dataclasses import replace
 from multiprocessing.context import SpawnProcess
 
 import pytest
-from lidardesign.scoring.evaluation.workers import scorer_of
 from support.command_line import make_run, program
+from support.plugins import install_plugins
 from support.workers import make_request, results, without_times
 
 from lidardesign.errors import ConfigError, NumericalError, PluginError
 from lidardesign.registry import load_task
 from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.workers import opened_workers
 
 
 def test_processes_score_as_this_one_does_and_end():
     request, before = make_request(), multiprocessing.active_children()
-    with scorer_of(2, request.task, 6) as scorer:
-        assert results(evaluate(replace(request, scorer=scorer))) == results(evaluate(request))
+    with opened_workers(2, request.task, 6) as starmap:
+        assert results(evaluate(replace(request, starmap=starmap))) == results(evaluate(request))
         assert len(multiprocessing.active_children()) == len(before) + 2
     assert multiprocessing.active_children() == before
 
@@ -32,8 +33,8 @@ def test_processes_score_as_this_one_does_and_end():
 def test_a_worker_that_dies_ends_the_evaluation_with_what_to_do(install):
     task = install(f"import os\n{BROKEN}".replace('raise RuntimeError("the map of test 1 is lost")', "os._exit(7)"))
     request = make_request(task=task)
-    with pytest.raises(NumericalError, match="died") as raised, scorer_of(2, task, 6) as scorer:
-        evaluate(replace(request, scorer=scorer))
+    with pytest.raises(NumericalError, match="died") as raised, opened_workers(2, task, 6) as starmap:
+        evaluate(replace(request, starmap=starmap))
     assert "memory" in raised.value.hint
 
 
@@ -49,7 +50,7 @@ def test_a_system_that_allows_fewer_processes_leaves_none(monkeypatch):
     monkeypatch.setattr(SpawnProcess, "start", limited)
     with (
         pytest.raises(ConfigError, match="3 processes could not be started: Resource"),
-        scorer_of(3, make_request().task, 6),
+        opened_workers(3, make_request().task, 6),
     ):
         pass
     assert not started[0].is_alive()
@@ -60,21 +61,21 @@ def test_a_script_is_not_run_again_by_its_workers(tmp_path):
     script.write_text(
         "print('begun', flush=True)\n"
         "from support.workers import make_request\n"
-        "from lidardesign.scoring.evaluation.workers import scorer_of\n"
+        "from lidardesign.workers import opened_workers\n"
         "request = make_request()\n"
-        "with scorer_of(2, request.task, 2) as scorer:\n"
-        "    print(len(scorer(request.scene_pass(lambda number: [], request.planner), None)))\n"
+        "with opened_workers(2, request.task, 2) as starmap:\n"
+        "    print(*starmap(pow, [(2, 3), (3, 2)]))\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, env=environment)
-    assert done.stdout.split() == ["begun", "6"]
+    assert done.stdout.split() == ["begun", "8", "9"]
 
 
 BROKEN = """
 from lidardesign_tasks.flatland import FlatlandTask
 
-class BrokenTask(FlatlandTask):
-    name = "broken"
+class Task(FlatlandTask):
+    name = "NAME"
 
     def score(self, scene, returns):
         if scene.name == "test 1":
@@ -88,18 +89,12 @@ def install(tmp_path, monkeypatch):
     """Installs a task by its source."""
 
     def installed(source):
-        folder = tmp_path / "site"
-        (folder / "broken-1.0.dist-info").mkdir(parents=True)
-        (folder / "broken_task.py").write_text(source)
-        (folder / "broken-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
-        (folder / "broken-1.0.dist-info" / "entry_points.txt").write_text(
-            "[lidardesign.tasks]\nbroken = broken_task:BrokenTask\n"
-        )
-        monkeypatch.syspath_prepend(folder)
+        install_plugins(tmp_path / "site", {"broken": source})
+        monkeypatch.syspath_prepend(tmp_path / "site")
         return load_task("broken")
 
     yield installed
-    sys.modules.pop("broken_task", None)
+    sys.modules.pop("plugins_broken", None)
 
 
 @pytest.fixture
@@ -113,18 +108,18 @@ def test_what_a_plugin_raises_in_a_worker_arrives_whole(broken):
     for count in (1, 2):
         with (
             pytest.raises(PluginError, match="the map of test 1 is lost") as raised,
-            scorer_of(count, broken, 6) as scorer,
+            opened_workers(count, broken, 6) as starmap,
         ):
-            evaluate(replace(request, scorer=scorer))
+            evaluate(replace(request, starmap=starmap))
         said.append(raised.value.as_dict())
     assert said[0] == said[1]
-    assert "broken_task.py" in str(raised.value.__cause__)
+    assert "plugins_broken.py" in str(raised.value.__cause__)
 
 
 @pytest.fixture
 def run(lidardesign, tmp_path):
     folder = make_run(tmp_path / "run", count=1000)
-    assert lidardesign("fit", folder, "--layout", "grid", "--sensors", 1).code == 0
+    assert lidardesign("fit", folder, "--layout", "even", "--sensors", 1).code == 0
     return folder
 
 

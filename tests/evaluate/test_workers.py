@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import partial
@@ -9,19 +10,18 @@ from multiprocessing.reduction import ForkingPickler
 from types import MappingProxyType
 
 import pytest
-from lidardesign.scoring.evaluation.workers import check_workers, scorer_of
 from lidardesign_tasks.flatland import FlatlandTask
 from support.scoring import MissTask
-from support.tables import each_row
 from support.workers import make_request, random_rays, results
 
-from lidardesign import errors
+from lidardesign import errors, workers
 from lidardesign.errors import ConfigError, LidardesignError, PluginError
-from lidardesign.scoring.evaluation import workers
 from lidardesign.scoring.evaluation.score import evaluate
+from lidardesign.scoring.scene_scores import score_scenes
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner
 from lidardesign.task import Score
+from lidardesign.workers import check_workers, opened_workers
 
 
 def arrived(thing):
@@ -55,49 +55,46 @@ def executor():
 
 
 @pytest.fixture
-def scorer(executor):
-    return partial(workers._score_by, executor, lambda: 2)
+def starmap(executor):
+    return partial(workers._map_there, executor, lambda: 2, FlatlandTask())
 
 
-def test_rows_do_not_depend_on_who_scores_or_in_which_order(scorer):
+def test_rows_do_not_depend_on_who_scores_or_in_which_order(starmap):
     request = make_request()
-    assert results(evaluate(replace(request, scorer=scorer))) == results(evaluate(request))
+    assert results(evaluate(replace(request, starmap=starmap))) == results(evaluate(request))
 
 
-@each_row("name", ["single-photon", "consumer-8x8"])
+@pytest.mark.parametrize("name", ["single-photon", "consumer-8x8"])
 def test_effects_are_planned_and_audited_by_workers_as_they_are_here(name):
     planner = Planner(load_detector(name))
     request = make_request(planner=planner, audit=name == "single-photon", rays=(8,), equal_bandwidth=False)
     request = replace(request, test=request.test[:2])
-    scorer = partial(workers._score_by, BackwardExecutor(), lambda: 0)
-    assert results(evaluate(replace(request, scorer=scorer))) == results(evaluate(request))
+    starmap = partial(workers._map_there, BackwardExecutor(), lambda: 0, request.task)
+    assert results(evaluate(replace(request, starmap=starmap))) == results(evaluate(request))
 
 
-@each_row("kind", ["ConfigError", "DataError", "PluginError", "NumericalError", "InfeasibleError"])
+@pytest.mark.parametrize("kind", ["ConfigError", "DataError", "PluginError", "NumericalError", "InfeasibleError"])
 def test_errors_arrive_whole(kind):
     error = getattr(errors, kind)("found", where="here", allowed="this", hint="that")
     assert arrived(error).as_dict() == error.as_dict()
     assert (type(arrived(error)), str(arrived(error))) == (type(error), str(error))
 
 
-def test_details_of_any_mapping_arrive(monkeypatch, scorer):
+def test_details_of_any_mapping_arrive(monkeypatch, starmap):
     monkeypatch.setattr(
         FlatlandTask, "score", lambda self, scene, returns: Score(0.5, details=MappingProxyType({"seen": 3.0}))
     )
-    evaluation = evaluate(replace(make_request(), scorer=scorer))
+    evaluation = evaluate(make_request(starmap=starmap))
     assert evaluation.rows[0].details == {"seen": 3.0}
 
 
-def test_progress_counts_scenes_and_never_goes_back(scorer):
+def test_progress_names_each_scene_before_it_is_waited_for(starmap):
     counted = []
-    evaluate(
-        replace(make_request(), scorer=scorer), progress=lambda name, done, total: counted.append((name, done, total))
-    )
-    assert counted[0] == ("test 0", 0, 6)
-    assert counted[1:] == [(f"test {number}", number + 1, 6) for number in range(6)]
+    evaluate(make_request(starmap=starmap), progress=lambda *arguments: counted.append(arguments))
+    assert counted == [*((f"test {number}", number, 6) for number in range(6)), ("", 6, 6)]
 
 
-def test_the_first_scenes_error_is_raised_and_no_further_scene_is_begun(monkeypatch, scorer, executor):
+def test_the_first_scenes_error_is_raised_and_no_further_scene_is_begun(monkeypatch, starmap, executor):
     def score(self, scene, returns):
         if scene.name in ("test 0", "test 1"):
             raise ValueError(f"no score of {scene.name}")
@@ -106,19 +103,22 @@ def test_the_first_scenes_error_is_raised_and_no_further_scene_is_begun(monkeypa
     monkeypatch.setattr(FlatlandTask, "score", score)
     scenes = make_request().scene_pass(lambda number: [(random_rays(3, number),)], Planner())
     with pytest.raises(PluginError, match="no score of test 0"):
-        scorer(scenes, None)
+        score_scenes(scenes, starmap=starmap)
     assert executor.asked < 6
 
 
+def test_results_come_in_the_order_of_what_was_asked(starmap):
+    assert list(starmap(divmod, [(number, 3) for number in range(6)])) == [divmod(number, 3) for number in range(6)]
+
+
 def test_a_worker_of_another_version_is_refused():
-    scenes = make_request().scene_pass(lambda number: [], Planner())
     with pytest.raises(ConfigError, match="the cluster has lidardesign"):
-        workers._score_there("lidardesign 9.9", scenes.task)
+        workers._call("lidardesign 9.9", FlatlandTask(), divmod, 7, 3)
 
 
-@each_row("task", [type("Other", (FlatlandTask,), {})(), MissTask()])
+@pytest.mark.parametrize("task", [type("Other", (FlatlandTask,), {})(), MissTask()])
 def test_a_task_that_is_not_installed_is_refused_before_any_worker_is_asked(task):
-    with pytest.raises(ConfigError, match=task.name), scorer_of("tcp://127.0.0.1:1", task, 6):
+    with pytest.raises(ConfigError, match=task.name), opened_workers("tcp://127.0.0.1:1", task, 6):
         pass
 
 
@@ -127,18 +127,18 @@ BAD = ("0", "-1", "1025", "1.5", "", "two", "tcp://", "tcp://host", "tcp://host:
 BAD += ("http://host:80", "tcp://host:80/x", "99999999999999999999", "tcp:// :80", "²")
 
 
-@each_row("text", GOOD)
+@pytest.mark.parametrize("text", GOOD)
 def test_workers_are_a_number_or_an_address(text):
     assert check_workers(text) == GOOD[text]
 
 
-@each_row("text", BAD)
+@pytest.mark.parametrize("text", BAD)
 def test_workers_that_are_neither_are_refused(text):
     with pytest.raises(ConfigError, match="--workers"):
         check_workers(text)
 
 
-@each_row(("count", "scenes"), [(1, 9), (8, 1)])
+@pytest.mark.parametrize(("count", "scenes"), [(1, 9), (8, 1)])
 def test_one_process_is_this_one(count, scenes):
-    with scorer_of(count, MissTask(), scenes) as scorer:
-        assert scorer is workers.score_here
+    with opened_workers(count, MissTask(), scenes) as starmap:
+        assert starmap is itertools.starmap

@@ -9,14 +9,14 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 from support.rigs import even, farthest_nearest, sensor
-from support.tables import each_row
+from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
 
-ONE = DesignSpec("one", (Sensor("one", 1.0, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.1),))
+ONE = DesignSpec("one", (normal_sensor("one"),))
 
 
 def rays_with_gates(gates_m):
@@ -87,7 +87,7 @@ def helios_scanner(folder, gates_m):
     return scanner, list(scanner.iter("channel")), notes
 
 
-@each_row("version", HELIOS)
+@pytest.mark.parametrize("version", HELIOS)
 def test_helios_returns_what_lies_inside_a_gate_wherever_that_starts(tmp_path, version):
     gates_m = np.array([[0, 0.0005], [0, 100], [1e-6, 25], [0.001, 100], [0.02, 3], [0.4, 0.5], [5, 100], [24.9, 25]])
     scanner, channels, notes = helios_scanner(tmp_path / "out", gates_m)
@@ -105,7 +105,7 @@ def test_helios_returns_what_lies_inside_a_gate_wherever_that_starts(tmp_path, v
     assert any("3 of 8 rays start below 0.001 m" in note for note in notes)
 
 
-@each_row("version", HELIOS)
+@pytest.mark.parametrize("version", HELIOS)
 def test_helios_would_send_no_power_through_a_gate_from_0(tmp_path, version):
     scanner, [channel], _ = helios_scanner(tmp_path / "out", np.array([[0.0, 25]]))
     found = helios_range_m(scanner, channel, 1.0, version, 1.0, start_m=0.0)
@@ -163,7 +163,7 @@ CARLA_GRIDS = {
 }
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("rate_hz", "case"),
     [(rate, case) for rate in (2.5, 3.7, 10, 29.97, 30, 60, 144, 333, 2000) for case in CARLA_GRIDS],
 )
@@ -190,16 +190,16 @@ def test_every_frame_of_carla_has_the_grids_rays_once(tmp_path, rate_hz, case):
 
 
 # few numbers near these do
-HARD_TO_SWEEP = """
-1024.3652784223673 0.015327117154160736
-128.03374440245298 25.87963506289764
-512.4703039523956 121.9597825772253
-128.01017118282869 1.5650519973915888
-4.00009405912849 91.6654571465388
-"""
+HARD_TO_SWEEP = [
+    (1024.3652784223673, 0.015327117154160736),
+    (128.03374440245298, 25.87963506289764),
+    (512.4703039523956, 121.9597825772253),
+    (128.01017118282869, 1.5650519973915888),
+    (4.00009405912849, 91.6654571465388),
+]
 
 
-@each_row(("rate_hz", "field_deg"), [map(float, row.split()) for row in HARD_TO_SWEEP.strip().splitlines()])
+@pytest.mark.parametrize(("rate_hz", "field_deg"), HARD_TO_SWEEP)
 def test_carla_sweeps_just_the_whole_field_in_a_frame(tmp_path, rate_hz, field_deg):
     field = np.radians(field_deg)
     local = even(4, 1, (-field / 2, field / 4), (0.0, 0.0))
@@ -214,7 +214,7 @@ def test_carla_sweeps_just_the_whole_field_in_a_frame(tmp_path, rate_hz, field_d
     assert float(text["horizontal_fov"]) == pytest.approx(field_deg, rel=5e-4)
 
 
-@each_row("rate_hz", [0.001, 1.0, 2.49, 2001, 1e5])
+@pytest.mark.parametrize("rate_hz", [0.001, 1.0, 2.49, 2001, 1e5])
 def test_carla_refuses_frames_that_unreal_does_not_have(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match=r"--rate-hz[\s\S]*2\.5 to 2000 Hz"):
         EXPORTERS["carla"].write(ONE, rays_with_gates(np.array([[0.0, 9.0]])), tmp_path / "out.json", rate_hz)
@@ -270,7 +270,7 @@ GAZEBO_GRIDS = {
 }
 
 
-@each_row("case", GAZEBO_GRIDS)
+@pytest.mark.parametrize("case", GAZEBO_GRIDS)
 def test_gazebos_pixels_are_no_farther_from_the_rays_than_the_note_says(tmp_path, case):
     (columns, rows), azimuth, elevation, side = GAZEBO_GRIDS[case]
     local = even(columns, rows, azimuth, elevation)
@@ -298,7 +298,7 @@ def test_gazebos_pixels_are_no_farther_from_the_rays_than_the_note_says(tmp_path
 # RGLGazeboPlugin: Lidar.cc, LidarPatternLoader.cc; RobotecGPULidar: src/graph/SetRangeRaysNode.cpp
 
 
-@each_row("rate_hz", [0.001, 29.97, 1e6])
+@pytest.mark.parametrize("rate_hz", [0.001, 29.97, 1e6])
 def test_rgl_takes_patterns_ranges_and_rates_at_their_ends(tmp_path, rate_hz):
     gates_m = np.array([[0, 0], [0, 1e-9], [0.3, 0.3 + 1e-12], [1e-30, 1e9]])
     EXPORTERS["rgl"].write(ONE, rays_with_gates(gates_m), tmp_path / "out", rate_hz)

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lidardesign.layouts.rays import lay_out
-from support.tables import each_row
+from support.sensors import normal_sensor
 
 from lidardesign.errors import DataError
 from lidardesign.formats.designs import load_design
 from lidardesign.formats.galvo import SPEED_OF_LIGHT_M_PER_PS, read_galvo
 from lidardesign.formats.mounts import angles_between
 from lidardesign.formats.registry import EXPORTERS
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.sensor import interval_factor
 
 
 def design(count=2):
-    numbers = (0.0, 0.1, 0.05, 1.0, 0.1)
     sensors = tuple(
-        Sensor(f"s{i}, größe", 1 / count, np.array([0.1 * i, -0.2, 1 / 3]), np.eye(3), i * 2.0, -0.7 * i, *numbers)
+        normal_sensor(
+            f"s{i}, größe", 1 / count, (0.1 * i, -0.2, 1 / 3), i * 2.0, -0.7 * i, origin_covariance_m2=np.eye(3)
+        )
         for i in range(count)
     )
-    return DesignSpec("two", sensors, rays=37, constraints={"gate": {"width_m": {"max": 1.0}}})
+    return DesignSpec("two", sensors, constraints={"gate": {"width_m": {"max": 1.0}}, "budget": {"rays": 37}})
 
 
 def read_csv(path):
@@ -35,10 +36,10 @@ def read_npz(path):
         return dict(arrays)
 
 
-@each_row(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
-@each_row("count", [0, 1, 37])
+@pytest.mark.parametrize(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
+@pytest.mark.parametrize("count", [0, 1, 37])
 def test_a_ray_list_comes_back_to_the_last_bit(tmp_path, name, read, count):
-    rays = lay_out(design(), count)
+    rays = design().rays(count)
     path = tmp_path / "out"
     notes = EXPORTERS[name].write(design(), rays, path)
     columns = read(path)
@@ -54,10 +55,10 @@ def test_a_ray_list_comes_back_to_the_last_bit(tmp_path, name, read, count):
 
 def test_the_sensor_table_is_a_design_again(tmp_path):
     path = tmp_path / "two.csv"
-    notes = EXPORTERS["sensors-csv"].write(design(), lay_out(design()), path)
+    notes = EXPORTERS["sensors-csv"].write(design(), design().rays(), path)
     assert any("37 rays" in note for note in notes)
     loaded = load_design(path)
-    np.testing.assert_allclose(lay_out(loaded, 37).direction, lay_out(design()).direction, atol=1e-12)
+    np.testing.assert_allclose(loaded.rays(37).direction, design().rays().direction, atol=1e-12)
 
 
 def contents(path):
@@ -66,21 +67,21 @@ def contents(path):
     return {str(file.relative_to(path)): file.read_bytes() for file in files}
 
 
-@each_row("name", EXPORTERS)
+@pytest.mark.parametrize("name", EXPORTERS)
 def test_every_format_is_written_whole_or_not_at_all(tmp_path, name):
     exporter = EXPORTERS[name]
     assert exporter.name == name
     assert exporter.suffix.startswith(".")
     path = tmp_path / f"a design{exporter.suffix}"
-    exporter.write(design(), lay_out(design()), path)
+    exporter.write(design(), design().rays(), path)
     assert path.is_dir() == exporter.folder
     first = contents(path)
-    exporter.write(design(), lay_out(design()), path)
+    exporter.write(design(), design().rays(), path)
     assert contents(path) == first
     assert list(tmp_path.iterdir()) == [path]
 
 
-@each_row("name", EXPORTERS)
+@pytest.mark.parametrize("name", EXPORTERS)
 def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(tmp_path, name):
     exporter, path = EXPORTERS[name], tmp_path / "taken"
     if exporter.folder:
@@ -88,7 +89,7 @@ def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(tmp_path
     else:
         path.mkdir()
     with pytest.raises(DataError, match="taken"):
-        exporter.write(design(), lay_out(design()), path)
+        exporter.write(design(), design().rays(), path)
     assert contents(path) == ({".": b"mine"} if exporter.folder else {})
 
 
@@ -97,13 +98,12 @@ ROUNDING = 1e-15
 
 def plain_design(roll=0.0):
     sensors = tuple(
-        Sensor(f"s{i}", 0.5, np.array([0.1, -0.2, 1 / 3]), np.zeros((3, 3)), 0.1 * i, -0.07, roll, 0.05, 0.02, 1.0, 0.1)
-        for i in range(2)
+        normal_sensor(f"s{i}", 0.5, (0.1, -0.2, 1 / 3), 0.1 * i, -0.07, roll, (0.05, 0.02)) for i in range(2)
     )
-    return DesignSpec("two", sensors, rays=37)
+    return DesignSpec("two", sensors)
 
 
-RAYS = lay_out(plain_design(), 37)
+RAYS = plain_design().rays(37)
 
 
 def test_a_scanners_gates_are_off_by_less_than_a_picosecond(tmp_path):
@@ -116,10 +116,10 @@ def test_a_scanners_gates_are_off_by_less_than_a_picosecond(tmp_path):
     assert any("whole picoseconds" in note for note in notes)
 
 
-@each_row(("roll", "spread_rad"), [(0.0, 0.05), (np.pi / 2, 0.02)])
+@pytest.mark.parametrize(("roll", "spread_rad"), [(0.0, 0.05), (np.pi / 2, 0.02)])
 def test_a_roll_that_a_table_cannot_hold_is_told_and_stays_in_its_spreads(tmp_path, roll, spread_rad):
     path = tmp_path / "two.csv"
     notes = EXPORTERS["sensors-csv"].write(plain_design(roll), RAYS, path)
     assert any("roll is lost" in note for note in notes) == (roll != 0)
     for one in load_design(path).sensors:
-        assert one.spread_horizontal_rad == pytest.approx(spread_rad, abs=ROUNDING)
+        assert one.field_of_view_rad[0] == pytest.approx(2 * interval_factor(0.95) * spread_rad, abs=ROUNDING)

@@ -10,9 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from lidardesign.layouts.rays import lay_out
 from support.rigs import NASTY, even, farthest_nearest, read_sdf, rig, sdf_reader, spinning
-from support.tables import each_row
 
 from lidardesign.api.export import DesignSource, ExportRequest
 from lidardesign.errors import ConfigError, DataError
@@ -23,7 +21,7 @@ from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.mujoco_models import RobotFile, bodies_from_mujoco, load_model
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, Sphere, rigid
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 
 ROBOTS = ("mjcf", "sdf", "urdf", "xacro", "carla", "isaac-usd")
 GRIDS = ("sdf", "urdf", "xacro", "carla")
@@ -181,7 +179,7 @@ def test_sensors_on_a_robot_measure_our_distances_wherever_it_is(tmp_path, robot
 
 def test_a_mounted_design_goes_into_the_model_of_its_run(tmp_path):
     config = SimpleNamespace(task=SimpleNamespace(model=own_robot(tmp_path), folder=tmp_path))
-    fixed = replace(DESIGN, mount="torso", layout="fixed", rays=len(RAYS), ray_table=RAYS)
+    fixed = replace(DESIGN, mount="torso")
     source = DesignSource(fixed, SimpleNamespace(config=config, folder=tmp_path))
     exported = ExportRequest(source, EXPORTERS["mjcf"], tmp_path / "with.xml").write()
     assert exported.rays == len(RAYS)
@@ -220,9 +218,9 @@ def test_a_ray_along_any_axis_is_a_site_that_looks_there(tmp_path):
 
 
 def test_two_sensors_of_one_name_are_two_bodies(tmp_path):
-    twins = DesignSpec("twins", (DESIGN.sensors[0], DESIGN.sensors[0]), rays=2)
+    twins = DesignSpec("twins", (DESIGN.sensors[0], DESIGN.sensors[0]))
     path = tmp_path / "twins.xml"
-    EXPORTERS["mjcf"].write(twins, lay_out(twins, 2), path)
+    EXPORTERS["mjcf"].write(twins, twins.rays(2), path)
     model, _ = simulated(path)
     assert {model.body(index).name for index in (1, 2)} == {"front left", "front left 2"}
 
@@ -239,12 +237,12 @@ def test_no_name_is_a_word_of_the_format(reader, tmp_path):
             check_gazebo(read_sdf(reader, path), design, rays, 1e-9)
 
 
-@each_row("name", ["mjcf", "sdf"])
+@pytest.mark.parametrize("name", ["mjcf", "sdf"])
 def test_what_is_written_for_a_simulator_is_a_design_again(tmp_path, name):
     design, rays = spinning()
     path = tmp_path / f"spin{EXPORTERS[name].suffix}"
     EXPORTERS[name].write(design, rays, path)
-    found = lay_out(load_design(path))
+    found = load_design(path).rays()
     assert len(found) == len(rays)
     assert farthest_nearest(rays.direction, found.direction) < 1e-7
     np.testing.assert_allclose(found.origin_m, rays.origin_m, atol=1e-12)
@@ -312,7 +310,7 @@ def test_urdfdom_finds_a_link_per_sensor(exported):
     assert check_urdf(exported["urdf"][0]) == {"lidar_base", *(f"{name}_link" for name in NAMES)}
 
 
-@each_row("name", ["lidar_base", "World", "world link"])
+@pytest.mark.parametrize("name", ["lidar_base", "World", "world link"])
 def test_no_sensor_takes_the_name_of_what_holds_it(tmp_path, name):
     one = replace(DESIGN.sensors[0], name=name)
     path = tmp_path / "named.urdf"
@@ -360,7 +358,7 @@ def described(path):
     return found
 
 
-@each_row("name", GRIDS[:3])
+@pytest.mark.parametrize("name", GRIDS[:3])
 def test_a_description_holds_the_rays_that_are_on_even_grids_and_says_how_far_off_others_are(exported, name):
     path, notes = exported[name]
     found = described(path)
@@ -373,7 +371,7 @@ def test_a_description_holds_the_rays_that_are_on_even_grids_and_says_how_far_of
     assert told < 0.3
 
 
-@each_row("name", ROBOTS)
+@pytest.mark.parametrize("name", ROBOTS)
 def test_what_a_format_cannot_hold_is_counted(exported, name):
     _, notes = exported[name]
     assert any("start all over them" in note for note in notes) == (name != "mjcf")
@@ -381,7 +379,7 @@ def test_what_a_format_cannot_hold_is_counted(exported, name):
     assert any(note.startswith("23 of 50 rays are not on an even grid") for note in notes) == (name in GRIDS)
 
 
-@each_row("name", ROBOTS)
+@pytest.mark.parametrize("name", ROBOTS)
 def test_a_gate_start_that_is_not_held_is_told(exported, name):
     told = [note for note in exported[name][1] if "gate start" in note]
     assert len(told) == (name in ("mjcf", "carla"))
@@ -392,14 +390,14 @@ def test_a_gate_start_that_is_not_held_is_told(exported, name):
         assert f"{RAYS.gate_m[RAYS.gate_m[:, 0] > 0, 0].min():.3g} to 1 m" in told[0]
 
 
-@each_row("rate_hz", [np.nan, np.inf, 0.0, -1.0, 1e-320, 1e300])
+@pytest.mark.parametrize("rate_hz", [np.nan, np.inf, 0.0, -1.0, 1e-320, 1e300])
 def test_no_sensor_has_such_a_frame_rate(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match=r"0\.001 to 1e"):
         EXPORTERS["sdf"].write(DESIGN, RAYS, tmp_path / "out", rate_hz)
     assert not list(tmp_path.iterdir())
 
 
-@each_row("name", ["mjcf", "sdf", "urdf", "xacro"])
+@pytest.mark.parametrize("name", ["mjcf", "sdf", "urdf", "xacro"])
 def test_names_cannot_leave_their_attribute(exported, name):
     path, notes = exported[name]
     text = path.read_text(encoding="utf-8")

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.tables import each_row
+from support.sensors import normal_sensor
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.mounts import mounts
 from lidardesign.formats.registry import EXPORTERS
 from lidardesign.scenes.rays import Rays
-from lidardesign.sensors.sensor import DesignSpec, Sensor
+from lidardesign.sensors.design import DesignSpec
 
 SCHEMAS = Path(__file__).parents[1] / "schemas"
 MINE = ("helios", "osi", "rgl", "mitsuba", "ply", "stl")
@@ -36,7 +36,7 @@ def design(names=NASTY, roll=True):
         elevation = (-np.pi / 2, np.pi / 2)[number] if number < 2 else elevation
         origin, spreads = generator.uniform(-3, 3, 3), generator.uniform(0.05, 0.2, 2)
         pose = (azimuth, elevation, turn if roll else 0.0)
-        sensors.append(Sensor(name, 1 / len(names), origin, np.zeros((3, 3)), *pose, *spreads, 4.0, 0.5))
+        sensors.append(normal_sensor(name, 1 / len(names), origin, *pose, spreads, 4.0, 0.5))
     return DesignSpec("a <design> & 'more'", tuple(sensors), constraints={"gate": {"width_m": {"max": 9.0}}})
 
 
@@ -77,13 +77,13 @@ def written(tmp_path_factory):
     return found
 
 
-@each_row("name", FORMATS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_every_format_says_that_it_does_not_hold_the_constraints(written, name):
     for case in CASES:
         assert any("constraints" in note for note in written[name, case][1])
 
 
-@each_row("name", MINE)
+@pytest.mark.parametrize("name", MINE)
 def test_names_of_files_are_plain_whatever_the_sensors_are_called(written, name):
     for case in CASES:
         path, _ = written[name, case]
@@ -92,14 +92,14 @@ def test_names_of_files_are_plain_whatever_the_sensors_are_called(written, name)
         assert len({one.lower() for one in files}) == len(files)
 
 
-@each_row("name", ["helios", "osi", "rgl", "mitsuba"])
+@pytest.mark.parametrize("name", ["helios", "osi", "rgl", "mitsuba"])
 def test_sensors_that_fire_nothing_are_left_out_and_told(tmp_path, name):
     rays = CASES["mounted"].subset(CASES["mounted"].sensor % 2 == 0)
     notes = EXPORTERS[name].write(DESIGN, rays, tmp_path / "out")
     assert "3 of 6 sensors fire no ray and are left out" in notes
 
 
-@each_row("name", [name for name in EXPORTERS if name not in ("csv", "npz", "galvo", "sensors-csv")])
+@pytest.mark.parametrize("name", [name for name in EXPORTERS if name not in ("csv", "npz", "galvo", "sensors-csv")])
 def test_formats_made_of_rays_refuse_a_design_without_them_and_others_take_it(tmp_path, name):
     none, exporter = CASES["mounted"].subset(np.arange(0)), EXPORTERS[name]
     if name in ("helios", "osi", "rgl", "mitsuba"):
@@ -111,7 +111,7 @@ def test_formats_made_of_rays_refuse_a_design_without_them_and_others_take_it(tm
     assert ("6 of 6 sensors fire no ray and are left out" in notes) == (name not in ("ply", "stl"))
 
 
-@each_row("name", EXPORTERS)
+@pytest.mark.parametrize("name", EXPORTERS)
 def test_a_format_holds_its_frame_rate_or_refuses_one(tmp_path, name):
     exporter, path, rays = EXPORTERS[name], tmp_path / "out", NARROW
     if not exporter.rated:
@@ -174,7 +174,7 @@ def helios_pulses(folder, survey):
     return fired
 
 
-@each_row("case", CASES)
+@pytest.mark.parametrize("case", CASES)
 def test_helios_fires_every_ray_once_with_its_own_gate(written, case):
     folder, _ = written["helios", case]
     rays, surveys = CASES[case], sorted(folder.glob("*.survey.xml"))
@@ -188,7 +188,7 @@ def test_helios_fires_every_ray_once_with_its_own_gate(written, case):
     assert len(set(nearest.argmin(axis=1))) == len(rays)
 
 
-@each_row("case", CASES)
+@pytest.mark.parametrize("case", CASES)
 def test_helios_files_are_valid(written, case):
     etree = pytest.importorskip("lxml.etree", reason="lxml is not installed")
     folder, _ = written["helios", case]
@@ -250,8 +250,8 @@ def published_osi_message():
     return module.SensorViewConfiguration()
 
 
-@each_row("message", [own_osi_message, published_osi_message])
-@each_row("case", CASES)
+@pytest.mark.parametrize("message", [own_osi_message, published_osi_message])
+@pytest.mark.parametrize("case", CASES)
 def test_osi_is_read_by_protobuf_and_its_rays_are_ours(written, case, message):
     json_format = pytest.importorskip("google.protobuf.json_format", reason="protobuf is not installed")
     path, _ = written["osi", case]
@@ -277,7 +277,7 @@ def test_osi_is_read_by_protobuf_and_its_rays_are_ours(written, case, message):
     assert (found.update_cycle_time.seconds, found.update_cycle_time.nanos) == (0, 100_000_000)
 
 
-@each_row("rate_hz", [0.001, 10.0, 30.0, 1e6])
+@pytest.mark.parametrize("rate_hz", [0.001, 10.0, 30.0, 1e6])
 def test_osi_fires_nothing_in_the_next_frame(tmp_path, rate_hz):
     rays = CASES["mounted"]
     late = Rays(rays.origin_m, rays.direction, rays.gate_m, rays.sensor, np.linspace(0, 0.1, len(rays), endpoint=False))
@@ -289,7 +289,7 @@ def test_osi_fires_nothing_in_the_next_frame(tmp_path, rate_hz):
     assert max(times_us) >= 1e6 / rate_hz - 1
 
 
-@each_row("rate_hz", [1e-5, 1e10])
+@pytest.mark.parametrize("rate_hz", [1e-5, 1e10])
 def test_osi_refuses_frames_whose_times_it_cannot_count(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match="rate-hz"):
         EXPORTERS["osi"].write(DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=rate_hz)
@@ -298,7 +298,7 @@ def test_osi_refuses_frames_whose_times_it_cannot_count(tmp_path, rate_hz):
 # Robotec GPU Lidar --------------------------------------------------------------------------------------------------
 
 
-@each_row("case", CASES)
+@pytest.mark.parametrize("case", CASES)
 def test_rgl_patterns_look_along_the_third_axis_of_proper_poses(written, case):
     folder, _ = written["rgl", case]
     rays, rows = CASES[case], []
@@ -368,8 +368,7 @@ def rendered(tmp_path_factory):
     names = ("left & <right>", "other")
     at = (np.array([0.3, -0.2, 0.0]), np.array([-2.0, 0.5, 0.1]))
     sensors = tuple(
-        Sensor(name, 0.5, place, np.zeros((3, 3)), 1.0, -1.2, 0.4, 0.1, 0.1, 1.25, 0.1)
-        for name, place in zip(names, at, strict=True)
+        normal_sensor(name, 0.5, place, 1.0, -1.2, 0.4, (0.1, 0.1), 1.25) for name, place in zip(names, at, strict=True)
     )
     some = DesignSpec("floor", sensors)
     rays = rays_of(some, count=40)
@@ -502,8 +501,7 @@ def test_ply_frusta_hold_what_lies_in_the_field_of_view_and_gate(written):
 
 
 def test_ply_leaves_out_frusta_that_have_no_width(tmp_path):
-    thin = Sensor("thin", 1.0, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.1)
-    some = DesignSpec("scan", (thin,), layout="scan")
+    some = DesignSpec("ray", (normal_sensor("thin", spread_rad=(0.0, 0.0)),))
     notes = EXPORTERS["ply"].write(some, rays_of(some, count=1), tmp_path / "out")
     assert "1 of 1 sensors have no width, so no frustum" in notes
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["beams.ply", "rays.ply"]
@@ -539,9 +537,8 @@ def test_names_that_look_like_the_format_do_not_become_part_of_it(tmp_path):
     assert len(trimesh.load(tmp_path / "out.ply.d" / "rays.ply", process=False).vertices) == len(rays)
 
 
-@each_row(("name", "what"), [("stl", "solids"), ("ply", "frusta")])
+@pytest.mark.parametrize(("name", "what"), [("stl", "solids"), ("ply", "frusta")])
 def test_shapes_of_sensors_that_are_regions_stand_in_their_middles_and_say_so(tmp_path, name, what):
-    wide = Sensor("wide", 1.0, np.zeros(3), np.diag([1.0, 0, 0]), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.1)
-    some = DesignSpec("region", (wide,))
+    some = DesignSpec("region", (normal_sensor("wide", origin_covariance_m2=np.diag([1.0, 0, 0])),))
     notes = EXPORTERS[name].write(some, rays_of(some), tmp_path / "out")
-    assert f"1 sensors are regions of up to 3.92 m: {what} stand in their middles" in notes
+    assert any("1 sensors are regions" in note and f"1 m: {what} stand in their middles" in note for note in notes)

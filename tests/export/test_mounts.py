@@ -3,10 +3,10 @@
 from xml.etree import ElementTree
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.rigs import even, farthest_nearest, sensor
-from support.tables import each_row
 
 from lidardesign.formats.mounts import grid_losses, mounts, nearest_grid, quaternion
 from lidardesign.formats.names import (
@@ -18,8 +18,9 @@ from lidardesign.formats.names import (
     xml_text,
 )
 from lidardesign.scenes.rays import Rays, rotation_of_quaternion
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.pattern import grid_tangent
-from lidardesign.sensors.sensor import DesignSpec, tangent_directions
+from lidardesign.sensors.sensor import tangent_directions
 from lidardesign.space import angles, direction
 
 angle = st.floats(-1.2, 1.2)
@@ -40,8 +41,8 @@ def test_an_even_grid_is_found_again(columns, rows, left, width, low, height):
     assert found.distance_rad(azimuth, elevation).max() < 1e-6
 
 
-@each_row("columns", [1, 2, 3, 7, 360])
-@each_row("turn", [0.0, 0.4, np.pi, -2.9])
+@pytest.mark.parametrize("columns", [1, 2, 3, 7, 360])
+@pytest.mark.parametrize("turn", [0.0, 0.4, np.pi, -2.9])
 def test_a_whole_turn_is_found_wherever_it_begins(columns, turn):
     step = 2 * np.pi / columns
     wanted = even(columns, 3, (turn, turn + 2 * np.pi - step), (-0.2, 0.1))
@@ -62,7 +63,7 @@ def test_any_rays_are_near_the_grid_by_no_more_than_is_said(count, seed):
     assert far <= grid.distance_rad(azimuth, elevation).max() + 1e-12
 
 
-@each_row("wide_deg", [5, 20, 40])
+@pytest.mark.parametrize("wide_deg", [5, 20, 40])
 def test_our_own_grids_are_nearly_even(wide_deg):
     """The tangent plane's grid is off by the third power of the angle."""
     field = np.radians(wide_deg)
@@ -90,7 +91,7 @@ def test_notes_count_the_rays_that_move():
     assert 0.15 < told < 0.3
 
 
-@each_row("seed", range(8))
+@pytest.mark.parametrize("seed", range(8))
 def test_a_mounts_rotation_is_its_sensors_frame(seed):
     generator = np.random.default_rng(seed)
     elevation = (np.pi / 2, -np.pi / 2)[seed] if seed < 2 else generator.uniform(-1.5, 1.5)

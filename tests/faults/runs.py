@@ -29,7 +29,7 @@ FINISHED = (0, 1)
 TIMES = ("manifest.json", "page.html")
 COMMANDS = {
     "learn": LEARN,
-    "fit": ["fit", "run", "--layout", "grid", "--sensors", "2", "--quiet"],
+    "fit": ["fit", "run", "--layout", "even", "--sensors", "2", "--quiet"],
     # half of its time it writes
     "evaluate": ["evaluate", "run", "--rays", "8", "--csv", "run/rows.csv", "--report", "run/page.html",
                  "--quiet"],

@@ -11,7 +11,6 @@ import time
 import numpy as np
 import pytest
 from support.meshes import BOX_FACES, BOX_VERTICES, write_box
-from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.scenes.mesh_files import load_mesh
@@ -121,7 +120,7 @@ TEXTS = {
 }  # fmt: skip
 
 
-@each_row("suffix, content, message", list(TEXTS.values()), ids=list(TEXTS))
+@pytest.mark.parametrize(("suffix", "content", "message"), list(TEXTS.values()), ids=list(TEXTS))
 def test_a_mesh_that_names_or_promises_what_it_lacks_is_refused_with_its_place(tmp_path, suffix, content, message):
     path = tmp_path / f"mesh.{suffix}"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -207,7 +206,7 @@ GLTF = {
 }  # fmt: skip
 
 
-@each_row("path, value, message", list(GLTF.values()), ids=list(GLTF))
+@pytest.mark.parametrize(("path", "value", "message"), list(GLTF.values()), ids=list(GLTF))
 def test_a_gltf_that_names_or_promises_what_it_lacks_is_refused_with_its_place(tmp_path, path, value, message):
     file = tmp_path / "mesh.gltf"
     file.write_text(json.dumps(changed(path, value) if path else value))
@@ -253,7 +252,7 @@ CORNER_STYLES = {
 }
 
 
-@each_row("style", list(CORNER_STYLES.values()), ids=list(CORNER_STYLES))
+@pytest.mark.parametrize("style", list(CORNER_STYLES.values()), ids=list(CORNER_STYLES))
 def test_every_way_to_write_a_corner_gives_the_same_mesh(tmp_path, style):
     expected = load_mesh(write_box(tmp_path / "box.ply"))
     faces = "".join("f " + " ".join(style(int(index) + 1) for index in face) + "\n" for face in BOX_FACES)
@@ -282,7 +281,7 @@ def test_a_line_may_go_on_in_the_next_and_errors_name_where_it_began(tmp_path):
         load_mesh(tmp_path / "mesh.obj")
 
 
-@each_row("begin", ["OFF\n8 6 0\n", "OFF 8 6 0\n", "# made\n\nOFF\n# counts\n8 6 12\n", "NOFF\n8 6 0\n"])
+@pytest.mark.parametrize("begin", ["OFF\n8 6 0\n", "OFF 8 6 0\n", "# made\n\nOFF\n# counts\n8 6 12\n", "NOFF\n8 6 0\n"])
 def test_off_of_quads_with_or_without_more_columns_is_the_box(tmp_path, begin):
     more = " 0 0 1" if begin.startswith("N") else ""
     points = "".join(f"{x} {y} {z}{more}\n" for x, y, z in BOX_VERTICES)

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.tables import each_row
 
 from lidardesign.scenes.rays import angles_in_view, in_view, receiver_axes
 from lidardesign.scenes.scene import Receiver
@@ -17,7 +16,7 @@ STRAIGHT = Receiver((0.0, 0.0, 0.0), 0.0, 0.0, math.radians(60), math.radians(50
 LOOKS = [(0.0, 0.0), (2.0, 0.4), (5.5, -1.2), (1.0, math.pi / 2), (0.3, -math.pi / 2)]
 
 
-@each_row("look", LOOKS)
+@pytest.mark.parametrize("look", LOOKS)
 def test_axes_are_right_handed_with_a_level_lateral_axis_and_the_boresight_first(look):
     axes = receiver_axes(replace(STRAIGHT, azimuth_rad=look[0], elevation_rad=look[1]))
     assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-15)
@@ -35,7 +34,7 @@ def test_angles_are_turns_about_the_upright_and_the_lateral_axis():
     assert distance_m == pytest.approx(np.sqrt([2, 2, 4, 1, 3]))
 
 
-@each_row("look", LOOKS)
+@pytest.mark.parametrize("look", LOOKS)
 def test_angles_turn_and_move_with_the_receiver(look):
     points = np.random.default_rng(0).normal(size=(200, 3))
     turned = replace(STRAIGHT, origin_m=(3.0, -2.0, 0.5), azimuth_rad=look[0], elevation_rad=look[1])

@@ -66,10 +66,10 @@ READ_ONLY = """
 import contextlib, os
 from lidardesign.cli.main import run
 with contextlib.suppress(SystemExit), contextlib.redirect_stdout(sys.stderr):
-    run(["fit", sys.argv[1], "--layout", "grid", "--sensors", "1", "--json"])
+    run(["fit", sys.argv[1], "--layout", "even", "--sensors", "1", "--json"])
 if os.geteuid() == 0:
     os.setuid(65534)
-run(["fit", sys.argv[2], "--layout", "grid", "--sensors", "1", "--json"])
+run(["fit", sys.argv[2], "--layout", "even", "--sensors", "1", "--json"])
 """
 
 
@@ -112,7 +112,7 @@ class TestKillsFullDisksAndTwoWriters:
         run = make_run(tmp_path / "run", count=1000)
         before = files_under(run)
         with run_lock(run):
-            result = lidardesign("fit", run, "--layout", "grid", "--sensors", 1, "--json")
+            result = lidardesign("fit", run, "--layout", "even", "--sensors", 1, "--json")
             assert result.code == 2
             assert f"process {os.getpid()} on" in result.json["error"]["message"]
             assert "wait for it" in result.json["error"]["hint"]
@@ -197,7 +197,7 @@ class TestKillsFullDisksAndTwoWriters:
     @pytest.mark.parametrize("damage", ["cut between sensors", "cut inside", "one digit"])
     def test_a_design_that_is_not_as_it_was_written_says_so_wherever_it_is_used(self, tmp_path, lidardesign, damage):
         run = make_run(tmp_path / "run", count=1000)
-        assert lidardesign("fit", run, "--layout", "grid", "--sensors", 2).code == 0
+        assert lidardesign("fit", run, "--layout", "even", "--sensors", 2).code == 0
         design = run / "designs" / "fit.yaml"
         text = design.read_text()
         second = text.index("- name", text.index("- name") + 1)
@@ -440,7 +440,7 @@ class TestStreamsLocalesAndSignals:
 
     def test_notes_that_nobody_reads_any_more_do_not_end_the_work(self, tmp_path):
         make_run(tmp_path / "run", count=1000)
-        process = program("fit", "run", "--layout", "grid", "--sensors", 2, "--json", cwd=tmp_path)
+        process = program("fit", "run", "--layout", "even", "--sensors", 2, "--json", cwd=tmp_path)
         process.stderr.close()
         out, _ = process.stdout.read(), process.stdout.close()
         assert process.wait() == 0
@@ -455,7 +455,7 @@ class TestStreamsLocalesAndSignals:
     @pytest.mark.parametrize("closed", [(0, 1), (1, 2)])
     def test_streams_that_were_never_open_are_no_place_for_files(self, tmp_path, closed):
         make_run(tmp_path / "run", count=1000)
-        fit = ("fit", "run", "--layout", "grid", "--sensors", 1)
+        fit = ("fit", "run", "--layout", "even", "--sensors", 1)
         process = program(*fit, cwd=tmp_path, stdin=subprocess.DEVNULL, before=CLOSED.format(*closed))
         out, err = process.communicate()
         assert process.returncode == 0, err
@@ -490,7 +490,7 @@ class TestStreamsLocalesAndSignals:
         # an editable installation, in such a locale, is found in a folder of plain letters only
         folders = [str(Path(sys.modules[name].__file__).parents[1]) for name in ("lidardesign", "lidardesign_tasks")]
         environment["PYTHONPATH"] = os.pathsep.join(folders)
-        command = [sys.executable, "-m", "lidardesign", "fit", name, "--layout", "grid", "--sensors", "1", "--json"]
+        command = [sys.executable, "-m", "lidardesign", "fit", name, "--layout", "even", "--sensors", "1", "--json"]
         ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, check=False)
         assert ended.returncode == 0, ended.stderr
         assert json.loads(ended.stdout)["design"].endswith("/designs/fit.yaml")
@@ -499,7 +499,7 @@ class TestStreamsLocalesAndSignals:
     def test_a_report_of_a_folder_whose_name_is_no_utf_8_is_written(self, tmp_path, lidardesign, monkeypatch):
         name = os.fsdecode(b"no utf-8 \xff")
         make_run(tmp_path / "made", count=1000).rename(tmp_path / name)
-        assert lidardesign("fit", name, "--layout", "grid", "--sensors", 1).code == 0
+        assert lidardesign("fit", name, "--layout", "even", "--sensors", 1).code == 0
         monkeypatch.setattr(sys, "argv", ["lidardesign", "evaluate", name])
         result = lidardesign("evaluate", name, "--rays", 4, "--set", "test=1", "--report", f"{name}/page.html")
         assert result.code == 0, result.err

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.run.arrays import csv_rows, read_npz
@@ -26,7 +25,7 @@ TABLES = {
 }
 
 
-@each_row("text", list(TABLES.values()), ids=list(TABLES))
+@pytest.mark.parametrize("text", list(TABLES.values()), ids=list(TABLES))
 def test_a_table_beyond_measure_is_refused_with_its_line_soon(tmp_path, text):
     (tmp_path / "table.csv").write_text(text)
     started = time.perf_counter()

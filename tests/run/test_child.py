@@ -1,7 +1,6 @@
 """Work in processes of their own: answered, or lost with the reason."""
 
 import pytest
-from support.tables import each_row
 
 from lidardesign.run import child
 from lidardesign.run.child import Child, ChildError, ask
@@ -20,7 +19,7 @@ def test_answers_come_back_apart_from_what_is_printed():
     assert not process.alive
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("work", "reason", "words"),
     [
         ("crashes", "died", "crashes while it works"),

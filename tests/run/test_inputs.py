@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 from lidardesign_tasks.basel import load_model
 from lidardesign_tasks.poses_csv import read_poses
-from support.tables import each_row
 
 from lidardesign.config import load_run_config
 from lidardesign.density.training.checkpoint import load_arrays
@@ -91,8 +90,8 @@ def make_folder(path):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-@each_row(
-    "name, read, make",
+@pytest.mark.parametrize(
+    ("name", "read", "make"),
     [(name, read, make) for name, read, _ in READERS for make in (make_pipe, make_socket, make_device, make_folder)],
 )
 def test_what_is_no_regular_file_is_refused_by_its_name_without_waiting(tmp_path, name, read, make):
@@ -104,7 +103,7 @@ def test_what_is_no_regular_file_is_refused_by_its_name_without_waiting(tmp_path
     assert re.search("not a regular file|folder", str(refused.value))
 
 
-@each_row("name, read, kind", READERS)
+@pytest.mark.parametrize(("name", "read", "kind"), READERS)
 def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path, name, read, kind):
     with (tmp_path / name).open("wb") as file:
         file.truncate(kind.most_bytes + 1)
@@ -115,14 +114,14 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path, name, r
     assert time.perf_counter() - started < 1.0
 
 
-@each_row("name, read", [(name, read) for name, read, _ in READERS])
+@pytest.mark.parametrize(("name", "read"), [(name, read) for name, read, _ in READERS])
 def test_a_name_that_no_file_can_have_is_refused(tmp_path, name, read):
     for path in (tmp_path / f"{'x' * 300}{name}", tmp_path.joinpath(*["y" * 200] * 30, name)):
         with pytest.raises((ConfigError, DataError)):
             read(path)
 
 
-@each_row("name", ["manifest.json", "config.yaml", "checkpoint.safetensors"])
+@pytest.mark.parametrize("name", ["manifest.json", "config.yaml", "checkpoint.safetensors"])
 def test_a_pipe_in_a_run_is_refused_without_waiting(tmp_path, name):
     read = {
         "manifest.json": read_manifest,
@@ -142,7 +141,7 @@ def test_the_documentation_lists_the_limits():
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-@each_row("make", [make_pipe, make_socket, make_folder, make_device])
+@pytest.mark.parametrize("make", [make_pipe, make_socket, make_folder, make_device])
 def test_a_lock_that_is_no_file_is_refused_and_nothing_behind_it_is_touched(tmp_path, make):
     make(tmp_path / FILE_NAME)
     with an_alarm(), pytest.raises(DataError, match="not a regular file"), run_lock(tmp_path):
@@ -150,7 +149,7 @@ def test_a_lock_that_is_no_file_is_refused_and_nothing_behind_it_is_touched(tmp_
     assert os.path.lexists(tmp_path / FILE_NAME)
 
 
-@each_row("there", [True, False])
+@pytest.mark.parametrize("there", [True, False])
 def test_a_lock_that_is_a_link_neither_empties_nor_makes_what_it_names(tmp_path, there):
     target = tmp_path / "precious"
     if there:

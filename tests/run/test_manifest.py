@@ -13,7 +13,6 @@ import threading
 import time
 
 import pytest
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run import files
@@ -56,7 +55,7 @@ def test_a_write_makes_folders_and_leaves_only_the_file(tmp_path):
 
 
 @pytest.mark.hard_case("38")
-@each_row(
+@pytest.mark.parametrize(
     ("failing", "error", "told", "words"),
     [
         ("fsync", FULL, DataError, "No space left"),
@@ -93,7 +92,7 @@ def test_a_device_is_written_straight():
 
 
 @pytest.mark.hard_case("38")
-@each_row("name", ["samples.npz", "größe " * 14 + ".npz"])
+@pytest.mark.parametrize("name", ["samples.npz", "größe " * 14 + ".npz"])
 def test_the_next_writer_of_a_file_removes_what_a_killed_one_left(tmp_path, name):
     left = files.temporary_beside(tmp_path / name)
     abandoned = left.with_name(left.name.replace(f"-{os.getpid()}.", f"-{GONE}."))
@@ -166,7 +165,7 @@ DAMAGE = {
 }  # fmt: skip
 
 
-@each_row("how", DAMAGE)
+@pytest.mark.parametrize("how", DAMAGE)
 def test_every_damage_has_its_own_message(tmp_path, how):
     run, (damage, message) = recorded(tmp_path), DAMAGE[how]
     damage(run, json.loads((run / "manifest.json").read_text()))
@@ -205,7 +204,7 @@ def test_the_lock_of_a_killed_process_is_free(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-@each_row("content", ["", "{}", "[]", json.dumps({"pid": 1, "host": "elsewhere"})])
+@pytest.mark.parametrize("content", ["", "{}", "[]", json.dumps({"pid": 1, "host": "elsewhere"})])
 def test_a_lock_file_that_nobody_holds_is_no_obstacle(tmp_path, content):
     (tmp_path / files.FILE_NAME).write_text(content)
     assert files.writer(tmp_path) == ("process 1 on elsewhere" if "host" in content else "another process")
@@ -259,7 +258,7 @@ def test_a_file_that_somebody_is_still_making_says_to_wait(run):
 
 
 @pytest.mark.hard_case("P3")
-@each_row("stopped_at", ["announce", "write_atomic", "record"])
+@pytest.mark.parametrize("stopped_at", ["announce", "write_atomic", "record"])
 def test_a_kill_while_a_run_s_file_is_written_anew_leaves_one_that_verifies(tmp_path, monkeypatch, stopped_at):
     run = recorded(tmp_path)
     names = ("announce", "write_atomic", "record")

@@ -9,7 +9,6 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.run.yaml import MAX_DEPTH, dump_yaml, leaves, load_yaml, parse_yaml
@@ -65,7 +64,7 @@ BAD = {
 
 
 @pytest.mark.hard_case("36")
-@each_row(("text", "value"), PLAIN)
+@pytest.mark.parametrize(("text", "value"), PLAIN)
 def test_plain_scalars_mean_what_they_look_like(text, value):
     read = parse_yaml(f"key: {text}", where="f").value["key"]
     assert read == value
@@ -73,7 +72,7 @@ def test_plain_scalars_mean_what_they_look_like(text, value):
 
 
 @pytest.mark.hard_case("36")
-@each_row("case", BAD)
+@pytest.mark.parametrize("case", BAD)
 def test_bad_yaml_is_refused_with_its_position(case):
     text, position, words = BAD[case]
     with pytest.raises(ConfigError) as caught:
@@ -169,7 +168,7 @@ def test_numpy_values_and_tuples_are_written_as_plain_ones():
     assert parse_yaml(text, where="f").value == {"a": 0.1, "b": [0, 1, 2], "c": [1, 2], "d": True}
 
 
-@each_row("value", [math.nan, math.inf, np.array([1.0, -np.inf])])
+@pytest.mark.parametrize("value", [math.nan, math.inf, np.array([1.0, -np.inf])])
 def test_numbers_that_are_not_finite_are_never_written(value):
     with pytest.raises(NumericalError, match="a"):
         dump_yaml({"a": {"b": value}})

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.coverages import small
+from support.rays import random_fan, rays_along
 
 from lidardesign.rays.choice import RayCounts, choose
-from lidardesign.rays.selection import SelectionProblem, are_enough
+from lidardesign.rays.selection import Selection, are_enough
+from lidardesign.sensors.bandwidth import Bandwidth
 
-fields = ("rays", "gates", "informs", "scenes", "bandwidth", "one_gate", "most_scenes")
-PROBLEM = SelectionProblem(**dict.fromkeys(fields), visits=[slice(0, 7)], shares=None, limit_mbps=np.inf, name="small")
+SELECTION = Selection(rays_along(random_fan(7, 1.0)), [slice(0, 7)], gates=None, bandwidth=Bandwidth())
 
 
 @given(st.integers(0, 1000), st.floats(0, 1), st.floats(0, 0.05))
@@ -23,7 +24,7 @@ def test_no_choice_loses_less_than_nothing_however_dear_bandwidth_is(seed, price
     choice = choose(coverage, RayCounts.of_one(7, 3), price=price)
     # next to nothing is left to know
     coverage = replace(coverage, complete=choice.worth - choice.harm + left)
-    loss, bound = PROBLEM.certified(coverage, [choice])
+    loss, bound = SELECTION.certified(coverage, [choice])
     assert 0 <= bound <= loss + 1e-12
 
 
@@ -49,7 +50,7 @@ def test_the_price_of_bandwidth_leaves_what_little_can_be_known(seed, unknown, o
     if one_gate:
         coverage = coverage.through(np.zeros(7, dtype=np.intp))
     free = choose(coverage, RayCounts.of_one(7, 3))
-    (choice,) = PROBLEM.choices(replace(coverage, complete=unknown * free.worth), 3)
+    (choice,) = SELECTION.choices(replace(coverage, complete=unknown * free.worth), 3)
     assert choice.worth >= 0.8 * free.worth - 1e-9
 
 
@@ -57,5 +58,5 @@ def test_the_price_of_bandwidth_leaves_what_little_can_be_known(seed, unknown, o
 def test_the_price_of_bandwidth_follows_the_loss_where_little_is_left(seed, left):
     coverage = small(seed, gates=3)
     free = choose(coverage, RayCounts.of_one(7, 3), passes=0)
-    (choice,) = PROBLEM.choices(replace(coverage, complete=free.worth * (1 + left)), 3)
+    (choice,) = SELECTION.choices(replace(coverage, complete=free.worth * (1 + left)), 3)
     assert choice.price == pytest.approx(0.2 * left * free.worth / free.bits)

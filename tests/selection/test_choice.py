@@ -41,7 +41,7 @@ def every_choice(coverage, counts):
     rays, gates = coverage.shape
     for gate in itertools.product(range(-1, gates), repeat=rays):
         gate = np.array(gate)
-        if (np.bincount(counts.sensor[gate >= 0], minlength=len(counts.most)) <= counts.most).all():
+        if (np.bincount(counts.group[gate >= 0], minlength=len(counts.most)) <= counts.most).all():
             yield gate
 
 
@@ -87,7 +87,7 @@ class TestAChoice:
         certificate = certify(coverage, counts, choice)
         assert certificate.value <= best + 1e-12
         assert certificate.bound >= best - 1e-12
-        assert (np.bincount(counts.sensor[choice.rays], minlength=2) <= counts.most).all()
+        assert (np.bincount(counts.group[choice.rays], minlength=2) <= counts.most).all()
 
     def test_has_room_in_the_bandwidth_that_its_rays_take_however_bits_are_added_up(self, table):
         coverage = small(0, table=table)
@@ -122,10 +122,25 @@ class TestAChoice:
         assert min(ratios) >= 0.8
 
     @given(seed=seeds)
-    def test_fires_all_rays_of_every_sensor_where_it_is_asked_to(self, table, seed):
+    def test_fires_as_many_rays_of_every_group_as_may_fire_however_dear_they_are(self, table, seed):
         coverage, counts = small(seed, table=table), RayCounts(np.arange(7) % 2, np.array([2, 3]))
         choice = choose(coverage, counts, price=10.0)
-        assert np.bincount(counts.sensor[choice.rays]).tolist() == [2, 3]
+        assert np.bincount(counts.group[choice.rays]).tolist() == [2, 3]
+
+    @given(seed=seeds, most=st.integers(3, 5), price=st.sampled_from([0.0, 0.05, 10.0]))
+    def test_fires_a_ray_of_each_sensor_where_it_has_to_and_is_near_the_best_of_those(self, table, seed, most, price):
+        coverage, owner = small(seed, table=table), np.array([0, 0, 1, 1, 1, 2, 2])
+        counts = RayCounts(np.zeros(7, dtype=int), np.array([most]), owner)
+        choice = choose(coverage, counts, price=price)
+        assert len(choice.rays) == most
+        assert set(owner[choice.rays]) == {0, 1, 2}
+        best = max(
+            coverage.value_of(gate) - price * coverage.charge(gate)[0]
+            for gate in every_choice(coverage, counts)
+            if set(owner[gate >= 0]) == {0, 1, 2} and (gate >= 0).sum() == most
+        )
+        value = choice.worth - price * choice.bits
+        assert best - 0.2 * abs(best) <= value <= best + 1e-12
 
 
 @given(seed=seeds)

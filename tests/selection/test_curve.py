@@ -1,4 +1,4 @@
-"""The price curve, and gaps against choices among more candidates."""
+"""The price curve: what choices lose, by what they cost."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lidardesign.rays.curve import gap_among_more, price_curve
 from support.coverages import SUMS, small
 
-from lidardesign.rays.certificate import certify
+from lidardesign.rays.certificate import certify, price_curve
 from lidardesign.rays.choice import RayCounts, choose, choose_within
 from lidardesign.rays.coverage import LARGEST
 
@@ -48,23 +47,3 @@ def test_gates_that_cost_nothing_have_one_point():
     coverage = small(0)
     coverage.bits[:] = 0.0
     assert len(price_curve(coverage, RayCounts.of_one(7, 3))) == 1
-
-
-@TABLES
-class TestTheGapAmongMoreRays:
-    @given(seed=seeds)
-    def test_without_more_rays_it_is_the_certificates(self, table, seed):
-        coverage, counts = small(seed, table=table), RayCounts.of_one(7, 3)
-        certificate = certify(coverage, counts, choose(coverage, counts))
-        assert gap_among_more(coverage, counts, np.ones(7, dtype=bool)) == certificate.gap(coverage.complete)
-
-    @given(seed=seeds, share=st.sampled_from([None, 0.7]))
-    def test_covers_what_a_choice_of_all_rays_gains(self, table, seed, share):
-        coverage, counts, own = small(seed, rays=10, table=table), RayCounts.of_one(10, 3), np.arange(10) < 5
-        among = RayCounts((~own).astype(int), np.array([3, 0]))
-        budget = None if share is None else share * choose(coverage, among).bits
-        first, best = (
-            choose(coverage, c) if budget is None else choose_within(coverage, c, budget) for c in (among, counts)
-        )
-        gained = (best.worth - first.worth) / (coverage.complete - first.worth)
-        assert gap_among_more(coverage, counts, own, budget) >= gained - 1e-9

@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lidardesign.layouts.rays import certificates_of, lay_out
-from support.command_line import caller, make_run
-from support.tables import each_row
+from support.command_line import make_run
 
 from lidardesign.api.run import open_run
 from lidardesign.constraints.check import check_design
@@ -19,17 +17,13 @@ from lidardesign.fitting.part_sets import SetLimits, choose_set
 from lidardesign.fitting.part_shapes import COARSE_CELL_RAD, PartBundle, cells_of, part_table, parts_inform
 from lidardesign.parts.catalogue import find_part, part_rays
 from lidardesign.rays import information
+from lidardesign.rays.certificate import certificates_of
 from lidardesign.samples import load_samples
 from lidardesign.sensors.design_file import design_document
 from lidardesign.simulate.returns import simulate_many
 from lidardesign.task import Information
 
 THREE = ["vl53l5cx", "vl53l5cx:4x4", "tmf8828"]
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +46,7 @@ class TestDesignsOfParts:
     def test_fire_the_rays_of_parts_that_were_named(self, run):
         spec = bought(run)
         assert [sensor.part in THREE for sensor in spec.sensors] == [True, True]
-        assert len(lay_out(spec)) == sum(find_part(sensor.part).rays for sensor in spec.sensors)
+        assert len(spec.rays()) == sum(find_part(sensor.part).rays for sensor in spec.sensors)
         rules = {"parts": {"names": THREE}}
         assert all(check.satisfied for check in check_design(design_document(spec), rules))
 
@@ -80,7 +74,7 @@ class TestDesignsOfParts:
 
     def test_keep_a_bandwidth_and_a_number_of_rays(self, run):
         spec = bought(run, budget={"rays": 30, "bandwidth_mbps": 10.0})
-        assert spec.rays == 30
+        assert spec.count == 30
         with pytest.raises(InfeasibleError, match="rays, not 500"):
             bought(run, budget={"rays": 500})
 
@@ -100,12 +94,12 @@ class TestDesignsOfParts:
         assert any("tmf8828" in note and "left out" in note for note in notes)
 
 
-@each_row(
-    "options, words",
+@pytest.mark.parametrize(
+    ("options", "words"),
     [
         ({"parts": ["vl53l8xc"], "sensors": 1}, "no part 'vl53l8xc'"),
         ({"parts": ["vl53l8cx"]}, "number of parts is missing"),
-        ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "grid"}, "parts in the layout grid"),
+        ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "even"}, "parts in the layout even"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "ray"}, "with gates"),
         ({"parts": [str(Path(__file__).parent)], "sensors": 1}, "holds no file"),
         ({"parts": ["vl53l8cx"], "sensors": 1, "constraints": {"each": [{"gate": {"width_m": {"max": 1}}}]}}, "each"),

@@ -8,26 +8,22 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lidardesign.layouts.rays import certificates_of, lay_out
-from support.command_line import caller, make_run
+from support.command_line import make_run
 from support.coverages import SUMS, small
 
 from lidardesign.api.run import open_run
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError
 from lidardesign.fitting import spinning
-from lidardesign.fitting.spinning import RingCandidates, chosen_rings, finer, places_of
+from lidardesign.fitting.spinning import RingCandidates, chosen_rings, places_of, refine_elevations
+from lidardesign.formats.designs import load_design
 from lidardesign.numerics import FULL_TURN
+from lidardesign.rays.certificate import certificates_of
 from lidardesign.rays.coverage import LARGEST
-from lidardesign.sensors.design_file import design_document, load_design, save_design
+from lidardesign.sensors.design_file import design_document, save_design
 from lidardesign.space import DesignSpace
 
 RINGS = RingCandidates(np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 2.0]]), np.radians([-20.0, -5.0, 3.0]), 8, (1.0, 60.0))
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +84,7 @@ class TestCandidates:
 
     def test_are_some_of_them_even_and_the_others_where_rings_tell(self):
         even = np.linspace(-0.6, 0.2, 81)
-        elevation = finer(even, np.where(np.abs(even + 0.1) < 0.05, 1.0, 0.0))
+        elevation = refine_elevations(even, np.where(np.abs(even + 0.1) < 0.05, 1.0, 0.0))
         assert (len(elevation), elevation[0], elevation[-1]) == (81, -0.6, 0.2)
         assert (np.diff(elevation) >= 0).all()
         assert np.isin(np.linspace(-0.6, 0.2, 21), elevation).all()
@@ -98,18 +94,18 @@ class TestCandidates:
 class TestDesigns:
     def test_have_channels_that_files_and_other_numbers_of_rays_keep(self, run, tmp_path):
         spec = open_run(run).fit(layout="spinning", channels=3, rays=150, name="spun").specification
-        table = spec.ray_table
-        assert (spec.layout, spec.rays, len(spec.sensors)) == ("spinning", 150, 1)
-        elevation, points = np.unique(table.elevation_rad, return_counts=True)
+        rays = spec.rays()
+        assert (spec.layout, spec.count, len(spec.sensors)) == ("spinning", 150, 1)
+        elevation, points = np.unique(rays.elevation_rad, return_counts=True)
         assert points.tolist() == [50, 50, 50]
         _, vertical = spec.sensors[0].field_of_view_rad
         assert vertical == pytest.approx(2 * np.abs(elevation).max())
-        assert np.ptp(table.azimuth_rad) == pytest.approx(FULL_TURN * 49 / 50)
+        assert np.ptp(rays.azimuth_rad) == pytest.approx(FULL_TURN * 49 / 50)
         save_design(spec, tmp_path / "spun.yaml")
         again = load_design(tmp_path / "spun.yaml")
         assert design_document(again) == design_document(spec)
-        np.testing.assert_array_equal(lay_out(again, 150).direction, table.direction)
-        assert len(lay_out(again, 75)) == 75
+        np.testing.assert_array_equal(again.rays(150).direction, rays.direction)
+        assert len(again.rays(75)) == 75
         (entry,) = certificates_of(spec)
         assert 0 <= entry["bound"] <= entry["value"]
         assert (entry["rays"], entry["candidates"], entry["gates"]) == (150, 15, 1)
@@ -132,7 +128,7 @@ class TestDesigns:
         [
             (("--layout", "spinning", "--channels", 4, "--rays", 30), "30 rays of 1 sensors with 4 channels"),
             (("--layout", "spinning", "--sensors", "best"), "'best' sensors that spin"),
-            (("--layout", "grid", "--channels", 4), "4 channels in the layout grid"),
+            (("--layout", "even", "--channels", 4), "4 channels in the layout even"),
             (("--layout", "spinning", "--gates", "ray"), "a gate per ray in the layout spinning"),
             (("--layout", "spinning", "--channels", 100_000), "1 to 1000"),
         ],

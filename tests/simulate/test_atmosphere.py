@@ -11,7 +11,6 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import exp1
 from support.rays import rays_along
-from support.tables import each_row
 
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import path_windows
@@ -149,8 +148,8 @@ def test_a_rays_haze_depends_on_no_other_ray_but_for_the_shared_energy():
     assert np.array_equal(together.counts[1], alone.counts[0])
 
 
-@each_row("gate", [(0.0, 8.0), (0.05, 3.0), (0.5, 8.0), (4.0, 4.5)])
-@each_row("pixel_sr", [1e-7, 1e-4, 1.0])
+@pytest.mark.parametrize("gate", [(0.0, 8.0), (0.05, 3.0), (0.5, 8.0), (4.0, 4.5)])
+@pytest.mark.parametrize("pixel_sr", [1e-7, 1e-4, 1.0])
 def test_the_planner_bounds_the_haze_that_is_counted(gate, pixel_sr):
     detector = replace(COUNTING, photons=replace(PHOTONS, field_of_view_sr=pixel_sr))
     scene, rays = Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0], [0.8, 0.6, 0], [-1.0, 0, 0]], gate)

@@ -25,7 +25,6 @@ from support.planning import (
     sight,
 )
 from support.rays import rays_along
-from support.tables import each_row
 
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import (
@@ -97,9 +96,9 @@ def test_expected_signal_is_the_light_budget_of_a_wall_met_head_on():
     assert found == pytest.approx(np.full(16, expected), rel=1e-6)
 
 
-@each_row("mean", [0.0, 1e-9, 1e-3, 0.2, 1.0, 7.3, 100.0, 4e4])
-@each_row("bins", [1.0, 40.0, 3000.0])
-@each_row("allowed", [0.5, 0.01, 1e-6])
+@pytest.mark.parametrize("mean", [0.0, 1e-9, 1e-3, 0.2, 1.0, 7.3, 100.0, 4e4])
+@pytest.mark.parametrize("bins", [1.0, 40.0, 3000.0])
+@pytest.mark.parametrize("allowed", [0.5, 0.01, 1e-6])
 def test_a_return_needs_the_fewest_counts_that_background_rarely_reaches(mean, bins, allowed):
     needed = float(needed_counts(np.array([mean]), np.array([bins]), allowed)[0])
     rounding = 1 + 1e-6
@@ -116,8 +115,8 @@ def test_a_bin_holds_its_share_of_an_echo_on_its_edge():
     assert (share_in_bins(1, bin_m, 0.0), share_in_bins(3, bin_m, 0.0)) == (0.5, 1.0)
 
 
-@each_row("signal", [0.0, 3.0, 20.0, 80.0])
-@each_row("level", [0.01, 0.5, 4.0])
+@pytest.mark.parametrize("signal", [0.0, 3.0, 20.0, 80.0])
+@pytest.mark.parametrize("level", [0.01, 0.5, 4.0])
 def test_the_union_over_bins_bounds_how_often_another_bin_wins(signal, level):
     """Against drawn histograms: within four standard errors."""
     scene = facing_wall()
@@ -130,9 +129,9 @@ def test_the_union_over_bins_bounds_how_often_another_bin_wins(signal, level):
     assert wrong - 4 * math.sqrt(wrong * (1 - wrong) / draws) <= bounded <= 1
 
 
-@each_row("estimator", ["peak", "matched"])
-@each_row("signal", [1, 4, 30, 300, 2000])
-@each_row("bins_per_sigma", [0.3, 1.0, 4.0])
+@pytest.mark.parametrize("estimator", ["peak", "matched"])
+@pytest.mark.parametrize("signal", [1, 4, 30, 300, 2000])
+@pytest.mark.parametrize("bins_per_sigma", [0.3, 1.0, 4.0])
 def test_estimated_ranges_stray_no_further_than_bounded(estimator, signal, bins_per_sigma):
     """The highest bin and the mean of n photons, drawn 2000 times, after rounding is taken off."""
     sigma_m, draws, generator = metres(5e-11), 2000, np.random.default_rng(5)
@@ -189,7 +188,7 @@ def test_bounds_grow_with_jitter_bins_and_dead_time():
     growing("pile_up", [(sunny, detector) for detector in dead])
 
 
-@each_row("tilt_deg", [0, 30, 60, 80, 88])
+@pytest.mark.parametrize("tilt_deg", [0, 30, 60, 80, 88])
 def test_a_slanted_plane_spreads_a_beam_as_far_as_its_rim(tilt_deg):
     tilt, width = math.radians(tilt_deg), 0.01
     turned = np.array([[math.cos(tilt), -math.sin(tilt), 0], [math.sin(tilt), math.cos(tilt), 0], [0, 0, 1.0]])
@@ -301,7 +300,7 @@ MOVERS = {
 }
 
 
-@each_row("shape", MOVERS.values(), ids=MOVERS)
+@pytest.mark.parametrize("shape", MOVERS.values(), ids=MOVERS)
 def test_what_flies_into_view_calls_for_motion(shape):
     """Nothing of the body is met when the frame begins; rays that it has reached by their time are, exactly."""
     still = rigid(Rotation.from_rotvec((0.3, math.pi / 2, 0.2)).as_matrix(), (0.7, -0.8, 0.0))
@@ -319,8 +318,8 @@ def test_what_flies_into_view_calls_for_motion(shape):
     assert "motion" in Planner(TIMED).plan(scene, [rays]).effects
 
 
-@each_row("place", [(4.8, 0, 0.3), (2, 0.01, 0), (0, 0, 0), (-1, 0.5, 0.2), (5, 1, 0)])
-@each_row("gate_m", [(0.1, 6.5), (2.5, 3.0)])
+@pytest.mark.parametrize("place", [(4.8, 0, 0.3), (2, 0.01, 0), (0, 0, 0), (-1, 0.5, 0.2), (5, 1, 0)])
+@pytest.mark.parametrize("gate_m", [(0.1, 6.5), (2.5, 3.0)])
 def test_haze_beside_a_fixed_receiver_is_bounded(place, gate_m):
     """Against what the effect counts: all haze, and the fullest cell per length."""
     receiver = Receiver(place, 0.0, 0.0, 3.1, 3.1, (0.0, 20.0))
@@ -411,7 +410,7 @@ def check_effect(name, bound, scene, detector, rays):
     assert added <= bound.lost + STANDARD_ERRORS * np.sqrt(max(bound.lost, 1 / returns) / returns)
 
 
-@each_row("seed", range(25))
+@pytest.mark.parametrize("seed", range(25))
 def test_no_effect_changes_more_than_its_bound(seed):
     scene, detector, rays = random_case(seed)
     found = decisions(Planner(detector).plan(scene, [rays]))
@@ -419,7 +418,7 @@ def test_no_effect_changes_more_than_its_bound(seed):
         check_effect(name, found[name].bound, scene, detector, rays)
 
 
-@each_row("seed", range(100, 118))
+@pytest.mark.parametrize("seed", range(100, 118))
 def test_planned_effects_err_as_all_do_within_the_tolerance(seed):
     scene, detector, rays = random_case(seed)
     tolerance = Tolerance(2 * Tolerance.of(detector).range_m, 0.01)
@@ -480,7 +479,7 @@ def test_without_dead_time_everything_is_left():
     assert (unevenness(found, blind) == 0).all()
 
 
-@each_row("field_of_view_sr", [1e-6, 1e-5])
+@pytest.mark.parametrize("field_of_view_sr", [1e-6, 1e-5])
 def test_what_is_left_is_what_is_counted(field_of_view_sr):
     """Against histograms: the echo's counts within 5 %, the background at the gate's start within 3 %."""
     scene, detector = facing_wall(), counting(field_of_view_sr=field_of_view_sr, pulse_energy_j=3e-13)

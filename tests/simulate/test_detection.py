@@ -17,7 +17,6 @@ from support.synthetic_light import (
     single_echoes,
     windows,
 )
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.detection import PHOTONS_ONE_BY_ONE
@@ -42,7 +41,7 @@ def total_counts(expected, effects, **timing):
     return counts
 
 
-@each_row("expected", [0.2, 40.0, PHOTONS_ONE_BY_ONE - 1, PHOTONS_ONE_BY_ONE + 1, 1e5])
+@pytest.mark.parametrize("expected", [0.2, 40.0, PHOTONS_ONE_BY_ONE - 1, PHOTONS_ONE_BY_ONE + 1, 1e5])
 def test_counts_are_poisson_with_the_expected_mean(expected):
     totals = total_counts(expected, {"photon_noise", "quantisation"}).sum(axis=1)
     error = np.sqrt(expected / RAYS)
@@ -51,12 +50,12 @@ def test_counts_are_poisson_with_the_expected_mean(expected):
     assert abs(totals.var() - expected) < STANDARD_ERRORS * np.sqrt((2 * expected**2 + expected) / RAYS)
 
 
-@each_row("expected", [0.2, 3.4, 40.0, 700.3])
+@pytest.mark.parametrize("expected", [0.2, 3.4, 40.0, 700.3])
 def test_without_photon_noise_every_ray_gets_the_rounded_expectation(expected):
     assert (total_counts(expected, {"quantisation"}).sum(axis=1) == round(expected)).all()
 
 
-@each_row("effects", [{"photon_noise"}, {"photon_noise", "jitter"}, {"jitter"}, set()])
+@pytest.mark.parametrize("effects", [{"photon_noise"}, {"photon_noise", "jitter"}, {"jitter"}, set()])
 def test_photon_by_photon_and_bin_by_bin_give_the_same_histogram(effects):
     """On average over rays whose echoes lie anywhere in a bin, either way of counting has the pulse's shape."""
     timing = {"jitter_sigma_s": 80e-12}
@@ -69,7 +68,7 @@ def test_photon_by_photon_and_bin_by_bin_give_the_same_histogram(effects):
     assert (np.abs(shapes[0] - shapes[1]) <= (STANDARD_ERRORS + 0.5) * error).all()
 
 
-@each_row("expected", [300.0, 3000.0])
+@pytest.mark.parametrize("expected", [300.0, 3000.0])
 def test_photons_have_the_pulse_s_shape_and_the_jitter_s(expected):
     detector = counting_detector(RAYS, pulse_sigma_s=SIGMA_S, jitter_sigma_s=2 * SIGMA_S, bin_s=SIGMA_S)
     echoes = single_echoes(np.full(RAYS, 2.0), expected)
@@ -89,8 +88,8 @@ def ambient_counts(rays, start, end, per_metre, bin_s=BIN_S, effects=("ambient",
     return counted(windows(rays, start, end), no_echoes(), background(rays, per_metre), detector, effects)
 
 
-@each_row("width", [0.03, 0.3, 1.5])
-@each_row("per_metre", [1e-4, 2e-2, 5.0])
+@pytest.mark.parametrize("width", [0.03, 0.3, 1.5])
+@pytest.mark.parametrize("per_metre", [1e-4, 2e-2, 5.0])
 def test_ambient_counts_are_linear_in_the_gate(width, per_metre):
     rays = 1000
     counts, _ = ambient_counts(rays, 1.0, 1.0 + width, per_metre)
@@ -100,7 +99,7 @@ def test_ambient_counts_are_linear_in_the_gate(width, per_metre):
     assert abs(totals.var() - expected) < STANDARD_ERRORS * np.sqrt((2 * expected**2 + expected) / rays)
 
 
-@each_row("per_metre", [2e-3, 5.0])
+@pytest.mark.parametrize("per_metre", [2e-3, 5.0])
 def test_ambient_counts_are_linear_in_the_bin_also_in_the_part_of_the_last_one(per_metre):
     rays, width = 2000, 10.25 * BIN_M
     counts, bins = ambient_counts(rays, 1.0, 1.0 + width, per_metre)
@@ -132,7 +131,7 @@ def errors(effects, expected, estimator, paths=PATHS, **timing):
     return found.path_m - paths
 
 
-@each_row("expected", [20, 100, 2000])
+@pytest.mark.parametrize("expected", [20, 100, 2000])
 def test_the_matched_filter_reaches_the_bound_of_timing(expected):
     """(c / 2) sigma / sqrt(N) (Cramer and Rao for a Gaussian pulse in darkness), and of bins by Sheppard."""
     off = errors({"jitter", "photon_noise"}, expected, "matched", jitter_sigma_s=SIGMA_S, bin_s=SIGMA_S / 2)
@@ -144,7 +143,7 @@ def test_the_matched_filter_reaches_the_bound_of_timing(expected):
     assert theory * (1 - STANDARD_ERRORS / np.sqrt(2 * RAYS)) < rms < theory * 1.08
 
 
-@each_row("count", [64, 400])
+@pytest.mark.parametrize("count", [64, 400])
 def test_jitter_alone_strays_by_its_own_share(count):
     off = errors({"jitter"}, count, "matched", jitter_sigma_s=SIGMA_S, bin_s=SIGMA_S / 2)
     theory = SIGMA_M / np.sqrt(count)
@@ -183,8 +182,8 @@ def test_false_alarms_in_even_light_are_as_rare_as_asked():
             assert invented.mean() <= allowed + STANDARD_ERRORS * np.sqrt(allowed / RAYS), per_metre
 
 
-@each_row("per_metre", [0.1, 2.0])
-@each_row(("dead_s", "repetition_hz"), [(1e-9, 1e6), (40e-9, 1e6), (40e-9, 20e6)])
+@pytest.mark.parametrize("per_metre", [0.1, 2.0])
+@pytest.mark.parametrize(("dead_s", "repetition_hz"), [(1e-9, 1e6), (40e-9, 1e6), (40e-9, 20e6)])
 def test_false_alarms_under_pile_up_are_as_rare_as_asked_of_a_detector_that_reckons_with_it(
     per_metre, dead_s, repetition_hz
 ):
@@ -203,7 +202,7 @@ def test_false_alarms_under_pile_up_are_as_rare_as_asked_of_a_detector_that_reck
         assert shares["none", "matched"] > 0.2
 
 
-@each_row("counts", [500.0, 3000.0])
+@pytest.mark.parametrize("counts", [500.0, 3000.0])
 def test_a_detector_that_reckons_with_its_dead_time_is_not_early(counts):
     """With 0.5 or 3 photons a pulse, of which the first is counted."""
     timing = {"pulse_sigma_s": SIGMA_S, "bin_s": SIGMA_S / 2, "dead_s": 50e-9, "estimator": "matched"}
@@ -358,8 +357,8 @@ def test_no_light_is_not_detected():
         assert (found.body == -1).all()
 
 
-@each_row("estimator", ["peak", "matched"])
-@each_row("effects", [ALL, {"photon_noise"}, {"quantisation"}, {"jitter"}, {"pile_up"}, {"ambient"}])
+@pytest.mark.parametrize("estimator", ["peak", "matched"])
+@pytest.mark.parametrize("effects", [ALL, {"photon_noise"}, {"quantisation"}, {"jitter"}, {"pile_up"}, {"ambient"}])
 def test_ranges_lie_inside_their_gates_whatever_the_light(effects, estimator):
     rays = 300
     generator = np.random.default_rng(5)
@@ -380,8 +379,8 @@ def test_ranges_lie_inside_their_gates_whatever_the_light(effects, estimator):
     assert (found.body[~inside] == -1).all()
 
 
-@each_row("effects", [ALL, {"footprint"}])
-@each_row("detector", [counting_detector(1, **FULL), Detector("timing", bin_s=BIN_S)])
+@pytest.mark.parametrize("effects", [ALL, {"footprint"}])
+@pytest.mark.parametrize("detector", [counting_detector(1, **FULL), Detector("timing", bin_s=BIN_S)])
 def test_an_empty_list_of_rays_has_an_empty_result(detector, effects):
     found = detected(np.zeros((0, 2)), no_echoes(), background(0), detector, effects)
     assert found.path_m.shape == found.body.shape == (0,)
@@ -458,7 +457,7 @@ class TestTimingOnly:
 class TestGatesThatDoNotFit:
     """A histogram of a given length, or the time between pulses, limits what gates can be."""
 
-    @each_row("effects", [{"quantisation"}, {"footprint"}, ALL])
+    @pytest.mark.parametrize("effects", [{"quantisation"}, {"footprint"}, ALL])
     def test_a_gate_longer_than_the_histogram_is_refused(self, effects):
         detector = counting_detector(1, bin_s=BIN_S, bins=100)
         fits, longer = windows(1, 1.0, 1.0 + 100 * BIN_M), windows(1, 1.0, 1.0 + 100.5 * BIN_M)
@@ -468,7 +467,7 @@ class TestGatesThatDoNotFit:
         assert "100 bins of 100 ps" in str(caught.value)
         assert "detector synthetic" in str(caught.value)
 
-    @each_row(("start", "end", "what"), [(0.1, 1.6, "ends outside"), (1.7, 1.8, "starts outside")])
+    @pytest.mark.parametrize(("start", "end", "what"), [(0.1, 1.6, "ends outside"), (1.7, 1.8, "starts outside")])
     def test_a_gate_outside_of_a_histogram_that_starts_with_the_pulse_is_refused(self, start, end, what):
         detector = Detector("timing", bin_s=BIN_S, bins=100, histogram_start="pulse")
         detected(windows(1, 0.2, 1.4), no_echoes(), background(1), detector, {"quantisation"})
@@ -492,7 +491,7 @@ class TestGatesThatDoNotFit:
             detected(windows(1, 1.0, 3.0), no_echoes(), background(1), detector, ALL)
 
 
-@each_row("seed", range(12))
+@pytest.mark.parametrize("seed", range(12))
 def test_any_detector_and_any_light_give_ranges_in_their_gates_or_none(seed):
     """Values from end to end of what detector files may hold; warnings are errors."""
     generator = np.random.default_rng(seed)

@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 
 import pytest
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.detector.files import CHOICES, FOLDER, QUANTITIES, detector_names, load_detector
@@ -35,7 +34,7 @@ def load(tmp_path, text):
     return load_detector(path)
 
 
-@each_row("name", detector_names())
+@pytest.mark.parametrize("name", detector_names())
 def test_presets_load_bear_their_own_name_and_say_why_beside_every_number(name):
     assert load_detector(name).name == name
     for line in (FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
@@ -65,8 +64,8 @@ def test_a_file_without_a_name_is_called_as_its_file_and_one_of_a_name_alone_is_
     assert load(tmp_path, "name: ideal") == IDEAL == load_detector("ideal")
 
 
-@each_row("rays", [1, 7, 576])
-@each_row("emission", ["scanned", "flood"])
+@pytest.mark.parametrize("rays", [1, 7, 576])
+@pytest.mark.parametrize("emission", ["scanned", "flood"])
 def test_rays_share_all_light_and_no_more(tmp_path, emission, rays):
     photons = load(tmp_path, LIGHT.replace("scanned", emission)).photons
     sent = rays * photons.pulses(rays) * photons.emitted(rays) * photons.photon_energy_j
@@ -105,7 +104,7 @@ BAD = {
 }
 
 
-@each_row("case", BAD)
+@pytest.mark.parametrize("case", BAD)
 def test_bad_files_say_where_what_and_what_is_allowed(tmp_path, case):
     text, fragments = BAD[case]
     with pytest.raises(ConfigError) as caught:
@@ -146,7 +145,7 @@ STRANGE = ["-1", "0", "1e308", "-1e308", "1e-308", "x", "''", "~", "true", "[]",
 NEVER = set(STRANGE) - {"0", "1e-308"}
 
 
-@each_row("name", QUANTITIES)
+@pytest.mark.parametrize("name", QUANTITIES)
 def test_strange_values_of_any_quantity_are_refused_or_possible(tmp_path, name):
     others = [line for line in LIGHT.splitlines() if not re.match(rf"{name}(_[a-z0-9]+)?:", line)]
     for key in QUANTITIES[name].keys(name):

@@ -9,7 +9,6 @@ import pytest
 from scipy.special import pdtrc
 from scipy.stats import norm
 from support.references import first_photon_distribution
-from support.tables import each_row
 
 from lidardesign.simulate.detector.dead_time import alive_shares, find_corrected
 from lidardesign.simulate.detector.kernels import at_least, find_returns, pulse_shape
@@ -36,7 +35,7 @@ def pulse(size, centre, photons, sigma=SIGMA):
     return np.round(photons * np.diff(norm.cdf((edges - centre) / sigma))).astype(int)
 
 
-@each_row("mean", [1e-12, 0.3, 7.0, 900.0, 9e4])
+@pytest.mark.parametrize("mean", [1e-12, 0.3, 7.0, 900.0, 9e4])
 def test_tails_agree_with_scipy(mean):
     for extra in (0.5, 1.0, 3.0, 8.0):
         number = math.ceil(mean + extra * math.sqrt(mean) + 1e-9)
@@ -60,13 +59,13 @@ def test_the_pulse_s_shape_is_even_and_whole():
     assert np.array_equal(pulse_shape(1.0, 0.0, 10), [1.0])
 
 
-@each_row("centre", [12.5, 12.6, 12.9, 13.0, 40.2])
+@pytest.mark.parametrize("centre", [12.5, 12.6, 12.9, 13.0, 40.2])
 def test_the_matched_filter_finds_a_pulse_anywhere_in_a_bin(centre):
     # rounding to whole photons moves the pulse by about a thousandth of a bin
     assert found(pulse(60, centre, 1e5)) == pytest.approx(centre, abs=0.02)
 
 
-@each_row("centre", [0.5, 1.5, 58.5, 59.5])
+@pytest.mark.parametrize("centre", [0.5, 1.5, 58.5, 59.5])
 def test_pulses_that_the_gate_cuts_are_found_where_they_are(centre):
     """Within a bin: without the likelihood's second term, cut pulses would be taken for ones further inside."""
     counts = pulse(60, centre, 1000) + 2
@@ -79,7 +78,7 @@ def log_likelihood(counts, place, signal, level):
     return np.sum(counts * np.log(expected) - expected)
 
 
-@each_row("photons", [20, 100])
+@pytest.mark.parametrize("photons", [20, 100])
 def test_the_matched_filter_agrees_with_the_largest_likelihood(photons):
     generator = np.random.default_rng(photons)
     size, level, off = 100, 0.5, []
@@ -111,7 +110,7 @@ def test_one_photon_is_a_return_in_darkness_and_none_in_light():
     assert np.isnan(found(counts, known=1e-3))
 
 
-@each_row("matched", [True, False])
+@pytest.mark.parametrize("matched", [True, False])
 def test_it_takes_as_many_photons_as_background_seldom_brings(matched):
     """bins * P(Poisson(5 b) >= n) <= 0.01 for the 5 bins within the pulse's width."""
     size, level = 200, 3
@@ -135,7 +134,7 @@ def test_parts_of_bins_count_as_parts():
     assert np.isnan(found(counts, ends=whole))
 
 
-@each_row("matched", [True, False])
+@pytest.mark.parametrize("matched", [True, False])
 def test_any_histogram_gives_a_place_inside_or_none(matched):
     generator = np.random.default_rng(2)
     for size in (1, 2, 3, 7, 50):
@@ -149,7 +148,7 @@ def test_any_histogram_gives_a_place_inside_or_none(matched):
 class TestCorrected:
     """With a dead time that the detector reckons with."""
 
-    @each_row(("dead", "period"), [(0.5, 1e6), (4.0, 1e6), (50.0, 1e6), (50.0, 45.0), (130.0, 45.0)])
+    @pytest.mark.parametrize(("dead", "period"), [(0.5, 1e6), (4.0, 1e6), (50.0, 1e6), (50.0, 45.0), (130.0, 45.0)])
     def test_alive_shares_agree_with_a_naive_count_over_pulses(self, dead, period):
         counts = np.random.default_rng(1).poisson(3.0, 40)
         pulses = 10_000.0
@@ -164,8 +163,8 @@ class TestCorrected:
             naive.append(1 - blind / pulses)
         np.testing.assert_allclose(alive_shares(counts, pulses, dead, period), naive, rtol=1e-12)
 
-    @each_row("matched", [True, False])
-    @each_row("seed", range(5))
+    @pytest.mark.parametrize("matched", [True, False])
+    @pytest.mark.parametrize("seed", range(5))
     def test_without_blindness_it_agrees_with_the_uncorrected_search(self, matched, seed):
         generator = np.random.default_rng(seed)
         counts = generator.poisson(1.0, 80) + generator.poisson(pulse(80, 40.3, 60))
@@ -177,7 +176,7 @@ class TestCorrected:
         else:
             assert corrected == plain
 
-    @each_row("seed", range(5))
+    @pytest.mark.parametrize("seed", range(5))
     def test_what_pile_up_tilts_is_no_pulse(self, seed):
         """Even light that is counted once per pulse: exp(-l b)."""
         generator = np.random.default_rng(seed)
@@ -185,7 +184,7 @@ class TestCorrected:
         assert np.isfinite(found(counts))
         assert np.isnan(found_corrected(counts, dead=1e3, pulses=4000))
 
-    @each_row("seed", range(5))
+    @pytest.mark.parametrize("seed", range(5))
     def test_a_pulse_behind_the_tilt_is_found(self, seed):
         generator = np.random.default_rng(seed)
         arriving = np.full(200, 0.01) + 0.15 * np.diff(norm.cdf((np.arange(201) - 90.2) / SIGMA))
@@ -199,7 +198,7 @@ class TestCorrected:
         assert found(counts) < 30.3 - 0.4 * SIGMA
         assert found_corrected(counts, dead=1e3, pulses=1e5) == pytest.approx(30.3, abs=0.1 * SIGMA)
 
-    @each_row("matched", [True, False])
+    @pytest.mark.parametrize("matched", [True, False])
     def test_any_histogram_gives_a_place_inside_or_none(self, matched):
         generator = np.random.default_rng(2)
         for size in (1, 2, 3, 7, 50):

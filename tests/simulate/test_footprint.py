@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.tables import each_row
 
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays
@@ -35,7 +34,7 @@ def echoes_of(scene, beams):
     return direct_echoes(scene, beams, SceneCaster(scene).first_hit(beams.origin_m, beams.direction))
 
 
-@each_row("count", [2, 3, 8, 16, 33, 100])
+@pytest.mark.parametrize("count", [2, 3, 8, 16, 33, 100])
 def test_points_of_the_disc_are_its_own_half_turn_with_the_mean_square_radius_of_a_disc(count):
     points = even_disc(count)
     assert points.shape == (count, 2)
@@ -53,8 +52,8 @@ def test_points_of_the_disc_keep_their_distance():
         assert apart.min() > 1.6 / math.sqrt(count)
 
 
-@each_row("count", [1, 7, 32])
-@each_row("half_rad", [1e-6, 0.02, 1.0, math.pi])
+@pytest.mark.parametrize("count", [1, 7, 32])
+@pytest.mark.parametrize("half_rad", [1e-6, 0.02, 1.0, math.pi])
 def test_a_beams_parts_lie_in_its_cone_evenly_over_its_solid_angle(count, half_rad):
     looking = direction(np.array([0.3, 2.0]), np.array([-0.7, 1.1]))
     parts = split_beams(beams_along(looking), wide(count, 2 * half_rad))
@@ -103,7 +102,7 @@ def test_the_mean_range_on_a_tilted_plane_is_that_of_the_cone():
     assert echoes.path_m.std() == pytest.approx(tangent * HALF_RAD, rel=5e-3)
 
 
-@each_row("inside", [0.15, 0.5, 0.8])
+@pytest.mark.parametrize("inside", [0.15, 0.5, 0.8])
 def test_at_an_edge_both_depths_get_their_share_of_the_disc(inside):
     # a near plate covers all lateral angles above an edge that cuts the disc at offset h: a circle's segment
     h = math.cos(math.pi * inside)

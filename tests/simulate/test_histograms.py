@@ -10,7 +10,6 @@ import pytest
 from support.rays import rays_along
 from support.references import STANDARD_ERRORS
 from support.synthetic_light import PHOTON_EFFECTS
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.rays import Outcome
@@ -40,8 +39,8 @@ def captured(scene, rays, effects, detector=DETECTOR):
     return photon_histograms(scene, 0, rays, build_casters(scene)[0], Physics(detector, frozenset(effects)))
 
 
-@each_row(("distance", "tilt", "reflectance"), [(0.4, 0.0, 0.6), (0.4, 1.0, 0.6), (1.5, 0.5, 0.05)])
-@each_row("emission", ["scanned", "flood"])
+@pytest.mark.parametrize(("distance", "tilt", "reflectance"), [(0.4, 0.0, 0.6), (0.4, 1.0, 0.6), (1.5, 0.5, 0.05)])
+@pytest.mark.parametrize("emission", ["scanned", "flood"])
 def test_signal_counts_follow_the_radar_equation(distance, tilt, reflectance, emission):
     """N = E / (h c / lambda) * eta * A rho cos / (pi R^2), for each of a frame's shared pulses."""
     rays = rays_towards(np.tile([math.sin(tilt), 0.0, math.cos(tilt)], (50, 1)), (0.0, 5.0))
@@ -55,7 +54,7 @@ def test_signal_counts_follow_the_radar_equation(distance, tilt, reflectance, em
     assert abs(found - 50 * expected) < STANDARD_ERRORS * math.sqrt(50 * expected)
 
 
-@each_row("illuminance", [300.0, 100_000.0])
+@pytest.mark.parametrize("illuminance", [300.0, 100_000.0])
 def test_ambient_counts_follow_radiance_aperture_and_solid_angle(illuminance):
     scene = ceiling(2.0, ambient=Ambient(illuminance, "sun"))
     rays = rays_towards(np.tile([0.0, 0.0, 1.0], (100, 1)), (0.5, 1.5))
@@ -82,7 +81,7 @@ def photopic(wavelength_nm):
     return 1.019 * np.exp(-285.4 * (wavelength_nm / 1000 - 0.559) ** 2)
 
 
-@each_row(("table", "lux"), [(SUN_AT_100_KLUX, 1e5), (LED_AT_1_LUX, 1.0)])
+@pytest.mark.parametrize(("table", "lux"), [(SUN_AT_100_KLUX, 1e5), (LED_AT_1_LUX, 1.0)])
 def test_the_spectra_have_the_illuminance_that_they_are_for(table, lux):
     wavelength_nm = FIRST_NM + STEP_NM * np.arange(len(table))
     assert 683 * STEP_NM * np.sum(table * photopic(wavelength_nm)) == pytest.approx(lux, rel=0.03)
@@ -200,7 +199,7 @@ def test_noise_that_is_taken_for_a_return_belongs_to_no_body():
     assert set(found.outcome.tolist()) == {Outcome.RETURN, Outcome.MISS}
 
 
-@each_row("choice", ["auto", "none", "all"])
+@pytest.mark.parametrize("choice", ["auto", "none", "all"])
 def test_gates_that_a_detector_cannot_hear_are_refused_whatever_is_simulated(choice):
     scene, directions = face_like()
     short = replace(DETECTOR, bins=100)

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.tables import each_row
 from support.transients import binned, flood, needs_simulator, pixel_rays, rays_from, spiral, spot
 
 from lidardesign.errors import ConfigError, NumericalError
@@ -95,8 +94,8 @@ def histogram(path_m: np.ndarray, weight: np.ndarray, bins: PathBins) -> np.ndar
 
 
 @needs_simulator
-@each_row("receiver", [None, BISTATIC], ids=["co-located", "bistatic"])
-@each_row("name", SCENES)
+@pytest.mark.parametrize("receiver", [None, BISTATIC], ids=["co-located", "bistatic"])
+@pytest.mark.parametrize("name", SCENES)
 def test_every_ray_has_the_gain_and_the_time_of_the_direct_component(name, receiver):
     scene = replace(SCENES[name](), receiver=receiver)
     rays = rays_from((0, 0, 0), spiral(4000, 0.3))
@@ -121,8 +120,8 @@ def test_every_ray_has_the_gain_and_the_time_of_the_direct_component(name, recei
 
 
 @needs_simulator
-@each_row("emitter_m", [(0.0, 0.0, 0.0), (-0.02, -0.08, 0.05)], ids=["co-located", "elsewhere"])
-@each_row("name", SCENES)
+@pytest.mark.parametrize("emitter_m", [(0.0, 0.0, 0.0), (-0.02, -0.08, 0.05)], ids=["co-located", "elsewhere"])
+@pytest.mark.parametrize("name", SCENES)
 def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitter_m):
     """Forward: a spot light of 1 W and a camera of the simulator's, against our beams from the emitter."""
     receiver = Receiver((0, 0, 0), 0.0, 0.0, VIEW_RAD, VIEW_RAD, (0.0, 5.0))
@@ -145,8 +144,8 @@ def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitte
 
 
 @needs_simulator
-@each_row("shape", [Sphere(0.3), Box((0.2, 0.3, 0.25)), Capsule(0.2, 0.25), Plane()], ids=repr)
-@each_row("offset_m", [0.0, 1e5])
+@pytest.mark.parametrize("shape", [Sphere(0.3), Box((0.2, 0.3, 0.25)), Capsule(0.2, 0.25), Plane()], ids=repr)
+@pytest.mark.parametrize("offset_m", [0.0, 1e5])
 def test_every_shape_is_exported_where_it_is(shape, offset_m):
     place = np.array([1.5 + offset_m, 0.2, 0.1])
     scene = Scene((Body(shape, reflectance=0.6, poses=rigid(turned(2), place)),))
@@ -158,7 +157,7 @@ def test_every_shape_is_exported_where_it_is(shape, offset_m):
 
 
 @needs_simulator
-@each_row("shape", [Cylinder(0.2, 0.25), Ellipsoid((0.2, 0.3, 0.25))], ids=repr)
+@pytest.mark.parametrize("shape", [Cylinder(0.2, 0.25), Ellipsoid((0.2, 0.3, 0.25))], ids=repr)
 def test_shapes_that_the_renderer_takes_as_meshes_send_back_as_much_light(shape):
     scene = Scene((Body(shape, poses=rigid(turned(2), (1.5, 0.2, 0.1))),))
     rays = rays_from((0.0, 0.0, 0.0), spiral(500, 0.3), far_m=100.0)
@@ -190,7 +189,7 @@ def test_meshes_are_shaded_on_both_sides_and_follow_their_poses():
 
 
 @needs_simulator
-@each_row("bounces", [1, 2, 4, 7])
+@pytest.mark.parametrize("bounces", [1, 2, 4, 7])
 def test_light_within_a_ball_adds_up_to_the_geometric_series(bounces):
     """Inside a matt ball every bounce lights all of it evenly: E_k = rho^k Phi / (4 pi R^2), Ulbricht's sphere."""
     radius_m, reflectance = 1.5, 0.6
@@ -253,20 +252,20 @@ def test_a_camera_fills_its_field_of_view():
     np.testing.assert_allclose(mean / np.linalg.norm(mean), ahead, atol=1e-6)
 
 
-@each_row("numbers", [{"bounces": 0}, {"samples": 0}, {"own_light": True}])
+@pytest.mark.parametrize("numbers", [{"bounces": 0}, {"samples": 0}, {"own_light": True}])
 def test_impossible_requests_are_refused_before_anything_runs(numbers):
     rays = rays_from((0, 0, 0), spiral(3, 0.1))
     with pytest.raises(ConfigError, match="allowed"):
         render_transient(sphere_scene(), 0, rays, flood(np.zeros((1, 3))), PathBins(0.1, 10), **numbers)
 
 
-@each_row("numbers", [(0.0, 10), (math.nan, 10), (0.1, 0), (0.1, 10, math.inf)])
+@pytest.mark.parametrize("numbers", [(0.0, 10), (math.nan, 10), (0.1, 0), (0.1, 10, math.inf)])
 def test_bins_have_a_width_and_a_number(numbers):
     with pytest.raises(ConfigError, match="allowed"):
         PathBins(*numbers)
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("name", "version"),
     [
         ("libLLVM-19.so", 19),
@@ -307,7 +306,7 @@ def test_a_simulator_that_is_too_old_is_not_used(monkeypatch):
     assert "too old: 99.1 or newer" in process.missing()
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("work", "words", "limit_s"),
     [
         ("aborts", ("crashes while it renders (Aborted)", "LLVM ERROR: Cannot select", "libllvm19"), 60),

@@ -9,7 +9,6 @@ import pytest
 import trimesh
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
-from support.tables import each_row
 
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
@@ -60,7 +59,7 @@ def test_a_flying_ball_is_hit_where_it_is_at_each_rays_time():
     assert hits.normal[hit] == pytest.approx((points - centre[hit]) / 0.5, abs=1e-7)
 
 
-@each_row("shape", SHAPES.values(), ids=SHAPES)
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_every_ray_sees_what_a_scene_at_rest_at_its_time_shows(shape):
     generator = np.random.default_rng(3)
     ahead = rigid(translation_m=(2.5, 0.0, 0.0))

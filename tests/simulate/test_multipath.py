@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.tables import each_row
 from support.transients import binned, needs_simulator, rays_from, spiral, spot
 
 from lidardesign.scenes.casting import shared_caster
@@ -73,9 +72,9 @@ def bounded(scene: Scene, rays: Rays, detector: Detector) -> Detours:
 
 
 @needs_simulator
-@each_row("receiver", [None, RECEIVER], ids=["co-located", "fixed"])
-@each_row("detector", [FLOOD, WIDE], ids=["flood", "scanned"])
-@each_row("scene", [ball, lambda receiver: Scene((corner().bodies[0],), receiver=receiver)])
+@pytest.mark.parametrize("receiver", [None, RECEIVER], ids=["co-located", "fixed"])
+@pytest.mark.parametrize("detector", [FLOOD, WIDE], ids=["flood", "scanned"])
+@pytest.mark.parametrize("scene", [ball, lambda receiver: Scene((corner().bodies[0],), receiver=receiver)])
 def test_convex_and_flat_bodies_alone_hear_no_detours(scene, detector, receiver):
     share, _ = shares(scene(receiver), into_the_corner(100), detector)
     assert not share.any()
@@ -107,7 +106,7 @@ def test_a_scanned_pixel_hears_its_own_spot_by_way_of_the_wall_as_in_closed_form
 
 
 @needs_simulator
-@each_row("count", [400, 3000])
+@pytest.mark.parametrize("count", [400, 3000])
 def test_a_flood_of_rays_hears_what_a_lamp_of_the_same_cone_shows(count):
     """The spots of rays, even in solid angle, stand for a lamp that lights the cone evenly."""
     rays = into_the_corner(count)
@@ -152,9 +151,9 @@ def test_a_fixed_receiver_hears_a_beam_by_way_of_the_wall_as_an_integral_says():
 
 
 @needs_simulator
-@each_row("receiver", [None, RECEIVER], ids=["co-located", "fixed"])
-@each_row("detector", [FLOOD, WIDE], ids=["flood", "scanned"])
-@each_row("scene", [corner, room])
+@pytest.mark.parametrize("receiver", [None, RECEIVER], ids=["co-located", "fixed"])
+@pytest.mark.parametrize("detector", [FLOOD, WIDE], ids=["flood", "scanned"])
+@pytest.mark.parametrize("scene", [corner, room])
 def test_the_bound_holds_and_says_something(scene, detector, receiver):
     rays = into_the_corner()
     share, _ = shares(scene(receiver), rays, detector)

@@ -7,7 +7,6 @@ import pytest
 from scipy.stats import chi2, norm
 from support.references import STANDARD_ERRORS, first_photon_distribution, naive_counts_with_dead_time
 from support.synthetic_light import PULSES, background, counted, counting_detector, no_echoes, single_echoes, windows
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.detection import coates
@@ -41,7 +40,7 @@ def even_light(per_bin, **options):
     return seen(per_bin, {"ambient", "pile_up"}, **options)
 
 
-@each_row("per_bin", [0.002, 0.03, 0.3])
+@pytest.mark.parametrize("per_bin", [0.002, 0.03, 0.3])
 def test_the_first_photon_of_a_pulse_follows_its_distribution(per_bin):
     counts = even_light(per_bin).sum(axis=0)
     observed = np.append(counts, RAYS * PULSES - counts.sum())
@@ -90,7 +89,7 @@ def pulses_of(key, ray, arrived, pulses):
     return [min(int(uniform(np.uint64(key), ray, draw) * pulses), pulses - 1) for draw in draws]
 
 
-@each_row(("dead", "period"), [(3.0, 45.0), (30.0, 45.0), (44.0, 45.0), (100.5, 45.0), (1000.0, 45.0)])
+@pytest.mark.parametrize(("dead", "period"), [(3.0, 45.0), (30.0, 45.0), (44.0, 45.0), (100.5, 45.0), (1000.0, 45.0)])
 def test_dead_times_that_reach_across_pulses_agree_with_a_naive_loop_to_the_photon(dead, period):
     generator = np.random.default_rng(3)
     for ray in range(20):
@@ -104,8 +103,8 @@ def test_dead_times_that_reach_across_pulses_agree_with_a_naive_loop_to_the_phot
         assert np.array_equal(found, expected)
 
 
-@each_row("per_bin", [0.3, 3.0, 60.0])
-@each_row("dead", [0.4, 1.0, 2.5, 7.0, 100.0])
+@pytest.mark.parametrize("per_bin", [0.3, 3.0, 60.0])
+@pytest.mark.parametrize("dead", [0.4, 1.0, 2.5, 7.0, 100.0])
 def test_dead_times_within_pulses_agree_with_a_naive_loop_on_average(dead, per_bin):
     generator, pulses, repeats = np.random.default_rng(4), 50, 150 if per_bin < 10 else 40
     ours, naive = np.zeros((repeats, BINS)), np.zeros((repeats, BINS))
@@ -123,7 +122,7 @@ def test_dead_times_within_pulses_agree_with_a_naive_loop_on_average(dead, per_b
     assert ours.sum(axis=1).std() == pytest.approx(naive.sum(axis=1).std(), rel=0.4, abs=0.2)
 
 
-@each_row("follow", [_within_pulses, _across_pulses])
+@pytest.mark.parametrize("follow", [_within_pulses, _across_pulses])
 def test_a_photon_more_changes_nothing_in_bins_that_its_pulse_does_not_blind(follow):
     arrived = np.random.default_rng(8).poisson(3.0, BINS)
     one_more = arrived.copy()
@@ -157,8 +156,8 @@ def test_photons_that_fall_into_the_same_pulse_are_counted_once():
     assert ours.var() == pytest.approx(naive.var() + 1 / 12, rel=0.15)
 
 
-@each_row(("alive", "pulses"), [(1, 10_000), (7, 10_000), (60, 10_000), (300, 10_000), (5, 40)])
-@each_row("photons", [33, 80, 400])
+@pytest.mark.parametrize(("alive", "pulses"), [(1, 10_000), (7, 10_000), (60, 10_000), (300, 10_000), (5, 40)])
+@pytest.mark.parametrize("photons", [33, 80, 400])
 def test_the_last_pulses_are_hit_as_often_as_they_should(alive, pulses, photons):
     """Few of many pulses are alive where gates begin brightly: less than one is hit per bin."""
     share = (np.arange(100_000) + 0.5) / 100_000
@@ -166,7 +165,7 @@ def test_the_last_pulses_are_hit_as_often_as_they_should(alive, pulses, photons)
     assert mean == pytest.approx(alive * (1 - (1 - 1 / pulses) ** photons), rel=0.01)
 
 
-@each_row(("alive", "pulses", "photons"), [(0, 10, 50), (1, 1, 10**12), (2, 2, 100), (10, 10, 10**12)])
+@pytest.mark.parametrize(("alive", "pulses", "photons"), [(0, 10, 50), (1, 1, 10**12), (2, 2, 100), (10, 10, 10**12)])
 def test_light_that_hits_every_pulse_is_counted_in_every_pulse_that_is_alive(alive, pulses, photons):
     for z in (-3.0, 0.0, 3.0):
         assert _hit_pulses(photons, alive, pulses, z) == alive
@@ -224,7 +223,7 @@ def test_coates_knows_nothing_after_the_last_pulse_is_used_up():
     assert np.isnan(corrected[1:]).all()
 
 
-@each_row("counts", [[6, 5], [-1, 2]])
+@pytest.mark.parametrize("counts", [[6, 5], [-1, 2]])
 def test_coates_refuses_counts_that_no_single_photon_detector_gives(counts):
     with pytest.raises(ConfigError, match="at most one photon per pulse"):
         coates(np.array(counts), 10)

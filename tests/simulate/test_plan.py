@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.planning import CONSUMER, SINGLE, TIMED, decisions, grid, room
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
@@ -34,7 +33,7 @@ def test_an_ideal_detector_calls_for_nothing_where_light_goes_straight_and_no_ra
         assert Planner().physics(plan, 0) is None
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("name", "scene", "detector", "reason"),
     [
         ("specular", room(ball={"specular": 0.4}), IDEAL, "ball"),
@@ -58,9 +57,9 @@ def test_each_effect_is_called_for_by_its_own_cause_with_its_reason(name, scene,
     assert decision.bound.range_m > tolerance.range_m or decision.bound.lost > tolerance.lost
 
 
-@each_row("detector", [TIMED, SINGLE, CONSUMER], ids=lambda detector: detector.name)
-@each_row("tolerance", [Tolerance(1e-4, 1e-3), Tolerance(3e-3, 0.05), Tolerance(0.2, 0.6)])
-@each_row("scene", [room(), room(**EVERYTHING)], ids=["plain", "everything"])
+@pytest.mark.parametrize("detector", [TIMED, SINGLE, CONSUMER], ids=lambda detector: detector.name)
+@pytest.mark.parametrize("tolerance", [Tolerance(1e-4, 1e-3), Tolerance(3e-3, 0.05), Tolerance(0.2, 0.6)])
+@pytest.mark.parametrize("scene", [room(), room(**EVERYTHING)], ids=["plain", "everything"])
 def test_all_that_is_skipped_stays_within_the_tolerance_together(detector, tolerance, scene):
     plan = Planner(detector, tolerance=tolerance).plan(scene, [grid()])
     skipped = [decision.bound for decision in plan.decisions if not decision.on and decision.missing is None]
@@ -143,7 +142,7 @@ def test_what_cannot_be_simulated_here_is_named_and_asking_for_it_is_refused(mon
 
 
 @pytest.mark.hard_case("21")
-@each_row("text", ["noise", "", "jitter,", "photon_noise,ambint", "Auto"])
+@pytest.mark.parametrize("text", ["noise", "", "jitter,", "photon_noise,ambint", "Auto"])
 def test_unknown_effects_are_refused_with_the_names_of_all(text):
     with pytest.raises(ConfigError) as caught:
         parse_effects(text)
@@ -156,7 +155,7 @@ def test_a_choice_does_not_stand_among_names():
             parse_effects(text)
 
 
-@each_row("bad", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
 def test_tolerances_are_finite_and_above_zero(bad):
     for values in ((bad, 0.001), (0.001, bad)):
         with pytest.raises(ConfigError, match="tolerance"):

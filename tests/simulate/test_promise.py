@@ -11,7 +11,6 @@ import pytest
 from scipy.stats import norm
 from soak.promise import kept_promise, random_case
 from support.planning import CONSUMER, SINGLE, TIMED, decisions, facing_wall, grid, sight
-from support.tables import each_row
 
 from lidardesign.scenes.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.kernels import find_returns
@@ -20,7 +19,7 @@ from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import simulate
 
 
-@each_row("seed", range(60))
+@pytest.mark.parametrize("seed", range(60))
 def test_what_is_skipped_changes_no_more_than_is_tolerated(seed):
     kept = kept_promise(random_case(seed))
     assert not kept.broken, str(kept)
@@ -40,7 +39,7 @@ def wall_at(range_m):
     return Scene((Body(Box((0.05, 9, 9)), "wall", poses=rigid(translation_m=(range_m + 0.05, 0, 0))),))
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("place", "jitter_share", "is_on"),
     [
         # in bins of 0.1 m from range 0; the wall lies so many bins off
@@ -72,9 +71,9 @@ def test_steps_in_even_phases_are_as_likely_as_shifts_are_long():
     assert drawn <= jitter <= 2 * drawn
 
 
-@each_row("pulse_bins", [0.02, 0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 1.7, 2.5, 4.0])
-@each_row("timing_share", [0.0, 1.0, 5.0])
-@each_row("level", [0.0, 1e3, 1e6, 1e8])
+@pytest.mark.parametrize("pulse_bins", [0.02, 0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 1.7, 2.5, 4.0])
+@pytest.mark.parametrize("timing_share", [0.0, 1.0, 5.0])
+@pytest.mark.parametrize("level", [0.0, 1e3, 1e6, 1e8])
 def test_the_matched_filter_leaves_no_more_of_a_step_than_bounded(pulse_bins, timing_share, level):
     """Ten million photons of a pulse at every place in a bin, found by a filter for the pulse or a wider one."""
     bin_s, places = SINGLE.bin_s, np.linspace(-0.499, 0.499, 41)
@@ -91,14 +90,14 @@ def test_the_matched_filter_leaves_no_more_of_a_step_than_bounded(pulse_bins, ti
     assert (off <= sight(facing_wall(), detector).step_m[0] / detector.bin_m / 2 + 1e-3).all()
 
 
-@each_row("place", [20.0, 20.25, 20.5])
+@pytest.mark.parametrize("place", [20.0, 20.25, 20.5])
 def test_rounding_is_bounded_by_what_it_does_to_walls_met_head_on(place):
     rays = grid(4, 1e-6)
     found = decisions(Planner(rounding(0.0)).plan(wall_at(0.1 * place), [rays]))["quantisation"].bound.range_m
     assert found == pytest.approx(max(0.1 / math.sqrt(12), 0.1 * abs(place % 1 - 0.5)), rel=1e-6)
 
 
-@each_row(("baseline_m", "range_m"), [(0.0, 1.0), (0.4, 1.0), (2.0, 1.0), (0.4, 0.1)])
+@pytest.mark.parametrize(("baseline_m", "range_m"), [(0.0, 1.0), (0.4, 1.0), (2.0, 1.0), (0.4, 0.1)])
 def test_errors_of_paths_are_larger_ones_of_ranges_beside_a_receiver(baseline_m, range_m):
     """One timing error per return: dr = dp / ((1 + cos) / 2), by finite differences of the whole way."""
     scene = replace(wall_at(range_m), receiver=Receiver((0, baseline_m, 0), 0, 0, 3.1, 3.1, (0, 20)))
@@ -120,9 +119,9 @@ TOUCHING = {
 }
 
 
-@each_row("scene", TOUCHING.values(), ids=TOUCHING)
-@each_row("detector", [SINGLE, CONSUMER, SHARP, replace(SHARP, estimator="peak"), BRIGHT])
-@each_row("gate_m", [(0.0, 4.0), (0.0, 1e-9), (0.5, 4.0)])
+@pytest.mark.parametrize("scene", TOUCHING.values(), ids=TOUCHING)
+@pytest.mark.parametrize("detector", [SINGLE, CONSUMER, SHARP, replace(SHARP, estimator="peak"), BRIGHT])
+@pytest.mark.parametrize("gate_m", [(0.0, 4.0), (0.0, 1e-9), (0.5, 4.0)])
 def test_surfaces_that_touch_a_receiver_are_bounded_without_overflow(scene, detector, gate_m):
     for air in ({}, {"medium": Medium(0.1, 0.01)}, {"receiver": Receiver((0, 0.2, 0), 0, 0, 3.1, 3.1, (0, 20))}):
         with warnings.catch_warnings():

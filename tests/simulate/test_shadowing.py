@@ -10,7 +10,6 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from support.rays import random_fan, rays_along
-from support.tables import each_row
 
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
@@ -56,7 +55,7 @@ def test_the_shadow_of_a_ball_on_a_wall_is_its_cone():
     assert np.array_equal(lit.ray[aside > 0.3], kept.ray[kept.body == 0])
 
 
-@each_row(
+@pytest.mark.parametrize(
     "change",
     [{"horizontal_rad": 0.4}, {"vertical_rad": 0.4}, {"range_m": (0.0, 4.1)}, {"range_m": (4.2, 9.0)}],
 )
@@ -79,8 +78,8 @@ def test_the_far_side_of_a_thin_plate_is_not_heard():
     assert not len(kept)
 
 
-@each_row("scale", [0.01, 1.0, 100.0])
-@each_row("shift", [0.0, 1000.0])
+@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize("shift", [0.0, 1000.0])
 def test_bodies_that_touch_do_not_hide_each_other_where_they_touch(scale, shift):
     # a floor, and on it a box and a meshed cube, all touching: each sees the receiver from all of its open faces
     made = trimesh.creation.box(extents=[1.0, 1.0, 1.0])
@@ -131,7 +130,7 @@ def test_turning_the_world_changes_nothing_that_is_heard():
     assert there.gain == pytest.approx(here.gain, rel=1e-9)
 
 
-@each_row("radius_m", [1.0, 30.0, 1000.0])
+@pytest.mark.parametrize("radius_m", [1.0, 30.0, 1000.0])
 def test_a_receiver_just_above_a_large_mesh_sees_all_that_is_lit_there(radius_m):
     room = trimesh.creation.box(extents=[2 * radius_m] * 3)
     mesh = Mesh(np.array(room.vertices), np.array(room.faces), "unsigned")

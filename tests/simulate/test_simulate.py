@@ -11,7 +11,6 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from support.rays import random_fan, rays_along
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.casting import SceneCaster
@@ -147,9 +146,9 @@ RAYS = {
 }
 
 
-@each_row("receiver", RECEIVERS.values(), ids=RECEIVERS)
-@each_row("rays", RAYS.values(), ids=RAYS)
-@each_row("name", ["single-photon", "consumer-8x8", "ideal"])
+@pytest.mark.parametrize("receiver", RECEIVERS.values(), ids=RECEIVERS)
+@pytest.mark.parametrize("rays", RAYS.values(), ids=RAYS)
+@pytest.mark.parametrize("name", ["single-photon", "consumer-8x8", "ideal"])
 def test_every_ray_has_one_outcome_and_a_range_in_its_gate_where_it_returns(receiver, rays, name):
     scene = Scene((BALL, FLOOR), ambient=Ambient(1e5), medium=Medium(0.3, 0.02), receiver=receiver)
     (returns,) = simulate(scene, rays, physics=Physics(load_detector(name), EVERYTHING))
@@ -174,7 +173,7 @@ def test_a_scene_of_mirrors_alone_returns_nothing():
     assert (returns.outcome[:2] == Outcome.NOT_DETECTED).all()
 
 
-@each_row(("reflectance", "gain"), [(0.0, 0.0), (0.5, np.finfo(float).max)])
+@pytest.mark.parametrize(("reflectance", "gain"), [(0.0, 0.0), (0.5, np.finfo(float).max)])
 def test_a_surface_that_touches_the_sensor_blinds_it_unless_it_is_black(reflectance, gain):
     floor = Scene((Body(Plane(), reflectance=reflectance),))
     down = rays_along([0.0, 0.0, -1.0], (0.0, 1.0))

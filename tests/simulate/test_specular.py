@@ -9,7 +9,6 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from support.rays import random_fan, rays_along
-from support.tables import each_row
 
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
@@ -51,7 +50,7 @@ def fan(count=100, spread=0.2, seed=0):
     return random_fan(count, spread, seed)
 
 
-@each_row("made", [lambda body: body, meshed], ids=["box", "mesh"])
+@pytest.mark.parametrize("made", [lambda body: body, meshed], ids=["box", "mesh"])
 def test_a_flat_mirror_shows_the_image_of_the_scene_at_its_whole_distance(made):
     mirror = made(slab(2.0, yaw_rad=math.radians(45), reflectance=0.0, specular=0.7))
     # the mirror x + ... turned by 45 degrees sends x to -y: the ball is seen as if it lay behind the mirror
@@ -189,8 +188,8 @@ def test_a_fixed_receiver_hears_through_panes_on_both_ways():
     assert behind.gain == pytest.approx([0.9**4 * 0.5 * (3 / back_m) / (math.pi * back_m**2)], rel=1e-9)
 
 
-@each_row("radius_m", [1.0, 30.0, 1000.0])
-@each_row("height_m", [0.05, 1.0])
+@pytest.mark.parametrize("radius_m", [1.0, 30.0, 1000.0])
+@pytest.mark.parametrize("height_m", [0.05, 1.0])
 def test_beams_leave_large_meshes_for_good_however_near_they_start(radius_m, height_m):
     room = trimesh.creation.box(extents=[2 * radius_m] * 3)
     mesh = Mesh(np.array(room.vertices), np.array(room.faces), "unsigned")
@@ -212,7 +211,7 @@ def test_a_beam_that_starts_on_a_mirror_comes_back_finite():
     assert np.isfinite(led.path_m).all()
 
 
-@each_row("at_once", [1, 7, 50])
+@pytest.mark.parametrize("at_once", [1, 7, 50])
 def test_beams_that_are_followed_in_groups_have_the_echoes_that_they_have_together(monkeypatch, at_once):
     window = slab(1.0, specular=0.3, transmission=0.6, reflectance=0.1)
     scene = Scene((window, slab(2.0, specular=0.4, reflectance=0.5)))

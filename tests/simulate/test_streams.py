@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.special import ndtri
 from scipy.stats import chi2, kstest, poisson
 from support.references import STANDARD_ERRORS
-from support.tables import each_row
 
 from lidardesign.simulate.detector.streams import (
     MOST_COUNTS,
@@ -38,8 +38,8 @@ def along_keys(key):
 DIRECTIONS = {"rows": along_rows, "draws": along_draws, "keys": along_keys}
 
 
-@each_row("direction", DIRECTIONS)
-@each_row("key", [0, 1, 2**63 - 1, 2**64 - 2**20])
+@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("key", [0, 1, 2**63 - 1, 2**64 - 2**20])
 def test_numbers_are_uniform_along_rows_draws_and_keys(direction, key):
     values = DIRECTIONS[direction](key)
     counts = np.bincount((values * 256).astype(int), minlength=256)
@@ -49,7 +49,7 @@ def test_numbers_are_uniform_along_rows_draws_and_keys(direction, key):
     assert 0 < values.min() < values.max() < 1
 
 
-@each_row("direction", DIRECTIONS)
+@pytest.mark.parametrize("direction", DIRECTIONS)
 def test_neighbours_fill_the_square_evenly(direction):
     values = DIRECTIONS[direction](11)
     cells = (values[:-1] * 32).astype(int) * 32 + (values[1:] * 32).astype(int)
@@ -95,13 +95,13 @@ def test_normal_quantiles_agree_with_scipy():
     np.testing.assert_allclose(ours, ndtri(shares), rtol=1e-13, atol=1e-15)
 
 
-@each_row("mean", [1e-9, 0.3, 4.0, 31.9])
+@pytest.mark.parametrize("mean", [1e-9, 0.3, 4.0, 31.9])
 def test_small_poisson_quantiles_are_exact(mean):
     shares = along_rows(8)[:5000]
     assert np.array_equal([poisson_quantile(mean, share) for share in shares], poisson.ppf(shares, mean))
 
 
-@each_row("mean", [32.1, 500.0, 1e6])
+@pytest.mark.parametrize("mean", [32.1, 500.0, 1e6])
 def test_large_poisson_quantiles_are_off_by_one_count_at_most_and_seldom(mean):
     shares = along_rows(8)[:20_000]
     off = np.array([poisson_quantile(mean, share) for share in shares]) - poisson.ppf(shares, mean)

@@ -45,7 +45,7 @@ def fitted(samples, constraints=None, **options) -> FittedSensors:
 
 
 def design_of(found: FittedSensors, level=0.95) -> DesignSpec:
-    """The design of fitted sensors that fire even rays, as many as the bandwidth allows where that says how many."""
+    """The design of fitted sensors with even rays, of which there are as many as a bandwidth allows."""
     budget = {} if found.rays is None else {"budget": {"rays": found.rays}}
     return DesignSpec("fitted", found.sensors, constraints=budget, level=level)
 

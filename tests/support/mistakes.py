@@ -5,9 +5,8 @@ from __future__ import annotations
 GARBAGE = bytes(range(256)) * 8
 
 GOOD = """\
-schema_version: 1
-layout: grid
-rays: 100
+schema_version: 2
+constraints: {budget: {rays: 100}}
 sensors:
 - name: one
   weight: 1.0

@@ -1,4 +1,4 @@
-"""Sensors of any figures, for hypothesis."""
+"""Sensors and patterns of any figures, for hypothesis."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import math
 import numpy as np
 from hypothesis import strategies as st
 
+from lidardesign.sensors.pattern import TRAVELLED, Pattern
 from lidardesign.sensors.sensor import Sensor
+from lidardesign.space import DIMENSIONS
 
 finite = st.floats(-1e6, 1e6)
 length = st.floats(0, 1e5)
@@ -30,5 +32,31 @@ def sensors(draw, name, weight, steepest=math.pi / 2, widest=2 * math.pi):
         azimuth_rad=draw(st.floats(-10, 10)), elevation_rad=draw(st.floats(-steepest, steepest)),
         roll_rad=draw(st.floats(-4, 4)),
         field_of_view_rad=(draw(st.floats(0, widest)), draw(st.floats(0, widest))),
-        gate_m=(start, start + width_m), origin_covariance_m2=draw(st.none() | covariances()),
+        gate_m=(start, start + width_m), origin_covariance_m2=draw(st.none() | covariances().filter(np.any)),
     )  # fmt: skip
+
+
+@st.composite
+def patterns(draw, sensors=2, rays=None, dimension=None):
+    """A pattern of any figures: a few rays of so many sensors, at knots where it follows a condition."""
+    count = draw(st.integers(1, 6)) if rays is None else rays
+    knots = draw(st.lists(st.integers(-999, 999), min_size=2, max_size=4, unique=True)) if dimension else []
+    shape = (max(len(knots), 1), count)
+
+    def column(values):
+        size = math.prod(shape)
+        return np.array(draw(st.lists(values, min_size=size, max_size=size)), dtype=np.float64).reshape(shape)
+
+    origin_m = np.stack([column(finite) for _ in range(3)], axis=2)
+    if dimension:
+        origin_m[..., DIMENSIONS.index(dimension)] = np.sort(knots)[:, None] / 8
+    start_m = column(length)
+    return Pattern(
+        origin_m, column(st.floats(-10, 10)), column(st.floats(-math.pi / 2, math.pi / 2)),
+        np.stack([start_m, start_m + column(width)], axis=2),
+        np.array(draw(st.lists(st.integers(0, sensors - 1), min_size=count, max_size=count)), dtype=np.int64),
+        dimension, tuple(knot / 8 for knot in sorted(knots)),
+    )  # fmt: skip
+
+
+conditions = st.sampled_from(TRAVELLED)

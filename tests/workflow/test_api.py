@@ -22,7 +22,7 @@ run = ld.learn("face", preset="draft", out="runs/face", seed=0)        # or ld.o
 print(run.quality.ess, run.quality.kl_nats)
 points = run.density.sample(1000)                                      # and run.density.log_prob(points)
 
-free = run.fit(sensors=4, layout="grid", name="free")
+free = run.fit(sensors=4, layout="even", name="free")
 kept = run.fit(sensors=4, constraints={"gate": {"width_m": {"max": 0.1}}}, rays=196, name="kept")
 best = run.fit(sensors=10, rays=361, layout="density", gates="ray", name="best")
 best.save(); best.export("rays.csv"); rays = best.rays(196)
@@ -96,7 +96,7 @@ class Tables(HTMLParser):
 
 
 def test_notebooks_show_tables_and_figures(run):
-    design = run.fit(layout="grid", sensors=2, rays=16, name="a-b")
+    design = run.fit(layout="even", sensors=2, rays=16, name="a-b")
     scores = run.evaluate([design], rays=[16])
     for noun, rows in ((run, 9), (design, 3), (scores, 7)):
         page = Tables()
@@ -112,11 +112,11 @@ def test_saved_designs_are_those_of_commands(run):
     from lidardesign.cli.main import run as program
 
     rules = {"gate": {"width_m": {"max": 0.3}}, "budget": {"rays": 16}}
-    mine = run.fit(layout="grid", sensors=2, constraints=rules, name="mine").save()
+    mine = run.fit(layout="even", sensors=2, constraints=rules, name="mine").save()
     before = mine.read_bytes()
     with pytest.raises(SystemExit) as ended:
         program(
-            ["constrain", str(run.folder), "--layout", "grid", "--sensors", "2", "--set", "gate.width_m.max=0.3",
+            ["constrain", str(run.folder), "--layout", "even", "--sensors", "2", "--set", "gate.width_m.max=0.3",
              "--set", "budget.rays=16", "--name", "mine", "--quiet"]
         )  # fmt: skip
     assert not ended.value.code
@@ -134,7 +134,7 @@ def test_a_design_is_fitted_again_with_what_is_not_chosen_anew(run):
 
 
 def test_designs_work_without_a_run_and_find_their_own(run, tmp_path):
-    design = run.fit(layout="grid", sensors=2, rays=16, name="away")
+    design = run.fit(layout="even", sensors=2, rays=16, name="away")
     path = design.save(tmp_path / "elsewhere" / "away.yaml")
     assert lidardesign.load_design(path).run.folder.resolve() == run.folder.resolve()
     shutil.rmtree(run.folder)

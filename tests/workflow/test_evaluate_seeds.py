@@ -26,8 +26,8 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("seeds")
     for seed in (1, 2, 3):
         run = package.open_run(make_run(folder / f"flat-{seed}", seed=seed))
-        run.fit(layout="grid", sensors=2, rays=8, name="two").save()
-    package.open_run(folder / "flat-1").fit(layout="grid", sensors=1, rays=8, name="one").save()
+        run.fit(layout="even", sensors=2, rays=8, name="two").save()
+    package.open_run(folder / "flat-1").fit(layout="even", sensors=1, rays=8, name="one").save()
     return folder
 
 

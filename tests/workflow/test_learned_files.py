@@ -136,8 +136,8 @@ def test_every_command_keeps_them_and_learning_again_takes_newcomers_in(place, c
     run = place / "run"
     for command in (
         ["show", run],
-        ["fit", run, "--sensors", 1, "--rays", 4, "--layout", "grid"],
-        ["constrain", run, "--sensors", 1, "--layout", "grid", "--set", "budget.rays=4"],
+        ["fit", run, "--sensors", 1, "--rays", 4, "--layout", "even"],
+        ["constrain", run, "--sensors", 1, "--layout", "even", "--set", "budget.rays=4"],
         ["evaluate", run / "designs" / "fit.yaml", "--rays", 4],
     ):
         result = lidardesign(*command)

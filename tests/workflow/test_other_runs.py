@@ -20,7 +20,7 @@ from lidardesign.scoring.evaluation.thresholds import difference_text
 from lidardesign.sensors.compare import outside_space
 from lidardesign.space import DIMENSIONS, direction
 
-LAYOUTS = ("grid", "selected")
+LAYOUTS = ("even", "chosen")
 OPTIONS = {"rays": [8], "baselines": ["lloyd", "occupancy", "no-visibility"]}
 
 
@@ -78,7 +78,7 @@ def test_the_command_takes_the_run_that_is_named(lidardesign, runs):
     scores = package.open_run(other).evaluate([design], rays=[8])
     assert without_times(json.loads(found.out)) == without_times(json.loads(json.dumps(scores.as_dict())))
     # the run that judges has a design of the name, too
-    package.open_run(other).fit(layout="grid", sensors=1, rays=8, name="grid").save()
+    package.open_run(other).fit(layout="even", sensors=1, rays=8, name="grid").save()
     both = lidardesign("evaluate", other, design, "--in", other, "--rays", 8, "--json").json
     values = {row["design"]: row["value"] for row in both["rows"]}
     assert values["own/grid"] == found.json["rows"][0]["value"]
@@ -103,7 +103,7 @@ def test_without_baselines_designs_score_and_pair_as_beside_them(lidardesign, ru
 
 def test_designs_of_two_runs_need_one_that_judges(lidardesign, runs):
     own, other = runs
-    package.open_run(other).fit(layout="grid", sensors=1, rays=8, name="flat").save()
+    package.open_run(other).fit(layout="even", sensors=1, rays=8, name="flat").save()
     files = own / "designs" / "grid.yaml", other / "designs" / "flat.yaml"
     for named in (files, (own, other)):
         refused = lidardesign("evaluate", *named)

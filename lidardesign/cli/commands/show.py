@@ -146,6 +146,10 @@ def _show_summary(document: dict[str, Any], rich: RichConsole) -> None:
         rich.print(f"{entry['name']} cannot be read: {entry['error']}", soft_wrap=True)
     if quality is not None and not scored:
         rich.print("no scores are kept yet" if fine else "no designs yet")
+    if document["cache"]:
+        kept = "fits keep what training scenes show of rays: {path}, {megabytes:.1f} MB"
+        megabytes = document["cache"]["bytes"] / 1e6
+        rich.print(kept.format(**document["cache"], megabytes=megabytes), soft_wrap=True)
     if document["next"]:
         rich.print("\n".join(["next:", *(f"  {line}" for line in document["next"])]), soft_wrap=True)
 

@@ -74,8 +74,8 @@ def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, 
     return arrays, state
 
 
-# The flow that steps move, and the average of where it was.
-FLOWS = ("flow", "average")
+# The flow that steps move, the average of where it was, and the best of these averages that was measured.
+FLOWS = ("flow", "average", "best")
 COUNTERS = ("step", "skipped", "skipped_in_a_row", "halvings")
 # A step size is divided by 2 to this power.
 MOST_HALVINGS, MOST_STEPS, MOST_SECONDS = 64, 10**12, 1e12
@@ -110,6 +110,9 @@ def check_resumable(
         whole = isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
         if not whole and not (name == "doubled_at" and value is None):
             raise DataError(f"has {name} = {value!r}", where=str(path), allowed="a whole number", hint=HINT)
+    least = state.get("least_misplaced")
+    if least is not None and not (isinstance(least, float) and 0 <= least <= 1):
+        raise DataError(f"has least_misplaced = {least!r}", where=str(path), allowed="a share from 0 to 1", hint=HINT)
     if not isinstance(state["stopped"], bool):
         raise DataError(f"has stopped = {state['stopped']!r}", where=str(path), allowed="true or false", hint=HINT)
     seconds = state.get("seconds")

@@ -13,31 +13,41 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidardesign.config import RunConfig
+from lidardesign.config import PRESET_LEARNING, RunConfig
 from lidardesign.density.coordinates import Coordinates, on_device, stays_on
 from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.prepare import prepare_target, training_scenes
-from lidardesign.density.objective.proposals import independent_points
+from lidardesign.density.objective.proposals import log_proposal
 from lidardesign.density.objective.scale import scale_notes
 from lidardesign.density.objective.target import Target
 from lidardesign.density.objective.visibility import common_receiver
 from lidardesign.density.training.checkpoint import clear_snapshots, save_flow
 from lidardesign.density.training.losses import Pool
-from lidardesign.density.training.quality import IndependentProbes, draw_probes, measure
-from lidardesign.density.training.sampling import draw_samples
+from lidardesign.density.training.quality import IndependentProbes, MeasuredFlow, draw_probes, measure
+from lidardesign.density.training.sampling import (
+    KnownPoints,
+    LearnedFlow,
+    MixedSamples,
+    condition_groups,
+    draw_samples,
+    log_density_of,
+    mixed,
+)
 from lidardesign.density.training.trainer import (
+    FEWEST_PROBES,
     PROGRESS,
     STOPPING_POINTS,
     LearnProgress,
     Trainer,
     least_balancing_steps,
+    reaches,
 )
 from lidardesign.errors import BackgroundNote, ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import peak_memory_bytes, phase, running
 from lidardesign.run.manifest import note, record
-from lidardesign.samples import Verdict, save_samples
+from lidardesign.samples import Samples, Verdict, save_samples
 from lidardesign.scenes.rays import in_view
 from lidardesign.scenes.scene import Scene
 from lidardesign.space import AZIMUTH, observed_point
@@ -49,6 +59,7 @@ ON_PROCESSOR = (
     "density.visibility=quadrature or off stay on the GPU"
 )
 DEVICES = ("auto", "cpu", "cuda")
+PILOTS = 2048  # of a flow's samples and of independent points, by which the share of these is chosen
 
 
 @dataclass(frozen=True)
@@ -56,7 +67,8 @@ class LearnResult:
     """What learning reached; `timings` are seconds by phase, `notes` what the user should know.
 
     `misplaced` is the share of the density's mass in the wrong place. `error_estimates` has the standard errors of ess,
-    kl_nats, log_z, coverage and misplaced.
+    kl_nats, log_z, coverage and misplaced. `samples` says how many are of the flow and how many independent of it, and
+    what they are worth, together and those of the flow alone.
     """
 
     run: str
@@ -71,6 +83,7 @@ class LearnResult:
     notes: tuple[str, ...] = ()
     timings: dict[str, float] = field(default_factory=dict)
     error_estimates: dict[str, Estimate] = field(default_factory=dict)
+    samples: dict[str, float] = field(default_factory=dict)
 
     @property
     def verdict(self) -> Verdict:
@@ -86,12 +99,14 @@ class LearnResult:
 class TrainingData:
     """What learning stands on, however many steps it takes: the target of the training scenes, notes, and proposals.
 
-    `pool` is what balancing draws from, `probes` are what is measured on while learning.
+    `pool` is what balancing draws from: the `independent` points by their weights. `probes` are what is measured on
+    while learning.
     """
 
     target: Target
     notes: tuple[str, ...]
     pool: Pool
+    independent: IndependentProbes
     probes: IndependentProbes | None = None
 
 
@@ -121,21 +136,20 @@ def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str],
         remark(line)
     target, notes = prepare_target(scenes, config)
     with phase("proposals"):
-        # independent of those that coverage is measured on
-        generator = random_generator(config.seed, "balancing")
-        points, log_density = independent_points(target, config.learning.balance_proposals, generator)
-        if not len(points):
+        # others than those that coverage is measured on
+        independent = draw_probes(target, config.learning.balance_proposals, random_generator(config.seed, "balancing"))
+        if not len(independent.points):
             raise DataError(
                 "no ray of the design space reaches a target surface in any training scene",
                 where="space",
                 hint="widen the angles or the range, move the origin, or raise density.sigma_m",
             )
-        refuse_blind_receiver(target.scenes, points)
+        refuse_blind_receiver(target.scenes, independent.points)
         # points on the space's faces may leave it by rounding
-        unit = config.space.to_unit(points).clip(-1.0, 1.0)
-        pool = Pool.of(unit, target.log_density(points), log_density)
+        unit = config.space.to_unit(independent.points).clip(-1.0, 1.0)
+        pool = Pool.of(unit, independent.log_target, independent.log_proposal)
         probes = draw_probes(target, STOPPING_POINTS, random_generator(config.seed, "stopping"))
-    return TrainingData(target, (*task_notes, *of_lengths, *notes), pool, probes)
+    return TrainingData(target, (*task_notes, *of_lengths, *notes), pool, independent, probes)
 
 
 def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
@@ -196,9 +210,10 @@ def learn(
         with phase("measuring"):
             probes = draw_probes(trainer.target, config.learning.coverage_proposals, generator)
         measured = measure(learned, probes, config.learning.samples)
+        found = mix_samples(learned, measured, data, probes)
         with phase("writing"):
             save_flow(learned.flow, run, FLOW, **asdict(measured.thinning))
-            save_samples(measured.samples, run)
+            save_samples(found.samples, run)
             if (run / PROGRESS).exists():
                 record(run, [PROGRESS])
     result = LearnResult(
@@ -206,7 +221,8 @@ def learn(
         task=config.task_name,
         seconds=round(clock.seconds, 3),
         steps=trainer.step,
-        notes=(*data.notes, *_notes(trainer, place), *measured.notes),
+        notes=(*data.notes, *_notes(trainer, place, config.preset), *measured.notes, *found.notes),
+        samples=found.as_dict(),
         timings=clock.timings(),
         error_estimates=measured.estimates,
         **{name: estimate.value for name, estimate in measured.estimates.items()},
@@ -214,6 +230,37 @@ def learn(
     visibility = data.target.visibility.name
     note(run, learn=result.as_dict(), visibility=visibility, round_trip_nats=measured.round_trip_nats)
     return result
+
+
+@phase("mixing")
+def mix_samples(
+    learned: LearnedFlow, measured: MeasuredFlow, data: TrainingData, probes: IndependentProbes
+) -> MixedSamples:
+    """The samples of a flow together with balancing's independent points, in the share that is worth most.
+
+    Arguments:
+        learned: The flow.
+        measured: Its samples.
+        data: What it was learned from.
+        probes: Further independent points, by which the share is chosen.
+    """
+    samples, thinning, space = measured.samples, measured.thinning, measured.samples.space
+
+    def known(points: np.ndarray, log_target: np.ndarray, log_density: np.ndarray) -> KnownPoints:
+        log_flow = thinning.log_prob(log_density_of(learned, points), log_target, condition_groups(space, points))
+        return KnownPoints(points, log_flow, log_density, log_target)
+
+    def of_flow(drawn: Samples) -> KnownPoints | None:
+        log_density = log_proposal(data.target, drawn.points)
+        return None if log_density is None else KnownPoints(drawn.points, drawn.log_prob, log_density, drawn.log_target)
+
+    kept = of_flow(samples)
+    if kept is None or min(len(kept), len(probes.points), len(data.independent.points)) < FEWEST_PROBES:
+        return MixedSamples.of_flow_alone(samples)
+    pilot = of_flow(thinning.thinned(draw_samples(learned, PILOTS), learned.generator))
+    others = known(*(values[:PILOTS] for values in (probes.points, probes.log_target, probes.log_proposal)))
+    pool = known(data.independent.points, data.independent.log_target, data.independent.log_proposal)
+    return mixed(samples, kept, pool, (pilot, others))
 
 
 @contextlib.contextmanager
@@ -227,14 +274,36 @@ def on_one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _notes(trainer: Trainer, place: torch.device) -> list[str]:
+def draft_note(measured: Sequence[tuple[int, Estimate]], preset: str) -> str | None:
+    """A line where learning longer than the preset draft does brought nothing that can be told; else None.
+
+    Arguments:
+        measured: Misplaced shares by step.
+        preset: What was learned with.
+    """
+    draft = PRESET_LEARNING["draft"]
+    early = [(step, found) for step, found in measured if step <= draft["steps"]]
+    if preset == "draft" or not early or early[-1][0] == measured[-1][0]:
+        return None
+    step, as_draft = next((one for one in early if reaches(one[1], draft["misplaced"])), early[-1])
+    last, best = min(measured, key=lambda one: one[1].value)
+    if as_draft.value - best.value > math.hypot(as_draft.error or 0.0, best.error or 0.0):
+        return None
+    return (
+        f"--preset {preset} is no better than draft here: {best.value:.2g} of the mass is in the wrong place after "
+        f"{last} steps, and {as_draft.value:.2g} after {step}, where draft stops"
+    )
+
+
+def _notes(trainer: Trainer, place: torch.device, preset: str) -> list[str]:
     notes = [] if stays_on(trainer.target, place) else [ON_PROCESSOR]
     if trainer.skipped:
         notes.append(f"{trainer.skipped} steps were skipped: their loss or gradient was not finite")
     if trainer.doubled_at is not None:
         splines = f"float32 could not invert the flow's splines: float64 was used from step {trainer.doubled_at} on"
         notes.append(BackgroundNote(splines))
-    return notes
+    note = None if trainer.stopped else draft_note(trainer.measured, preset)
+    return notes if note is None else [*notes, note]
 
 
 def choose_device(name: str) -> torch.device:

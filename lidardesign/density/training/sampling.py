@@ -34,6 +34,7 @@ from scipy.optimize import brentq
 from lidardesign.density.coordinates import Coordinates
 from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.target import Target
+from lidardesign.errors import BackgroundNote
 from lidardesign.estimates import Estimate, log_mean_error
 from lidardesign.numerics import SLACK, logsumexp
 from lidardesign.samples import Samples
@@ -43,6 +44,8 @@ POINTS_AT_ONCE = 16384
 CONDITION_GROUPS = 32
 # Of the independent points that there are: what is tried beside the flow's samples.
 MIXED_SHARES = (0.0, 0.25, 0.5, 1.0)
+# By how much independent points must be foretold to raise what samples are worth: less may be the pilots' luck.
+LEAST_GAIN = 1.05
 # Beyond so many nats two densities have next to nothing in common.
 LARGEST_NATS = 300.0
 # Of the samples of a condition group: what thinning leaves at least.
@@ -228,7 +231,8 @@ def log_constant(flow: KnownPoints, independent: KnownPoints) -> Estimate:
     def bridged(constant: float) -> tuple[np.ndarray, np.ndarray]:
         """q / m at points of the flow and p / m at independent ones."""
         mine, theirs = (ratio - constant for ratio in ratios)
-        return 1 / (share + (1 - share) * np.exp(-mine)), 1 / ((1 - share) + share * np.exp(theirs))
+        log_share, log_rest = math.log(share), math.log1p(-share)
+        return np.exp(-np.logaddexp(log_share, log_rest - mine)), np.exp(-np.logaddexp(log_rest, log_share + theirs))
 
     def excess(constant: float) -> float:
         mine, theirs = bridged(constant)
@@ -271,7 +275,7 @@ class MixedSamples:
         independent: How many of them are independent points.
         effective: How many distinct samples of equal weight they are worth; `of_flow`: those of the flow alone.
         constant: log of the constant of the independent points' density, with its standard error [nats]; None where
-            no independent point can be used.
+            their density is not known at samples of the flow.
     """
 
     samples: Samples
@@ -279,6 +283,34 @@ class MixedSamples:
     effective: float
     of_flow: float
     constant: Estimate | None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A line about the independent points, where there are some."""
+        if not self.independent or self.constant is None or self.constant.error is None:
+            return ()
+        return (
+            BackgroundNote(
+                f"{self.independent} independent points beside {len(self.samples) - self.independent} samples of the "
+                f"flow: {self.effective:.0f} distinct samples of equal weight, {self.of_flow:.0f} of the flow alone; "
+                f"the constant of their density is known to {self.constant.error:.1%}"
+            ),
+        )
+
+    def as_dict(self) -> dict[str, float]:
+        """The plain values of files and JSON."""
+        return {
+            "flow": len(self.samples) - self.independent,
+            "independent": self.independent,
+            "effective": self.effective,
+            "effective_of_flow": self.of_flow,
+            **({} if self.constant is None else {"log_constant_error_nats": self.constant.error or 0.0}),
+        }
+
+    @classmethod
+    def of_flow_alone(cls, samples: Samples, constant: Estimate | None = None) -> Self:
+        """Samples of a flow, and nothing beside them."""
+        return cls(samples, 0, samples.independent, samples.independent, constant)
 
 
 def mixed(
@@ -295,8 +327,9 @@ def mixed(
     constant = log_constant(kept, pool)
     numbers = [round(share * len(pool)) for share in MIXED_SHARES]
     worth = [effective_count_of_mixture(*pilots, (len(kept), number), constant.value, space) for number in numbers]
-    number = numbers[int(np.argmax(worth))]
-    if number:
+    best = int(np.argmax(worth))
+    if worth[best] > LEAST_GAIN * worth[0]:
+        number = numbers[best]
         both = [kept, pool.subset(slice(number))]
         log_target = np.concatenate([one.log_target for one in both])
         share = number / (len(kept) + number)
@@ -305,4 +338,4 @@ def mixed(
         # the same point may be drawn again and again, which counts once
         if together.independent > alone:
             return MixedSamples(together, number, together.independent, alone, constant)
-    return MixedSamples(samples, 0, alone, alone, constant)
+    return MixedSamples.of_flow_alone(samples, constant)

@@ -5,7 +5,8 @@ that surfaces are found while they are wide; eta falls to zero with it. All furt
 p* (`losses`), with steps that fall as the root of their number. What is learned is the average of the weights on the
 way, the later ones counting more: it is at every step about as good as if training had been planned to end there, so
 training may stop at any. Every `STRETCH` steps the average is measured against the target, and training stops once the
-share of its mass in the wrong place is small enough.
+share of its mass in the wrong place is small enough. The best average that was measured is what is kept: some targets
+turn worse again as steps go on.
 
 A step whose loss or gradient is not finite is skipped; several in a row take the last good weights back and halve the
 step size; when that does not help either, training stops with the last good checkpoint. Balancing looks back from
@@ -25,7 +26,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ import torch
 from torch.optim.adam import adam
 
 from lidardesign.config import LearningSettings
+from lidardesign.density.network import DesignFlow
 from lidardesign.density.objective.target import Target
 from lidardesign.density.training.checkpoint import (
     COUNTERS,
@@ -51,6 +53,7 @@ from lidardesign.density.training.losses import TOLERANCE_NATS, Pool, balancing_
 from lidardesign.density.training.quality import IndependentProbes, measure
 from lidardesign.density.training.sampling import LearnedFlow
 from lidardesign.errors import DataError, DivergenceError, NumericalError
+from lidardesign.estimates import Estimate
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.clock import phase
 from lidardesign.run.files import append_line, write_atomic
@@ -168,13 +171,19 @@ def least_balancing_steps(pathwise_steps: int) -> int:
     return max(pathwise_steps, LEAST_STRETCHES * STRETCH)
 
 
+def reaches(misplaced: Estimate, goal: float) -> bool:
+    """Whether a misplaced share is no larger than a goal by more than what is known of it."""
+    return misplaced.value + STANDARD_ERRORS * (misplaced.error or 0.0) <= goal
+
+
 @dataclass(eq=False)
 class Trainer(LearnedFlow):
     """The state of training: flow, optimiser, random stream and counters.
 
-    `average` is what is learned, in place of `flow`, which steps move. `is_over` is asked before each balancing step
-    once these are as many as the path-wise ones: a time budget. `doubled_at` is the step from which on float64 replaced
-    float32, None where it did not have to.
+    `average` is what is learned, in place of `flow`, which steps move, and `best` what it was when the least of its
+    mass was measured to be in the wrong place: `least_misplaced`, None before that. `is_over` is asked before each
+    balancing step once these are as many as the path-wise ones: a time budget. `doubled_at` is the step from which on
+    float64 replaced float32, None where it did not have to. `measured` has the misplaced shares by step.
     """
 
     settings: LearningSettings
@@ -188,11 +197,13 @@ class Trainer(LearnedFlow):
     skipped_in_a_row: int = 0
     halvings: int = 0
     doubled_at: int | None = None
+    least_misplaced: float | None = None
+    measured: list[tuple[int, Estimate]] = field(default_factory=list)
     seconds_before: float = 0.0
     _snapshot: _State | None = None
 
     def __post_init__(self) -> None:
-        self.average = copy.deepcopy(self.flow)
+        self.average, self.best = copy.deepcopy(self.flow), copy.deepcopy(self.flow)
         self.optimiser = Adam(self.flow.parameters(), self.settings.rate)
         self._started = time.perf_counter()
 
@@ -211,13 +222,16 @@ class Trainer(LearnedFlow):
         """Balancing steps that are done; negative before they begin."""
         return self.step - self.pathwise_steps
 
-    def learned(self, generator: torch.Generator | None = None) -> LearnedFlow:
-        """What is learned by now, in float64: the average; samples are drawn from the trainer's own stream, or another.
+    def learned(self) -> LearnedFlow:
+        """What is learned by now, in float64: the best average that was measured, else the last one.
 
         Steps are taken in float32 as well and cost less; samples and their densities are worth float64.
         """
-        average = copy.deepcopy(self.average).double()
-        return LearnedFlow(average, self.target, self.coordinates, generator or self.generator)
+        return self._in_double(self.average if self.least_misplaced is None else self.best)
+
+    def _in_double(self, flow: DesignFlow, generator: torch.Generator | None = None) -> LearnedFlow:
+        """A flow in float64, with samples from the trainer's own stream, or another."""
+        return LearnedFlow(copy.deepcopy(flow).double(), self.target, self.coordinates, generator or self.generator)
 
     def sigma_m(self, step: int) -> float:
         """The annealed sigma of a step [m]."""
@@ -251,9 +265,10 @@ class Trainer(LearnedFlow):
                 loss, ess = self._advance()
                 if is_snapshot(self.step, self.settings):
                     save_flow(self.average, self.run, snapshot_name(self.step), step=self.step)
-                reached = self._reached()
-                self.stopped = self._is_good_enough(reached) or self._is_over()
-                if reached or self.stopped or self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
+                is_last = self._is_over() or self.step == self.settings.steps
+                reached = self._reached(is_last)
+                self.stopped = self._is_good_enough(reached) or (is_last and self.step < self.settings.steps)
+                if reached or self.stopped or is_last or self.step % PROGRESS_STEPS == 0:
                     self._report(loss, ess, reached, progress)
         except KeyboardInterrupt:
             if self._snapshot is not None:
@@ -261,25 +276,27 @@ class Trainer(LearnedFlow):
             raise
         self._save(*self._state())
 
-    def _reached(self) -> dict[str, float]:
-        """The misplaced share and its standard error, after a stretch of balancing; nothing where nobody asks."""
-        if not self.settings.misplaced or self.probes is None or not self._may_stop:
+    def _reached(self, is_last: bool) -> dict[str, float]:
+        """The misplaced share and its standard error after a stretch of balancing, and at the end; the best is kept."""
+        if self.probes is None or len(self.probes.points) < FEWEST_PROBES or not self._may_stop:
             return {}
-        if len(self.probes.points) < FEWEST_PROBES:
+        if self.balanced_steps % STRETCH and not is_last:
             return {}
-        if self.balanced_steps % STRETCH or self.step == self.settings.steps:
-            return {}
-        own = torch.Generator().manual_seed(self.step)
+        # of the same base points every time, so that averages differ by what was learned
+        own = torch.Generator().manual_seed(0)
         try:
-            found = measure(self.learned(own), self.probes, STOPPING_POINTS).estimates["misplaced"]
+            found = measure(self._in_double(self.average, own), self.probes, STOPPING_POINTS).estimates["misplaced"]
         except NumericalError:  # a flow without numbers is not good
             return {}
+        if self.least_misplaced is None or found.value < self.least_misplaced:
+            self.least_misplaced = found.value
+            self.best.load_state_dict(self.average.state_dict())
+        self.measured.append((self.step, found))
         return {"misplaced": found.value, "misplaced_error": found.error or 0.0}
 
     def _is_good_enough(self, reached: Mapping[str, float]) -> bool:
-        if not reached:
-            return False
-        return reached["misplaced"] + STANDARD_ERRORS * reached["misplaced_error"] <= self.settings.misplaced
+        goal = self.settings.misplaced
+        return bool(reached and goal) and reaches(self.measured[-1][1], goal)
 
     @property
     def _may_stop(self) -> bool:
@@ -371,8 +388,8 @@ class Trainer(LearnedFlow):
 
     def _double(self, step: int) -> None:
         self.doubled_at = step
-        self.flow.double()
-        self.average.double()
+        for flow in (self.flow, self.average, self.best):
+            flow.double()
         for parameter in self.flow.parameters():
             state = self.optimiser.state.get(parameter, {})
             state.update({name: _moved(name, value, parameter) for name, value in state.items()})
@@ -431,7 +448,7 @@ class Trainer(LearnedFlow):
             self.optimiser.state[parameter] = {name: _moved(name, value, parameter) for name, value in moments.items()}
 
     def _state(self) -> _State:
-        counters = {name: getattr(self, name) for name in (*COUNTERS, "stopped", "doubled_at")}
+        counters = {name: getattr(self, name) for name in (*COUNTERS, "stopped", "doubled_at", "least_misplaced")}
         return self._state_arrays(), {**counters, "seconds": self.seconds}
 
     def _save(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
@@ -447,14 +464,17 @@ class Trainer(LearnedFlow):
             self._double(state["doubled_at"])
         self._restore_arrays(arrays)
         self.generator.set_state(torch.as_tensor(arrays["generator"]))
-        for name in (*COUNTERS, "stopped"):
+        for name in (*COUNTERS, "stopped", "least_misplaced"):
             setattr(self, name, state[name])
         self.seconds_before, self._started = state["seconds"], time.perf_counter()
         clear_snapshots(self.run, beyond=self.step)
         path = self.run / PROGRESS
         if path.exists():
             lines = read_file(path, RECORD).decode(errors="replace").splitlines()
-            write_atomic(path, "".join(line + "\n" for line in lines if _step_of(line) <= self.step))
+            lines = [line for line in lines if _step_of(line) <= self.step]
+            write_atomic(path, "".join(line + "\n" for line in lines))
+            rows = [row for row in map(json.loads, lines) if "misplaced" in row]
+            self.measured = [(row["step"], Estimate(row["misplaced"], row["misplaced_error"])) for row in rows]
 
 
 def _moved(name: str, value: torch.Tensor, parameter: torch.Tensor) -> torch.Tensor:

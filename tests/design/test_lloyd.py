@@ -1,10 +1,9 @@
-"""Weighted Lloyd: never worse than its seeds, no empty cells, deterministic, whatever the unit."""
+"""Weighted Lloyd seeds mixtures: never worse than its seeds, no empty cells, deterministic, whatever the unit."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.mixture.em import Nearest, lloyd
@@ -20,8 +19,8 @@ def cloud(seed, count=400, dimensions=2):
     return generator.normal(size=(count, dimensions)), generator.uniform(0.1, 3.0, count)
 
 
-@each_row("count", [1, 2, 7, 40])
-@each_row("dimensions", [1, 2, 5])
+@pytest.mark.parametrize("count", [1, 2, 7, 40])
+@pytest.mark.parametrize("dimensions", [1, 2, 5])
 def test_every_centre_is_the_weighted_mean_of_its_cell_and_every_label_the_nearest_centre(count, dimensions):
     features, weights = cloud(count, dimensions=dimensions)
     centres, labels = lloyd(features, weights, count, np.random.default_rng(0), iterations=2000)
@@ -91,7 +90,7 @@ def test_weights_of_any_size_stay_finite():
     assert len(np.unique(labels)) == 5
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("features", "weights", "count"),
     [
         (np.zeros((0, 2)), np.zeros(0), 1),
@@ -107,8 +106,8 @@ def test_what_cannot_be_quantised_is_refused(features, weights, count):
         lloyd(features, weights, count, np.random.default_rng(0))
 
 
-@each_row("moved", [1e-6, 0.02, 1.0])
-@each_row("count", [1, 2, 40])
+@pytest.mark.parametrize("moved", [1e-6, 0.02, 1.0])
+@pytest.mark.parametrize("count", [1, 2, 40])
 def test_bounds_spare_searches_and_change_no_answer(count, moved):
     points, _ = cloud(11, count=600, dimensions=3)
     centres = points[:count].copy()
