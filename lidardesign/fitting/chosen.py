@@ -22,7 +22,7 @@ from lidardesign.mixture.fit import FittedSensors
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.gates import GateLimits
 from lidardesign.rays.information import FEW_SCENES, MOST_SELECTED
-from lidardesign.rays.pool import CandidatePool, kept_information
+from lidardesign.rays.pool import CandidatePool, cached_information
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, first_candidates, owners, rays_of_points
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
 from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
@@ -126,7 +126,7 @@ def choose_rays(
         held_back = informed  # nobody asks how well a trial's rays do elsewhere
     else:
         # too few of a pool are inside the sensors: the run goes on keeping the pool
-        inform = kept_information if pool is None and training.keeps else inform_enough
+        inform = cached_information if pool is None and training.keeps else inform_enough
         informed, held_back = inform(selection, training, counts[len(counts) // 2], progress)
     selected = select(selection, informed, held_back, counts, certified, progress)
     patterns = tuple(_pattern(one, conditions, samples) for one in selected)

@@ -101,10 +101,10 @@ def pool_of(
     rays = Rays(points[:, :3], looking, gate_m, np.zeros(len(points)), np.zeros(len(points)))
     gates, share = partial(gate_choices, margin_m=training.margin_m), CHOSEN_SHARE / POOL_FACTOR
     selection = Selection(rays, visits, gates, Bandwidth(), share=share)
-    return CandidatePool(points, visits, *kept_information(selection, training, counts[len(counts) // 2], progress))
+    return CandidatePool(points, visits, *cached_information(selection, training, counts[len(counts) // 2], progress))
 
 
-def kept_information(
+def cached_information(
     selection: Selection, training: TrainingScenes, count: int, progress: Callable[[str], None]
 ) -> tuple[list[InformedScene], list[InformedScene]]:
     """See `inform_enough`: as it is kept in the run, or found anew and kept if it can be written."""
