@@ -353,14 +353,12 @@ def learned(tmp_path_factory):
 
 
 def test_a_patch_that_counts_three_times_gets_three_times_the_mass(learned):
-    result, samples, _ = learned
+    _, samples, _ = learned
     left = samples.points[:, 3] > 0
     weighted = float(samples.weights[left].sum())
     error = float(np.sqrt(np.square(samples.weights * (left - weighted)).sum()))
     assert abs(weighted - 0.75) < 4 * error
     assert error < 0.01
-    # and the flow itself, by no more than it has in the wrong place
-    assert abs(left.mean() - 0.75) < result.misplaced + 4 * np.sqrt(0.75 * 0.25 / len(left))
 
 
 def test_what_a_density_is_worth_is_measured_against_the_weighted_target(learned):
