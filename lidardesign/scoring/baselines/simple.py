@@ -32,18 +32,26 @@ where one angle is free and not at all where none is.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.numerics import TINY
 from lidardesign.run.clock import phase
 from lidardesign.scenes.scene import Scene
 from lidardesign.scenes.surface import sample_body
-from lidardesign.scoring.baselines.candidates import BaselineLayout, Candidate, LayoutSite, opened_gate, whole_range
+from lidardesign.scoring.baselines.candidates import (
+    BaselineLayout,
+    Candidate,
+    LayoutSite,
+    opened_gate,
+    rays_at,
+    whole_range,
+)
 from lidardesign.scoring.baselines.cma import CMA
 from lidardesign.scoring.baselines.even import bounding, central, even_placement
 from lidardesign.scoring.baselines.greedy import GREEDY, Fired
@@ -271,8 +279,13 @@ class TwinCandidate:
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
     ) -> RaysPerCondition:
-        """As many rays as the design of this bandwidth fires."""
-        return self._rays(max(one.rays for one in self._fired if one.mbps == limit_mbps), limit_mbps)
+        """As many rays as the design of this bandwidth fires; half as many where they do not fit, and so on to none."""
+        count = max(one.rays for one in self._fired if one.mbps == limit_mbps)
+        while count:
+            with contextlib.suppress(InfeasibleError):
+                return self._rays(count, limit_mbps)
+            count //= 2
+        return tuple(rays_at(np.zeros((0, RAY_AXES)), whole_range(space)) for space in spaces)
 
     def _rays(self, count: int, limit_mbps: float | None) -> RaysPerCondition:
         if (count, limit_mbps) not in self._known:
