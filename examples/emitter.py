@@ -35,7 +35,6 @@ FLOODS = """\
 # three floods, each in a part of the phone of its own, around the same camera
 sensors: {count: 3}
 origin:
-  spread_m: {max: 0.005}
   exclude: [{low_m: [0.3, -0.025, -0.02], high_m: [0.5, 0.025, 0.02]}]
 budget: {rays: 576}
 each:
