@@ -97,7 +97,7 @@ def fitted(run: Path, sensors: int) -> Path:
     name = f"sensors-{sensors}"
     step(
         f"Fit {sensors} sensors.",
-        "fit", run, "--layout", "grid", "--sensors", str(sensors), "--rays", str(RAYS), "--name", name,
+        "fit", run, "--layout", "even", "--sensors", str(sensors), "--rays", str(RAYS), "--name", name,
     )  # fmt: skip
     return run / "designs" / f"{name}.yaml"
 

@@ -156,7 +156,9 @@ class Fitter:
                 config = with_task_settings(run.task, run.config, settings, option=request.weighting.origin)
                 run = replace(run, config=config)
             self.samples = self._at(loaded)
-        self.training = TrainingScenes(run, request.seed, starmap, request.at)
+        # scenes are judged from where the design is
+        here = replace(run.config, space=run.config.space.at(request.at))
+        self.training = TrainingScenes(replace(run, config=here), request.seed, starmap, keeps=samples is None)
         self.is_pooled = samples is None and not settings and not request.at and has_pool(run)
 
     def _check_effective(self, samples: Samples, hint: str) -> None:
@@ -364,8 +366,7 @@ def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRe
 
     run, bounds = request.run, request.constraints
     rays = request.counts[len(request.counts) // 2]
-    # as in an evaluation: a design for one condition is carried to all of them
-    conditions = run.conditions()
+    conditions = [request.at] if request.at else run.conditions()
     casters = [build_casters(scene) for scene in scenes]
     sign = 1.0 if run.metric.better == "lower" else -1.0
     low = max(bounds.sensors.min or 1, len(bounds.each))

@@ -23,7 +23,6 @@ from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
 from lidardesign.sensors.pattern import Pattern
-from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 
 RAYS = 12
@@ -119,15 +118,21 @@ def test_rays_of_real_parts_and_rings_have_even_rays_beside_them(fitted):
     assert len(twin_without_visibility(part, run, 1).sensors) == 1
 
 
-@pytest.mark.parametrize(("most", "rays"), [(24, 24), (23, 12), (5, 3), (0, 0)])
-def test_where_not_as_many_rays_fit_half_as_many_are_fired(most, rays):
-    design = DesignSpec("aimed", (normal_sensor(),))
-
-    def fitted(count, limit_mbps):
+@pytest.mark.parametrize("most", [24, 23, 5, 1])
+def test_where_not_as_many_rays_fit_fewer_are_fired(most):
+    def fit(count, limit_mbps):
         if count > most:
-            raise InfeasibleError("too many rays")
-        return design
+            raise InfeasibleError("too many rays", conflicts=["budget.bandwidth_mbps", "gate.width_m.min"])
+        return DesignSpec("aimed", (normal_sensor(),))
 
-    space = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
-    candidate = TwinCandidate(fitted, [{}], [Fired(24, 1.5)])
-    assert [len(one) for one in candidate.positions_within([space], 1.5, Bandwidth())] == [rays]
+    candidate = TwinCandidate(fit, [{}], [Fired(24, 1.5), Fired(9, 1.0)])
+    (rays,) = candidate.positions_within([], 1.5, Bandwidth())
+    assert most * 0.8 - 1 <= len(rays) <= most
+
+
+def test_constraints_that_contradict_each_other_are_no_matter_of_the_number_of_rays():
+    def fit(count, limit_mbps):
+        raise InfeasibleError("no place is left", conflicts=["origin.exclude"])
+
+    with pytest.raises(InfeasibleError, match="no place"):
+        TwinCandidate(fit, [{}], [Fired(24, 1.5)]).positions_within([], 1.5, Bandwidth())

@@ -32,7 +32,7 @@ where one angle is free and not at all where none is.
 
 from __future__ import annotations
 
-import contextlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -44,14 +44,7 @@ from lidardesign.numerics import TINY
 from lidardesign.run.clock import phase
 from lidardesign.scenes.scene import Scene
 from lidardesign.scenes.surface import sample_body
-from lidardesign.scoring.baselines.candidates import (
-    BaselineLayout,
-    Candidate,
-    LayoutSite,
-    opened_gate,
-    rays_at,
-    whole_range,
-)
+from lidardesign.scoring.baselines.candidates import BaselineLayout, Candidate, LayoutSite, opened_gate, whole_range
 from lidardesign.scoring.baselines.cma import CMA
 from lidardesign.scoring.baselines.even import bounding, central, even_placement
 from lidardesign.scoring.baselines.greedy import GREEDY, Fired
@@ -251,6 +244,9 @@ def check_baseline(name: str, *, where: str = "baselines") -> None:
         raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=", ".join(BASELINES))
 
 
+FEWER_RAYS = 0.9  # of those that did not fit in a bandwidth
+
+
 class TwinCandidate:
     """A design that is fitted anew for each number of rays, as a baseline's layout.
 
@@ -279,13 +275,15 @@ class TwinCandidate:
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
     ) -> RaysPerCondition:
-        """As many rays as the design of this bandwidth fires; half as many where they do not fit, and so on to none."""
+        """As many rays as the design of this bandwidth fires, or fewer where its own gates need more for so many."""
         count = max(one.rays for one in self._fired if one.mbps == limit_mbps)
-        while count:
-            with contextlib.suppress(InfeasibleError):
+        while True:
+            try:
                 return self._rays(count, limit_mbps)
-            count //= 2
-        return tuple(rays_at(np.zeros((0, RAY_AXES)), whole_range(space)) for space in spaces)
+            except InfeasibleError as error:
+                if count == 1 or "budget.bandwidth_mbps" not in error.conflicts:
+                    raise
+                count = math.floor(FEWER_RAYS * count)
 
     def _rays(self, count: int, limit_mbps: float | None) -> RaysPerCondition:
         if (count, limit_mbps) not in self._known:
