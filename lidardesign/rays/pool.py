@@ -65,12 +65,6 @@ class CandidatePool:
     held_back: Sequence[InformedScene]
 
 
-def has_pool(run: RunFolder) -> bool:
-    """Whether all sensors of a run stand at one given place, but for conditions."""
-    space = run.config.space
-    return not [axis for axis in range(3) if axis in space.free and axis not in space.conditioned]
-
-
 @phase("pool")
 def pool_of(
     run: RunFolder, samples: Samples, training: TrainingScenes, progress: Callable[[str], None]
@@ -78,7 +72,7 @@ def pool_of(
     """The pool of a run: rays drawn from the whole density, and what scenes show of them.
 
     Arguments:
-        run: The run, whose sensors stand at one place (see `has_pool`).
+        run: The run, whose sensors stand at one place but for conditions.
         samples: Of its density.
         training: Its training scenes.
         progress: Called with every step.

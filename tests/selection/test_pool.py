@@ -16,7 +16,7 @@ from support.mesh_runs import make_mesh_run
 from lidardesign.api.run import open_run
 from lidardesign.config import resolve
 from lidardesign.rays import pool
-from lidardesign.rays.pool import FILE_NAME, has_pool, pool_of
+from lidardesign.rays.pool import FILE_NAME, pool_of
 from lidardesign.rays.training import InformedScene, TrainingScenes
 from lidardesign.run_folder import RunFolder
 from lidardesign.samples import load_samples, save_samples
@@ -72,12 +72,18 @@ def test_a_run_whose_density_has_a_condition_has_a_pool_of_rays_at_each_of_its_v
         assert (first.points[visit, 0] == at["x_m"]).all()
 
 
-def test_only_runs_whose_sensors_have_no_choice_of_place_have_a_pool(learned, tmp_path):
+def test_where_origins_are_free_the_candidates_of_the_last_fit_are_kept(tmp_path):
     free = make_run(tmp_path / "free", count=2000)
-    assert has_pool(RunFolder.open(learned[0]))
-    assert not has_pool(RunFolder.open(free))
+    bare = shutil.copytree(free, tmp_path / "bare")
+    budget = {"budget": {"bandwidth_mbps": 0.4}}
     open_run(free).fit(sensors=1, rays=16)
-    assert not (free / FILE_NAME).exists()
+    kept = (free / FILE_NAME).read_bytes()
+    within, alone = (open_run(run).fit(sensors=1, rays=16, constraints=budget) for run in (free, bare))
+    assert (free / FILE_NAME).read_bytes() == kept
+    fired = [(design.rays(16).direction.tobytes(), design.rays(16).gate_m.tobytes()) for design in (within, alone)]
+    assert fired[0] == fired[1]
+    open_run(free).fit(sensors=2, rays=16)
+    assert (free / FILE_NAME).read_bytes() != kept
 
 
 def configured(folder, setting):
@@ -161,7 +167,7 @@ def test_a_damaged_or_half_written_file_is_made_anew(damage, run):
     assert (run / FILE_NAME).read_bytes() == before
 
 
-@pytest.mark.parametrize("keys", [{}, {"key"}, {"key", "points"}])
+@pytest.mark.parametrize("keys", [{}, {"key"}, {"key", "ray"}])
 def test_a_file_of_something_else_is_made_anew(keys, run):
     with np.load(run / FILE_NAME) as arrays:
         kept = {name: arrays[name] for name in keys}
