@@ -50,6 +50,9 @@ if TYPE_CHECKING:
 
 # A larger share of scenes about which a design tells nothing is told.
 MOST_SILENT = 0.5
+# As many samples as the standard preset of `learn` leaves.
+TWIN_SAMPLES = 100_000
+TWIN_NAME = "no-visibility"
 
 
 def fit_design(
@@ -416,11 +419,6 @@ def _within(constraints: Constraints, mbps: float) -> Constraints:
     document = constraints.as_document()
     budget = document.get("budget") or {}
     return Constraints.from_mapping({**document, "budget": {"bandwidth_mbps": mbps, **budget}})
-
-
-# As many samples as the standard preset of `learn` leaves.
-TWIN_SAMPLES = 100_000
-TWIN_NAME = "no-visibility"
 
 
 def twin_without_visibility(
