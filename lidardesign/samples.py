@@ -28,6 +28,10 @@ from lidardesign.space import DesignSpace
 FILE_NAME = "samples.npz"
 NUMBERS = ("points", "log_prob", "log_target")
 DAMAGED_HINT = "learn the run again"
+# The most of its mass in the wrong place, the largest KL [nats] and the least ESS of a density with this verdict.
+BOUNDS: dict[str, tuple[float, float, float]] = {"good": (0.25, 0.5, 0.2), "usable": (0.5, 2.0, 0.05)}
+NEXT = {"draft": "--preset standard learns longer", "standard": "--preset fine learns longer"}
+LAST = "more learning.steps to a smaller learning.misplaced; a smaller space or a larger density.sigma_m learn faster"
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,12 +153,6 @@ def load_samples(run: Path, expected: DesignSpace | None = None) -> Samples:
     if outside:
         raise DataError(f"has {outside} of {count} points outside its design space", where=str(path), hint=DAMAGED_HINT)
     return samples
-
-
-# The most of its mass in the wrong place, the largest KL [nats] and the least ESS of a density with this verdict.
-BOUNDS: dict[str, tuple[float, float, float]] = {"good": (0.25, 0.5, 0.2), "usable": (0.5, 2.0, 0.05)}
-NEXT = {"draft": "--preset standard learns longer", "standard": "--preset fine learns longer"}
-LAST = "more learning.steps to a smaller learning.misplaced; a smaller space or a larger density.sigma_m learn faster"
 
 
 @dataclass(frozen=True)

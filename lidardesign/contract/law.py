@@ -49,6 +49,17 @@ LOADS = (
 
 # One call of a task's code may take so long, where nothing else is asked for.
 CALL_SECONDS = 60.0
+# The geometry and the scores of so many training scenes are looked at.
+LOOKED_AT = 3
+DEEPEST = 40
+# What of scenes and bodies no ray meets, or what is told apart otherwise.
+UNSEEN = ("name", "group", "notes", "truth", "bodies", "poses", "importance")
+DRAW_ROUNDS = 12
+# Of a scene that moves, so many frames are aimed at.
+MOST_FRAMES = 8
+# Half the gate where the space fixes the range, as a share of it.
+HALF_GATE = 0.05
+SEED = 20_251
 
 
 class BrokenLawError(PluginError):
@@ -186,10 +197,6 @@ def _random_states() -> dict[str, Any]:
     return found if torch is None else found | {"torch's random": torch.get_rng_state()}
 
 
-# The geometry and the scores of so many training scenes are looked at.
-LOOKED_AT = 3
-
-
 @dataclass(eq=False)
 class Subject:
     """A task with a configuration, tried by the laws.
@@ -302,11 +309,6 @@ class Subject:
             return checked_score(self.task, self.metric, scene, returns)
 
 
-DEEPEST = 40
-# What of scenes and bodies no ray meets, or what is told apart otherwise.
-UNSEEN = ("name", "group", "notes", "truth", "bodies", "poses", "importance")
-
-
 def fingerprint(value: Any) -> str:
     """SHA-256 of the content of dataclasses, arrays, models, mappings, sequences and plain values, in hexadecimal.
 
@@ -356,14 +358,6 @@ def _parts(value: Any) -> list[Any]:
     if isinstance(value, type) or callable(value):
         return [getattr(value, "__module__", ""), getattr(value, "__qualname__", "")]
     return sorted(vars(value).items()) if hasattr(value, "__dict__") else [repr(type(value))]
-
-
-DRAW_ROUNDS = 12
-# Of a scene that moves, so many frames are aimed at.
-MOST_FRAMES = 8
-# Half the gate where the space fixes the range, as a share of it.
-HALF_GATE = 0.05
-SEED = 20_251
 
 
 def rays_at_targets(scene: Scene, space: DesignSpace, casters: Sequence[SceneCaster], count: int) -> Rays:

@@ -37,6 +37,12 @@ from lidardesign.numerics import FLOAT32_ROUNDING, safe_sqrt
 INITIAL_SCALE = 0.1
 # Whole numbers of waves over a coordinate's range, so that those of a circle close.
 WAVES = (1.0, 2.0, 4.0)
+BOUND = 1.0
+# Foreign points and base samples are kept this far inside the box, where splines are smooth.
+EDGE = FLOAT32_ROUNDING
+# The smallest slope that a stack of splines may take; its inverse is the steepest. What may be steeper has gradients
+# that grow without end where a steep spline follows a flat one, and learning by steps of one size diverges.
+MINIMUM_SLOPE = 1e-4
 
 
 class _Constant(nn.Module):
@@ -151,14 +157,6 @@ class DesignFlow(nn.Module):
     def _uniform(self, count: int, columns: int, generator: torch.Generator) -> Tensor:
         points = torch.rand(count, columns, generator=generator, dtype=torch.float64)
         return (2 * points - 1).to(next(self.parameters()))
-
-
-BOUND = 1.0
-# Foreign points and base samples are kept this far inside the box, where splines are smooth.
-EDGE = FLOAT32_ROUNDING
-# The smallest slope that a stack of splines may take; its inverse is the steepest. What may be steeper has gradients
-# that grow without end where a steep spline follows a flat one, and learning by steps of one size diverges.
-MINIMUM_SLOPE = 1e-4
 
 
 class BoundedSpline(MonotonicRQSTransform):

@@ -50,6 +50,9 @@ if TYPE_CHECKING:
 
 # A larger share of scenes about which a design tells nothing is told.
 MOST_SILENT = 0.5
+# As many samples as the standard preset of `learn` leaves.
+TWIN_SAMPLES = 100_000
+TWIN_NAME = "no-visibility"
 
 
 def fit_design(
@@ -418,11 +421,6 @@ def _within(constraints: Constraints, mbps: float) -> Constraints:
     return Constraints.from_mapping({**document, "budget": {"bandwidth_mbps": mbps, **budget}})
 
 
-# As many samples as the standard preset of `learn` leaves.
-TWIN_SAMPLES = 100_000
-TWIN_NAME = "no-visibility"
-
-
 def twin_without_visibility(
     design: DesignSpec, run: RunFolder, rays: int, bandwidth_mbps: float | None = None
 ) -> DesignSpec:
@@ -432,7 +430,8 @@ def twin_without_visibility(
         design: The design whose number of sensors, layout, constraints, level, gates and seed are taken.
         run: The run that judges.
         rays: Rays per frame.
-        bandwidth_mbps: The most that its rays may cost; None: what the design's constraints say.
+        bandwidth_mbps: The most that its rays may cost, by the read-out model of evaluations; None: what the design's
+            constraints say, by theirs.
 
     Raises:
         DataError: No ray of the design space comes near a target.
@@ -451,8 +450,9 @@ def twin_without_visibility(
     if not len(samples):
         raise DataError("no ray of the design space comes near a target", where=f"--baseline {TWIN_NAME}")
     document = {key: value for key, value in design.constraints.items() if key != "parts"}
-    limit = {} if bandwidth_mbps is None else {"bandwidth_mbps": bandwidth_mbps}
-    document["budget"] = {**document.get("budget", {}), "rays": rays, **limit}
+    # a bandwidth is one of evaluations, whatever bits the design was made for
+    budget = document.get("budget", {}) if bandwidth_mbps is None else {"bandwidth_mbps": bandwidth_mbps}
+    document["budget"] = {**budget, "rays": rays}
     # the rays of real parts and rings are what they are: sensors like those have even rays
     layout = design.layout if design.layout in ("chosen", "even") else "even"
     request = FitRequest(
@@ -462,7 +462,7 @@ def twin_without_visibility(
         constraints=Constraints.from_mapping(document, where=f"constraints of {design.name}"),
         is_constrained=True,
         at=design.at,
-        sensors=len(design.sensors),
+        sensors=min(len(design.sensors), rays),
         layout=layout,
         rays=rays,
         gates="ray" if design.has_gates_per_ray and layout == "chosen" else "sensor",

@@ -40,6 +40,12 @@ from lidardesign.space import RANGE, DesignSpace, angles
 from lidardesign.task import Information, random_generator
 
 BOUNDED = ("field_of_view.horizontal_deg", "field_of_view.vertical_deg", "gate.start_m", "gate.end_m", "gate.width_m")
+MOST_CAST = 60_000  # rays of a scene, over all places
+MOST_CASTS = 1_000_000  # of a scene, over all its frames
+MOST_MEMBERS = 20_000_000  # rays of all parts' patterns that are told apart
+MOST_ITEMS = 60  # of a scene: the choice of a few parts needs few
+SIZED = 10  # one in so many parts says how large cells are, at first
+COARSE_CELL_RAD = math.radians(3.0)  # from which the size of cells is found
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,14 +115,6 @@ def broken_keys(shape: PartShape, rules: SensorRules) -> set[str]:
         if bounds.max is not None and value > bounds.max * (1 + SLACK):
             broken.add(f"{key}.max")
     return broken
-
-
-MOST_CAST = 60_000  # rays of a scene, over all places
-MOST_CASTS = 1_000_000  # of a scene, over all its frames
-MOST_MEMBERS = 20_000_000  # rays of all parts' patterns that are told apart
-MOST_ITEMS = 60  # of a scene: the choice of a few parts needs few
-SIZED = 10  # one in so many parts says how large cells are, at first
-COARSE_CELL_RAD = math.radians(3.0)  # from which the size of cells is found
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,6 +44,8 @@ CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones w
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
 # Keys by which tasks are told where sensors may be.
 PLACE_KEYS = ("origin_m", "origin_box_m")
+KEY = "weighting"
+FIT_AGAIN = "fit the design again: an earlier version refined it, or its file was changed by hand"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -430,10 +432,6 @@ class FitResult:
             "seconds": self.seconds,
             "error_estimates": as_documents(self.error_estimates),
         }
-
-
-KEY = "weighting"
-FIT_AGAIN = "fit the design again: an earlier version refined it, or its file was changed by hand"
 
 
 @dataclass(frozen=True)

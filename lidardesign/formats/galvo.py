@@ -53,6 +53,26 @@ MOST_NEAREST = 20_000
 MOST_ROUNDS = 500
 # Gains below this share of the tour's extent are rounding noise, and could be taken back and forth for ever.
 LEAST_GAIN = ROUNDING
+WHOLE = ("step", "position", "gate_start_ps", "gate_width_ps", "sensor", "ray")
+COLUMNS = (
+    "step", "position", "origin_x_m", "origin_y_m", "origin_z_m", "boresight_azimuth_deg", "boresight_elevation_deg",
+    "x_deg", "y_deg", "gate_start_ps", "gate_width_ps", "sensor", "ray",
+)  # fmt: skip
+LONGEST_SHOWN = 200
+# What spreadsheets put in front of UTF-8.
+BOM = b"\xef\xbb\xbf"
+# Angles at the limit come out of sines and cosines a few units in the last place off.
+ROUNDING_DEG = SLACK
+# Whole numbers up to here are exact as float64; light takes 104 days for so many picoseconds.
+MOST_WHOLE = 2**53
+LIMIT_DEG = 20.0
+SPEED_OF_LIGHT_M_PER_PS = SPEED_OF_LIGHT_M_S * 1e-12
+# Times of whole picoseconds come back from metres a few units in the last place off (1e-8 ps at 10 km).
+ROUNDING_PS = COARSE_SLACK
+# Boresights are given in so many decimals of a degree, which moves no ray by more than a microdegree.
+BORESIGHT_DECIMALS = 6
+# Centring converges within a few steps for fields of any size below a hemisphere.
+CENTRING_STEPS = 20
 
 
 def short_tour(points: np.ndarray) -> np.ndarray:
@@ -127,20 +147,6 @@ def _turned(points: np.ndarray, near: np.ndarray, tour: np.ndarray, least: float
             free[low : high + 2] = False
             tour[low + 1 : high + 1] = tour[low + 1 : high + 1][::-1].copy()
     return bool(len(helpful))
-
-
-WHOLE = ("step", "position", "gate_start_ps", "gate_width_ps", "sensor", "ray")
-COLUMNS = (
-    "step", "position", "origin_x_m", "origin_y_m", "origin_z_m", "boresight_azimuth_deg", "boresight_elevation_deg",
-    "x_deg", "y_deg", "gate_start_ps", "gate_width_ps", "sensor", "ray",
-)  # fmt: skip
-LONGEST_SHOWN = 200
-# What spreadsheets put in front of UTF-8.
-BOM = b"\xef\xbb\xbf"
-# Angles at the limit come out of sines and cosines a few units in the last place off.
-ROUNDING_DEG = SLACK
-# Whole numbers up to here are exact as float64; light takes 104 days for so many picoseconds.
-MOST_WHOLE = 2**53
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,16 +316,6 @@ def _numbers(row: list[str], where: str) -> list[float]:
         if name in ("x_deg", "y_deg") and abs(value) > LIMIT_DEG + ROUNDING_DEG:
             raise DataError(f"{name} is {value:g}", where=where, allowed=f"+-{LIMIT_DEG:g} degrees")
     return found
-
-
-LIMIT_DEG = 20.0
-SPEED_OF_LIGHT_M_PER_PS = SPEED_OF_LIGHT_M_S * 1e-12
-# Times of whole picoseconds come back from metres a few units in the last place off (1e-8 ps at 10 km).
-ROUNDING_PS = COARSE_SLACK
-# Boresights are given in so many decimals of a degree, which moves no ray by more than a microdegree.
-BORESIGHT_DECIMALS = 6
-# Centring converges within a few steps for fields of any size below a hemisphere.
-CENTRING_STEPS = 20
 
 
 def scan_angles_deg(frame: np.ndarray, directions: np.ndarray) -> np.ndarray:

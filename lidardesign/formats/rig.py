@@ -48,6 +48,12 @@ CENTRING_ROUNDS = 8
 SHORTEST_MEAN = 1e-3
 # More sensors than any rig has; each takes a row in every table.
 MOST_SENSORS = 10_000
+# Rays of one direction, or of directions that differ by rounding, have no field of view that could be a bound; those of
+# a fan have one in their plane, and this one across it.
+SMALLEST_FIELD_DEG = 1e-3
+PLACES = ("fixed_m", "low_m", "high_m", "mounts_m")
+MOST_NAMED = 4
+SHARED = tuple(SensorConstraints.model_fields)
 
 
 @dataclass(frozen=True)
@@ -230,14 +236,6 @@ def aim_of(directions: np.ndarray) -> Aim:
         mean = tangent_directions(frame, (seen.min(axis=0) + seen.max(axis=0))[None] / 2)[0]
     # near a pole the frame turns with the boresight, and no round need be the best
     return min(tried, key=lambda aim: aim.field_rad[0] * aim.field_rad[1])
-
-
-# Rays of one direction, or of directions that differ by rounding, have no field of view that could be a bound; those of
-# a fan have one in their plane, and this one across it.
-SMALLEST_FIELD_DEG = 1e-3
-PLACES = ("fixed_m", "low_m", "high_m", "mounts_m")
-MOST_NAMED = 4
-SHARED = tuple(SensorConstraints.model_fields)
 
 
 def rig_constraints(

@@ -35,6 +35,10 @@ COSINE_MARGIN = ROUNDING
 # A component without samples keeps this weight, so that its logarithm stays finite.
 SMALLEST_WEIGHT = ROUNDING
 LOG_TWO_PI = math.log(2 * math.pi)
+# Below this cosine of a fixed elevation the azimuth turns the ray about itself: it is no freedom there.
+POLE_COSINE = SLACK
+# A free axis on which the data do not vary is scaled by this share of its bounds: nothing divides by 0.
+IDLE_AXIS_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,12 +274,6 @@ def mean_directions(features: Features, labels: np.ndarray, count: int) -> tuple
     azimuth = np.arctan2(sums[1], sums[0]) if features.axes.horizontal else np.zeros(count)
     elevation = np.arctan2(sums[2], np.hypot(sums[0], sums[1])) if features.axes.vertical else np.zeros(count)
     return np.asarray(wrap_angle(azimuth)), elevation
-
-
-# Below this cosine of a fixed elevation the azimuth turns the ray about itself: it is no freedom there.
-POLE_COSINE = SLACK
-# A free axis on which the data do not vary is scaled by this share of its bounds: nothing divides by 0.
-IDLE_AXIS_SHARE = 1e-3
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,15 @@ FEW_SAMPLES = 256
 SMALLEST_STEP = 0.02
 # Mass that stands for an empty cell, so that its mean is finite.
 SMALLEST_CELL = TINY
+# Up to so many centres, looking at all of them costs as little as a tree, and nothing to import.
+FEW_CENTRES = 10
+# The iteration stops when no centre moves by more than this share of the features' extent: far below the
+# spacing of any ray layout, far above rounding.
+MOVEMENT_TOLERANCE = COARSE_SLACK
+# Seeds are drawn among at most so many points per centre: seeding costs N * K, an iteration only N log K.
+SEED_POOL = 16
+# Relative weights below this one count as it, so that the mass of a cell never underflows to nothing.
+SMALLEST_WEIGHT = SQUARABLE
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,10 +306,6 @@ class Nearest:
         return distance, self._labels.copy()
 
 
-# Up to so many centres, looking at all of them costs as little as a tree, and nothing to import.
-FEW_CENTRES = 10
-
-
 def _two_nearest(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances to the nearest centre and to the next, shape (N, 2), and the index of the nearest, shape (N,).
 
@@ -314,15 +319,6 @@ def _two_nearest(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, n
     squared = np.stack([np.square(points - centre).sum(axis=1) for centre in centres], axis=1)
     next_one = min(1, len(centres) - 1)
     return np.sqrt(np.partition(squared, next_one, axis=1)[:, [0, next_one]]), squared.argmin(axis=1)
-
-
-# The iteration stops when no centre moves by more than this share of the features' extent: far below the
-# spacing of any ray layout, far above rounding.
-MOVEMENT_TOLERANCE = COARSE_SLACK
-# Seeds are drawn among at most so many points per centre: seeding costs N * K, an iteration only N log K.
-SEED_POOL = 16
-# Relative weights below this one count as it, so that the mass of a cell never underflows to nothing.
-SMALLEST_WEIGHT = SQUARABLE
 
 
 def lloyd(

@@ -32,6 +32,8 @@ from lidardesign.workers import Starmap
 MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes returned, in the density's sigma
 # Chosen on, and held back from the choice.
 CHOICE, HELD_BACK = "choice", "held back"
+Informs = Callable[[Scene, Sequence[Returns]], Information]
+LARGEST = np.zeros(0)  # the table of items that count the largest worth
 
 
 class TrainingScenes:
@@ -104,10 +106,6 @@ def informed_scene(
     with choosing(share):
         found = inform(scene, rays, visits, partial(checked_information, task))
     return found.with_fewer_items(MOST_ITEMS, random_generator(seed, "items", purpose, number))
-
-
-Informs = Callable[[Scene, Sequence[Returns]], Information]
-LARGEST = np.zeros(0)  # the table of items that count the largest worth
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,6 +26,22 @@ from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, DesignSpace, angle
 POINTS = 48_000  # of a design, shared by its sensors
 FEWEST = 64  # of a sensor
 PLACES = 9  # along a condition
+MOST_STEPS = 512  # along a triangle's side: beyond, it is far larger than any picture
+PERCENT = 100.0
+# What lies further out than this share, at each end, is not shown: a stray sample would stretch every axis.
+TAIL = 0.001
+MARGIN = 0.04  # of an axis, beyond what it shows at each end
+LEAST_BINS, MOST_BINS = 12, 80
+LEAST_CELLS, MOST_CELLS = 16, 140
+# A plane whose second axis holds a thousandth of the first one's spread is a line.
+THINNEST = 1e-3
+# Designs whose marginals stand out further are cut off: a fixed origin is a spike of any height.
+HIGHEST = 2.5
+CENTIMETRES, METRES = ("cm", 100.0), ("m", 1.0)
+LONG_M = 5.0  # axes beyond this are told per metre
+# A full turn is cut at the one of so many bins about which least lies, counting its neighbours; unless that is much.
+TURN_BINS, CUT_BINS, EMPTY = 72, 4, 0.5
+NAMES = ("x", "y", "z", "azimuth", "elevation", "range")
 
 
 def mixture_points(design: DesignSpec) -> tuple[np.ndarray, np.ndarray]:
@@ -66,9 +82,6 @@ def sensor_points(sensor: Sensor, normal: np.ndarray, z: float) -> np.ndarray:
     return np.column_stack([origin + sensor.origin_m, azimuth, elevation, np.maximum(range_m, 0.0)])
 
 
-MOST_STEPS = 512  # along a triangle's side: beyond, it is far larger than any picture
-
-
 def silhouette(
     scene: Scene, frame: int, axes: tuple[int, int], edges: tuple[np.ndarray, np.ndarray], *, targets: bool = True
 ) -> np.ndarray:
@@ -104,23 +117,6 @@ def silhouette(
                     inside = inside[((inside >= 0) & (inside < upper)).all(axis=1)]
                     covered[inside[:, 1], inside[:, 0]] = True
     return covered
-
-
-PERCENT = 100.0
-# What lies further out than this share, at each end, is not shown: a stray sample would stretch every axis.
-TAIL = 0.001
-MARGIN = 0.04  # of an axis, beyond what it shows at each end
-LEAST_BINS, MOST_BINS = 12, 80
-LEAST_CELLS, MOST_CELLS = 16, 140
-# A plane whose second axis holds a thousandth of the first one's spread is a line.
-THINNEST = 1e-3
-# Designs whose marginals stand out further are cut off: a fixed origin is a spike of any height.
-HIGHEST = 2.5
-CENTIMETRES, METRES = ("cm", 100.0), ("m", 1.0)
-LONG_M = 5.0  # axes beyond this are told per metre
-# A full turn is cut at the one of so many bins about which least lies, counting its neighbours; unless that is much.
-TURN_BINS, CUT_BINS, EMPTY = 72, 4, 0.5
-NAMES = ("x", "y", "z", "azimuth", "elevation", "range")
 
 
 @dataclass(frozen=True, eq=False)

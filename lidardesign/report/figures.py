@@ -28,6 +28,20 @@ if TYPE_CHECKING:
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
 
 FAR_SHARE = 0.5  # of the worst design's score: rivals that are always worse by more are hidden at first
+# One hue from light to dark: it reads the same without colour vision and on paper.
+SCALE = [[0.0, "#ffffff"], [0.2, "#d6e6f4"], [0.45, "#6baed6"], [0.7, "#2171b5"], [1.0, "#08306b"]]
+FILL, INK, QUIET = "#b8c1cb", "#1f2933", "#7b8794"
+MOST_DESIGNS = 6  # drawn beside a marginal
+AXIS = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside", "tickformat": "~g"}
+LAYOUT = {
+    "font": {**FONT, "size": 12},
+    "paper_bgcolor": "#ffffff",
+    "plot_bgcolor": "#ffffff",
+    "margin": {"l": 58, "r": 12, "t": 10, "b": 46},
+    "showlegend": False,
+}
+# More lines are no picture.
+MOST_DRAWN_RAYS = 2000
 
 
 def far_rivals(evaluation: Evaluation) -> set[str]:
@@ -131,20 +145,6 @@ def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
     return [band, line]
 
 
-# One hue from light to dark: it reads the same without colour vision and on paper.
-SCALE = [[0.0, "#ffffff"], [0.2, "#d6e6f4"], [0.45, "#6baed6"], [0.7, "#2171b5"], [1.0, "#08306b"]]
-FILL, INK, QUIET = "#b8c1cb", "#1f2933", "#7b8794"
-MOST_DESIGNS = 6  # drawn beside a marginal
-AXIS = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside", "tickformat": "~g"}
-LAYOUT = {
-    "font": {**FONT, "size": 12},
-    "paper_bgcolor": "#ffffff",
-    "plot_bgcolor": "#ffffff",
-    "margin": {"l": 58, "r": 12, "t": 10, "b": 46},
-    "showlegend": False,
-}
-
-
 def marginal_figure(marginal: Marginal, looks: Mapping[str, Series]) -> dict[str, Any]:
     """One marginal as a filled outline, those of designs as lines."""
     density = {
@@ -227,10 +227,6 @@ def _steps(edges: np.ndarray, heights: np.ndarray) -> dict[str, Any]:
         "x": np.repeat(edges, 2).tolist(),
         "y": [0.0, *np.repeat(heights, 2).tolist(), 0.0],
     }
-
-
-# More lines are no picture.
-MOST_DRAWN_RAYS = 2000
 
 
 def design_figure(design: DesignSpec, rays: Rays | None = None) -> Figure:

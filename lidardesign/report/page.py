@@ -58,6 +58,11 @@ from lidardesign.space import observed_point
 from lidardesign.task import random_generator
 
 CURVE_PX, SMALL_PX, PLANE_PX = 440, 250, 400
+# Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
+DENSITY_POINTS = 3000
+COMMAND = "evaluate"
+MOST_SENTENCES = 3  # of designs that have one each; a table says the same of all
+MOST_NOTES = 2  # that are not folded
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,11 +212,6 @@ def _accuracy(sweeps: Sequence[Sweep]) -> str:
     return f'<p>{read}</p><div class="tiles wide">{pictures}</div>{accuracy_tables(sweeps)}'
 
 
-# Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
-DENSITY_POINTS = 3000
-COMMAND = "evaluate"
-
-
 @phase("report")
 def evaluation_report(
     evaluation: Evaluation,
@@ -275,10 +275,6 @@ def _origin(provenance: Mapping[str, object]) -> str:
 
 def _line(words: Sequence[object]) -> str:
     return shlex.join(str(word) for word in words)
-
-
-MOST_SENTENCES = 3  # of designs that have one each; a table says the same of all
-MOST_NOTES = 2  # that are not folded
 
 
 def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str:

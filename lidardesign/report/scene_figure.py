@@ -43,6 +43,12 @@ MOST_RAY_STEPS = 120_000  # the same at all frames: 5 bytes each
 FEWEST_RAYS = 300  # of a design, for which frames are given up
 
 Conditions = Mapping[str, float]
+MOST_FACES = 40_000  # of a scene's meshes, and of its round bodies; more would make the page large and slow to open
+STEPS = 24  # round a round body
+FEWEST_STEPS = 4  # where a scene has very many of them
+SHELL_STEPS = 8  # along each side of a gate's shell
+SMALLEST_SPREAD_M = 1e-3  # of origins; less looks like one place
+PLANE_MARGIN = 0.1  # of the scene's extent, beyond which an infinite plane is not drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,14 +197,6 @@ def constraint_slack_of(design: DesignSpec, space: DesignSpace) -> list[Constrai
     checks = check_design(design_document(design), design.constraints, space)
     slacks = constraint_slack(checks, [sensor.name for sensor in design.sensors])
     return sorted(slacks, key=lambda one: one.name.startswith(SPACE_MARK))
-
-
-MOST_FACES = 40_000  # of a scene's meshes, and of its round bodies; more would make the page large and slow to open
-STEPS = 24  # round a round body
-FEWEST_STEPS = 4  # where a scene has very many of them
-SHELL_STEPS = 8  # along each side of a gate's shell
-SMALLEST_SPREAD_M = 1e-3  # of origins; less looks like one place
-PLANE_MARGIN = 0.1  # of the scene's extent, beyond which an infinite plane is not drawn
 
 
 def drawn_share(scene: Scene) -> float:

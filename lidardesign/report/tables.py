@@ -26,6 +26,12 @@ from lidardesign.sensors.design import DesignSpec
 
 MOST_SENSORS = 60  # listed in a table
 TINY = 1e-4  # from here on the limit is shown
+# Phases of a smaller share of their command are left out; `other` has what they took.
+LEAST_SHARE = 0.005
+DEEPEST = 2
+MEBIBYTE = 1024**2
+PERCENT = 100.0
+SHORT_S = 0.01  # costs from here on are shown as their limit
 
 
 def four_digits(value: float) -> str:
@@ -184,13 +190,6 @@ def table(
     )
 
 
-# Phases of a smaller share of their command are left out; `other` has what they took.
-LEAST_SHARE = 0.005
-DEEPEST = 2
-MEBIBYTE = 1024**2
-PERCENT = 100.0
-
-
 @dataclass(frozen=True)
 class CommandTimes:
     """Where the time of one command went.
@@ -335,9 +334,6 @@ def _scrolled(headings: Sequence[str], text: Sequence[int], rows: Iterable[str],
         f'<div class="scroll" tabindex="0" role="region" aria-label="{label}"><table><caption><span>{label}</span>'
         f"</caption><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
     )
-
-
-SHORT_S = 0.01  # costs from here on are shown as their limit
 
 
 def effects_section(evaluation: Evaluation) -> str:

@@ -23,6 +23,7 @@ from lidardesign.errors import UNSET_HINT, ConfigError
 from lidardesign.run.yaml import MAX_DEPTH, KeyPath, parse_yaml, resolve_scalar
 
 LIKE_TEXT = (str, bytes, Path)
+Model = TypeVar("Model", bound=BaseModel)
 
 
 def is_name(value: Any) -> bool:
@@ -69,9 +70,6 @@ def _wrong_values(admitted: list[Any], value: Any, path: KeyPath) -> Iterator[tu
     words = any(typing.get_origin(part) is typing.Literal or part in LIKE_TEXT for part in admitted)
     if (isinstance(value, bool) and bool not in admitted) or (isinstance(value, str) and not words):
         yield path, value
-
-
-Model = TypeVar("Model", bound=BaseModel)
 
 
 def check_model(model: type[Model], values: Any, locate: Callable[..., str], section: str = "") -> Model:

@@ -15,6 +15,24 @@ from lidardesign.numerics import ROUNDING
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Round, Scene, Shape, Sphere
 from lidardesign.space import RANGE, DesignSpace
 
+# Kinds of bodies, as compiled loops know them; a mesh is one of the grids of distance fields.
+SPHERE, BOX, CAPSULE, PLANE, GRID, CYLINDER, ELLIPSOID = range(7)
+KINDS: dict[type, int] = {
+    Sphere: SPHERE, Box: BOX, Capsule: CAPSULE, Plane: PLANE, Mesh: GRID, Cylinder: CYLINDER, Ellipsoid: ELLIPSOID,
+}  # fmt: skip
+# Relative rounding of squared distances, doubled many times over: bounding balls are never missed.
+BALL_SLACK = ROUNDING
+# Their lengths, as compiled loops take them; planes and meshes have none.
+SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
+    Sphere: lambda shape: (shape.radius_m, 0.0, 0.0),
+    Box: lambda shape: shape.half_extents_m,
+    Capsule: lambda shape: (shape.radius_m, shape.half_length_m, 0.0),
+    Cylinder: lambda shape: (shape.radius_m, shape.half_length_m, 0.0),
+    Ellipsoid: lambda shape: shape.semi_axes_m,
+    Plane: lambda shape: (0.0, 0.0, 0.0),
+    Mesh: lambda shape: (0.0, 0.0, 0.0),
+}
+
 
 class Sampled(NamedTuple):
     """Points (K, 3) [m] and the corners of the triangle of each (K, 3, 3); on primitives all three are it."""
@@ -164,25 +182,6 @@ def _on_primitive(shape: Round | Box, count: int, generator: np.random.Generator
     side = np.stack([shape.radius_m * np.cos(turn), shape.radius_m * np.sin(turn), height], axis=1)
     on_side = generator.random(count) * (shape.radius_m + shape.half_length_m) < shape.half_length_m
     return np.where(on_side[:, None], side, ends)
-
-
-# Kinds of bodies, as compiled loops know them; a mesh is one of the grids of distance fields.
-SPHERE, BOX, CAPSULE, PLANE, GRID, CYLINDER, ELLIPSOID = range(7)
-KINDS: dict[type, int] = {
-    Sphere: SPHERE, Box: BOX, Capsule: CAPSULE, Plane: PLANE, Mesh: GRID, Cylinder: CYLINDER, Ellipsoid: ELLIPSOID,
-}  # fmt: skip
-# Relative rounding of squared distances, doubled many times over: bounding balls are never missed.
-BALL_SLACK = ROUNDING
-# Their lengths, as compiled loops take them; planes and meshes have none.
-SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
-    Sphere: lambda shape: (shape.radius_m, 0.0, 0.0),
-    Box: lambda shape: shape.half_extents_m,
-    Capsule: lambda shape: (shape.radius_m, shape.half_length_m, 0.0),
-    Cylinder: lambda shape: (shape.radius_m, shape.half_length_m, 0.0),
-    Ellipsoid: lambda shape: shape.semi_axes_m,
-    Plane: lambda shape: (0.0, 0.0, 0.0),
-    Mesh: lambda shape: (0.0, 0.0, 0.0),
-}
 
 
 def half_extents_m(shape: Shape) -> tuple[float, float, float]:

@@ -22,6 +22,8 @@ from lidardesign.space import DIMENSIONS
 
 # Conditions that a sensor can travel along: where a ray starts, not where it looks.
 TRAVELLED = DIMENSIONS[:3]
+RECURRENCE_AXES = 2
+PRIMES = (2, 3, 5, 7, 11, 13)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +162,6 @@ def _assigned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     from scipy.optimize import linear_sum_assignment
 
     return linear_sum_assignment(np.square(before[:, None] - after[None]).sum(axis=2))[1]
-
-
-RECURRENCE_AXES = 2
-PRIMES = (2, 3, 5, 7, 11, 13)
 
 
 def grid_rows(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:

@@ -75,16 +75,6 @@ LIGHT_SECONDS = {"motion": 4e-7, "specular": 1.8e-6, "shadowing": 1e-6, "multipa
 # Per ray, where photons are counted [s].
 PHOTON_SECONDS = {"photon_noise": 2e-6, "jitter": 3e-7, "ambient": 4e-7, "pile_up": 5e-6, "atmosphere": 3.5e-6}
 ROUNDING_SECONDS = 1e-7
-
-
-def predicted_seconds(effect: str, detector: Detector, rays: int) -> float:
-    """Of an effect for so many rays over all frames [s]."""
-    if effect == "footprint":
-        return rays * (detector.footprint_rays - 1) * SUB_RAY_SECONDS
-    known = LIGHT_SECONDS if detector.photons is None else LIGHT_SECONDS | PHOTON_SECONDS
-    return rays * known.get(effect, ROUNDING_SECONDS)
-
-
 EFFECT_MODULES = {
     "footprint": footprint,
     "motion": motion,
@@ -114,6 +104,22 @@ MOST_FRAMES = 16
 SEVERAL_ECHOES = frozenset({"footprint", "specular", "multipath"})
 # What these change depends on first hits alone, behind mirrors and glass too.
 OF_FIRST_HITS = ("specular", "multipath", "shadowing")
+# Of a shift over the distance of an edge: how likely it is passed where other shifts are of unknown size.
+PASSED_SHARE = 0.2
+# An edge further than so many standard deviations of all shifts is not passed.
+EDGE_REACH = 4.0
+# Whether a return is reported that has barely enough light is a matter of these.
+OF_BARE_LIGHT = {"photon_noise", "jitter", "quantisation"}
+# By these rays meet what their first hits are not.
+ELSEWHERE = {"footprint", "motion"}
+
+
+def predicted_seconds(effect: str, detector: Detector, rays: int) -> float:
+    """Of an effect for so many rays over all frames [s]."""
+    if effect == "footprint":
+        return rays * (detector.footprint_rays - 1) * SUB_RAY_SECONDS
+    known = LIGHT_SECONDS if detector.photons is None else LIGHT_SECONDS | PHOTON_SECONDS
+    return rays * known.get(effect, ROUNDING_SECONDS)
 
 
 @dataclass(frozen=True)
@@ -393,16 +399,6 @@ class _BoundSum:
         squared_m2 = np.where(self._returns > 0, self._squared_m2 / returns, self._unseen_m2 / self._rays)
         lost = np.minimum(self._lost / returns, 1.0)
         return Bound(float(np.sqrt(squared_m2.max())), float(lost.max()), self._reason)
-
-
-# Of a shift over the distance of an edge: how likely it is passed where other shifts are of unknown size.
-PASSED_SHARE = 0.2
-# An edge further than so many standard deviations of all shifts is not passed.
-EDGE_REACH = 4.0
-# Whether a return is reported that has barely enough light is a matter of these.
-OF_BARE_LIGHT = {"photon_noise", "jitter", "quantisation"}
-# By these rays meet what their first hits are not.
-ELSEWHERE = {"footprint", "motion"}
 
 
 def with_steps(counts: Counts, bounds: dict[str, EffectBound]) -> dict[str, EffectBound]:

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from support.rivals import Rivals, balls
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
@@ -47,8 +46,8 @@ def design_points(rays):
     return np.column_stack([rays.origin_m, azimuth, elevation, rays.gate_m[:, 0]])
 
 
-@each_row("case", CASES)
-@each_row("name", BUILT)
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", BUILT)
 def test_any_number_of_rays_is_met_exactly_inside_the_space_and_repeats(case, name):
     space, train = CASES[case]
     source, same = (Rivals(space, train, seed=4) for _ in range(2))
@@ -136,9 +135,9 @@ def test_bounding_without_any_return_is_uniform():
     assert np.array_equal(bounding.gate_m, uniform.gate_m)
 
 
-@each_row("case", CASES)
-@each_row("name", ["uniform", "random", "bounding", "occupancy"])
-@each_row("limit", [0.0, 0.01, 0.5, 3.0])
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", ["uniform", "random", "bounding", "occupancy"])
+@pytest.mark.parametrize("limit", [0.0, 0.01, 0.5, 3.0])
 def test_as_many_rays_as_fit_in_a_bandwidth_fit_and_one_more_does_not(case, name, limit):
     space, train = CASES[case]
     bandwidth = Bandwidth()
@@ -160,7 +159,7 @@ def test_the_seed_moves_only_the_random_baseline():
         assert np.array_equal(first.direction, second.direction) == (name not in ("random", "occupancy"))
 
 
-@each_row("name", ["catalog:vl53l5cx", "uniform:3", "uniform:", ""])
+@pytest.mark.parametrize("name", ["catalog:vl53l5cx", "uniform:3", "uniform:", ""])
 def test_a_name_that_is_no_baselines_is_refused(name):
     with pytest.raises(ConfigError, match="unknown baseline"):
         check_baseline(name)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 from support.captures import BINS, make_capture
-from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.run.inputs import CAPTURE
@@ -44,8 +43,8 @@ def path_of(folder, kind):
     return folder / f"scan.{kind.split()[0]}"
 
 
-@each_row("images", [True, False])
-@each_row("kind", FORMATS)
+@pytest.mark.parametrize("images", [True, False])
+@pytest.mark.parametrize("kind", FORMATS)
 def test_a_capture_is_the_same_from_every_kind_of_file(tmp_path, kind, images):
     arrays = make_capture(9, images=images)
     found = stored(tmp_path, kind, arrays)
@@ -239,8 +238,8 @@ def test_matlab_7_structures_and_foreign_hdf5_are_refused(tmp_path):
         load_capture(path)
 
 
-@each_row("kind", FORMATS)
-@each_row("share", [0.0, 0.01, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
 def test_a_file_that_was_cut_short_is_refused(tmp_path, kind, share):
     path = path_of(tmp_path, kind)
     FORMATS[kind](path, make_capture(5))

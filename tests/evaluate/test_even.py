@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial import ConvexHull, SphericalVoronoi, cKDTree
 from scipy.spatial.transform import Rotation
 from support.rivals import Rivals, balls
-from support.tables import each_row
 
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
 from lidardesign.scoring.baselines.candidates import LayoutSite
@@ -39,7 +38,7 @@ def nearest(looking):
     return 2 * np.arcsin(cKDTree(looking).query(looking, k=2)[0][:, 1] / 2)
 
 
-@each_row("place", PLACES)
+@pytest.mark.parametrize("place", PLACES)
 def test_a_crop_has_as_even_a_grid_at_any_place_of_the_sphere(place):
     looking = seen(PLACES[place])
     field = central_field(SPHERE, *angles(looking))
@@ -59,7 +58,7 @@ def test_a_crop_has_as_even_a_grid_at_any_place_of_the_sphere(place):
     assert field.area_sr < 1.1 * plain
 
 
-@each_row("place", PLACES)
+@pytest.mark.parametrize("place", PLACES)
 def test_lattices_have_hexagonal_cells_of_one_area(place):
     field = central_field(SPHERE, *angles(seen(PLACES[place])))
     spacing = 0.03
@@ -78,7 +77,9 @@ def test_a_zone_is_even_up_to_the_pole():
         assert areas.std() < 0.1
 
 
-@each_row("field", [Zone(np.array([0.2, -1.5]), np.array([6.0, 0.4])), central_field(SPHERE, *angles(seen(np.eye(3))))])
+@pytest.mark.parametrize(
+    "field", [Zone(np.array([0.2, -1.5]), np.array([6.0, 0.4])), central_field(SPHERE, *angles(seen(np.eye(3))))]
+)
 def test_spread_points_are_even_in_solid_angle_and_in_further_axes(field):
     points = field.spread(4000, 2)
     assert points.shape == (4000, 4)

@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from support.tables import each_row
 from support.triangles import naive_triangle_distance_m
 
 from lidardesign.errors import DataError
@@ -131,7 +130,7 @@ def test_every_triangle_is_delaunay_on_the_sphere_even_over_more_than_half_a_tur
         assert not inside, "a return lies inside the circle of three others"
 
 
-@each_row(
+@pytest.mark.parametrize(
     "points",
     [
         np.zeros((0, 3)),

@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.command_line import make_run
 from support.scoring import design, make_request, rows_by_key, scenes
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.report.tables import mounting_table
@@ -35,7 +34,7 @@ def rays_of(sensors, seed=0):
     return Rays(generator.normal(size=(count, 3)), looking, gates, np.asarray(sensors), np.arange(count) / 100)
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("text", "place_m", "angle_rad"),
     [
         ("5mm,0.5deg", 0.005, 0.5 * DEGREE),
@@ -50,7 +49,7 @@ def test_errors_are_read_in_their_units(text, place_m, angle_rad):
     assert MountError.parse(text) == MountError(pytest.approx(place_m), pytest.approx(angle_rad))
 
 
-@each_row(
+@pytest.mark.parametrize(
     "text",
     ["", "5", "5 miles", "mm", "1e,2mm", "-1mm", "nan mm", "5mm,6mm", "1deg,2rad", "5mm 1deg", "200deg", "1e99m"],
 )

@@ -4,7 +4,7 @@ import itertools
 import math
 
 import plotly.graph_objects as go
-from support.tables import each_row
+import pytest
 
 from lidardesign.report.pareto import (
     ABOVE_PX,
@@ -49,7 +49,7 @@ def test_the_front_is_what_no_other_rung_beats():
     assert [mark.beaten for mark in panels([twins])[0].marks] == [False, False]
 
 
-@each_row(
+@pytest.mark.parametrize(
     "measurements",
     [
         [Measurement("a", 0.0, 0.0, 0.0), Measurement("b", 0.0, 0.0, 0.0)],
@@ -58,7 +58,7 @@ def test_the_front_is_what_no_other_rung_beats():
         [Measurement("a", math.inf, math.nan, 1.0), Measurement("b", 0.5, 0.0, 1.0)],
     ],
 )
-@each_row("tolerance", [0.0, 0.02, math.inf])
+@pytest.mark.parametrize("tolerance", [0.0, 0.02, math.inf])
 def test_figures_without_a_logarithm_are_drawn_too(measurements, tolerance):
     sweep = make_sweep(measurements, tolerance=tolerance)
     (panel,) = panels([sweep])

@@ -2,7 +2,7 @@
 
 import mmap
 
-from support.tables import each_row
+import pytest
 
 from lidardesign.scoring.sweep import Measurement, Sweep, timed
 
@@ -18,7 +18,7 @@ def measure(setting, error, seconds, **changes):
 OWN = {"default": True}
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("errors_and_seconds", "chosen", "verdict"),
     [
         # the cheapest inside the tolerance; of those that cost the same, the most accurate

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 from support.scoring import RAYS, HitTask, MissTask, design, make_request, rows_by_key, scenes
-from support.tables import each_row
 
 from lidardesign.cli.terminal.score_tables import show_evaluation
 from lidardesign.errors import ConfigError, DataError, PluginError
@@ -65,7 +64,7 @@ def test_a_worst_value_of_the_configuration_cuts_scores_and_is_what_failures_hav
         np.testing.assert_array_equal(row.per_scene, np.minimum(usual[key].per_scene, 40.0))
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("designs", "task", "baselines", "said"),
     [
         ([design()], MissTask(), (), None),
@@ -229,7 +228,7 @@ class BrokenTask(MissTask):
         return self.result
 
 
-@each_row(
+@pytest.mark.parametrize(
     "result",
     [
         ValueError("boom"),
@@ -278,7 +277,7 @@ def test_a_failure_has_the_worst_value_whatever_the_task_put_there():
     assert (row.value, row.failures) == (150.0, 0)
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"test": []}, "no held-out scenes"),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from support.scoring import design, make_request, scenes
-from support.tables import each_row
 
 from lidardesign.scenes.rays import Rays
 from lidardesign.scenes.scene import rigid
@@ -23,13 +23,13 @@ def ahead(gate_m=(0.05, 4.0), azimuth=0.0):
     return Rays.from_angles(np.zeros((2, 3)), np.full(2, azimuth), np.zeros(2), gates_m, np.zeros(2, int))
 
 
-@each_row("azimuth", [0.0, 0.45])
+@pytest.mark.parametrize("azimuth", [0.0, 0.45])
 def test_an_evaluation_names_designs_that_look_past_the_targets(azimuth):
     found = silent(evaluate(make_request([design(), design("other", azimuth=azimuth)])))
     assert [note.split(",")[1].split(" returns")[0] for note in found] == ([" no ray of 'other'"] if azimuth else [])
 
 
-@each_row(
+@pytest.mark.parametrize(
     "case",
     [
         ("ahead", ahead(), False),

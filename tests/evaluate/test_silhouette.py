@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.rivals import Rivals, balls
-from support.tables import each_row
 
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scoring.baselines.candidates import LayoutSite
@@ -40,8 +39,8 @@ def laid_out(name, subject, count):
     return layout.lay_out(count, LayoutSite(space))
 
 
-@each_row("subject", SUBJECTS)
-@each_row("name", MAKE)
+@pytest.mark.parametrize("subject", SUBJECTS)
+@pytest.mark.parametrize("name", MAKE)
 def test_any_number_is_met_exactly_inside_the_space_where_scenes_return_and_repeats(subject, name):
     space, scenes = SUBJECTS[subject]
     casters = [SceneCaster(scene) for scene in scenes]
@@ -60,7 +59,7 @@ def test_any_number_is_met_exactly_inside_the_space_where_scenes_return_and_repe
         assert hit.sum() >= 0.95 * count
 
 
-@each_row("subject", ["ahead", "straight down", "along a line", "all around"])
+@pytest.mark.parametrize("subject", ["ahead", "straight down", "along a line", "all around"])
 def test_gates_hold_what_training_scenes_return(subject):
     space, scenes = SUBJECTS[subject]
     for name, share in (("silhouette", 0.99), ("lloyd", 0.97)):
@@ -74,7 +73,7 @@ def test_gates_hold_what_training_scenes_return(subject):
         assert np.median(np.diff(gates, axis=1)) < 0.3 * (space.high[5] - space.low[5])
 
 
-@each_row("subject", ["ahead", "straight down", "all around"])
+@pytest.mark.parametrize("subject", ["ahead", "straight down", "all around"])
 def test_a_silhouette_is_a_hexagonal_lattice_at_any_pole(subject):
     points, _ = laid_out("silhouette", subject, 300)
     looking = direction(points[:, 3], points[:, 4])
@@ -96,7 +95,7 @@ def test_lloyd_has_more_rays_where_returns_are_frequent_and_surfaces_large():
     assert here.mean() > 1.05 * density[found.supported].mean()
 
 
-@each_row("name", MAKE)
+@pytest.mark.parametrize("name", MAKE)
 def test_where_nothing_returns_there_is_no_candidate_and_the_rival_is_uniform(name):
     nothing = balls(np.array([-3.0, 0, 0]))
     assert MAKE[name](TrainingViews(AHEAD, nothing)) == []
@@ -105,7 +104,7 @@ def test_where_nothing_returns_there_is_no_candidate_and_the_rival_is_uniform(na
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.1])
-@each_row("name", MAKE)
+@pytest.mark.parametrize("name", MAKE)
 def test_a_bandwidth_is_kept_and_used(name, limit):
     space, scenes = SUBJECTS["ahead"]
     (rays,) = Rivals(space, scenes, 0).positions_within(name, limit, Bandwidth())
@@ -114,7 +113,7 @@ def test_a_bandwidth_is_kept_and_used(name, limit):
     assert cost >= 0.9 * limit - 0.003
 
 
-@each_row("subject", ["ahead", "straight down", "from a box"])
+@pytest.mark.parametrize("subject", ["ahead", "straight down", "from a box"])
 def test_bounding_has_gates_per_ray_to_choose_where_a_design_has_them(subject):
     space, scenes = SUBJECTS[subject]
     layouts = {layout.name: layout for layout in bounding(TrainingViews(space, scenes), gates_per_ray=True)}

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from support.evaluations import METRIC, make_row
 from support.scoring import HitTask, design, make_request
-from support.tables import each_row
 
 from lidardesign.errors import ThresholdError
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, verdict
@@ -16,7 +15,7 @@ from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.scoring.evaluation.thresholds import check_better, check_limit, difference_text
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("better", "difference", "told"),
     [
         ("lower", (-0.6, -0.9, -0.3), "f3 is better than greedy by 0.60 mm (0.30 to 0.90) at 361 rays"),

@@ -1,104 +1,138 @@
-"""The design without visibility: the same fit to other samples, in every layout."""
+"""The design without visibility: fitted and chosen as the design was, to the density without its occlusion term."""
 
-import math
+from __future__ import annotations
+
 from dataclasses import replace
 
-import numpy as np
-from lidardesign.layouts.rays import lay_out
-from support.tables import each_row
+import pytest
+from support.command_line import make_run
+from support.conditioned_runs import make_conditioned_run
+from support.sensors import normal_sensor
 
 from lidardesign.constraints.check import check_design
 from lidardesign.constraints.document import Constraints
-from lidardesign.mixture.fit import fit, rays_at
-from lidardesign.samples import Samples
-from lidardesign.scoring.baselines.candidates import mean_mbps
-from lidardesign.scoring.baselines.simple import TwinCandidate, fitted_twin
-from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.density.objective.proposals import samples_without_visibility
+from lidardesign.errors import InfeasibleError
+from lidardesign.fitting import fit as fit_module
+from lidardesign.fitting.fit import fit_design, twin_without_visibility
+from lidardesign.fitting.request import FitOptions, FitRequest, RunTarget
+from lidardesign.run_folder import RunFolder
+from lidardesign.scoring.baselines.greedy import Fired
+from lidardesign.scoring.baselines.simple import TwinCandidate
+from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
-from lidardesign.space import DesignSpace
+from lidardesign.sensors.pattern import Pattern
+from lidardesign.task import random_generator
 
-SPACE = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
-CEILING = DesignSpace((-1, -1, 1, 0, -math.pi / 2, 0.1), (1, 1, 1, 2 * math.pi, -1.0, 2.0))
-AISLE = DesignSpace(
-    (-0.5, 0.0, 0.0, -math.pi / 2, 0.0, 0.1), (4.0, 0.0, 0.0, -math.pi / 2, math.pi / 2, 5.0), condition=("x_m",)
-)
-LIMITS = {"gate": {"width_m": {"max": 0.3}}, "budget": {"rays": 24}}
-
-
-def samples(space, centre, seed):
-    """Samples about a centre, equally weighted."""
-    generator = np.random.default_rng(seed)
-    spread = 0.08 * (np.array(space.high) - np.array(space.low))
-    points = generator.normal(centre, spread, (8_000, 6))
-    points[:, list(space.conditioned)] = space.sample(8_000, generator)[:, list(space.conditioned)]
-    fixed = [axis for axis in range(6) if axis not in space.free]
-    points[:, fixed] = np.array(space.low)[fixed]
-    points = points[space.contains(points)]
-    return Samples(points, np.zeros(len(points)), np.zeros(len(points)), space)
-
-
+RAYS = 12
+LIMITS = {"gate": {"width_m": {"max": 0.6}}}
 CASES = {
-    "grid": (SPACE, {"sensors": 3, "layout": "grid"}, LIMITS),
-    "density": (SPACE, {"sensors": 2, "layout": "density", "rays": 24}, LIMITS),
-    "gates per ray": (SPACE, {"sensors": 2, "layout": "density", "rays": 24, "gates": "ray"}, LIMITS),
-    "scan": (SPACE, {"layout": "scan", "rays": 24}, LIMITS),
-    "distributed": (CEILING, {"sensors": 3, "layout": "distributed", "rays": 24}, LIMITS),
-    "track": (AISLE, {"layout": "scan", "rays": 6}, {}),
-}
-CENTRES = {
-    "SPACE": ((0, 0, 0, 0.1, 0.0, 2.0), (0, 0, 0, -0.2, 0.1, 2.5)),
-    "CEILING": ((0.2, 0.1, 1, 2.0, -1.3, 1.0), (-0.3, 0.2, 1, 3.0, -1.2, 1.2)),
-    "AISLE": ((0, 0, 0, 0, 0.6, 1.2), (0, 0, 0, 0, 0.9, 1.6)),
+    "chosen": {"sensors": 2},
+    "a gate per ray": {"sensors": 2, "gates": "ray"},
+    "even": {"sensors": 2, "layout": "even"},
+    "along": {"sensors": 1},
+    "at one place": {"sensors": 1, "at": {"x_m": 0.4}},
 }
 
 
-def both(case):
-    """A design, and its twin fitted to samples about another centre."""
-    space, choices, limits = CASES[case]
-    name = next(name for name, value in globals().items() if value is space)
-    own, other = (samples(space, centre, seed) for seed, centre in enumerate(CENTRES[name]))
-    constraints = Constraints.from_mapping(limits, where="constraints")
-    design = fit(own, constraints=constraints, seed=5, name="own", **choices).design
-    return replace(design, provenance={"seed": 5}), own, other, choices
+SAMPLES = 20_000
 
 
-@each_row("case", CASES)
-def test_a_twin_has_as_many_sensors_and_rays_and_keeps_the_same_constraints(case):
-    design, _, other, _ = both(case)
-    twin = fitted_twin(design, other, name="no-visibility")
-    assert twin.name == "no-visibility"
+@pytest.fixture(autouse=True)
+def few_samples(monkeypatch):
+    monkeypatch.setattr(fit_module, "TWIN_SAMPLES", SAMPLES)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    place = tmp_path_factory.mktemp("runs")
+    plain, along = make_run(place / "plain"), make_conditioned_run(place / "along")
+    return {case: RunFolder.open(along if case in ("along", "at one place") else plain) for case in CASES}
+
+
+def fit(run, case, visibility):
+    """The design of a case, fitted to the exact density of its run without learning it."""
+    config = run.config
+    request = FitRequest.resolve(run, FitOptions(constraints=LIMITS, rays=RAYS, seed=5, name="own", **CASES[case]))
+    generator = random_generator(config.seed, "no visibility")
+    scenes, target = run.scenes("train", config.seed), RunTarget(run, visibility)
+    samples = samples_without_visibility(scenes, config.space, config.density, SAMPLES, generator)
+    return fit_design(request, samples=samples.retargeted(target(samples.points)), target=target).design
+
+
+@pytest.fixture(scope="module")
+def fitted(runs):
+    """Of each case its run and its design."""
+    return {case: (run, fit(run, case, "raycast")) for case, run in runs.items()}
+
+
+def fired(run, design):
+    """Its rays at every value of its condition."""
+    conditions = [design.at] if design.at else run.conditions()
+    return tuple(design.rays(RAYS, at=at or None) for at in conditions)
+
+
+def text(design):
+    document = design_document(replace(design, name="same"))
+    return {**document, "provenance": None, "constraints": None}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_twin_has_as_many_sensors_and_rays_and_keeps_the_same_constraints(fitted, case):
+    run, design = fitted[case]
+    twin = twin_without_visibility(design, run, RAYS)
+    assert (twin.name, twin.layout, twin.at) == ("no-visibility", design.layout, design.at)
+    assert (twin.condition, twin.has_gates_per_ray) == (design.condition, design.has_gates_per_ray)
     assert len(twin.sensors) == len(design.sensors)
-    assert twin.layout == design.layout
-    assert twin.rays == design.rays
-    assert (twin.track is None) == (design.track is None)
-    assert (twin.ray_table is None) == (design.ray_table is None)
-    limits = Constraints.from_mapping(CASES[case][2], where="constraints")
-    assert all(check.satisfied for check in check_design(design_document(twin), limits, CASES[case][0]))
-    for at in ({"x_m": 0.37}, {"x_m": 3.91}) if case == "track" else ({},):
-        rays = lay_out(twin, design.rays or 24, other, at=at)
-        assert len(rays) == (design.rays or 24)
+    assert [len(rays) for rays in fired(run, twin)] == [RAYS] * len(fired(run, design))
+    limits = Constraints.from_mapping(LIMITS)
+    assert all(check.satisfied for check in check_design(design_document(twin), limits, run.config.space))
 
 
-@each_row("case", CASES)
-def test_a_twin_of_the_same_samples_is_the_design_itself(case):
-    design, own, _, _ = both(case)
-    twin = fitted_twin(design, own, name="again")
-    written = [replace(one, name="same", provenance={}) for one in (design, twin)]
-    assert design_document(written[0]) == design_document(written[1])
+@pytest.mark.parametrize("case", CASES)
+def test_where_nothing_occludes_a_design_is_its_own_twin(runs, case):
+    design = fit(runs[case], case, "off")
+    assert text(twin_without_visibility(design, runs[case], RAYS)) == text(design)
 
 
-@each_row(("case", "limit"), [("grid", 0.0), ("grid", 0.5), ("grid", 9.0), ("scan", 0.0), ("scan", 0.3)])
-def test_a_twin_within_a_bandwidth_never_exceeds_it(case, limit):
-    design, own, _, _ = both(case)
-    calls = []
+@pytest.mark.parametrize("case", ["chosen", "a gate per ray", "even", "along"])
+def test_a_twin_within_a_bandwidth_never_exceeds_it_whatever_bits_the_design_was_made_for(fitted, case):
+    run, design = fitted[case]
+    coarse = replace(design, constraints={**design.constraints, "budget": {"rays": RAYS, "bin_ps": 1000.0}})
+    limit = 0.7 * mean_mbps(fired(run, design), Bandwidth())
+    spent = [
+        mean_mbps(fired(run, twin_without_visibility(one, run, RAYS, limit)), Bandwidth()) for one in (design, coarse)
+    ]
+    assert max(spent) <= limit * (1 + 1e-9)
+    assert spent[0] == spent[1]
 
-    def counted(one, count, samples, *, at=None):
-        calls.append(count)
-        return rays_at(one, count, samples, at=at)
 
-    candidate = TwinCandidate(design, own, [{}], counted)
-    positions = candidate.positions_within([SPACE], limit, Bandwidth())
-    assert mean_mbps(positions, Bandwidth()) <= limit
-    assert len(calls) == len(set(calls)) <= 10
-    if limit == 0.0:
-        assert len(positions[0]) == 0
+def test_rays_of_real_parts_and_rings_have_even_rays_beside_them(fitted):
+    run, design = fitted["even"]
+    part = replace(design, layout="fixed", patterns=(Pattern.of(design.rays(RAYS)),))
+    twin = twin_without_visibility(part, run, RAYS)
+    assert twin.layout == "even"
+    assert twin.rays_per_sensor(RAYS).sum() == RAYS
+    # sensors that all fire are no more than rays
+    assert len(twin_without_visibility(part, run, 1).sensors) == 1
+
+
+@pytest.mark.parametrize("most", [24, 23, 5, 1])
+def test_where_not_as_many_rays_fit_fewer_are_fired(most):
+    def fit(count, limit_mbps):
+        if count > most:
+            raise InfeasibleError("too many rays", conflicts=["budget.bandwidth_mbps", "gate.width_m.min"])
+        return DesignSpec("aimed", (normal_sensor(),))
+
+    candidate = TwinCandidate(fit, [{}], [Fired(24, 1.5), Fired(9, 1.0)])
+    (rays,) = candidate.positions_within([], 1.5, Bandwidth())
+    assert most * 0.8 - 1 <= len(rays) <= most
+
+
+def test_constraints_that_contradict_each_other_are_no_matter_of_the_number_of_rays():
+    def fit(count, limit_mbps):
+        raise InfeasibleError("no place is left", conflicts=["origin.exclude"])
+
+    with pytest.raises(InfeasibleError, match="no place"):
+        TwinCandidate(fit, [{}], [Fired(24, 1.5)]).positions_within([], 1.5, Bandwidth())

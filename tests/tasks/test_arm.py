@@ -29,7 +29,6 @@ from lidardesign_tasks.robot.motion import minimum_jerk
 from lidardesign_tasks.robot.tracking import MEAN_DEPTH, REACH_FRAMES, filled_path, tracked_places
 from support.rays import rays_along, rays_of_points
 from support.references import recursive_frechet
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.rays.information import checked_information
@@ -124,7 +123,7 @@ def test_phases_pass_their_waypoints_at_rest_and_in_order():
     assert final[2] - place[2] == pytest.approx(FINAL_DESCENT_M)
 
 
-@each_row("jitter_m", [0.02, 0.1, 0.3])
+@pytest.mark.parametrize("jitter_m", [0.02, 0.1, 0.3])
 def test_pick_and_place_points_differ_by_the_jitter_and_stay_above_the_floor(jitter_m):
     drawn = np.stack([draw_waypoints(jitter_m, np.random.default_rng(seed)) for seed in range(200)])
     for column, nominal in ((2, PICK_M), (6, PLACE_M)):
@@ -296,7 +295,7 @@ def path(count, seed=0):
     return np.cumsum(np.random.default_rng(seed).normal(size=(count, 3)), axis=0)
 
 
-@each_row(("rows", "columns"), [(1, 1), (1, 6), (6, 1), (2, 2), (9, 9), (5, 12), (12, 5), (50, 50)])
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (1, 6), (6, 1), (2, 2), (9, 9), (5, 12), (12, 5), (50, 50)])
 def test_the_frechet_distance_agrees_with_its_recursive_definition(rows, columns):
     for seed in range(4):
         first, second = path(rows, seed), path(columns, seed + 100)

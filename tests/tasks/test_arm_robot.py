@@ -12,7 +12,6 @@ from lidardesign_tasks.robot import arm_motion
 from lidardesign_tasks.robot.arm_motion import import_mink
 from lidardesign_tasks.robot.arm_robot import BALL, load_robot
 from support.robots import PIECE, TOOL_M, mjcf, written
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.scenes.scene import Box, Capsule, Cylinder, Mesh, Sphere
@@ -125,7 +124,7 @@ REFUSED = {
 }
 
 
-@each_row("case", REFUSED)
+@pytest.mark.parametrize("case", REFUSED)
 def test_a_model_that_cannot_be_used_is_refused_with_its_path(tmp_path, monkeypatch, case):
     text, message = REFUSED[case]
     folder = tmp_path / "model"

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from lidardesign_tasks.basel import load_model
 from lidardesign_tasks.face import FaceTask, HeadFamily
-from support.tables import each_row
 
 from lidardesign.errors import DataError
 
@@ -47,7 +46,7 @@ def write(path, model, *, prefix="shape/", scaled=False, cells="representer/cell
     return path
 
 
-@each_row(
+@pytest.mark.parametrize(
     "layout",
     [
         {},
@@ -66,8 +65,8 @@ def test_every_layout_gives_the_same_shapes_in_metres(tmp_path, layout):
     np.testing.assert_array_equal(loaded.faces, model["faces"])
 
 
-@each_row(("unit", "factor"), [("mm", 1.0), ("cm", 10.0), ("m", 1000.0)])
-@each_row("said", [True, False])
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1.0), ("cm", 10.0), ("m", 1000.0)])
+@pytest.mark.parametrize("said", [True, False])
 def test_the_unit_is_read_from_the_file_or_from_the_size_of_a_head(tmp_path, unit, factor, said):
     model = parts()
     model["mean"], model["variance"] = model["mean"] / factor, model["variance"] / factor**2
@@ -119,7 +118,7 @@ DAMAGE = {
 }  # fmt: skip
 
 
-@each_row("case", DAMAGE)
+@pytest.mark.parametrize("case", DAMAGE)
 def test_damaged_content_is_refused_with_file_and_dataset(tmp_path, case):
     name, damage, message = DAMAGE[case]
     with pytest.raises(DataError, match=message) as caught:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from lidardesign_tasks.meshes import TOLERATED_SHARE, MeshesTask
 from support.meshes import write_ball
-from support.tables import each_row
 
 from lidardesign.errors import PluginError
 from lidardesign.scoring.baselines.candidates import rays_at
@@ -31,7 +30,7 @@ def balls(tmp_path):
     return tmp_path / "balls"
 
 
-@each_row("scale", [1e-3, 0.1, 1.0, 1000.0])
+@pytest.mark.parametrize("scale", [1e-3, 0.1, 1.0, 1000.0])
 @pytest.mark.parametrize("centre", [True, False])
 def test_the_worst_value_is_the_longest_extent_of_any_mesh_wherever_it_stands(balls, scale, centre):
     metric = metric_of(TASK, config_of(balls, scale=scale, centre=centre))
@@ -45,7 +44,7 @@ def test_a_head_keeps_its_tolerance_of_a_tenth_of_a_millimetre(tmp_path):
     assert metric_of(TASK, config_of(tmp_path / "heads")).tolerance == pytest.approx(0.1, rel=1e-5)
 
 
-@each_row("moves", [False, True])
+@pytest.mark.parametrize("moves", [False, True])
 def test_scenes_at_any_scale_are_scored_up_to_their_own_worst_value(balls, moves, tmp_path):
     (tmp_path / "path.csv").write_text(PATH)
     motion = {"motion": tmp_path / "path.csv"} if moves else {}
@@ -62,7 +61,7 @@ def test_scenes_at_any_scale_are_scored_up_to_their_own_worst_value(balls, moves
     assert checked_score(TASK, metric, scene, blind).value == metric.worst
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("found", "said"),
     [
         (1000.0, "it returned float"),

@@ -16,7 +16,6 @@ from lidardesign_tasks.robot.targets import mean_depth_m, refuse_sensors_inside
 from lidardesign_tasks.robot.task import MujocoTask, model_of
 from support.rays import rays_of_points
 from support.robots import written
-from support.tables import each_row
 
 from lidardesign.config import resolve, save_run_config
 from lidardesign.contract import contract_of
@@ -75,7 +74,7 @@ def write_csv(path, table):
 
 
 @pytest.mark.slow
-@each_row(
+@pytest.mark.parametrize(
     "keys",
     [
         "metric=position",
@@ -154,7 +153,7 @@ BAD = {
 }
 
 
-@each_row("case", BAD)
+@pytest.mark.parametrize("case", BAD)
 def test_a_motion_that_cannot_be_used_is_refused_with_its_file(folder, configured, case):
     change, said = BAD[case]
     path = write_csv(folder / "walk.csv", change(table(np.zeros(10))))
@@ -210,7 +209,9 @@ def test_windows_of_one_recording_stay_in_the_half_of_their_split(folder, config
     assert "one recording" in TASK.notes(config, TASK.space(config))[1]
 
 
-@each_row(("step_s", "rows", "is_doubtful"), [(0.001, 60, False), (0.5, 60, False), (10.0, 60, True), (5.0, 8, False)])
+@pytest.mark.parametrize(
+    ("step_s", "rows", "is_doubtful"), [(0.001, 60, False), (0.5, 60, False), (10.0, 60, True), (5.0, 8, False)]
+)
 def test_times_in_another_unit_than_seconds_are_told(folder, configured, step_s, rows, is_doubtful):
     moments = {"time_s": step_s * np.arange(rows)}
     walk = write_csv(folder / "walk.csv", table(np.linspace(-1, 1, rows), **moments))
@@ -344,7 +345,7 @@ WRONG = {
 }
 
 
-@each_row("case", WRONG)
+@pytest.mark.parametrize("case", WRONG)
 def test_a_configuration_that_cannot_be_used_says_what_to_do(configured, case):
     keys, said = WRONG[case]
     with pytest.raises(ConfigError) as error:

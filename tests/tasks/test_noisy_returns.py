@@ -19,7 +19,6 @@ from lidardesign_tasks.surface import surface_score, with_visible_truth
 from lidardesign_tasks.warehouse import WarehouseTask
 from support.meshes import write_ball
 from support.rays import rays_along, rays_of_points
-from support.tables import each_row
 
 from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Body, Box, Mesh, Scene, rigid
@@ -73,7 +72,7 @@ def turned(returns, chosen, outcome, range_m):
     )
 
 
-@each_row("name", TASKS)
+@pytest.mark.parametrize("name", TASKS)
 def test_invented_returns_are_scored_as_returns_of_no_body(name, tmp_path):
     task, scene, returns = measure(name, tmp_path)
     generator = np.random.default_rng(2)
@@ -110,7 +109,7 @@ def test_noise_is_not_told_from_the_ball_that_a_robot_carries():
     assert task.score(scene, noisy).value > 0.1
 
 
-@each_row("radius_m", [0.1, 3.0])
+@pytest.mark.parametrize("radius_m", [0.1, 3.0])
 def test_outliers_are_returns_off_the_surface_however_large_it_is(radius_m):
     ball = trimesh.creation.icosphere(subdivisions=4, radius=radius_m)
     space = DesignSpace(

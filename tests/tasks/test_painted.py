@@ -19,7 +19,6 @@ from lidardesign_tasks.importance import (
 from lidardesign_tasks.meshes import MeshesConfig, MeshesTask
 from lidardesign_tasks.pose import rotation_matrix
 from pydantic import ValidationError
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.scenes.mesh_files import Painted, check_mesh, load_mesh
@@ -59,7 +58,7 @@ def weight_at(mesh, places):
     return mesh.importance[apart.argmin(axis=0)]
 
 
-@each_row("suffix", COLOURED)
+@pytest.mark.parametrize("suffix", COLOURED)
 def test_the_brightness_of_vertex_colours_is_the_weight_in_every_format_that_has_them(tmp_path, suffix):
     mesh = painted_ball(lambda v: 127.5 * (1 + v[:, 2]))
     loaded = load_mesh(save(mesh, tmp_path / f"ball.{suffix}"), painted=Painted("colours", 100.0))
@@ -81,7 +80,7 @@ def test_green_is_brighter_than_blue_as_eyes_and_television_have_it(tmp_path):
     assert found == pytest.approx([0.2126, 0.7152, 0.0722])
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("name", "options"),
     [
         ("scalar_care", {"file_type": "ply", "encoding": "binary"}),
@@ -109,7 +108,7 @@ def test_a_property_that_is_not_there_is_answered_with_those_that_are(tmp_path):
     assert "ball.ply" in str(refused.value)
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("paint", "words"),
     [
         (lambda mesh: None, "no colours"),
@@ -126,7 +125,7 @@ def test_a_file_without_vertex_colours_is_refused(tmp_path, paint, words):
         load_mesh(save(mesh, tmp_path / "ball.ply"), painted=Painted("colours"))
 
 
-@each_row("value", [0.0, -1.0, np.nan, np.inf, 1e9])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, 1e9])
 def test_values_that_are_no_weights_are_refused_with_their_number(tmp_path, value):
     mesh = ball()
     weights = np.ones(len(mesh.vertices), dtype=np.float32)
@@ -146,7 +145,7 @@ def test_vertices_that_become_one_count_as_their_geometric_mean_and_lost_ones_no
         check_mesh(vertices, [(0, 1, 2), (3, 5, 4)], importance=weights[:5])
 
 
-@each_row("radius", [0.05, 0.2])
+@pytest.mark.parametrize("radius", [0.05, 0.2])
 def test_the_roughness_of_a_ball_is_the_spread_of_heights_of_its_caps(radius):
     # a cap that a ball of radius r cuts is r^2 / (2 R) high, and evenly so in area (Archimedes)
     made = ball(radius=1.0, subdivisions=5)
@@ -238,8 +237,8 @@ def test_the_rim_of_a_ball_counts_no_more_than_tenfold():
     assert relative.max() == pytest.approx(10.0, rel=1e-3)
 
 
-@each_row("shape", [{"region_radius_m": 0.1}, {"region_half_size_m": (0.1, 0.1, 0.1)}])
-@each_row("edge", [0.0, 0.05])
+@pytest.mark.parametrize("shape", [{"region_radius_m": 0.1}, {"region_half_size_m": (0.1, 0.1, 0.1)}])
+@pytest.mark.parametrize("edge", [0.0, 0.05])
 def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shape, edge):
     config = Importance(region_centre_m=(1, 2, 3), region_weight=9.0, region_edge_m=edge, **shape)
     along = np.array([0.0, 0.09, 0.0999, 0.125, 0.1501, 1.0])
@@ -248,7 +247,7 @@ def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shap
     assert np.allclose(found, expected)
 
 
-@each_row(
+@pytest.mark.parametrize(
     "keys",
     [
         {"region_radius_m": 0.1},
@@ -265,13 +264,13 @@ def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shap
         {"region_weight": 0},
     ],
 )
-@each_row("kind", [FaceConfig, EmitterConfig, MeshesConfig])
+@pytest.mark.parametrize("kind", [FaceConfig, EmitterConfig, MeshesConfig])
 def test_half_a_region_and_impossible_numbers_are_refused(kind, keys):
     with pytest.raises(ValidationError):
         kind(**keys)
 
 
-@each_row(("task", "kind"), [(FaceTask(), FaceConfig), (EmitterTask(), EmitterConfig)])
+@pytest.mark.parametrize(("task", "kind"), [(FaceTask(), FaceConfig), (EmitterTask(), EmitterConfig)])
 def test_all_heads_of_a_model_count_alike_vertex_by_vertex(task, kind):
     config = kind(train=2, test=1, roughness_exponent=0.5, region_centre_m=(0, 0, 0), region_radius_m=0.03)
     meshes = [scene.bodies[0].shape for split in ("train", "test") for scene in task.scenes(config, split, 0)]

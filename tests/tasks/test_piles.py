@@ -14,7 +14,6 @@ from pydantic import ValidationError
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from support.meshes import write_ball
-from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.scenes.rays import Rays
@@ -30,7 +29,7 @@ SHAPES = {
     "cone": trimesh.creation.cone(0.04, 0.08, sections=16),
     "ball": trimesh.creation.icosphere(1, 0.035),
 }
-each_kind = each_row("kind", ["bin", "table"])
+each_kind = pytest.mark.parametrize("kind", ["bin", "table"])
 
 
 def mesh(shape, scale=1.0):
@@ -57,7 +56,7 @@ def corners(placed):
 
 
 @each_kind
-@each_row("scale", [1.0, 10.0])
+@pytest.mark.parametrize("scale", [1.0, 10.0])
 def test_no_two_objects_overlap_by_a_millimetre_and_none_sinks_into_the_background(kind, scale):
     for seed in range(2):
         background, placed = pile(kind, seed, scale=scale)
@@ -192,7 +191,9 @@ def test_a_pile_shows_the_mesh_of_its_scene_and_others_of_its_split_alone(folder
         assert shown["train"] | shown["test"] == {f"{name}.stl" for name in SHAPES}
 
 
-@each_row("keys", [{}, {"origin_m": (0.0, 0.0, 1.0)}, {"origin_m": (-0.5, 0.4, 0.6), "origin_box_m": 0.1}])
+@pytest.mark.parametrize(
+    "keys", [{}, {"origin_m": (0.0, 0.0, 1.0)}, {"origin_m": (-0.5, 0.4, 0.6), "origin_box_m": 0.1}]
+)
 def test_the_derived_space_sees_the_whole_pile(folder, keys):
     task = MeshesTask()
     config = task.Config(folder=folder, clutter=6, poses=1, truth_points=100, **keys)

@@ -19,7 +19,6 @@ from lidardesign_tasks.poses_csv import interpolated, read_poses, rotation_vecto
 from lidardesign_tasks.surface import METRIC
 from pydantic import ValidationError
 from support.rays import rays_of_points
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.rays.information import checked_information
@@ -44,7 +43,7 @@ def test_a_rotation_is_that_of_its_vector(values):
     assert np.linalg.norm(rotation_vector(rotation)) <= np.pi + EXACT
 
 
-@each_row("axis", [(1, 0, 0), (0, -1, 0), (0, 0, 1), (1, 1, 0), (-1, 2, 3)])
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, -1, 0), (0, 0, 1), (1, 1, 0), (-1, 2, 3)])
 def test_half_a_turn_has_an_axis_too(axis):
     vector = np.pi * np.array(axis) / np.linalg.norm(axis)
     found = rotation_vector(rotation_matrix(vector))
@@ -112,7 +111,7 @@ BAD = {
 }
 
 
-@each_row("case", BAD)
+@pytest.mark.parametrize("case", BAD)
 def test_a_file_that_cannot_be_used_is_refused_at_its_cell(tmp_path, monkeypatch, case):
     text, where, message = BAD[case]
     monkeypatch.chdir(tmp_path)
@@ -236,7 +235,7 @@ def test_occluders_and_single_objects_move_by_their_names(folder):
     np.testing.assert_allclose(bodies["post.stl"].poses[:, 1, 3], [0, 1, 1])
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("rows", "message"),
     [
         ("0,cup,0,0,0\n", "no mesh is called 'cup'"),

@@ -17,7 +17,6 @@ from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.surroundings import fog
 from lidardesign_tasks.warehouse import WarehouseTask
 from support.rays import rays_along
-from support.tables import each_row
 
 from lidardesign.scenes.casting import shared_caster
 from lidardesign.scenes.scene import Ambient
@@ -54,7 +53,7 @@ def scene_of(name, folder, **changes):
     return task.scenes(task.Config(**given), "test", 0)[0]
 
 
-@each_row("name", FEW)
+@pytest.mark.parametrize("name", FEW)
 def test_by_default_a_scene_is_matt_and_rests_in_clear_air_in_the_light_of_a_room(name, folder):
     scene = scene_of(name, folder)
     assert scene.ambient == Ambient(300.0, "indoor")
@@ -64,7 +63,7 @@ def test_by_default_a_scene_is_matt_and_rests_in_clear_air_in_the_light_of_a_roo
         assert not any(body.velocity_m_s)
 
 
-@each_row("name", FEW)
+@pytest.mark.parametrize("name", FEW)
 def test_surroundings_reach_the_scene_and_leave_its_geometry_and_truth(name, folder):
     harsh = {**HARSH, **({"speed_m_s": 3.0} if name in MOVING else {})}
     calm, changed = scene_of(name, folder), scene_of(name, folder, **harsh)
@@ -93,7 +92,7 @@ def same(one, other):
     return np.array_equal(one, other) if isinstance(one, np.ndarray) else one == other
 
 
-@each_row("name", ["face", "meshes"])
+@pytest.mark.parametrize("name", ["face", "meshes"])
 def test_bodies_of_different_scenes_move_in_different_directions_at_one_speed(name, folder):
     task = TASKS[name]
     given = {"folder": folder, "poses": 6} if name == "meshes" else {"test": 6}

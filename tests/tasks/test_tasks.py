@@ -17,7 +17,6 @@ from lidardesign_tasks.surface import fewer_points
 from lidardesign_tasks.warehouse import WarehouseTask
 from support.meshes import write_ball
 from support.rays import rays_of_points
-from support.tables import each_row
 
 from lidardesign.contract import contract_of
 from lidardesign.contract.contract import LAWS
@@ -63,7 +62,7 @@ def folders(tmp_path_factory):
 
 if not REAL_MODEL.exists():
     del CASES["face of the real model"]
-each_case = each_row("name", CASES)
+each_case = pytest.mark.parametrize("name", CASES)
 
 
 def placed(folders, values):
@@ -226,7 +225,7 @@ def often(name):
     return task, config, lists, {split: task.scenes(config, split, 0) for split in ("train", "test")}
 
 
-@each_row("name", SEEN_OFTEN)
+@pytest.mark.parametrize("name", SEEN_OFTEN)
 def test_returns_tell_about_the_frames_and_positions_that_they_are_of(name):
     task, _, lists, scenes = often(name)
     for scene in scenes["train"]:
@@ -273,7 +272,7 @@ def test_what_gives_no_scenes_or_the_same_ones_everywhere_is_refused(folders, tm
             getattr(task, call)(task.Config(**values), *split)
 
 
-@each_row("up", ["x", "y", "z"])
+@pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_turning_the_up_axis_keeps_handedness(folders, up):
     config = MeshesTask.Config(folder=str(folders / "one"), up=up, truth_points=100, poses=1)
     mesh = MeshesTask().scenes(config, "train", 0)[0].bodies[0].shape
@@ -285,8 +284,8 @@ def test_turning_the_up_axis_keeps_handedness(folders, up):
     assert np.ptp(mesh.bounds_m[:, 2]) == pytest.approx(height, rel=0.02)
 
 
-@each_row("origin", [None, (0.0, 0.0, 1.0), (-0.7, 0.7, 0.4), (0.0, 0.0, 0.0), (0.5, 0.0, -0.6)])
-@each_row("box", [0.0, 0.1])
+@pytest.mark.parametrize("origin", [None, (0.0, 0.0, 1.0), (-0.7, 0.7, 0.4), (0.0, 0.0, 0.0), (0.5, 0.0, -0.6)])
+@pytest.mark.parametrize("box", [0.0, 0.1])
 def test_the_derived_design_space_sees_the_whole_of_every_mesh(folders, origin, box):
     config = MeshesTask.Config(folder=str(folders / "one"), origin_m=origin, origin_box_m=box)
     space = MeshesTask().space(config)

@@ -10,7 +10,6 @@ from lidardesign_tasks.warehouse import AISLE_M, PAPER_POSITIONS_M, WarehouseCon
 from lidardesign_tasks.warehouse_shelf import LEVELS, SHELF_DEPTH_M, build_shelf
 from lidardesign_tasks.warehouse_truth import ON_FACE_M, BoxTruth, cut_scene, visible_boxes
 from support.rays import rays_along
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.rays.information import checked_information
@@ -81,7 +80,7 @@ def test_boxes_stand_on_boards_within_the_shelf_and_have_the_sizes_asked_for(she
                 assert 0.2 - ROUNDING_M <= high[0] - low[0] <= 0.6 + ROUNDING_M
 
 
-@each_row(
+@pytest.mark.parametrize(
     "values",
     [
         {},
@@ -115,7 +114,7 @@ def test_a_shelf_has_four_levels_poles_in_front_and_spans_the_aisle(shelves):
             assert cut.high[boards, 0].max() < 1.3 + SHELF_DEPTH_M
 
 
-@each_row(("bays", "at_least"), [(2, 2), (4, 4), (8, 7)])
+@pytest.mark.parametrize(("bays", "at_least"), [(2, 2), (4, 4), (8, 7)])
 def test_more_bays_mean_more_poles(bays, at_least):
     plan = WarehouseConfig(bays=bays).plan
     for seed in range(5):
@@ -131,7 +130,7 @@ def test_the_full_size_has_the_counts_of_the_paper_and_explicit_ones_win():
     assert len(TASK.conditions(WarehouseConfig(size="small", positions=0))) == len(PAPER_POSITIONS_M)
 
 
-@each_row("config", [WarehouseConfig(), SMALL, WarehouseConfig(positions=100)])
+@pytest.mark.parametrize("config", [WarehouseConfig(), SMALL, WarehouseConfig(positions=100)])
 def test_designs_are_evaluated_at_the_papers_positions_and_others_all_inside_the_aisle(config):
     values = [one["x_m"] for one in conditions_of(TASK, config, TASK.space(config))]
     assert tuple(values[:4]) == PAPER_POSITIONS_M
@@ -173,7 +172,7 @@ def test_the_score_agrees_with_counting_the_bodies_that_the_ray_caster_hit(shelv
         assert TASK.score(scene, returns).value == pytest.approx(share, abs=1e-12)
 
 
-@each_row("rays", [2, 6, 40])
+@pytest.mark.parametrize("rays", [2, 6, 40])
 def test_what_is_not_told_about_is_the_miss_rate(shelves, rays):
     elevation = np.linspace(0.05, 1.5, rays)
     for scene in shelves:
@@ -266,7 +265,7 @@ def test_a_return_per_position_is_asked_for(shelves):
         TASK.score(shelves[0], returns[:-1])
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("changes", "words"),
     [
         *(({name: [-2.0, 0.5]}, "vertical plane") for name in ("y_m", "z_m", "azimuth_rad")),
@@ -288,7 +287,7 @@ def test_a_robot_that_stands_still_is_judged_where_it_stands():
     assert TASK.score(scene, returns_of(scene, np.linspace(0.0, math.pi / 2, SWEEP_RAYS))).value == 0.0
 
 
-@each_row(
+@pytest.mark.parametrize(
     "values",
     [
         {"train": 0},

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from support.plugins import GOOD
-from support.tables import each_row
 
 from lidardesign.contract import BrokenLawError, check_task, contract_of
 from lidardesign.contract.contract import LAWS
@@ -157,7 +156,7 @@ def mutants():
             yield pytest.param(law, replaced(group), group[0][2], id=f"{law}: {group[0][2]}")
 
 
-@each_row(("law", "source", "words"), list(mutants()))
+@pytest.mark.parametrize(("law", "source", "words"), list(mutants()))
 def test_a_task_that_breaks_a_law_is_told_so(law, source, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
@@ -201,7 +200,7 @@ SHIPPED = {
 }
 
 
-@each_row("name", SHIPPED)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_the_shipped_tasks_keep_the_contract(name):
     contract = contract_of(load_task(name), overrides=SHIPPED[name])
     for law in LAWS:

@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from support.command_line import caller, files_under
 from support.plugins import GOOD, install_plugins
-from support.tables import each_row
 
 from lidardesign import registry
 from lidardesign.contract import process
@@ -86,7 +85,7 @@ def findings(place):
     return found
 
 
-@each_row("name", [*BROKEN, *CONTAINED])
+@pytest.mark.parametrize("name", [*BROKEN, *CONTAINED])
 def test_each_broken_plugin_is_named_by_the_one_law_that_it_breaks(findings, name):
     _, law, words = {**BROKEN, **CONTAINED}[name]
     failed = {finding.law: finding.detail for finding in findings[name] if finding.outcome == "fail"}

@@ -18,7 +18,6 @@ from support.docs_output import difference
 from support.docs_pages import blocks_of, commands_of
 from support.docs_session import COLUMNS
 from support.plugins import GOOD, install_plugins
-from support.tables import each_row
 
 from lidardesign.contract.contract import LAWS
 from lidardesign.contract.law import LOADS
@@ -103,7 +102,7 @@ def test_the_guide_lists_every_law_and_shows_the_tests_that_are_written():
     assert shown["tests/test_contract.py"] in (TEMPLATES / "test_contract.py.txt").read_text(encoding="utf-8")
 
 
-@each_row("name", ["a", "drone_landing", "abcdefghij_klmnopqrst_uvwxyz_9"])
+@pytest.mark.parametrize("name", ["a", "drone_landing", "abcdefghij_klmnopqrst_uvwxyz_9"])
 def test_a_new_package_is_clean_whatever_the_length_of_its_name(tmp_path, name):
     ruff = shutil.which("ruff", path=str(Path(sys.executable).parent)) or shutil.which("ruff")
     if ruff is None:
@@ -135,7 +134,7 @@ def test_the_command_writes_every_file_and_says_what_comes_next(lidardesign, tmp
 NO_NAMES = ("Landmark", "land-mark", "", "1st", "a__b", "../up", "a b", "x" * 31, "landmärke", "a\n")
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("name", "words"),
     [
         *((name, "is not a name for a task") for name in NO_NAMES),

@@ -19,6 +19,9 @@ RichConsole: TypeAlias = "Console"
 
 # Wider than any terminal: what a table takes where nothing limits it.
 UNBOUNDED = 10_000
+# Between two lines away from a terminal: such a share of all the time that it takes, but so long at least and at most.
+SHARE = 0.2
+LEAST_S, MOST_S = 10.0, 600.0
 
 
 def number(value: Any, digits: int = 4) -> str:
@@ -141,11 +144,6 @@ def _fits(table: Table, rich: RichConsole) -> bool:
     from rich.measure import Measurement
 
     return Measurement.get(rich, rich.options.update(max_width=UNBOUNDED), table).maximum <= rich.width
-
-
-# Between two lines away from a terminal: such a share of all the time that it takes, but so long at least and at most.
-SHARE = 0.2
-LEAST_S, MOST_S = 10.0, 600.0
 
 
 class ProgressDisplay:

@@ -50,6 +50,15 @@ DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 STDOUT, STDERR = 1, 2
 # Commands that only read a run wait for its writer no longer than this.
 SHORT_WAIT_S = 0.5
+# One thread each: two thread pools that spin on shared cores make each other 8 to 40 times slower. These must
+# be set before torch and numpy are imported; whoever sets one of them in the environment keeps it.
+THREAD_DEFAULTS = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "PASSIVE",
+}
+PAGE_SUFFIXES = (".html", ".htm")
 
 
 def plain_json(value: Any) -> Any:
@@ -343,16 +352,6 @@ def keep_times(
         output.note(f"note: the times of {name} are not kept in {run}: {message}")
 
 
-# One thread each: two thread pools that spin on shared cores make each other 8 to 40 times slower. These must
-# be set before torch and numpy are imported; whoever sets one of them in the environment keeps it.
-THREAD_DEFAULTS = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OMP_WAIT_POLICY": "PASSIVE",
-}
-
-
 class TerminatedError(KeyboardInterrupt):
     """SIGTERM, treated like an interruption where things are tidied up."""
 
@@ -385,9 +384,6 @@ def terminate_cleanly() -> None:
 
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGTERM, interrupt)
-
-
-PAGE_SUFFIXES = (".html", ".htm")
 
 
 @contextlib.contextmanager

@@ -34,6 +34,13 @@ from lidardesign.scenes.primitive_kernels import (
 )
 from lidardesign.scenes.surface import BOX, CAPSULE, CYLINDER, ELLIPSOID, GRID, PLANE, SPHERE
 
+# Boxes have no NaN; without it to care for, the three axes of many boxes are compared at once.
+BOXES = {"nnan", "nsz"}
+# A point is taken to be at least so far from the middle plane of an ellipsoid, as a share of its smallest semi-axis:
+# below it the two nearest points, above and below the plane, are one.
+OFF_MIDDLE = EPSILON
+MOST_NEWTON_STEPS = 60
+
 
 @njit(cache=True, nogil=True)
 def _cell(values, grids, g, q):  # noqa: ANN001, ANN202
@@ -79,10 +86,6 @@ def _grid_distance(values, grids, g, q):  # noqa: ANN001, ANN202
     y = excess[1] / distance if excess[1] != 0.0 else y * inner / distance
     z = excess[2] / distance if excess[2] != 0.0 else z * inner / distance
     return distance, (x, y, z)
-
-
-# Boxes have no NaN; without it to care for, the three axes of many boxes are compared at once.
-BOXES = {"nnan", "nsz"}
 
 
 @njit(cache=True, nogil=True, fastmath=BOXES)
@@ -392,12 +395,6 @@ def rays_in_frames(to_body, chosen, rows, rays, out):  # noqa: ANN001, ANN201
         direction = turned(to_body, chosen[k], row(rays[1], rows[k]))
         for axis in range(3):
             out[0][k, axis], out[1][k, axis] = origin[axis], direction[axis]
-
-
-# A point is taken to be at least so far from the middle plane of an ellipsoid, as a share of its smallest semi-axis:
-# below it the two nearest points, above and below the plane, are one.
-OFF_MIDDLE = EPSILON
-MOST_NEWTON_STEPS = 60
 
 
 @njit(cache=True, nogil=True)

@@ -45,6 +45,11 @@ RAYS, MOST_SCENES = 60_000, 20
 MOST_THIN_RAYS = 6_000_000
 # Effects that take longer than this in one pass over the scenes are left out of all passes [s].
 MOST_SECONDS = 2.0
+RIVAL = "bounding"
+# Numbers of scenes that are tried where there are more.
+COUNTS = (5, 10, 20, 50, 100, 200)
+# So many sets of scenes are drawn for each; a mean half-width is then known to a few percent beside the scenes' own.
+DRAWS = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,13 +261,6 @@ def _measure(setting: str, found: _Pass, full: _Pass, changes: Mapping[str, tupl
     if changes:
         values["seconds_saved"] = full.seconds - found.seconds
     return Measurement(setting, *error, found.seconds, found.memory_bytes, values=values)
-
-
-RIVAL = "bounding"
-# Numbers of scenes that are tried where there are more.
-COUNTS = (5, 10, 20, 50, 100, 200)
-# So many sets of scenes are drawn for each; a mean half-width is then known to a few percent beside the scenes' own.
-DRAWS = 32
 
 
 def scenes_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:

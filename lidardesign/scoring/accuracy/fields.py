@@ -32,6 +32,24 @@ from lidardesign.scoring.accuracy.probes import AccuracyRequest, Probes, density
 from lidardesign.scoring.sweep import Measurement, Sweep, timed
 from lidardesign.space import DesignSpace
 
+RESOLUTIONS = (16, 24, 32, 48, 64, 96, 128)
+# The more scenes, the more their errors average out; so many can be built anew at every resolution.
+COLUMNS = 12
+PROBES = 16_384
+# Resolutions beyond the run's own are measured where building them for all these scenes takes at most so long.
+LONGEST_SECONDS = 20.0
+# A coarse field has its surfaces elsewhere: probes must meet them there too.
+WIDENING = 3.0
+# log T of hidden points: far below anything that counts, and finite
+LOG_OPAQUE = -1e4
+# Errors of cheap ways, of the quadrature on a common table, and of that over bodies one by one.
+VISIBILITY_PROBES, TABLE_PROBES, BODY_PROBES = 32_768, 8192, 2048
+BODY_BATCH = 256
+# A quadrature over bodies without a common table evaluates every body at every midpoint of every probe.
+MOST_BODIES = 120
+# Compiled loops are loaded before anything is timed.
+WARM_UP_PROBES = 32
+
 
 class ExactField:
     """The exact distances of the chosen bodies of all scenes: to meshes by libigl, triangle by triangle.
@@ -99,16 +117,6 @@ def fresh_table(scenes: Sequence[Scene], around: Sequence[Scene], resolution: in
 def target_meshes(scene: Scene) -> list[Mesh]:
     """The target meshes of a scene at rest, in the world."""
     return [b.shape.transformed(b.pose()) for b in scene.bodies if b.is_target and isinstance(b.shape, Mesh)]
-
-
-RESOLUTIONS = (16, 24, 32, 48, 64, 96, 128)
-# The more scenes, the more their errors average out; so many can be built anew at every resolution.
-COLUMNS = 12
-PROBES = 16_384
-# Resolutions beyond the run's own are measured where building them for all these scenes takes at most so long.
-LONGEST_SECONDS = 20.0
-# A coarse field has its surfaces elsewhere: probes must meet them there too.
-WIDENING = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,10 +250,6 @@ def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: Dens
     return BodyField(place_bodies(entries, len(columns), build))
 
 
-# log T of hidden points: far below anything that counts, and finite
-LOG_OPAQUE = -1e4
-
-
 def opaque_target(target: Target) -> Target:
     """The same target with opaque occluders."""
     return target.with_visibility(Opaque(target.surfaces.raycast(target.scenes)))
@@ -269,15 +273,6 @@ class Opaque(Visibility):
     def take(self, columns: np.ndarray) -> Opaque:
         """See `Visibility`."""
         return Opaque(self._exact.take(columns))
-
-
-# Errors of cheap ways, of the quadrature on a common table, and of that over bodies one by one.
-VISIBILITY_PROBES, TABLE_PROBES, BODY_PROBES = 32_768, 8192, 2048
-BODY_BATCH = 256
-# A quadrature over bodies without a common table evaluates every body at every midpoint of every probe.
-MOST_BODIES = 120
-# Compiled loops are loaded before anything is timed.
-WARM_UP_PROBES = 32
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,6 +33,18 @@ STEPS_TOLERANCE = 0.1
 STEPS_BECAUSE = (
     "a tenth of the rays in the wrong place is at worst a tenth fewer rays: 5 % of an error that falls like their root"
 )
+# Errors of a tenth of the noise add a hundredth to its variance.
+DTYPE_TOLERANCE = 0.1
+DTYPE_BATCHES = 10
+POOL = 8192
+# Of a normal sample: standard deviation over median deviation, and the median's standard error over the mean's.
+MEDIAN_DEVIATION, MEDIAN_ERROR = 1.4826, 1.2533
+_STEPS: WeakKeyDictionary[AccuracyRequest, LearningSteps | None] = WeakKeyDictionary()
+# The error of few scenes is noise like that of few design points; half as much adds a quarter to its variance.
+FRAMES_TOLERANCE = 0.5
+POWERS = (4, 16, 64, 256)
+# Batches, and how often scenes are drawn for each. Few batches have most of the error, so many are better than draws.
+FRAMES_BATCHES, DRAWS = 32, 1
 
 
 def steps_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
@@ -67,16 +79,6 @@ def steps_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
             because=STEPS_BECAUSE,
         )
     ]
-
-
-# Errors of a tenth of the noise add a hundredth to its variance.
-DTYPE_TOLERANCE = 0.1
-DTYPE_BATCHES = 10
-POOL = 8192
-# Of a normal sample: standard deviation over median deviation, and the median's standard error over the mean's.
-MEDIAN_DEVIATION, MEDIAN_ERROR = 1.4826, 1.2533
-
-_STEPS: WeakKeyDictionary[AccuracyRequest, LearningSteps | None] = WeakKeyDictionary()
 
 
 def dtype_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
@@ -147,13 +149,6 @@ def _dtype_measure(
         deviation = MEDIAN_DEVIATION * float(np.median(np.abs(shares - middle)))
         medians.append((middle, MEDIAN_ERROR * deviation / math.sqrt(len(shares))))
     return Measurement(dtype, *max(medians), seconds, memory, default, values=values)
-
-
-# The error of few scenes is noise like that of few design points; half as much adds a quarter to its variance.
-FRAMES_TOLERANCE = 0.5
-POWERS = (4, 16, 64, 256)
-# Batches, and how often scenes are drawn for each. Few batches have most of the error, so many are better than draws.
-FRAMES_BATCHES, DRAWS = 32, 1
 
 
 def frames_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:

@@ -46,6 +46,9 @@ SMALLEST_SHARE = 0.1
 SHARE_POINTS = 1024
 GOLDEN_TURN = FULL_TURN * (1.0 - 2.0 / (1.0 + math.sqrt(5.0)))
 SIXTH = math.sqrt(3.0) / 2  # height of an equilateral triangle
+# an origin axis within 45 degrees of parallel rays only moves them along themselves
+ALIGNED = math.cos(math.pi / 4)
+TAIL = 0.005  # of the returns are left out at either end of a gate
 
 
 class SphereField(Protocol):
@@ -291,11 +294,6 @@ def even_placement(low: np.ndarray, high: np.ndarray, count: int, field: SphereF
         extents = np.ones(2)
     points[:, free] += even_unit(count, extents) * (high - low)[free]
     return np.clip(points, low, high)
-
-
-# an origin axis within 45 degrees of parallel rays only moves them along themselves
-ALIGNED = math.cos(math.pi / 4)
-TAIL = 0.005  # of the returns are left out at either end of a gate
 
 
 @dataclass(frozen=True, eq=False)

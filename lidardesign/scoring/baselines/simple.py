@@ -58,6 +58,20 @@ from lidardesign.task import random_generator
 
 Judge = Callable[[Sequence[RaysPerCondition]], Sequence[float]]
 NO_VISIBILITY = "no-visibility"
+# In the place of names: no baselines at all.
+NONE = "none"
+# What stands beside every design, asked for or not.
+ALWAYS = ("uniform", "random", "bounding", "silhouette", GREEDY)
+FEWER_RAYS = 0.9  # of those that did not fit in a bandwidth
+CELLS = 64  # along the longest side of the box round all surface points
+MOST_VIEWS = 4096  # scenes times frames that enter the grid, evenly spread where there are more
+SURFACE_POINTS = 400_000  # over all views, between these numbers in each
+FEWEST_POINTS, MOST_POINTS = 256, 4096
+BLOCK = 16_384  # draws at a time
+HOPELESS_BLOCKS = 32  # without one aimed point
+# Rays are drawn from so many times as many weighted points as there are rays, so that few are drawn twice.
+POINTS_PER_RAY = 16
+GATE_POINTS = 4096
 
 
 class Option(NamedTuple):
@@ -228,12 +242,6 @@ BASELINES: dict[str, Callable[[Baselines], list[Candidate]]] = {
 }
 
 
-# In the place of names: no baselines at all.
-NONE = "none"
-# What stands beside every design, asked for or not.
-ALWAYS = ("uniform", "random", "bounding", "silhouette", GREEDY)
-
-
 def check_baseline(name: str, *, where: str = "baselines") -> None:
     """Refuse a name that is no baseline's.
 
@@ -242,9 +250,6 @@ def check_baseline(name: str, *, where: str = "baselines") -> None:
     """
     if name not in BASELINES:
         raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=", ".join(BASELINES))
-
-
-FEWER_RAYS = 0.9  # of those that did not fit in a bandwidth
 
 
 class TwinCandidate:
@@ -281,7 +286,7 @@ class TwinCandidate:
             try:
                 return self._rays(count, limit_mbps)
             except InfeasibleError as error:
-                if count == 1 or error.conflicts != ("budget.bandwidth_mbps",):
+                if count == 1 or "budget.bandwidth_mbps" not in error.conflicts:
                     raise
                 count = math.floor(FEWER_RAYS * count)
 
@@ -290,17 +295,6 @@ class TwinCandidate:
             design = self._fit(count, limit_mbps)
             self._known[count, limit_mbps] = tuple(design.rays(count, at=at or None) for at in self._conditions)
         return self._known[count, limit_mbps]
-
-
-CELLS = 64  # along the longest side of the box round all surface points
-MOST_VIEWS = 4096  # scenes times frames that enter the grid, evenly spread where there are more
-SURFACE_POINTS = 400_000  # over all views, between these numbers in each
-FEWEST_POINTS, MOST_POINTS = 256, 4096
-BLOCK = 16_384  # draws at a time
-HOPELESS_BLOCKS = 32  # without one aimed point
-# Rays are drawn from so many times as many weighted points as there are rays, so that few are drawn twice.
-POINTS_PER_RAY = 16
-GATE_POINTS = 4096
 
 
 @dataclass(frozen=True, eq=False)

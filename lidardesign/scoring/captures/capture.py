@@ -58,6 +58,17 @@ MOST_COUNTS = 1 << 40
 STRETCHES = 16
 # Counts are checked so many numbers at a time, which bounds memory.
 CHUNK = 1 << 22
+# Numpy's types by MATLAB's classes.
+NUMBERS = {"double": "f8", "single": "f4", "logical": "?"} | {
+    f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)
+}
+CONVERTER = f"{__name__}:convert"
+# A file of the largest size takes some seconds.
+PATIENCE_SECONDS = 120.0
+# Memory of the process, in times of the largest size: packed data, the same unpacked, the array, and the libraries.
+MEMORY_SHARE = 4
+MOST_ARRAYS = 1000
+SUFFIXES = (".npz", ".mat")
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,18 +311,6 @@ def _check_values(capture: Capture, where: str) -> None:
         )
 
 
-# Numpy's types by MATLAB's classes.
-NUMBERS = {"double": "f8", "single": "f4", "logical": "?"} | {
-    f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)
-}
-CONVERTER = f"{__name__}:convert"
-# A file of the largest size takes some seconds.
-PATIENCE_SECONDS = 120.0
-# Memory of the process, in times of the largest size: packed data, the same unpacked, the array, and the libraries.
-MEMORY_SHARE = 4
-MOST_ARRAYS = 1000
-
-
 def read_matlab(path: Path) -> dict[str, np.ndarray]:
     """All arrays of a file by name, at least two-dimensional, in MATLAB's shapes.
 
@@ -362,9 +361,6 @@ def convert(request: dict[str, Any], _: object) -> dict[str, Any]:
         arrays = [read[name].astype(NUMBERS[kind]) for name, _, kind in listed]
         np.savez(target, **{f"array_{number}": array for number, array in enumerate(arrays)})
     return {"names": [name for name, _, _ in listed], "bytes": size}
-
-
-SUFFIXES = (".npz", ".mat")
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:

@@ -28,6 +28,8 @@ from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Estimator
 
 # Histograms are worked on so many bins at a time, which bounds memory at some 150 MB.
 CHUNK_BINS = 1 << 22
+# A ray that starts further from the scanner than this was not captured: it sees other surfaces.
+SAME_PLACE_M = 0.005
 
 
 @dataclass(frozen=True)
@@ -91,10 +93,6 @@ def _chunks(lengths: np.ndarray) -> Iterator[tuple[int, int]]:
         end = max(int(np.searchsorted(ends[1:], ends[begin] + CHUNK_BINS, side="right")), begin + 1)
         yield begin, end
         begin = end
-
-
-# A ray that starts further from the scanner than this was not captured: it sees other surfaces.
-SAME_PLACE_M = 0.005
 
 
 class Captured(IntEnum):

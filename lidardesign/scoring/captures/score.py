@@ -51,6 +51,11 @@ SURFACE_POINTS = 4000
 STEEPEST_DEG = 85.0
 MILLIMETRES = 1000.0
 OWN, WHOLE = "own", "whole"
+COLUMNS = (
+    "design", "gate", "ray", "sensor", "captured", "pixel", "away_deg", "gate_start_m", "gate_end_m", "photons",
+    "range_m", "reference_m", "outlier",
+    "point_x_m", "point_y_m", "point_z_m",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -295,13 +300,6 @@ def _visible_mesh(capture: Capture, path: Path) -> SurfaceCloud:
             where=str(path),
             hint="give it in metres, in the frame of origin_m and of the directions",
         ) from error
-
-
-COLUMNS = (
-    "design", "gate", "ray", "sensor", "captured", "pixel", "away_deg", "gate_start_m", "gate_end_m", "photons",
-    "range_m", "reference_m", "outlier",
-    "point_x_m", "point_y_m", "point_z_m",
-)  # fmt: skip
 
 
 def write_csv(found: CaptureEvaluation, path: Path) -> None:

@@ -37,6 +37,12 @@ from lidardesign.task import conditions_of
 # Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
 # at a fraction of the held-out scenes' cost.
 JUDGED_SCENES = 8
+# The strongest baseline is found on training scenes that no baseline's rays were chosen on: whoever picks the best of
+# several by their scores on held-out scenes holds designs against a lucky one.
+MOST_RIVAL_SCENES = 20
+FEWEST_RIVAL_SCENES = 5
+LARGEST_RIVAL_SHARE = 0.1  # of the rays that an evaluation fires may be fired to find it
+MILLIMETRES = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,13 +238,6 @@ def _judge(request: EvaluationRequest, lists: Sequence[RaysPerCondition]) -> lis
     return objective.values(lists).mean(axis=0).tolist()
 
 
-# The strongest baseline is found on training scenes that no baseline's rays were chosen on: whoever picks the best of
-# several by their scores on held-out scenes holds designs against a lucky one.
-MOST_RIVAL_SCENES = 20
-FEWEST_RIVAL_SCENES = 5
-LARGEST_RIVAL_SHARE = 0.1  # of the rays that an evaluation fires may be fired to find it
-
-
 @dataclass(frozen=True)
 class StrongestRival:
     """The best of all baselines at one number of rays.
@@ -303,9 +302,6 @@ def mean_rival(found: Iterable[StrongestRival | None], better: str) -> Strongest
     names = [name for name in known[0].values if all(name in one.values for one in known)]
     values = {name: float(np.mean([one.values[name] for one in known])) for name in names}
     return StrongestRival.best_of(values, better, known[0].rays, sum(one.scenes for one in known))
-
-
-MILLIMETRES = 1000.0
 
 
 @dataclass(frozen=True)
