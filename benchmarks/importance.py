@@ -1,8 +1,7 @@
 """What weights on the surface bring: where rays go, and where the error falls and rises, on held-out faces.
 
-Every design is fitted to the same learned density, weighted without learning again as `fit --weight` does it. Gates
-are fitted to samples that are spread a little further in range than training heads are, so that what is compared is
-where rays go and not which heads a narrow gate happens to miss.
+Every design is fitted to the same learned density, weighted without learning again as `fit --weight` does it, and its
+rays are chosen on training heads whose surfaces count by the same weights.
 
     python benchmarks/importance.py --run runs/face [--picture docs/importance.png]
 """
@@ -10,8 +9,8 @@ where rays go and not which heads a narrow gate happens to miss.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ WEIGHTS: dict[str, Mapping[str, Any]] = {
     "roughness 0.5": {"roughness_exponent": 0.5},
     "region 8": REGION,
 }
-DESIGNS = {"4 sensors": {"sensors": 4}, "10 sensors": {"sensors": 10}, "scan": {"layout": "scan", "level": 0.99}}
+SENSORS = (4, 10)
 COLUMNS = ["design", "rays", "weights", "ESS", "mm", "difference [%]", "interval [%]"]
 REGION_COLUMNS = ["weights", "rays", "returns inside [%]", "inside mm", "outside mm"]
 
@@ -62,44 +61,30 @@ class Bench:
     Arguments:
         run: The run.
         heads: Its held-out scenes with their casters.
-        spread_m: By how much samples are spread in range.
+        rays: Numbers of rays.
         fits: Per design.
     """
 
     run: Any
     heads: list[tuple[Any, Any]]
-    spread_m: float
+    rays: Sequence[int]
     fits: int
 
-    def samples(self, settings: Mapping[str, Any]) -> Any:
-        """The run's samples with the weights of some settings."""
+    def measured(self, sensors: int, settings: Mapping[str, Any]) -> tuple[float, dict[int, Measured]]:
+        """The effective share of the samples, and designs of so many sensors under weights at each number of rays."""
         import numpy as np
 
-        from lidardesign.fitting.request import RunTarget, Weighting, weighted_samples
-        from lidardesign.space import RANGE
-        from lidardesign.task import random_generator
-
-        texts = tuple(f"{key}={value}" for key, value in settings.items())
-        weighting = Weighting(texts)
-        samples = weighted_samples(self.run, weighting, RunTarget(self.run, weighting=weighting))
-        points, space = samples.points.copy(), samples.space
-        noise = random_generator(self.run.config.seed, "range spread").normal(size=len(samples))
-        points[:, RANGE] = np.clip(points[:, RANGE] + self.spread_m * noise, space.low[RANGE], space.high[RANGE])
-        return replace(samples, points=points)
-
-    def measured(self, samples: Any, choices: Mapping[str, Any], count: int) -> Measured:
-        """Designs of one kind at a number of rays."""
-        import numpy as np
-        from lidardesign.layouts.rays import lay_out
-
-        from lidardesign.mixture.fit import fit
-
-        found, rays = [], None
+        found: dict[int, list[Any]] = {count: [] for count in self.rays}
+        shares, last = [], {}
         for seed in range(self.fits):
-            further = {"rays": count} if choices.get("layout") == "scan" else {}
-            rays = lay_out(fit(samples, seed=seed, **choices, **further).design, count, samples)
-            found.append([self._head(scene, casters, rays) for scene, casters in self.heads])
-        return Measured(*np.mean(found, axis=0).T, rays)
+            for count in self.rays:
+                design = self.run.fit(sensors=sensors, rays=count, weights=settings, seed=seed, name="benchmark")
+                last[count] = rays = design.rays(count)
+                found[count].append([self._head(scene, casters, rays) for scene, casters in self.heads])
+                shares.append(design.result.ess)
+        return float(np.mean(shares)), {
+            count: Measured(*np.mean(one, axis=0).T, last[count]) for count, one in found.items()
+        }
 
     def _head(self, scene: Any, casters: Any, rays: Any) -> tuple[float, float, float, float]:
         """The score, and the error of the visible surface inside and outside of the region [mm], and its returns."""
@@ -138,31 +123,25 @@ def percent(values: Any, plain: Any) -> tuple[str, str]:
     return f"{found[0]:+.1f}", f"{found[1]:+.1f} to {found[2]:+.1f}"
 
 
-def compared(
-    bench: Bench, names: Sequence[str], counts: Sequence[int], keep: Callable[[str, int, Measured], None]
-) -> list[list[object]]:
-    """Rows of every design under every weight against itself without weights; scans are kept."""
-    samples = {name: bench.samples(WEIGHTS[name]) for name in names}
-    rows = []
-    for design, choices in DESIGNS.items():
-        for count in counts:
-            plain = None
-            for name in names:
-                found = bench.measured(samples[name], choices, count)
-                plain = found if plain is None else plain
-                apart = ("-", "-") if found is plain else percent(found.scores, plain.scores)
-                ess = samples[name].effective_sample_size
-                rows.append([design, count, name, ess, found.scores.mean(), *apart])
-                if design == "scan":
-                    keep(name, count, found)
-    return rows
+def compared(bench: Bench, sensors: Sequence[int]) -> tuple[list[list[object]], dict[tuple[str, int], Measured]]:
+    """Rows of every design under every weight against itself without weights; what the last of the designs reach."""
+    rows, kept = [], {}
+    for number in sensors:
+        found = {name: bench.measured(number, settings) for name, settings in WEIGHTS.items()}
+        for count in bench.rays:
+            plain = found["none"][1][count]
+            for name, (ess, measured) in found.items():
+                one = kept[name, count] = measured[count]
+                apart = ("-", "-") if name == "none" else percent(one.scores, plain.scores)
+                rows.append([f"{number} sensors", count, name, ess, one.scores.mean(), *apart])
+    return rows, kept
 
 
-def region_rows(scans: Mapping[tuple[str, int], Measured], counts: Sequence[int]) -> list[list[object]]:
+def region_rows(kept: Mapping[tuple[str, int], Measured], counts: Sequence[int]) -> list[list[object]]:
     """The error inside and outside of the region, with and without its weight, and the differences in percent."""
     rows = []
     for count in counts:
-        plain, weighted = scans["none", count], scans["region 8", count]
+        plain, weighted = kept["none", count], kept["region 8", count]
         for name, found in (("none", plain), ("region 8", weighted)):
             rows.append([name, count, 100 * found.share.mean(), found.inside.mean(), found.outside.mean()])
         parts = [percent(getattr(weighted, part), getattr(plain, part)) for part in ("inside", "outside")]
@@ -170,8 +149,8 @@ def region_rows(scans: Mapping[tuple[str, int], Measured], counts: Sequence[int]
     return rows
 
 
-def draw(path: Path, scene: Any, scans: Mapping[tuple[str, int], Measured], count: int) -> None:
-    """Where the rays of scans go on a head, and the error inside and outside of the region."""
+def draw(path: Path, scene: Any, kept: Mapping[tuple[str, int], Measured], count: int) -> None:
+    """Where rays go on a head, and the error inside and outside of the region."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -184,7 +163,7 @@ def draw(path: Path, scene: Any, scans: Mapping[tuple[str, int], Measured], coun
     figure, axes = plt.subplots(1, 4, figsize=(12, 4), width_ratios=[1, 1, 1, 0.9], layout="constrained")
     truth = scene.truth["surface"].points
     for panel, name in zip(axes[:3], shown, strict=True):
-        rays = scans[name, count].rays
+        rays = kept[name, count].rays
         seen = np.degrees(aim(rays.origin_m[:1], truth)[:, 3:5])
         colours = np.where(in_region(scene, truth), "#f4a261", "#cfd8dc")
         panel.scatter(180 - seen[:, 0], seen[:, 1], c=colours, s=3, linewidths=0)
@@ -195,7 +174,7 @@ def draw(path: Path, scene: Any, scans: Mapping[tuple[str, int], Measured], coun
         panel.set_xlabel("azimuth [deg]")
     axes[0].set_ylabel("elevation [deg]")
     for offset, part in enumerate(("inside", "outside")):
-        values = [getattr(scans[name, count], part).mean() for name in shown]
+        values = [getattr(kept[name, count], part).mean() for name in shown]
         axes[3].bar(np.arange(3) + 0.4 * offset, values, 0.38, label=part, color=("#f4a261", "#90a4ae")[offset])
     axes[3].set_xticks(np.arange(3) + 0.2, [name.replace(" ", "\n") for name in shown])
     axes[3].set_ylabel("distance to the reconstruction [mm]")
@@ -211,34 +190,30 @@ def main() -> None:
     model_option(made)
     run_options(made)
     made.add_argument("--rays", type=int, nargs="+", default=[196, 361, 576])
-    made.add_argument("--spread-mm", type=float, default=20.0, help="of samples in range (default %(default)s)")
+    made.add_argument("--sensors", type=int, nargs="+", default=SENSORS, help="of the designs (default %(default)s)")
     made.add_argument("--picture", type=Path, metavar="FILE", help="also draw where rays go")
     options = made.parse_args()
     from lidardesign import open_run
     from lidardesign.simulate.returns import build_casters
 
     settings = face_settings(options.model) if options.run is None else {}
-    scans: dict[tuple[str, int], Measured] = {}
     with tempfile.TemporaryDirectory() as folder:
         run = open_run(learned("face", Path(folder), options, settings))
         heads = [(scene, build_casters(scene)) for scene in run.scenes("test", run.config.seed)]
-        bench = Bench(run, heads, options.spread_mm / MILLIMETRES, options.rounds)
-        rows = compared(
-            bench, list(WEIGHTS), options.rays, lambda name, count, found: scans.update({(name, count): found})
-        )
+        rows, kept = compared(Bench(run, heads, options.rays, options.rounds), options.sensors)
     report(
         f"Weights on the surface, {len(heads)} held-out heads, {options.rounds} fits each",
         {
             "Chamfer distance, against the same design without weights": (COLUMNS, rows),
-            "The visible surface inside and outside of the region, scans": (
+            f"The visible surface inside and outside of the region, {options.sensors[-1]} sensors": (
                 REGION_COLUMNS,
-                region_rows(scans, options.rays),
+                region_rows(kept, options.rays),
             ),
         },
         path=options.json,
     )
     if options.picture is not None:
-        draw(options.picture, heads[0][0], scans, sorted(options.rays)[len(options.rays) // 2])
+        draw(options.picture, heads[0][0], kept, sorted(options.rays)[len(options.rays) // 2])
 
 
 if __name__ == "__main__":

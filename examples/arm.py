@@ -1,8 +1,8 @@
-"""Sensors on the ceiling that track what a robot arm carries: scenes that move, origins that are free.
+"""Sensors on the ceiling that track what a robot arm carries: scenes that move, places that are free.
 
 python examples/arm.py [--out FOLDER] [--set KEY=VALUE]...
 
-It learns a small draft, so that all of it takes about a minute: the figures are those of a draft, on 4 motions.
+It learns a small draft, so that all of it takes a minute or two: the figures are those of a draft, on 4 motions.
 For the README's, learn with `lidardesign learn arm` alone.
 """
 
@@ -22,13 +22,11 @@ origin:
 budget: {rays: 400}
 """
 RAILS = """\
-# four sensors whose rays start along rails: 1 cm across at most, and no more than 0.2 m of spread along them
+# four regions along rails: rays start all over them, thin across and no more than 0.2 m of spread along them
 sensors: {count: 4}
 origin: {spread_m: {max: 0.2}, thickness_m: {max: 0.002}}
 budget: {rays: 400}
 """
-# Rays follow from the density alone, in seconds; to choose them on training motions takes longer
-LAYOUT = ("--layout", "distributed")
 
 
 def main() -> None:
@@ -46,17 +44,17 @@ def main() -> None:
         "learn", "arm", "--set", "size=small", "--preset", "draft", *settings, "--out", run,
     )  # fmt: skip
     step(
-        "Fit four sensors. Their rays start all over a region of the ceiling; `travel` says how long it is.",
-        "fit", run, *LAYOUT, "--sensors", "4", "--rays", "400", "--name", "free",
+        "Fit four sensors, each where it stands best, and choose their rays on training motions.",
+        "fit", run, "--sensors", "4", "--rays", "400", "--name", "free",
     )  # fmt: skip
     for name, text, explanation in (
         ("mounted", MOUNTS, "Sensors that cannot move: the program picks the mounting points."),
-        ("rails", RAILS, "Sensors on rails: thin regions, of any direction."),
+        ("rails", RAILS, "Rays that start all over rails: thin regions, of any direction."),
     ):
         path = folder / f"{name}.yaml"
         path.write_text(text, encoding="utf-8")
         print(f"\n# {path}:\n{text}", end="")
-        step(explanation, "constrain", run, *LAYOUT, "--constraints", path, "--name", name)
+        step(explanation, "constrain", run, "--constraints", path, "--name", name)
     step(
         "Score all three on motions that were held out. `occupancy` aims at where the ball was in training, from "
         "anywhere;\n# `no-visibility` is the first design fitted without knowing that the arm hides the ball.",

@@ -25,8 +25,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lidardesign import open_run
-from lidardesign.formats.galvo import read_galvo
-from lidardesign.formats.galvo import SPEED_OF_LIGHT_M_PER_PS, degree_frame, scan_directions
+from lidardesign.formats.galvo import SPEED_OF_LIGHT_M_PER_PS, degree_frame, read_galvo, scan_directions
 from lidardesign.run.files import write_atomic
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays
@@ -98,7 +97,7 @@ def fitted(run: Path, sensors: int) -> Path:
     name = f"sensors-{sensors}"
     step(
         f"Fit {sensors} sensors.",
-        "fit", run, "--layout", "grid", "--sensors", str(sensors), "--rays", str(RAYS), "--name", name,
+        "fit", run, "--layout", "even", "--sensors", str(sensors), "--rays", str(RAYS), "--name", name,
     )  # fmt: skip
     return run / "designs" / f"{name}.yaml"
 

@@ -27,7 +27,6 @@ sensors: {count: 1}
 origin:
   low_m: [0.39, -0.03, 0]
   high_m: [0.41, 0.03, 0.06]
-  spread_m: {max: 0.005}
   exclude: [{low_m: [0.3, -0.025, -0.02], high_m: [0.5, 0.025, 0.02]}]
 budget: {rays: 576}
 """
@@ -35,7 +34,6 @@ FLOODS = """\
 # three floods, each in a part of the phone of its own, around the same camera
 sensors: {count: 3}
 origin:
-  spread_m: {max: 0.005}
   exclude: [{low_m: [0.3, -0.025, -0.02], high_m: [0.5, 0.025, 0.02]}]
 budget: {rays: 576}
 each:
@@ -76,7 +74,7 @@ def main() -> None:
         path = folder / f"{name}.yaml"
         path.write_text(text, encoding="utf-8")
         print(f"\n# {path}:\n{text}", end="")
-        step(explanation, "constrain", run, "--layout", "grid", "--constraints", path, "--name", name)
+        step(explanation, "constrain", run, "--layout", "even", "--constraints", path, "--name", name)
     designs = [run / "designs" / f"{name}.yaml" for name in EMITTERS]
     print("\n# Score them on held-out heads at equal rays; what the detector cannot see does not count.", flush=True)
     compare(evaluated(designs, folder / "report.html"))

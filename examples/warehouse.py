@@ -25,7 +25,7 @@ def main() -> None:
     options = parser.parse_args()
     folder, started = new_folder(options.out), time.perf_counter()
     run, settings = folder / "run", [word for value in options.set for word in ("--set", value)]
-    track = run / "designs" / "track.yaml"
+    along = run / "designs" / "along.yaml"
     folder.mkdir(parents=True)
 
     step(
@@ -33,22 +33,22 @@ def main() -> None:
         "learn", "warehouse", "--set", "size=small", "--preset", "draft", *settings, "--out", run,
     )  # fmt: skip
     step(
-        "Fit a track: 12 rays with gates of their own, which change smoothly with the position.",
-        "fit", run, "--rays", "12", "--name", "track",
+        "Choose 12 rays with gates of their own at every position; between positions they are linear.",
+        "fit", run, "--rays", "12", "--name", "along",
     )  # fmt: skip
     step(
         "The same under a constraint: no gate is wider than 0.3 m, anywhere along the aisle.",
         "constrain", run, "--set", "gate.width_m.max=0.3", "--rays", "12", "--name", "tight",
     )  # fmt: skip
     for x_m in POSITIONS_M:
-        step(f"The rays of the track at {x_m} m.", "show", track, "--at", f"x_m={x_m}")
+        step(f"The rays at {x_m} m.", "show", along, "--at", f"x_m={x_m}")
         step(
             "Hand them to another program.",
-            "export", track, "--at", f"x_m={x_m}", "--format", "csv", "--out", folder / f"rays_{x_m}.csv",
+            "export", along, "--at", f"x_m={x_m}", "--format", "csv", "--out", folder / f"rays_{x_m}.csv",
         )  # fmt: skip
     step(
         "Which boxes of held-out shelves do they miss, at all positions together?",
-        "evaluate", track, run / "designs" / "tight.yaml", "--rays", "12", "--report", folder / "report.html",
+        "evaluate", along, run / "designs" / "tight.yaml", "--rays", "12", "--report", folder / "report.html",
     )  # fmt: skip
     print(f"\nDone in {time.perf_counter() - started:.0f} s. Curves and a 3D view: {folder / 'report.html'}")
 

@@ -41,13 +41,15 @@ class TrainingScenes:
         run: The run, whose task says what returns tell.
         seed: Root of the random streams.
         starmap: How scenes are informed: `itertools.starmap`, or by workers.
+        keeps: Whether what is found may be kept in the run.
     """
 
-    def __init__(self, run: RunFolder, seed: int, starmap: Starmap = itertools.starmap) -> None:
-        self.run, self.seed, self._starmap = run, seed, starmap
+    def __init__(self, run: RunFolder, seed: int, starmap: Starmap = itertools.starmap, *, keeps: bool = False) -> None:
+        self.run, self.seed, self._starmap, self.keeps = run, seed, starmap, keeps
         self._first: dict[str, list[Scene]] = {}
-        # of every draw so far, by purpose: draws that are skipped need not be made again
+        # of every draw so far, by purpose, and the last draw: what is skipped need not be made again
         self._sizes: dict[str, list[int]] = {}
+        self._last: dict[str, tuple[int, list[Scene]]] = {}
 
     @property
     def margin_m(self) -> float:
@@ -59,8 +61,11 @@ class TrainingScenes:
         sizes = self._sizes.setdefault(purpose, [])
         for draw in itertools.count():
             if draw == len(sizes) or start < sizes[draw]:
-                label = random_generator(self.seed, "selection", purpose, draw)
-                scenes = self.run.scenes("train", int(label.integers(2**31)))
+                number, scenes = self._last.get(purpose, (-1, []))
+                if number != draw:
+                    label = random_generator(self.seed, "selection", purpose, draw)
+                    scenes = self.run.scenes("train", int(label.integers(2**31)))
+                    self._last[purpose] = draw, scenes
                 if draw == len(sizes):
                     sizes.append(len(scenes))
                 yield from scenes[start:]

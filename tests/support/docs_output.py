@@ -16,6 +16,7 @@ VERDICTS = re.compile(r"\b(?:better|worse|not told apart|yes, tight|yes|no)\b")
 # Lines and words that follow from the numbers alone: which rival is the strongest, which constraint is tight.
 VARYING = re.compile(r"tight: |no constraint is tight|the constraints leave |.*the strongest rival on training scenes")
 RIVAL = re.compile(r"\bdifference to \w+")
+RIVAL_ROW = re.compile(r"\b(?:uniform|random|bounding|silhouette|greedy) (?=# )")
 # Said only where the numbers ask for it.
 OCCASIONAL = re.compile(r", # rays in all(?=:)|, rays #$|<(?=#)| \(# %\)(?= verdict)")
 
@@ -23,7 +24,8 @@ OCCASIONAL = re.compile(r", # rays in all(?=:)|, rays #$|<(?=#)| \(# %\)(?= verd
 def masked(text: str) -> str:
     """The words of a text in one line, without the lines of tables, a # for every number."""
     words = " ".join(NUMBER.sub("#", BOXES.sub(" ", text)).split())
-    return OCCASIONAL.sub("", RIVAL.sub("difference to it", VERDICTS.sub("verdict", words)))
+    words = RIVAL_ROW.sub("rival ", RIVAL.sub("difference to it", VERDICTS.sub("verdict", words)))
+    return OCCASIONAL.sub("", words)
 
 
 def difference(expected: list[str], out: str, err: str, *, small: bool) -> str | None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from support.meshes import write_ball
 
 from lidardesign.config import resolve, save_run_config
 from lidardesign.density.objective.proposals import samples_without_visibility
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import save_samples
+from support.meshes import write_ball
 
 
 def make_mesh_run(folder, count=3000, seed=3, overrides=()):

@@ -32,13 +32,14 @@ where one angle is free and not at all where none is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.numerics import TINY
 from lidardesign.run.clock import phase
 from lidardesign.scenes.scene import Scene
@@ -243,6 +244,9 @@ def check_baseline(name: str, *, where: str = "baselines") -> None:
         raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=", ".join(BASELINES))
 
 
+FEWER_RAYS = 0.9  # of those that did not fit in a bandwidth
+
+
 class TwinCandidate:
     """A design that is fitted anew for each number of rays, as a baseline's layout.
 
@@ -271,8 +275,15 @@ class TwinCandidate:
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
     ) -> RaysPerCondition:
-        """As many rays as the design of this bandwidth fires."""
-        return self._rays(max(one.rays for one in self._fired if one.mbps == limit_mbps), limit_mbps)
+        """As many rays as the design of this bandwidth fires, or fewer where its own gates need more for so many."""
+        count = max(one.rays for one in self._fired if one.mbps == limit_mbps)
+        while True:
+            try:
+                return self._rays(count, limit_mbps)
+            except InfeasibleError as error:
+                if count == 1 or error.conflicts != ("budget.bandwidth_mbps",):
+                    raise
+                count = math.floor(FEWER_RAYS * count)
 
     def _rays(self, count: int, limit_mbps: float | None) -> RaysPerCondition:
         if (count, limit_mbps) not in self._known:
