@@ -377,7 +377,7 @@ def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRe
 
     run, bounds = request.run, request.constraints
     rays = request.counts[len(request.counts) // 2]
-    conditions = [request.at] if request.at else run.conditions()
+    conditions = [{**request.at, **one} for one in run.conditions(run.config.space.at(request.at))]
     casters = [build_casters(scene) for scene in scenes]
     sign = 1.0 if run.metric.better == "lower" else -1.0
     low = max(bounds.sensors.min or 1, len(bounds.each))
