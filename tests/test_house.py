@@ -51,8 +51,8 @@ SLOW_AT_TOP = {
     "torch", "cma", "numba", "trimesh", "matplotlib", "plotly", "igl", "h5py", "scipy", "zuko", "embreex",
 }  # fmt: skip
 FAST_ROOMS = (
-    "run", "run_folder", "workers", "sensors", "parts", "constraints", "mixture", "fitting", "formats", "cli", "registry",
-    "task", "api", "config", "samples",
+    "run", "run_folder", "workers", "sensors", "parts", "constraints", "mixture", "fitting", "formats", "cli",
+    "registry", "task", "api", "config", "samples",
 )  # fmt: skip
 
 # Words that say nothing of what a module, class or function holds.

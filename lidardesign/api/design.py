@@ -21,10 +21,8 @@ from lidardesign.api.export import (
 )
 from lidardesign.constraints.document import Constraints
 from lidardesign.errors import ConfigError, DataError, names_arguments
-from lidardesign.fitting.fit import fit_design
 from lidardesign.fitting.request import FitOptions, FitRequest, FitResult
 from lidardesign.formats.designs import need_run, reach_beside, read_design, relative_folder, run_of
-from lidardesign.rays.certificate import certificates_of
 from lidardesign.rays.information import FEW_SCENES
 from lidardesign.run.clock import WAIT_S, Progress, phase
 from lidardesign.run.files import run_lock
@@ -32,7 +30,7 @@ from lidardesign.run.manifest import write_recorded
 from lidardesign.run_folder import Notes, RunFolder, ignore, log_note
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.compare import outside_space
-from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design import DesignSpec, certificates_of
 from lidardesign.sensors.design_file import design_text, save_design
 from lidardesign.task import scoring_settings
 from lidardesign.workers import check_workers, opened_workers
@@ -85,6 +83,8 @@ class Design(DesignSource):
         progress: Progress | None = None,
     ) -> Design:
         """The design that a request comes to; it is not saved yet. `progress` is called with every step."""
+        from lidardesign.fitting.fit import fit_design
+
         steps = ignore if progress is None else (lambda step: progress(step, None, None))
         with opened_workers(check_workers(str(workers)), request.run.task, FEW_SCENES) as starmap:
             result = fit_design(request, notes=notes, progress=steps, starmap=starmap)

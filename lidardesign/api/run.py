@@ -14,10 +14,10 @@ from lidardesign.constraints.document import Constraints
 from lidardesign.errors import DataError, LidardesignError, names_arguments
 from lidardesign.fitting.request import FitOptions, FitRequest
 from lidardesign.formats.designs import folder_of, reach_of, read_design
-from lidardesign.rays.pool import FILE_NAME as CACHE
 from lidardesign.run.clock import Progress
 from lidardesign.run.files import writer
 from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
+from lidardesign.run.outputs import CACHE
 from lidardesign.run_folder import MANIFEST, Notes, RunFolder, log_note
 
 if TYPE_CHECKING:

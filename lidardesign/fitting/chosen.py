@@ -21,8 +21,8 @@ from lidardesign.errors import check_number
 from lidardesign.mixture.fit import FittedSensors
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.gates import GateLimits
-from lidardesign.rays.information import FEW_SCENES, MOST_SCENES, MOST_SELECTED
-from lidardesign.rays.pool import CandidatePool
+from lidardesign.rays.information import FEW_SCENES, MOST_SELECTED
+from lidardesign.rays.pool import CandidatePool, cached_information
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, first_candidates, owners, rays_of_points
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
 from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
@@ -125,9 +125,9 @@ def choose_rays(
         informed = training.inform(CHOICE, selection.rays, selection.visits, 0, FEW_SCENES)
         held_back = informed  # nobody asks how well a trial's rays do elsewhere
     else:
-        # each of a few values of a condition sees little of a scene
-        most_scenes = MOST_SCENES * (1 + (len(lists) > 1))
-        informed, held_back = inform_enough(selection, training, counts[len(counts) // 2], most_scenes, progress)
+        # too few of a pool are inside the sensors: the run goes on keeping the pool
+        inform = cached_information if pool is None and training.keeps else inform_enough
+        informed, held_back = inform(selection, training, counts[len(counts) // 2], progress)
     selected = select(selection, informed, held_back, counts, certified, progress)
     patterns = tuple(_pattern(one, conditions, samples) for one in selected)
     per_sensor = patterns[-1].per_sensor(len(fitted.sensors))

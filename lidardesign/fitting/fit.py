@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,13 +25,11 @@ from lidardesign.constraints.document import Constraints, merged
 from lidardesign.constraints.feasibility import check_feasible
 from lidardesign.constraints.origins import placement_notes
 from lidardesign.errors import BackgroundNote, DataError, InfeasibleError
-from lidardesign.fitting.chosen import choose_rays
 from lidardesign.fitting.request import BEST, COUNTS, KEY, FitRequest, FitResult, RunTarget, Weighting
 from lidardesign.formats.designs import relative_folder
 from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
 from lidardesign.rays.information import checked_information
-from lidardesign.rays.pool import CandidatePool, has_pool, pool_of
 from lidardesign.rays.proposals import nearest_samples
 from lidardesign.rays.training import CHOICE, HELD_BACK, TrainingScenes
 from lidardesign.registry import plugin_guard
@@ -46,6 +44,9 @@ from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
 from lidardesign.task import mount_of, random_generator
 from lidardesign.workers import Starmap
+
+if TYPE_CHECKING:
+    from lidardesign.rays.pool import CandidatePool
 
 # A larger share of scenes about which a design tells nothing is told.
 MOST_SILENT = 0.5
@@ -156,8 +157,12 @@ class Fitter:
                 config = with_task_settings(run.task, run.config, settings, option=request.weighting.origin)
                 run = replace(run, config=config)
             self.samples = self._at(loaded)
-        self.training = TrainingScenes(run, request.seed, starmap, request.at)
-        self.is_pooled = samples is None and not settings and not request.at and has_pool(run)
+        # scenes are judged from where the design is
+        here = replace(run.config, space=run.config.space.at(request.at))
+        self.training = TrainingScenes(replace(run, config=here), request.seed, starmap, keeps=samples is None)
+        space = run.config.space
+        is_fixed = {axis for axis in range(3) if axis in space.free} <= set(space.conditioned)
+        self.is_pooled = samples is None and not settings and not request.at and is_fixed
 
     def _check_effective(self, samples: Samples, hint: str) -> None:
         """Refuse samples of which too few are effective to fit anything to, whatever the constraints."""
@@ -185,6 +190,9 @@ class Fitter:
         """What is known of rays at the sensors' place; None where their origins are free."""
         if not self.is_pooled:
             return None
+        # compiled, which even rays do without
+        from lidardesign.rays.pool import pool_of
+
         return pool_of(self.request.run, self.samples, self.training, self.progress)
 
     def fit(self) -> FitResult:
@@ -259,6 +267,8 @@ class Fitter:
         )
         notes = [*placement_notes(constraints.rules)]
         if is_chosen:
+            from lidardesign.fitting.chosen import choose_rays
+
             middle = counts[len(counts) // 2]
             chosen = choose_rays(
                 self.training,
@@ -364,8 +374,7 @@ def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRe
 
     run, bounds = request.run, request.constraints
     rays = request.counts[len(request.counts) // 2]
-    # as in an evaluation: a design for one condition is carried to all of them
-    conditions = run.conditions()
+    conditions = [request.at] if request.at else run.conditions()
     casters = [build_casters(scene) for scene in scenes]
     sign = 1.0 if run.metric.better == "lower" else -1.0
     low = max(bounds.sensors.min or 1, len(bounds.each))

@@ -177,7 +177,11 @@ def _is_loose(rules: SensorRules, samples: Samples) -> bool:
 
 @phase("support")
 def _supports(
-    problem: FitProblem, rules: Sequence[SensorRules], count: int, shares: np.ndarray | None = None
+    problem: FitProblem,
+    rules: Sequence[SensorRules],
+    count: int,
+    placed: Sequence[int] = (),
+    shares: np.ndarray | None = None,
 ) -> list[Support]:
     """The samples of each group of sensors, refused where they are too few.
 
@@ -185,6 +189,7 @@ def _supports(
         problem: The fit.
         rules: Of all sensors.
         count: How many sensors there are.
+        placed: Sensors whose place is the fit's own, not the constraints'.
         shares: How much each of the samples belongs to each sensor, (N, S), where groups of one sensor share them out.
     """
     supports, samples = [], problem.samples
@@ -198,7 +203,10 @@ def _supports(
             generator = random_generator(problem.seed, "pinned", index)
             support = pin_samples(own, rules, group, problem.retarget, problem.em_samples, generator)
         mass = support.total if is_free else None
-        check_support(support, group, mass=mass, several=len(groups) > 1)
+        if group.sensors[0] not in placed:
+            check_support(support, group, mass=mass, several=len(groups) > 1)
+        elif support.effective < LEAST_SAMPLES:
+            raise _too_few(group.sensors[0], count, support.effective)
         supports.append(replace(support, mass=mass))
     return supports
 
@@ -244,13 +252,13 @@ def _fixed(
     sensors = sensors_of(ensemble, problem.samples.space)
     places = [tuple(map(float, sensors[index].origin_m)) if index in loose else None for index in range(count)]
     fixed = fix_origins(rules, places)
-    supports = _supports(problem, fixed, count)
+    supports = _supports(problem, fixed, count, loose)
     whole = fit_groups(_group_samples(problem, fixed, supports, count), problem.seed, problem.restarts)
     if not any(
         _is_widest(part, mixture.mixture.spread_rad) for part, mixture in zip(whole.parts, whole.results, strict=True)
     ):
         return whole, fixed, supports
-    supports = _supports(problem, fixed, count, _belonging(problem.samples, ensemble, count))
+    supports = _supports(problem, fixed, count, loose, _belonging(problem.samples, ensemble, count))
     return fit_groups(_group_samples(problem, fixed, supports, count), problem.seed, problem.restarts), fixed, supports
 
 
@@ -278,12 +286,16 @@ def _check_effective(ensemble: Ensemble, supports: Sequence[Support]) -> None:
         for sensor, weights in zip(part.group.sensors, own.T, strict=True):
             found = effective_count(weights) * min(worth, 1.0)
             if found < LEAST_SAMPLES:
-                raise InfeasibleError(
-                    f"sensor {sensor} of {len(ensemble.order)} would rest on {found:.0f} effective samples",
-                    conflicts=["--sensors"],
-                    allowed=f"at least {LEAST_SAMPLES:g}",
-                    hint="fewer sensors, or learn longer (--preset standard or fine)",
-                )
+                raise _too_few(sensor, len(ensemble.order), found)
+
+
+def _too_few(sensor: int, count: int, found: float) -> InfeasibleError:
+    return InfeasibleError(
+        f"sensor {sensor} of {count} would rest on {found:.0f} effective samples",
+        conflicts=["--sensors"],
+        allowed=f"at least {LEAST_SAMPLES:g}",
+        hint="fewer sensors, or learn longer (--preset standard or fine)",
+    )
 
 
 def _likelihood(ensemble: Ensemble, supports: Sequence[Support]) -> Estimate:

@@ -24,7 +24,6 @@ from lidardesign.numerics import COARSE_SLACK, ROUNDING
 from lidardesign.rays import kernels
 from lidardesign.rays.choice import Choice, RayCounts, choose
 from lidardesign.rays.coverage import Coverage
-from lidardesign.sensors.design import DesignSpec
 
 # Of subgradients, at most; more of them lower the bound of 361 rays on faces by less than 0.1 % of the loss.
 ROUNDS = 80
@@ -91,14 +90,6 @@ def certificate_document(
         "proxy": PROXY,
         "unit": unit,
     }
-
-
-CERTIFIED = ("rays", "value", "bound", "gap", "held_back_value", "candidates", "gates", "scenes")
-
-
-def certificates_of(design: DesignSpec) -> list[dict[str, Any]]:
-    """How far from the best a design's choices of rays may be, one entry per number of rays; none that is damaged."""
-    return [entry for entry in design.certificates if all(type(entry.get(name)) in (int, float) for name in CERTIFIED)]
 
 
 def certify(

@@ -1,9 +1,10 @@
-"""What training scenes show of a pool of rays: found once, kept in the run, and picked from by every fit.
+"""What training scenes show of candidate rays: found once, kept in the run, and read by every fit that asks it again.
 
 Where origins are given a change of constraints changes neither the scenes nor what rays return there. So rays are drawn
-from the whole density, more than any design chooses from, and what their returns tell about training scenes is kept in
-a file of the run. A fit picks those inside its sensors. The file says what it was made of: with another mesh, setting,
-seed or version of the program or the task it is made anew, and what is read is bit for bit what is found without it.
+from the whole density, more than any design chooses from, and a fit picks those inside its sensors. Where origins are
+free the candidates of the last fit are kept: another bandwidth, or other gates, asks of the same ones. The file says
+what it was made of: with other rays, another mesh, setting, seed or version of the program or the task it is made anew,
+and what is read is bit for bit what is found without it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 from lidardesign import __file__ as package_file
 from lidardesign.errors import LidardesignError
 from lidardesign.rays.gates import gate_choices
-from lidardesign.rays.information import CHOSEN_SHARE, MOST_SCENES, MOST_SELECTED
+from lidardesign.rays.information import CHOSEN_SHARE, MOST_SELECTED
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY, draw_order, nearest_samples
 from lidardesign.rays.selection import Selection, inform_enough
 from lidardesign.rays.training import InformedScene, TrainingScenes
@@ -33,9 +34,8 @@ from lidardesign.run.arrays import read_npz
 from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
 from lidardesign.run.inputs import SAMPLES
-from lidardesign.run.manifest import read_manifest, versions
+from lidardesign.run.manifest import versions
 from lidardesign.run_folder import RunFolder, input_hashes
-from lidardesign.samples import FILE_NAME as SAMPLES_FILE
 from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth
@@ -65,20 +65,14 @@ class CandidatePool:
     held_back: Sequence[InformedScene]
 
 
-def has_pool(run: RunFolder) -> bool:
-    """Whether all sensors of a run stand at one given place, but for conditions."""
-    space = run.config.space
-    return not [axis for axis in range(3) if axis in space.free and axis not in space.conditioned]
-
-
 @phase("pool")
 def pool_of(
     run: RunFolder, samples: Samples, training: TrainingScenes, progress: Callable[[str], None]
 ) -> CandidatePool:
-    """The pool of a run: as it is kept there, or found anew and kept if it can be written.
+    """The pool of a run: rays drawn from the whole density, and what scenes show of them.
 
     Arguments:
-        run: The run, whose sensors stand at one place (see `has_pool`).
+        run: The run, whose sensors stand at one place but for conditions.
         samples: Of its density.
         training: Its training scenes.
         progress: Called with every step.
@@ -86,24 +80,6 @@ def pool_of(
     Raises:
         DataError: No ray tells anything about the scenes.
     """
-    path, key = run.folder / FILE_NAME, _key(run, training.seed)
-    with contextlib.suppress(LidardesignError, KeyError, ValueError):
-        arrays = read_npz(path, SAMPLES)
-        if bytes(arrays["key"]).decode() == key:
-            return _unpacked(arrays)
-    arrays = _packed(_found(run, samples, training, progress))
-    buffer = io.BytesIO()
-    np.savez(buffer, key=np.frombuffer(key.encode(), dtype=np.uint8), **arrays)
-    if buffer.tell() <= MOST_BYTES:
-        # a run that cannot be written, or a full disk, costs time alone
-        with contextlib.suppress(LidardesignError):
-            write_atomic(path, buffer.getvalue())
-    return _unpacked(arrays)
-
-
-def _found(
-    run: RunFolder, samples: Samples, training: TrainingScenes, progress: Callable[[str], None]
-) -> CandidatePool:
     conditions, counts = run.conditions(), sorted(run.task.defaults.rays)
     size = POOL_FACTOR * CANDIDATES_PER_RAY * min(counts[-1], MOST_SELECTED)
     parts = []
@@ -117,25 +93,47 @@ def _found(
     gate_m = np.tile([run.config.space.low[RANGE], run.config.space.high[RANGE]], (len(points), 1))
     looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
     rays = Rays(points[:, :3], looking, gate_m, np.zeros(len(points)), np.zeros(len(points)))
-    gates = partial(gate_choices, margin_m=training.margin_m)
-    selection = Selection(rays, visits, gates, Bandwidth(), share=CHOSEN_SHARE / POOL_FACTOR)
-    # each of a few values of a condition sees little of a scene
-    most_scenes = MOST_SCENES * (1 + (len(conditions) > 1))
-    return CandidatePool(
-        points, visits, *inform_enough(selection, training, counts[len(counts) // 2], most_scenes, progress)
-    )
+    gates, share = partial(gate_choices, margin_m=training.margin_m), CHOSEN_SHARE / POOL_FACTOR
+    selection = Selection(rays, visits, gates, Bandwidth(), share=share)
+    return CandidatePool(points, visits, *cached_information(selection, training, counts[len(counts) // 2], progress))
 
 
-def _key(run: RunFolder, seed: int) -> str:
-    """A hash of everything that a pool follows from."""
+def cached_information(
+    selection: Selection, training: TrainingScenes, count: int, progress: Callable[[str], None]
+) -> tuple[list[InformedScene], list[InformedScene]]:
+    """See `inform_enough`: as it is kept in the run, or found anew and kept if it can be written."""
+    path, key = training.run.folder / FILE_NAME, _key(selection, training, count)
+    with contextlib.suppress(LidardesignError, KeyError, ValueError):
+        arrays = read_npz(path, SAMPLES)
+        if bytes(arrays["key"]).decode() == key:
+            return _unpacked(arrays)
+    informed, held_back = inform_enough(selection, training, count, progress)
+    arrays = _packed(informed, held_back, len(selection.rays))
+    buffer = io.BytesIO()
+    np.savez(buffer, key=np.frombuffer(key.encode(), dtype=np.uint8), **arrays)
+    if buffer.tell() <= MOST_BYTES:
+        # a run that cannot be written, or a full disk, costs time alone
+        with contextlib.suppress(LidardesignError):
+            write_atomic(path, buffer.getvalue())
+    # rounded as the file rounds it
+    return _unpacked(arrays)
+
+
+def _key(selection: Selection, training: TrainingScenes, count: int) -> str:
+    """A hash of everything that information follows from."""
+    run, rays = training.run, selection.rays
     task = type(run.task)
     source = inspect.getsourcefile(task)
     folders = [Path(package_file).parent, *([Path(source).parent] if source else [])]
     made_of = {
         "config": run.config.as_document(),
         "inputs": input_hashes(run.config.task),
-        "samples": (read_manifest(run.folder)["files"].get(SAMPLES_FILE) or {}).get("sha256"),
-        "seed": seed,
+        "rays": [
+            hashlib.sha256(column.tobytes()).hexdigest() for column in (rays.origin_m, rays.direction, rays.gate_m)
+        ],
+        "visits": [(visit.start, visit.stop) for visit in selection.visits],
+        "asked": [count, selection.share],
+        "seed": training.seed,
         "versions": versions(),
         "task": [distribution_of(run.task.name), task.__module__, task.__qualname__],
         # of programs that are being written: their source as well as its version
@@ -149,10 +147,10 @@ def _stamp(path: Path) -> tuple[str, int, int]:
     return str(path), found.st_size, found.st_mtime_ns
 
 
-def _packed(pool: CandidatePool) -> dict[str, np.ndarray]:
-    """The arrays of a pool: those of all scenes one after the other, and where each begins."""
-    scenes = [*pool.informed, *pool.held_back]
-    small = np.uint16 if len(pool.points) <= np.iinfo(np.uint16).max else np.int32
+def _packed(informed: Sequence[InformedScene], held_back: Sequence[InformedScene], rays: int) -> dict[str, np.ndarray]:
+    """The arrays of all scenes one after the other, and where each begins."""
+    scenes = [*informed, *held_back]
+    small = np.uint16 if rays <= np.iinfo(np.uint16).max else np.int32
     kinds = {"ray": small, "item": np.uint16, "worth": np.float32, "range_m": np.float32, "weight": np.float64}
     kinds |= {"spoiling": small, "harm": np.float32, "harm_range_m": np.float32}
     arrays = {
@@ -163,18 +161,16 @@ def _packed(pool: CandidatePool) -> dict[str, np.ndarray]:
     first = scenes[0]
     return {
         **arrays,
-        "points": pool.points,
-        "visits": np.array([[visit.start, visit.stop] for visit in pool.visits]),
         "starts": np.concatenate([np.zeros((1, 3), dtype=np.int64), np.cumsum(sizes, axis=0)]),
         "complete": np.array([scene.complete for scene in scenes]),
-        "chosen_on": np.array(len(pool.informed)),
+        "chosen_on": np.array(len(informed)),
         "sums": first.sums,
         "is_repeated": np.array(first.is_repeated),
         "unit": np.frombuffer(first.unit.encode(), dtype=np.uint8),
     }
 
 
-def _unpacked(arrays: Mapping[str, np.ndarray]) -> CandidatePool:
+def _unpacked(arrays: Mapping[str, np.ndarray]) -> tuple[list[InformedScene], list[InformedScene]]:
     scenes, starts = [], arrays["starts"]
     shared = {
         "sums": arrays["sums"],
@@ -198,5 +194,4 @@ def _unpacked(arrays: Mapping[str, np.ndarray]) -> CandidatePool:
             )
         )
     chosen_on = int(arrays["chosen_on"])
-    visits = [slice(int(start), int(stop)) for start, stop in arrays["visits"]]
-    return CandidatePool(arrays["points"], visits, scenes[:chosen_on], scenes[chosen_on:])
+    return scenes[:chosen_on], scenes[chosen_on:]

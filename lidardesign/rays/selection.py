@@ -17,7 +17,7 @@ from lidardesign.numerics import SLACK
 from lidardesign.rays.certificate import certificate_document, certify, price_curve
 from lidardesign.rays.choice import MOST_PASSES, Choice, RayCounts, choose, choose_within
 from lidardesign.rays.coverage import Coverage, gather
-from lidardesign.rays.information import CHOSEN_SHARE, FEW_SCENES, MOST_ENTRIES
+from lidardesign.rays.information import CHOSEN_SHARE, FEW_SCENES, MOST_ENTRIES, MOST_SCENES
 from lidardesign.rays.training import CHOICE, HELD_BACK, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
@@ -276,7 +276,7 @@ def silent_share(scenes: Sequence[InformedScene], gate_m: np.ndarray) -> float:
 
 
 def inform_enough(
-    selection: Selection, training: TrainingScenes, count: int, most_scenes: int, progress: Callable[[str], None]
+    selection: Selection, training: TrainingScenes, count: int, progress: Callable[[str], None]
 ) -> tuple[list[InformedScene], list[InformedScene]]:
     """What candidates tell about as many scenes as a choice of so many rays needs, and about others held back.
 
@@ -284,13 +284,14 @@ def inform_enough(
         selection: The candidates.
         training: The scenes.
         count: How many rays will fire.
-        most_scenes: How many scenes there are at most.
         progress: Called with every step.
 
     Raises:
         DataError: No candidate tells anything about the scenes.
     """
     rays, visits = selection.rays, selection.visits
+    # each of a few values of a condition sees little of a scene
+    most_scenes = MOST_SCENES * (1 + (len(visits) > 1))
     # how many scenes are needed hardly depends on gates, and open ones may not fit
     selection, open_gates = replace(selection, limit_mbps=np.inf), rays.gate_m[:, None]
     held_back = training.inform(HELD_BACK, rays, visits, 0, FEW_SCENES, selection.share)

@@ -6,7 +6,7 @@ What the returns of candidate rays tell about training scenes, scene by scene.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -25,9 +25,7 @@ from lidardesign.run.clock import phase
 from lidardesign.run_folder import RunFolder
 from lidardesign.scenes.rays import Outcome, Rays, Returns
 from lidardesign.scenes.scene import Scene
-from lidardesign.sensors.pattern import TRAVELLED, with_coordinates
 from lidardesign.simulate.returns import simulate_many
-from lidardesign.space import DIMENSIONS
 from lidardesign.task import Information, Task, random_generator
 from lidardesign.workers import Starmap
 
@@ -43,16 +41,15 @@ class TrainingScenes:
         run: The run, whose task says what returns tell.
         seed: Root of the random streams.
         starmap: How scenes are informed: `itertools.starmap`, or by workers.
-        at: The one value of its conditions that rays are at; none where they are at all of them.
+        keeps: Whether what is found may be kept in the run.
     """
 
-    def __init__(
-        self, run: RunFolder, seed: int, starmap: Starmap = itertools.starmap, at: Mapping[str, float] | None = None
-    ) -> None:
-        self.run, self.seed, self._starmap, self._at = run, seed, starmap, at or {}
+    def __init__(self, run: RunFolder, seed: int, starmap: Starmap = itertools.starmap, *, keeps: bool = False) -> None:
+        self.run, self.seed, self._starmap, self.keeps = run, seed, starmap, keeps
         self._first: dict[str, list[Scene]] = {}
-        # of every draw so far, by purpose: draws that are skipped need not be made again
+        # of every draw so far, by purpose, and the last draw: what is skipped need not be made again
         self._sizes: dict[str, list[int]] = {}
+        self._last: dict[str, tuple[int, list[Scene]]] = {}
 
     @property
     def margin_m(self) -> float:
@@ -64,8 +61,11 @@ class TrainingScenes:
         sizes = self._sizes.setdefault(purpose, [])
         for draw in itertools.count():
             if draw == len(sizes) or start < sizes[draw]:
-                label = random_generator(self.seed, "selection", purpose, draw)
-                scenes = self.run.scenes("train", int(label.integers(2**31)))
+                number, scenes = self._last.get(purpose, (-1, []))
+                if number != draw:
+                    label = random_generator(self.seed, "selection", purpose, draw)
+                    scenes = self.run.scenes("train", int(label.integers(2**31)))
+                    self._last[purpose] = draw, scenes
                 if draw == len(sizes):
                     sizes.append(len(scenes))
                 yield from scenes[start:]
@@ -92,20 +92,9 @@ class TrainingScenes:
         """
         kept = self._first.get(purpose, [])
         scenes = kept[start:stop] if stop <= len(kept) else itertools.islice(self.scenes(purpose, start), stop - start)
-        if self._at:
-            rays, visits = self._at_nearest(rays, visits[0])
         asked = ((scene, number) for number, scene in enumerate(scenes, start))
         work = partial(informed_scene, self.run.task, rays, visits, share, self.seed, purpose)
         return list(self._starmap(work, asked))
-
-    def _at_nearest(self, rays: Rays, visit: slice) -> tuple[Rays, list[slice]]:
-        """Rays carried to the nearest condition that the task judges at, and when they fire: at no other."""
-        conditions = self.run.conditions()
-        away = [sum(abs(one[name] - value) for name, value in self._at.items()) for one in conditions]
-        nearest = away.index(min(away))
-        moves = {DIMENSIONS.index(name): value for name, value in conditions[nearest].items() if name in TRAVELLED}
-        visits = [visit if number == nearest else slice(0, 0) for number in range(len(conditions))]
-        return replace(rays, origin_m=with_coordinates(rays.origin_m, moves)), visits
 
 
 def informed_scene(
@@ -233,17 +222,7 @@ def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) 
     """
     fired = simulate_many(scene, [rays.subset(visit) for visit in visits])
     returns = [pad_returns(rays, visit, frame) for visit, frames in zip(visits, fired, strict=True) for frame in frames]
-    fires = np.repeat([visit.stop > visit.start for visit in visits], [len(frames) for frames in fired])
-    return InformedScene.of(_of_frames(informs(scene, returns), fires), returns)
-
-
-def _of_frames(information: Information, counts: np.ndarray) -> Information:
-    """The same, but only items of frames that count (F,) have a weight; of all frames where those have no items."""
-    if counts.all():
-        return information
-    weight = np.ones(len(information.frame)) if information.weight is None else np.asarray(information.weight)
-    weight = np.where(counts[information.frame], weight, 0.0)
-    return replace(information, weight=weight) if weight.sum() > 0 else information
+    return InformedScene.of(informs(scene, returns), returns)
 
 
 def pad_returns(rays: Rays, fired: slice, returns: Returns) -> Returns:

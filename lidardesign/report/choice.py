@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.rays.certificate import certificates_of
 from lidardesign.report.figures import AXIS, LAYOUT
 from lidardesign.report.markup import figure, folded, paragraphs, swatch
 from lidardesign.report.series import Series
 from lidardesign.report.tables import four_digits, table
 from lidardesign.scoring.evaluation.results import Evaluation
-from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design import DesignSpec, certificates_of
 
 FEWEST_POINTS = 4  # of a rank correlation that says anything
 FIGURE_PX = 320

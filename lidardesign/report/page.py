@@ -21,7 +21,6 @@ import numpy as np
 from lidardesign.config import FILE_NAME, RunConfig
 from lidardesign.constraints.slack import ConstraintSlack
 from lidardesign.estimates import figure_and_interval
-from lidardesign.rays.certificate import certificates_of
 from lidardesign.report.choice import choice_section
 from lidardesign.report.density_views import DensityView, density_view
 from lidardesign.report.figures import FONT, MOST_DESIGNS, curve_figure, far_rivals, marginal_figure, plane_figure
@@ -54,7 +53,7 @@ from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.scoring.evaluation.results import Evaluation, Paired, Row, verdict
 from lidardesign.scoring.evaluation.thresholds import difference_text
 from lidardesign.scoring.sweep import Sweep
-from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design import DesignSpec, certificates_of
 from lidardesign.space import observed_point
 from lidardesign.task import random_generator
 

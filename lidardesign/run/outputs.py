@@ -15,8 +15,10 @@ from lidardesign.run.files import FILE_NAME as LOCK
 from lidardesign.run.inputs import parse_json
 from lidardesign.run.manifest import FILE_NAME as MANIFEST
 
+# What fits keep in a run of what training scenes show of rays.
+CACHE = "informed.npz"
 # What a run has beside the files that its manifest lists.
-RUN_FILES = (MANIFEST, LOCK, "config.yaml", "progress.jsonl")
+RUN_FILES = (MANIFEST, LOCK, CACHE, "config.yaml", "progress.jsonl")
 STREAMS = {1: "standard output", 2: "standard error"}
 # A full disk has room for an empty file.
 TRIAL = bytes(1024)

@@ -196,3 +196,11 @@ class DesignSpec:
                     hint=f"lidardesign fit RUN --at {name}={value:g}",
                 )
         return {DIMENSIONS.index(name): float(value) for name, value in at.items() if name in TRAVELLED}
+
+
+CERTIFIED = ("rays", "value", "bound", "gap", "held_back_value", "candidates", "gates", "scenes")
+
+
+def certificates_of(design: DesignSpec) -> list[dict[str, Any]]:
+    """How far from the best a design's choices of rays may be, one entry per number of rays; none that is damaged."""
+    return [entry for entry in design.certificates if all(type(entry.get(name)) in (int, float) for name in CERTIFIED)]

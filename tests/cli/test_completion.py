@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-from support.tables import each_row
+import pytest
 
 from lidardesign.cli.terminal import options as completion
 from lidardesign.simulate.detector.files import load_detector
@@ -16,7 +16,7 @@ OFFERED = [
     ("le", "learn"),
     ("tasks sh", "show"),
     ("fit run --la", "--layout"),
-    ("fit run --layout ", "selected"),
+    ("fit run --layout ", "spinning"),
     ("learn fl", "flatland"),
     ("learn flatland --set learning.st", "learning.steps="),
     ("config init face --set tr", "train="),
@@ -40,7 +40,7 @@ def asked(line):
     )
 
 
-@each_row(("line", "candidate"), OFFERED)
+@pytest.mark.parametrize(("line", "candidate"), OFFERED)
 def test_a_shell_is_offered_commands_options_and_values(line, candidate):
     assert candidate in asked(line).stdout.split()
 
@@ -56,6 +56,6 @@ def test_the_script_of_a_shell_is_shown():
     assert "_LIDARDESIGN_COMPLETE" in done.stdout
 
 
-@each_row("name", completion.detectors())
+@pytest.mark.parametrize("name", completion.detectors())
 def test_every_detector_that_is_offered_is_one(name):
     assert load_detector(name).name

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.command_line import make_run
-from support.tables import each_row
 
 from lidardesign.api.config_reference import config_template, config_text, default_document, schema_of
 from lidardesign.config import PRESETS, DensitySettings, LearningSettings, resolve
@@ -40,7 +39,7 @@ def uncommented(text):
     return whole
 
 
-@each_row("name", TASKS)
+@pytest.mark.parametrize("name", TASKS)
 def test_a_file_to_begin_with_changes_nothing(name, tmp_path):
     task = load_task(name)
     path = written(task, tmp_path)
@@ -52,8 +51,8 @@ def test_a_file_to_begin_with_changes_nothing(name, tmp_path):
         assert resolve(task, preset=preset, config_file=path) == resolve(task, preset=preset)
 
 
-@each_row("name", [name for name in TASKS if name not in WITHOUT_DEFAULTS])
-@each_row("preset", PRESETS)
+@pytest.mark.parametrize("name", [name for name in TASKS if name not in WITHOUT_DEFAULTS])
+@pytest.mark.parametrize("preset", PRESETS)
 def test_all_of_its_defaults_are_the_ones_that_hold(name, preset, tmp_path):
     task = load_task(name)
     path = written(task, tmp_path, preset)
@@ -61,7 +60,7 @@ def test_all_of_its_defaults_are_the_ones_that_hold(name, preset, tmp_path):
     assert resolve(task, config_file=path).as_document() == resolve(task, preset=preset).as_document()
 
 
-@each_row("name", TASKS)
+@pytest.mark.parametrize("name", TASKS)
 def test_every_key_is_there_with_what_it_is(name, tmp_path):
     task = load_task(name)
     text = written(task, tmp_path).read_text()
@@ -123,7 +122,7 @@ def test_schemas_are_schemas_and_are_printed_as_such(lidardesign, kind):
     assert lidardesign("config", "schema", kind, "--json").json["schema"] == printed
 
 
-@each_row("name", TASKS)
+@pytest.mark.parametrize("name", TASKS)
 def test_a_configuration_that_is_resolved_is_valid(name, tmp_path):
     task = load_task(name)
     document = parse_yaml(uncommented(written(task, tmp_path).read_text()), where="text", empty_sections=True).value
@@ -162,7 +161,7 @@ CONFIGURATIONS = [
 ]
 
 
-@each_row("values", CONFIGURATIONS, ids=str)
+@pytest.mark.parametrize("values", CONFIGURATIONS, ids=str)
 def test_the_schema_of_a_configuration_takes_what_the_program_takes(values, tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(dump_yaml(values))
@@ -204,7 +203,7 @@ CONSTRAINTS = [
 ]
 
 
-@each_row("values", CONSTRAINTS, ids=str)
+@pytest.mark.parametrize("values", CONSTRAINTS, ids=str)
 def test_the_schema_of_constraints_takes_what_the_program_takes(values):
     try:
         Constraints.from_mapping(values)

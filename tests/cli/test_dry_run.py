@@ -6,7 +6,6 @@ import time
 
 import pytest
 from support.command_line import files_under
-from support.tables import each_row
 
 from lidardesign.density.training.trainer import Trainer
 
@@ -35,7 +34,7 @@ def test_learning_writes_what_was_said_and_before_that_nothing(lidardesign, tmp_
 SLOW_S = 0.02
 
 
-@each_row("further", [(), ("--set", "learning.pathwise=0"), ("--time-budget", 60)])
+@pytest.mark.parametrize("further", [(), ("--set", "learning.pathwise=0"), ("--time-budget", 60)])
 def test_learning_foresees_its_time_from_real_steps(lidardesign, monkeypatch, further):
     whole = Trainer.find_gradient
 

@@ -9,7 +9,6 @@ import pytest
 import trimesh
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 from support.command_line import caller, make_run
-from support.tables import each_row
 
 from lidardesign.config import load_run_config
 from lidardesign.density.objective.prepare import resolution_notes
@@ -68,8 +67,8 @@ def test_large_meshes_are_doubted_only_where_no_unit_was_given():
     assert doubtful_meshes({"a.stl": 300.0, "b.stl": 0.1}, 1.0)[0].startswith("1 of 2 meshes")
 
 
-@each_row("way_m", [0.6, 12.0, 600.0])
-@each_row("reach_m", [1.5, 2000.0])
+@pytest.mark.parametrize("way_m", [0.6, 12.0, 600.0])
+@pytest.mark.parametrize("reach_m", [1.5, 2000.0])
 def test_a_way_is_doubted_where_it_dwarfs_what_goes_it(way_m, reach_m):
     space = DesignSpace(low=SPACE.low, high=(*SPACE.high[:5], reach_m))
     box = {"ball": np.array([[-0.1, -way_m / 2, -0.1], [0.1, way_m / 2, 0.1]])}

@@ -13,7 +13,6 @@ import pytest
 from lidardesign_tasks.robot.arm_robot import load_robot
 from support.captures import make_capture
 from support.command_line import make_run
-from support.tables import each_row
 
 from lidardesign.cli.terminal.output import Output, describe_error
 from lidardesign.constraints.document import MOST_FITTED, Constraints
@@ -63,7 +62,7 @@ BAD_SAMPLES = {
 }
 
 
-@each_row("case", BAD_SAMPLES)
+@pytest.mark.parametrize("case", BAD_SAMPLES)
 def test_samples_that_are_none_are_refused_although_their_hash_is_right(tmp_path, case):
     run = make_run(tmp_path / "run", count=20)
     change, words = BAD_SAMPLES[case]
@@ -115,7 +114,7 @@ BAD_PROGRESS = {
 }
 
 
-@each_row("case", BAD_PROGRESS)
+@pytest.mark.parametrize("case", BAD_PROGRESS)
 def test_progress_that_is_none_is_refused_and_cut_back_at_resume(tmp_path, case):
     run = make_run(tmp_path / "run", count=20)
     good = '{"step": 10, "seconds": 0.5}'
@@ -179,8 +178,8 @@ def test_a_direction_of_travel_may_have_any_length_but_none(tmp_path, length, fi
             load_design(tmp_path / "d.yaml")
 
 
-@each_row("key", ["bin_ps", "bits_per_bin", "rate_hz"])
-@each_row("value", [5e-324, 1e-300, 1e300])
+@pytest.mark.parametrize("key", ["bin_ps", "bits_per_bin", "rate_hz"])
+@pytest.mark.parametrize("value", [5e-324, 1e-300, 1e300])
 def test_a_read_out_that_no_detector_has_is_refused_without_a_warning(key, value):
     with pytest.raises(ConfigError, match=key):
         Constraints.from_mapping({"budget": {key: value, "rays": 10, "bandwidth_mbps": 5.0}})

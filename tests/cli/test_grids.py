@@ -6,7 +6,6 @@ import io
 
 import pytest
 from rich.console import Console
-from support.tables import each_row
 
 from lidardesign.cli.terminal.grids import duration, print_table
 from lidardesign.report.tables import plain_number
@@ -29,7 +28,7 @@ def test_no_figure_is_broken_and_no_line_is_too_wide(width):
         assert piece in text
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("seconds", "shown"),
     [(0.04, "0.0 s"), (3.21, "3.2 s"), (9.97, "10 s"), (33.4, "33 s"), (59.7, "1 min 0 s"), (200.0, "3 min 20 s"),
      (7_500.0, "2 h 5 min")],
@@ -49,7 +48,7 @@ def test_sentences_wrap_instead():
     assert console.file.getvalue().count("jitter") == 1
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("value", "digits", "shown"),
     [(0.0, 2, "0"), (1300.0, 2, "1,300"), (99.9, 2, "100"), (14.71, 3, "14.7"), (0.0036, 2, "0.0036"),
      (1.7e-7, 2, "<0.0001"), (1.0, 2, "1"), (1.5, 2, "1.5")],

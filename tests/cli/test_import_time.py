@@ -48,8 +48,10 @@ def test_lists_import_nothing_heavy(arguments):
 
 def test_a_fitted_mixture_is_constrained_shown_and_exported_without_heavy_libraries(tmp_path):
     run, rays = make_run(tmp_path / "run"), tmp_path / "rays.csv"
+    # a region needs no density at any one place
+    keys = ["--set", "gate.width_m.max=0.2", "--set", "origin.spread_m.max=0.5"]
     commands = (
-        ["constrain", run, "--layout", "even", "--sensors", 2, "--set", "gate.width_m.max=0.2", "--name", "narrow"],
+        ["constrain", run, "--layout", "even", "--sensors", 2, *keys, "--name", "narrow"],
         ["show", run],
         ["show", run / "designs" / "narrow.yaml"],
         ["export", run / "designs" / "narrow.yaml", "--rays", 100, "--format", "csv", "--out", rays],

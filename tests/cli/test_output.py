@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import pytest
 from support.command_line import caller
-from support.tables import each_row
 
 from lidardesign.cli.terminal import grids as progress
 from lidardesign.cli.terminal.grids import ProgressDisplay
@@ -24,7 +23,7 @@ def lidardesign(capsys, tmp_path, monkeypatch):
     return lambda line, *more: program(*line.split(), *more)
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("quiet", "verbose", "said"),
     [(False, False, ["note: act"]), (False, True, ["note: act", "note: decided"]), (True, False, [])],
 )
@@ -59,7 +58,7 @@ def pair(name, low, high):
 END = "; greedy is the strongest rival on training scenes"
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("pairs", "better", "said"),
     [
         ([pair("fit", -3, -1)], "lower", f"fit is better than greedy by 2.0 mm (1.0 to 3.0) at 20 rays{END}"),
@@ -83,7 +82,7 @@ def lines_of_work(monkeypatch, seconds, steps=5000):
     return said
 
 
-@each_row(("seconds", "least", "most"), [(9, 0, 0), (35, 2, 3), (3600, 4, 6), (86400, 100, 150)])
+@pytest.mark.parametrize(("seconds", "least", "most"), [(9, 0, 0), (35, 2, 3), (3600, 4, 6), (86400, 100, 150)])
 def test_away_from_a_terminal_a_line_comes_now_and_then_with_the_time_that_remains(seconds, least, most, monkeypatch):
     said = lines_of_work(monkeypatch, seconds)
     assert least <= len(said) <= most

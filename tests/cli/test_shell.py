@@ -17,7 +17,6 @@ import pytest
 import typer
 import yaml
 from support.command_line import make_run, program
-from support.tables import each_row
 
 from lidardesign.cli.main import EXAMPLES, app
 
@@ -90,7 +89,7 @@ def test_colours_are_left_out_where_they_are_not_wanted(tmp_path, monkeypatch):
     assert not COLOUR.search(on_terminal("tasks", "list", PYTHONPATH=str(tmp_path), NO_COLOR="1"))
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("arguments", "named"),
     [
         ("lern face", "'learn'"),
@@ -118,7 +117,7 @@ COMMANDS = dict(commands())
 NARROW = 80
 
 
-@each_row("name", ["", "tasks", "catalog", "config", *COMMANDS])
+@pytest.mark.parametrize("name", ["", "tasks", "catalog", "config", *COMMANDS])
 def test_help_fits_80_columns_and_nothing_is_cut(lidardesign, monkeypatch, name):
     monkeypatch.setenv("COLUMNS", str(NARROW))
     shown = lidardesign(*name.split(), "--help").out
@@ -128,7 +127,7 @@ def test_help_fits_80_columns_and_nothing_is_cut(lidardesign, monkeypatch, name)
         assert parameter.param_type_name == "argument" or parameter.opts[0] in shown
 
 
-@each_row("name", list(COMMANDS))
+@pytest.mark.parametrize("name", list(COMMANDS))
 def test_every_command_has_examples_and_pages_that_are_there(lidardesign, name):
     shown = lidardesign(*name.split(), "--help").out
     assert all(example in shown for example in EXAMPLES[name])
@@ -141,7 +140,7 @@ def examples():
         yield from (shlex.split(line)[1:] for line in lines)
 
 
-@each_row("words", list(examples()))
+@pytest.mark.parametrize("words", list(examples()))
 def test_an_example_is_parsed_by_the_program(words):
     command = typer.main.get_command(app)
     while hasattr(command, "commands"):

@@ -8,7 +8,6 @@ import pytest
 import typer
 from support.command_line import make_run
 from support.mistakes import check_one_clear_message
-from support.tables import each_row
 
 from lidardesign.cli.main import app
 from lidardesign.errors import ConfigError
@@ -28,7 +27,7 @@ PARAMETERS = [
 ]
 
 
-@each_row(("command", "option"), PARAMETERS)
+@pytest.mark.parametrize(("command", "option"), PARAMETERS)
 def test_no_option_and_no_argument_may_be_empty(command, option):
     for value in ("", " ", "\t\n"):
         for given in ([value],) if option is None else ([option, value], [f"{option}={value}"]):
@@ -76,7 +75,7 @@ FIRST = {
 AROUND = {"--mount-error": "{}mm", "--at-origin": "0,0,{}", "--at=x_m": "{}"}
 
 
-@each_row(("command", "option"), NUMBERS, ids=" ".join)
+@pytest.mark.parametrize(("command", "option"), NUMBERS, ids=" ".join)
 def test_numbers_are_decimal_digits_as_in_files(lidardesign, command, option):
     if not Path("run").exists():
         make_run(Path("run"), count=1000)
@@ -111,7 +110,7 @@ RAYS = [
 ]
 
 
-@each_row(("changed", "words"), RAYS)
+@pytest.mark.parametrize(("changed", "words"), RAYS)
 def test_a_ray_whose_numbers_mean_nothing_is_refused(lidardesign, changed, words):
     row = [{**RAY, **changed}.get(name, "0") for name in HEADER.split(",")]
     Path("rays.csv").write_text(f"{HEADER}\n{','.join(row)}\n", encoding="utf-8")

@@ -27,7 +27,6 @@ from lidardesign.mixture.bounds import sensor_groups
 from lidardesign.mixture.components import log_density
 from lidardesign.mixture.support import pin_samples, restrict_samples
 from lidardesign.numerics import systematic_draw
-from lidardesign.rays.proposals import draw_order
 from lidardesign.samples import Samples
 from lidardesign.scenes.scene import Body, Box, Capsule, Mesh, Scene, Sphere
 from lidardesign.scenes.surface import sample_body
@@ -370,21 +369,6 @@ def test_even_rays_are_even_over_a_wide_field_of_view_on_the_sphere():
     wide = np.random.default_rng(13).uniform(-0.5, 0.5, (DRAWS, 2)) * one.field_of_view_rad
     crooked = np.column_stack([wide[:, 0] + one.azimuth_rad, np.sin(wide[:, 1] + one.elevation_rad)])
     assert p_value(counts_of_cells(crooked, CHART_EDGES), np.maximum(DRAWS * mass, 1e-3)) < UNLIKELY
-
-
-def test_candidates_are_drawn_by_weight_one_after_the_other_and_none_twice():
-    generator, weights = np.random.default_rng(14), np.array([0.5, 0.0, 3.0, 1.0, 0.1])
-    orders = np.array([draw_order(weights, generator) for _ in range(DRAWS)])
-    assert (np.sort(orders, axis=1) == np.arange(5)).all()
-    assert (orders[:, -1] == 1).all()
-    share = weights / weights.sum()
-    # the second is drawn by weight from those that the first left
-    pairs = np.outer(share, share) / (1 - share)[:, None]
-    np.fill_diagonal(pairs, 0.0)
-    drawn = pairs > 0
-    counts = np.zeros((5, 5))
-    np.add.at(counts, tuple(orders[:, :2].T), 1)
-    assert p_value(counts[drawn], DRAWS * pairs[drawn]) > UNLIKELY
 
 
 @pytest.mark.parametrize("measure", ["solid_angle", "angles"])

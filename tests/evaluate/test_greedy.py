@@ -12,7 +12,6 @@ from support.rivals import Rivals, balls
 from support.scoring import MissTask, design, make_request, rows_by_key
 
 from lidardesign.rays import information
-from lidardesign.rays.certificate import CERTIFIED
 from lidardesign.rays.training import TrainingScenes
 from lidardesign.scoring.baselines import greedy as greedy_module
 from lidardesign.scoring.baselines.candidates import whole_range
@@ -21,6 +20,7 @@ from lidardesign.scoring.baselines.views import TrainingViews
 from lidardesign.scoring.evaluation.entries import entries_of
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
+from lidardesign.sensors.design import CERTIFIED
 from lidardesign.sensors.pattern import Pattern
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import DesignSpace, angles

@@ -17,8 +17,8 @@ from lidardesign.fitting.part_sets import SetLimits, choose_set
 from lidardesign.fitting.part_shapes import COARSE_CELL_RAD, PartBundle, cells_of, part_table, parts_inform
 from lidardesign.parts.catalogue import find_part, part_rays
 from lidardesign.rays import information
-from lidardesign.rays.certificate import certificates_of
 from lidardesign.samples import load_samples
+from lidardesign.sensors.design import certificates_of
 from lidardesign.sensors.design_file import design_document
 from lidardesign.simulate.returns import simulate_many
 from lidardesign.task import Information

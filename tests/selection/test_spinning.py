@@ -18,8 +18,8 @@ from lidardesign.fitting import spinning
 from lidardesign.fitting.spinning import RingCandidates, chosen_rings, places_of, refine_elevations
 from lidardesign.formats.designs import load_design
 from lidardesign.numerics import FULL_TURN
-from lidardesign.rays.certificate import certificates_of
 from lidardesign.rays.coverage import LARGEST
+from lidardesign.sensors.design import certificates_of
 from lidardesign.sensors.design_file import design_document, save_design
 from lidardesign.space import DesignSpace
 

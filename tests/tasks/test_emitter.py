@@ -9,18 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lidardesign.layouts.rays import lay_out
 from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
 from support.rays import rays_of_points
-from support.tables import each_row
 
-from lidardesign.config import DensitySettings
+from lidardesign.config import resolve
 from lidardesign.constraints.document import Constraints
 from lidardesign.density.objective.proposals import propose
 from lidardesign.density.objective.target import build_target
-from lidardesign.mixture.fit import fit
+from lidardesign.fitting.fit import fit_design
+from lidardesign.fitting.request import FitOptions, FitRequest
+from lidardesign.run.manifest import start_manifest
 from lidardesign.run.yaml import parse_yaml
+from lidardesign.run_folder import RunFolder
 from lidardesign.samples import Samples
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, in_view, path_of_range, range_of_path
@@ -219,7 +220,7 @@ def test_the_truth_is_what_both_places_see_where_the_emitter_is_fixed(heads):
 # the configuration
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("values", "message"),
     [
         ({"range_m": (0.5, 0.5)}, "the longest above it"),
@@ -274,23 +275,21 @@ DESIGNS = {
 
 
 @pytest.fixture(scope="module")
-def fitted(heads):
+def fitted(heads, tmp_path_factory):
     """Designs by name, fitted to the exact density of training heads without learning it."""
-    task, config, scenes = heads
-    space, settings = task.space(config), DensitySettings(**task.defaults.density)
-    target = build_target(scenes, space, settings, "raycast")
-    proposals = propose(scenes, space, 60_000, settings.sigma_m, np.random.default_rng(13))
-    samples = Samples(proposals.points, proposals.log_density, target.log_density(proposals.points), space)
+    task, _, scenes = heads
+    config = resolve(task, preset="draft", overrides=[f"{name}={value}" for name, value in SMALL.items()])
+    run, settings = RunFolder(tmp_path_factory.mktemp("run"), task, config), config.density
+    target = build_target(scenes, config.space, settings, "raycast")
+    proposals = propose(scenes, config.space, 60_000, settings.sigma_m, np.random.default_rng(13))
+    samples = Samples(proposals.points, proposals.log_density, target.log_density(proposals.points), config.space)
+    start_manifest(run.folder, command=["lidardesign", "learn"], seed=config.seed)
+    requests = {
+        name: FitRequest.resolve(run, FitOptions(constraints=values, rays=RAYS)) for name, values in DESIGNS.items()
+    }
     return {
-        name: fit(
-            samples,
-            constraints=Constraints.from_mapping(values),
-            rays=RAYS,
-            layout="density",
-            level=task.defaults.level,
-            retarget=target.log_density,
-        )
-        for name, values in DESIGNS.items()
+        name: fit_design(request, samples=samples, target=target.log_density).design
+        for name, request in requests.items()
     }
 
 
@@ -299,8 +298,8 @@ def test_emitters_that_are_not_at_the_detector_are_nearly_as_good_as_a_laser_tha
     task, config, _ = heads
     held_out = task.scenes(config.model_copy(update={"test": 8}), "test", 0)
     chamfer_mm = {}
-    for name, result in fitted.items():
-        rays = lay_out(result.design, RAYS)
+    for name, design in fitted.items():
+        rays = design.rays(RAYS)
         scores = [task.score(scene, simulate(scene, rays, physics=SHADOWED)) for scene in held_out]
         chamfer_mm[name] = np.mean([score.value for score in scores])
     assert chamfer_mm["laser"] < 8.0

@@ -14,11 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli.terminal import options
-from lidardesign.cli.terminal import options as completion
 from lidardesign.cli.terminal.grids import RichConsole, number, text_table
 from lidardesign.cli.terminal.output import Output, command
 from lidardesign.errors import ConfigError, check_choice
-from lidardesign.parts.part import Part, conditions_of, disagreements
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
@@ -92,9 +90,7 @@ def list_(
 def show(
     name: Annotated[
         str,
-        typer.Argument(
-            metavar="NAME", help="A part's name, NAME:MODE, or a part file.", autocompletion=completion.parts
-        ),
+        typer.Argument(metavar="NAME", help="A part's name, NAME:MODE, or a part file.", autocompletion=options.parts),
     ],
     own: Own = None,
     reflectance: Reflectance = None,
@@ -134,7 +130,7 @@ def show(
             metavar="interleaved|beside",
             help="Several parts see the same, with interleaved rays, or have fields of view side by side.",
             show_default="interleaved",
-            autocompletion=completion.words("interleaved|beside"),
+            autocompletion=options.words("interleaved|beside"),
         ),
     ] = None,
     json: options.Json = False,
@@ -230,6 +226,8 @@ LONGEST_LIST = 8
 
 def part_entry(part: Part) -> dict[str, Any]:
     """The JSON form of a part's row."""
+    from lidardesign.parts.part import conditions_of, disagreements
+
     (left, right), (bottom, top) = part.view.azimuth, part.view.elevation
     near, far = part.range_m
     horizontal, vertical = part.field_of_view_rad
@@ -298,6 +296,8 @@ def show_parts(parts: Sequence[Part], rich: RichConsole) -> None:
 def show_part(part: Part, document: dict[str, Any], rich: RichConsole) -> None:
     """Print every figure of a part with its conditions and source, and what follows from them."""
     from rich.text import Text
+
+    from lidardesign.parts.part import conditions_of
 
     rich.print(Text.assemble((part.name, "bold"), f": {part.product}, {part.kind}"))
     rich.print(part.summary)

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import typer
 
 from lidardesign.cli.terminal import options
-from lidardesign.cli.terminal import options as completion
 from lidardesign.cli.terminal.grids import RichConsole, text_table
 from lidardesign.cli.terminal.output import command
 from lidardesign.run.clock import phase
@@ -56,7 +55,7 @@ def _show_list(entries: list[dict[str, Any]], rich: RichConsole) -> None:
 
 @tasks_app.command("show")
 def show(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a task.", autocompletion=completion.tasks)],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a task.", autocompletion=options.tasks)],
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -116,7 +115,7 @@ def _yaml_value(value: Any) -> str:
 @tasks_app.command("check")
 def check(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Name of an installed task.", autocompletion=completion.tasks)
+        str, typer.Argument(metavar="NAME", help="Name of an installed task.", autocompletion=options.tasks)
     ],
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,

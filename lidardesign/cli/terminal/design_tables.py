@@ -57,7 +57,7 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
 
 def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
     """Print what chosen rays leave unknown, and how much less any other choice of the same candidates could leave."""
-    from lidardesign.rays.certificate import certificates_of
+    from lidardesign.sensors.design import certificates_of
 
     columns = ("rays", "loss", "on other scenes", "less by at most", "candidates", "scenes")
     rows = [
@@ -207,7 +207,7 @@ def _frames(design: DesignSpec) -> str:
 
 def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
     """Among how many rays, on how many scenes, and how far from the best choice that may be."""
-    from lidardesign.rays.certificate import certificates_of
+    from lidardesign.sensors.design import certificates_of
 
     entries = certificates_of(design)
     if entries:

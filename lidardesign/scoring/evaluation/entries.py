@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.rays.certificate import certificates_of
 from lidardesign.rays.proposals import CANDIDATES_PER_RAY
 from lidardesign.rays.training import HELD_BACK
 from lidardesign.registry import plugin_guard
@@ -30,7 +29,7 @@ from lidardesign.scoring.baselines.views import TrainingObjective, TrainingViews
 from lidardesign.scoring.evaluation.request import EvaluationRequest, fired_numbers, numbers_fired
 from lidardesign.scoring.scene_scores import RaysPerCondition, score_scenes
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
-from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.design import DesignSpec, certificates_of
 from lidardesign.simulate.detector.physics import EFFECTS
 from lidardesign.simulate.plan import Choice, EffectPlan, Tolerance
 from lidardesign.task import conditions_of

@@ -22,7 +22,6 @@ from functools import partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lidardesign.scenes.casting import Primitives, SceneCaster, shared_caster
 from lidardesign.scenes.rays import Hits, Rays
@@ -56,6 +55,9 @@ class Screw:
     def between(cls, pose: np.ndarray, later: np.ndarray, rate_hz: float) -> Screw:
         """The screw that joins two poses, the shorter way round, the second 1 / rate after the first."""
         step = later @ inverse_rigid(pose)
+        # slow to import
+        from scipy.spatial.transform import Rotation
+
         turn = Rotation.from_matrix(step[:3, :3]).as_rotvec()
         drift = np.linalg.solve(_translations(turn, np.ones(1))[0], step[:3, 3])
         return cls(pose, turn * rate_hz, drift * rate_hz)
