@@ -421,11 +421,6 @@ def _within(constraints: Constraints, mbps: float) -> Constraints:
     return Constraints.from_mapping({**document, "budget": {"bandwidth_mbps": mbps, **budget}})
 
 
-# As many samples as the standard preset of `learn` leaves.
-TWIN_SAMPLES = 100_000
-TWIN_NAME = "no-visibility"
-
-
 def twin_samples(run: RunFolder) -> Samples:
     """Samples of a run's density without its occlusion term.
 
