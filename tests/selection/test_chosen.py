@@ -132,14 +132,15 @@ def test_rays_start_all_over_a_region_where_constraints_allow_one_and_else_at_th
 
 
 @pytest.mark.parametrize(("name", "sensors"), [("given", 4), ("given", 12), ("free", 5), ("moving", 4)])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_where_a_number_of_sensors_was_asked_for_each_of_them_fires(runs, name, sensors, seed):
     design = runs[name].fit(sensors=sensors, rays=sensors, seed=seed).specification
     assert design.rays_per_sensor().tolist() == [1] * sensors
 
 
-@pytest.mark.parametrize(("name", "most"), [("given", 12), ("free", 5), ("moving", 4)])
-@pytest.mark.parametrize("open_below", [1, 12])
+@pytest.mark.parametrize(
+    ("name", "most", "open_below"), [("given", 12, 12), ("given", 12, 1), ("free", 5, 1), ("moving", 4, 3)]
+)
 def test_where_the_number_is_free_no_sensor_is_idle_and_none_is_left_out_that_constraints_ask_for(
     runs, name, most, open_below, monkeypatch
 ):
