@@ -1,8 +1,7 @@
 """Laws of the task contract, the task that they are tried on, and what became of each of them.
 
-A digest of what a value holds, whatever the process: what is equal in content has the same one.
-
-Rays that see a scene's targets, and what becomes of their returns when they are disturbed.
+What several laws need is here too: digests that are equal for equal content, whatever the process; rays that see a
+scene's targets; and their returns, disturbed.
 """
 
 from __future__ import annotations
@@ -45,18 +44,15 @@ LOADS = (
     "interface",
     "it is imported, has all members of the interface, and its configuration resolves",
 )
-
-
 # One call of a task's code may take so long, where nothing else is asked for.
 CALL_SECONDS = 60.0
 # The geometry and the scores of so many training scenes are looked at.
 LOOKED_AT = 3
-DEEPEST = 40
+DEEPEST = 40  # nesting of a value that has a digest
 # What of scenes and bodies no ray meets, or what is told apart otherwise.
 UNSEEN = ("name", "group", "notes", "truth", "bodies", "poses", "importance")
-DRAW_ROUNDS = 12
-# Of a scene that moves, so many frames are aimed at.
-MOST_FRAMES = 8
+# So often rays at targets are drawn until they are enough; of a scene that moves, so many frames are aimed at.
+DRAW_ROUNDS, MOST_FRAMES = 12, 8
 # Half the gate where the space fixes the range, as a share of it.
 HALF_GATE = 0.05
 SEED = 20_251

@@ -1,11 +1,7 @@
-"""One HTML page about an evaluation, and what it is made of beside the scores.
+"""One HTML page about an evaluation: the result, designs in a scene, scores, where the time went, how to reproduce it.
 
 The page is one file that works offline and makes no network request: plotly is inside it, and its content
 security policy forbids every connection. All names are escaped.
-
-What the report of an evaluation holds beside the scores: pictures, where the time went, how to reproduce it.
-
-The report's first section: a row of every design, against the strongest rival on training scenes.
 """
 
 from __future__ import annotations
@@ -60,9 +56,9 @@ from lidardesign.task import random_generator
 CURVE_PX, SMALL_PX, PLANE_PX = 440, 250, 400
 # Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
 DENSITY_POINTS = 3000
-COMMAND = "evaluate"
-MOST_SENTENCES = 3  # of designs that have one each; a table says the same of all
-MOST_NOTES = 2  # that are not folded
+COMMAND = "evaluate"  # whose report it is, and which is not over yet
+# Of the first section: sentences of designs, which a table says of all, and notes that are not folded.
+MOST_SENTENCES, MOST_NOTES = 3, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,128 +84,6 @@ class Report:
     constraints: Mapping[str, Sequence[ConstraintSlack]] = field(default_factory=dict)
     times: Sequence[CommandTimes] = ()
     reproduce: Reproduction = field(default_factory=Reproduction)
-
-
-def write_report(report: Report, path: Path) -> None:
-    """Write the page, whole or not at all."""
-    write_atomic(Path(path), report_html(report))
-
-
-def report_html(report: Report) -> str:
-    """The page as text."""
-    metric = report.evaluation.metric
-    parts = [part for part in _parts(report) if part[2]]
-    body = "\n".join(section(heading, content, identifier) for identifier, heading, content in parts)
-    lead = f"{metric.name} in {metric.unit}, {metric.better} is better."
-    from plotly.offline import get_plotlyjs
-
-    links = [part[:2] for part in parts]
-    return page(report.title, lead, embedded(FONT, id="page-font") + body, get_plotlyjs(), links)
-
-
-def _parts(report: Report) -> list[tuple[str, str, str]]:
-    """Identifier, heading and content of every section; empty content where there is nothing to tell."""
-    evaluation = report.evaluation
-    designs = [one.design for one in report.shown.designs]
-    # lines without marks are told apart by their dashes
-    looks = {curve.name: curve for curve in series(evaluation)}
-    looks = {name: replace(look, dash=DASHES[index % len(DASHES)]) for index, (name, look) in enumerate(looks.items())}
-    shown = [looks[one.name] for one in designs]
-    constraints = "".join(constraints_table(name, bounds) for name, bounds in report.constraints.items())
-    sensors = "".join(folded(f"Sensors of {one.name}", sensors_table(one), len(one.sensors)) for one in designs)
-    return [
-        ("result", "Result", result_section(evaluation, designs)),
-        ("scene", "Designs in a scene", view_section(report.shown, shown, report.density_m)),
-        ("scores", "Scores", _scores(evaluation)),
-        ("mounting", "Mounted carelessly", mounting_table(evaluation)),
-        ("density", "The learned density", _density(report.density, looks) if report.density else ""),
-        ("choice", "Chosen rays and how far from the best", choice_section(designs, evaluation, looks)),
-        ("constraints", "Constraints and how tight each is", constraints),
-        ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
-        ("audit", "Audit of the physics", audit_section(evaluation, evaluation.audit) if evaluation.audit else ""),
-        ("accuracy", "What accuracy costs", _accuracy(evaluation.accuracy.sweeps if evaluation.accuracy else ())),
-        ("sensors", "Sensors", sensors),
-        ("time", "Where the time went", times_tables(report.times)),
-        ("reproduce", "How to reproduce this", reproduction(report.reproduce)),
-    ]
-
-
-def _scores(evaluation: Evaluation) -> str:
-    """Both curves with one legend, whose boxes switch curves in both, and all tables of scores, folded."""
-    far = far_rivals(evaluation)
-    legend = "".join(
-        switch(
-            curve.name,
-            picture=swatch(curve.colour, curve.dash, curve.marker),
-            checked=curve.name not in far,
-            curve=str(index),
-        )
-        for index, curve in enumerate(series(evaluation))
-    )
-    hidden = [curve.name for curve in series(evaluation) if curve.name in far]
-    note = f"Hidden at first, far worse than all designs at every number of rays: {', '.join(hidden)}."
-    said = paragraphs([note] if hidden else [])
-    means = f"means over {held_out_scenes(evaluation.scenes)}, with 95 % intervals as bands."
-    captions = {
-        "rays": f"Score against rays per frame: {means}",
-        "bandwidth": "The same scores against the bandwidth that it takes to read the gates out.",
-    }
-    figures = "".join(
-        figure(curve_figure(evaluation, against, far), f"curve-{against}", CURVE_PX, caption, "curves")
-        for against, caption in captions.items()
-    )
-    matched = len(evaluation.equal_bandwidth)
-    return (
-        f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>{said}{figures}'
-        + folded("All scores", rows_table(evaluation), len(evaluation.rows))
-        + paired_tables(evaluation)
-        + folded("Designs against rivals at equal bandwidth", bandwidth_table(evaluation), matched)
-    )
-
-
-def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
-    """Marginals, and the field in space, side by side where there is room."""
-    names = list(view.marginals[0].designs) if view.marginals else []
-    drawn = [name for name in names if name in looks][:MOST_DESIGNS]
-    legend = "".join(
-        f'<span class="switch">{swatch(looks[name].colour, looks[name].dash)}<span>{html.escape(name)}</span></span>'
-        for name in drawn
-    )
-    legend = f'<span class="switch">{swatch("#b8c1cb", None)}<span>learned density</span></span>{legend}'
-    about = (
-        f"Drawn from {view.samples:,} weighted samples, equivalent to {view.effective:,.0f} equal ones. "
-        "Below, how much of the density observes each place, seen along an axis, over the outlines of targets (solid) "
-        f"and occluders (dotted) of {view.scene}."
-    )
-    marginals = "".join(
-        figure(marginal_figure(one, looks), f"marginal-{index}", SMALL_PX, f"Share of the density along {one.label}")
-        for index, one in enumerate(view.marginals)
-    )
-    planes = "".join(
-        figure(plane_figure(one), f"plane-{index}", PLANE_PX, f"What is observed, {' and '.join(one.labels)}", "plane")
-        for index, one in enumerate(view.planes)
-    )
-    more = len(names) - len(drawn)
-    further = f"<p>{more} further designs are not drawn here.</p>" if more else ""
-    return (
-        f'<p>{html.escape(about)}</p><div class="curves-shown">{legend}</div>{further}'
-        f'<div class="tiles">{marginals}</div><div class="tiles wide">{planes}</div>'
-    )
-
-
-def _accuracy(sweeps: Sequence[Sweep]) -> str:
-    if not sweeps:
-        return ""
-    read = (
-        "Error against seconds on this machine, one picture per numerical choice. Orange is the cheapest setting "
-        "inside the tolerance (dashed), a ring the one of this run; pale settings are beaten in both; triangles on the "
-        "lower edge have no error to show, references among them."
-    )
-    pictures = "".join(
-        figure(one, f"accuracy-{index}", PANEL_PX, "Error against seconds")
-        for index, one in enumerate(pareto_figures(sweeps))
-    )
-    return f'<p>{read}</p><div class="tiles wide">{pictures}</div>{accuracy_tables(sweeps)}'
 
 
 @phase("report")
@@ -275,6 +149,50 @@ def _origin(provenance: Mapping[str, object]) -> str:
 
 def _line(words: Sequence[object]) -> str:
     return shlex.join(str(word) for word in words)
+
+
+def write_report(report: Report, path: Path) -> None:
+    """Write the page, whole or not at all."""
+    write_atomic(Path(path), report_html(report))
+
+
+def report_html(report: Report) -> str:
+    """The page as text."""
+    metric = report.evaluation.metric
+    parts = [part for part in _parts(report) if part[2]]
+    body = "\n".join(section(heading, content, identifier) for identifier, heading, content in parts)
+    lead = f"{metric.name} in {metric.unit}, {metric.better} is better."
+    from plotly.offline import get_plotlyjs
+
+    links = [part[:2] for part in parts]
+    return page(report.title, lead, embedded(FONT, id="page-font") + body, get_plotlyjs(), links)
+
+
+def _parts(report: Report) -> list[tuple[str, str, str]]:
+    """Identifier, heading and content of every section; empty content where there is nothing to tell."""
+    evaluation = report.evaluation
+    designs = [one.design for one in report.shown.designs]
+    # lines without marks are told apart by their dashes
+    looks = {curve.name: curve for curve in series(evaluation)}
+    looks = {name: replace(look, dash=DASHES[index % len(DASHES)]) for index, (name, look) in enumerate(looks.items())}
+    shown = [looks[one.name] for one in designs]
+    constraints = "".join(constraints_table(name, bounds) for name, bounds in report.constraints.items())
+    sensors = "".join(folded(f"Sensors of {one.name}", sensors_table(one), len(one.sensors)) for one in designs)
+    return [
+        ("result", "Result", result_section(evaluation, designs)),
+        ("scene", "Designs in a scene", view_section(report.shown, shown, report.density_m)),
+        ("scores", "Scores", _scores(evaluation)),
+        ("mounting", "Mounted carelessly", mounting_table(evaluation)),
+        ("density", "The learned density", _density(report.density, looks) if report.density else ""),
+        ("choice", "Chosen rays and how far from the best", choice_section(designs, evaluation, looks)),
+        ("constraints", "Constraints and how tight each is", constraints),
+        ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
+        ("audit", "Audit of the physics", audit_section(evaluation, evaluation.audit) if evaluation.audit else ""),
+        ("accuracy", "What accuracy costs", _accuracy(evaluation.accuracy.sweeps if evaluation.accuracy else ())),
+        ("sensors", "Sensors", sensors),
+        ("time", "Where the time went", times_tables(report.times)),
+        ("reproduce", "How to reproduce this", reproduction(report.reproduce)),
+    ]
 
 
 def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str:
@@ -356,3 +274,81 @@ def _figures(value: float, item: Row | Paired, sign: str = "") -> tuple[str, str
     """A figure and its interval, which stays in one line, also where cells wrap."""
     figure, low, high = figure_and_interval(value, item.ci_low, item.ci_high, sign=sign)
     return figure, low if item.ci_low is None else f"{low}\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}{high}"
+
+
+def _scores(evaluation: Evaluation) -> str:
+    """Both curves with one legend, whose boxes switch curves in both, and all tables of scores, folded."""
+    far = far_rivals(evaluation)
+    legend = "".join(
+        switch(
+            curve.name,
+            picture=swatch(curve.colour, curve.dash, curve.marker),
+            checked=curve.name not in far,
+            curve=str(index),
+        )
+        for index, curve in enumerate(series(evaluation))
+    )
+    hidden = [curve.name for curve in series(evaluation) if curve.name in far]
+    note = f"Hidden at first, far worse than all designs at every number of rays: {', '.join(hidden)}."
+    said = paragraphs([note] if hidden else [])
+    means = f"means over {held_out_scenes(evaluation.scenes)}, with 95 % intervals as bands."
+    captions = {
+        "rays": f"Score against rays per frame: {means}",
+        "bandwidth": "The same scores against the bandwidth that it takes to read the gates out.",
+    }
+    figures = "".join(
+        figure(curve_figure(evaluation, against, far), f"curve-{against}", CURVE_PX, caption, "curves")
+        for against, caption in captions.items()
+    )
+    matched = len(evaluation.equal_bandwidth)
+    return (
+        f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>{said}{figures}'
+        + folded("All scores", rows_table(evaluation), len(evaluation.rows))
+        + paired_tables(evaluation)
+        + folded("Designs against rivals at equal bandwidth", bandwidth_table(evaluation), matched)
+    )
+
+
+def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
+    """Marginals, and the field in space, side by side where there is room."""
+    names = list(view.marginals[0].designs) if view.marginals else []
+    drawn = [name for name in names if name in looks][:MOST_DESIGNS]
+    legend = "".join(
+        f'<span class="switch">{swatch(looks[name].colour, looks[name].dash)}<span>{html.escape(name)}</span></span>'
+        for name in drawn
+    )
+    legend = f'<span class="switch">{swatch("#b8c1cb", None)}<span>learned density</span></span>{legend}'
+    about = (
+        f"Drawn from {view.samples:,} weighted samples, equivalent to {view.effective:,.0f} equal ones. "
+        "Below, how much of the density observes each place, seen along an axis, over the outlines of targets (solid) "
+        f"and occluders (dotted) of {view.scene}."
+    )
+    marginals = "".join(
+        figure(marginal_figure(one, looks), f"marginal-{index}", SMALL_PX, f"Share of the density along {one.label}")
+        for index, one in enumerate(view.marginals)
+    )
+    planes = "".join(
+        figure(plane_figure(one), f"plane-{index}", PLANE_PX, f"What is observed, {' and '.join(one.labels)}", "plane")
+        for index, one in enumerate(view.planes)
+    )
+    more = len(names) - len(drawn)
+    further = f"<p>{more} further designs are not drawn here.</p>" if more else ""
+    return (
+        f'<p>{html.escape(about)}</p><div class="curves-shown">{legend}</div>{further}'
+        f'<div class="tiles">{marginals}</div><div class="tiles wide">{planes}</div>'
+    )
+
+
+def _accuracy(sweeps: Sequence[Sweep]) -> str:
+    if not sweeps:
+        return ""
+    read = (
+        "Error against seconds on this machine, one picture per numerical choice. Orange is the cheapest setting "
+        "inside the tolerance (dashed), a ring the one of this run; pale settings are beaten in both; triangles on the "
+        "lower edge have no error to show, references among them."
+    )
+    pictures = "".join(
+        figure(one, f"accuracy-{index}", PANEL_PX, "Error against seconds")
+        for index, one in enumerate(pareto_figures(sweeps))
+    )
+    return f'<p>{read}</p><div class="tiles wide">{pictures}</div>{accuracy_tables(sweeps)}'
