@@ -26,9 +26,8 @@ from lidardesign.sensors.design import DesignSpec
 
 MOST_SENSORS = 60  # listed in a table
 TINY = 1e-4  # from here on the limit is shown
-# Phases of a smaller share of their command are left out; `other` has what they took.
-LEAST_SHARE = 0.005
-DEEPEST = 2
+# Phases of a smaller share of their command, or deeper, are left out; `other` has what they took.
+LEAST_SHARE, DEEPEST = 0.005, 2
 MEBIBYTE = 1024**2
 PERCENT = 100.0
 SHORT_S = 0.01  # costs from here on are shown as their limit

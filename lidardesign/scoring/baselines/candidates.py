@@ -23,9 +23,8 @@ from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 # A gate without width hears nothing, since gates are open at their end. Ranges that never vary get the width
 # of the default 100 ps bin around them.
 SMALLEST_GATE_M = 0.015
-FIRST_GUESS = 64
 # Bandwidth grows almost in proportion to the number of rays: a few steps find the largest number that fits.
-MOST_STEPS = 8
+FIRST_GUESS, MOST_STEPS = 64, 8
 
 
 def rays_at(points: np.ndarray, gate_m: np.ndarray) -> Rays:

@@ -1,12 +1,9 @@
 """A captured scan seen through a list of rays: of each ray the nearest pixel, and its histogram inside the ray's gate.
 
-What a design would have measured is cut out of what was captured: a ray takes the pixel that looks its way, and hears
-only the bins whose middles lie in its gate.
-
-Ranges from captured histograms, cut to the bins that each ray hears.
-
-They are found as `lidardesign.simulate.detector.kernels` finds them in simulated histograms. Where a gate
-holds too few photons to tell the background, its threshold takes the level that is usual in the whole capture.
+A design would have measured what is cut out of what was captured: a ray takes the pixel that looks its way, and hears
+only the bins whose middles lie in its gate. Ranges are found as `lidardesign.simulate.detector.kernels` finds them in
+simulated histograms. Where a gate holds too few photons to tell the background, its threshold takes the level that is
+usual in the whole capture.
 """
 
 from __future__ import annotations
@@ -30,69 +27,6 @@ from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Estimator
 CHUNK_BINS = 1 << 22
 # A ray that starts further from the scanner than this was not captured: it sees other surfaces.
 SAME_PLACE_M = 0.005
-
-
-@dataclass(frozen=True)
-class Estimation:
-    """How a range follows from a histogram.
-
-    Arguments:
-        estimator: Its highest bin, or the log-matched filter with the pulse.
-        false_alarm: Probability that background alone is taken for a return, over all bins that a ray hears.
-    """
-
-    estimator: Estimator = "peak"
-    false_alarm: float = 0.01
-
-
-def measured(
-    capture: Capture, pixel: np.ndarray, first: np.ndarray, last: np.ndarray, estimation: Estimation
-) -> tuple[np.ndarray, np.ndarray]:
-    """Ranges [m], NaN without a return, and counts of pixels (K,) between bins (K,) and (K,), each of shape (K,).
-
-    Raises:
-        DataError: The matched filter is asked for, and the capture does not say how wide its pulse is.
-    """
-    from lidardesign.simulate.detector.kernels import find_returns
-
-    matched = estimation.estimator == "matched"
-    if matched and capture.pulse_fwhm_ps is None:
-        raise DataError(
-            "the matched filter needs the width of the pulse, and the capture has no pulse_fwhm_ps",
-            where="--estimator matched",
-            hint="add pulse_fwhm_ps to the capture, or take --estimator peak",
-        )
-    pulse_ps = capture.pulse_fwhm_ps or 0.0
-    place, photons = np.full(len(pixel), np.nan), np.zeros(len(pixel))
-    for begin, end in _chunks(last - first):
-        lengths = np.maximum(last - first, 0)[begin:end]
-        # the counts that rays hear one after the other, and where each begins in them
-        offset = np.concatenate([[0], np.cumsum(lengths)])
-        at = np.arange(offset[-1]) - np.repeat(offset[:-1] - first[begin:end], lengths)
-        counts = capture.counts[np.repeat(pixel[begin:end], lengths), at].astype(np.int64)
-        photons[begin:end] = np.diff(np.concatenate([[0], np.cumsum(counts)])[offset])
-        place[begin:end] = find_returns(
-            counts,
-            offset,
-            np.ones((end - begin, 2)),
-            capture.bin_ps,
-            pulse_ps / FWHM_PER_SIGMA,
-            int(pulse_ps / (2 * capture.bin_ps)),
-            np.full(end - begin, capture.background_per_bin),
-            estimation.false_alarm,
-            matched,
-        )
-    return capture.start_m[pixel] + (first + place) * capture.bin_m, photons
-
-
-def _chunks(lengths: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Rays whose bins are worked on together, as begin and end."""
-    ends = np.append(0, np.cumsum(lengths))
-    begin = 0
-    while begin < len(lengths):
-        end = max(int(np.searchsorted(ends[1:], ends[begin] + CHUNK_BINS, side="right")), begin + 1)
-        yield begin, end
-        begin = end
 
 
 class Captured(IntEnum):
@@ -218,6 +152,69 @@ def default_within_rad(capture: Capture) -> float:
             allowed="an angle in degrees",
         )
     return capture.spacing_rad
+
+
+@dataclass(frozen=True)
+class Estimation:
+    """How a range follows from a histogram.
+
+    Arguments:
+        estimator: Its highest bin, or the log-matched filter with the pulse.
+        false_alarm: Probability that background alone is taken for a return, over all bins that a ray hears.
+    """
+
+    estimator: Estimator = "peak"
+    false_alarm: float = 0.01
+
+
+def measured(
+    capture: Capture, pixel: np.ndarray, first: np.ndarray, last: np.ndarray, estimation: Estimation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges [m], NaN without a return, and counts of pixels (K,) between bins (K,) and (K,), each of shape (K,).
+
+    Raises:
+        DataError: The matched filter is asked for, and the capture does not say how wide its pulse is.
+    """
+    from lidardesign.simulate.detector.kernels import find_returns
+
+    matched = estimation.estimator == "matched"
+    if matched and capture.pulse_fwhm_ps is None:
+        raise DataError(
+            "the matched filter needs the width of the pulse, and the capture has no pulse_fwhm_ps",
+            where="--estimator matched",
+            hint="add pulse_fwhm_ps to the capture, or take --estimator peak",
+        )
+    pulse_ps = capture.pulse_fwhm_ps or 0.0
+    place, photons = np.full(len(pixel), np.nan), np.zeros(len(pixel))
+    for begin, end in _chunks(last - first):
+        lengths = np.maximum(last - first, 0)[begin:end]
+        # the counts that rays hear one after the other, and where each begins in them
+        offset = np.concatenate([[0], np.cumsum(lengths)])
+        at = np.arange(offset[-1]) - np.repeat(offset[:-1] - first[begin:end], lengths)
+        counts = capture.counts[np.repeat(pixel[begin:end], lengths), at].astype(np.int64)
+        photons[begin:end] = np.diff(np.concatenate([[0], np.cumsum(counts)])[offset])
+        place[begin:end] = find_returns(
+            counts,
+            offset,
+            np.ones((end - begin, 2)),
+            capture.bin_ps,
+            pulse_ps / FWHM_PER_SIGMA,
+            int(pulse_ps / (2 * capture.bin_ps)),
+            np.full(end - begin, capture.background_per_bin),
+            estimation.false_alarm,
+            matched,
+        )
+    return capture.start_m[pixel] + (first + place) * capture.bin_m, photons
+
+
+def _chunks(lengths: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Rays whose bins are worked on together, as begin and end."""
+    ends = np.append(0, np.cumsum(lengths))
+    begin = 0
+    while begin < len(lengths):
+        end = max(int(np.searchsorted(ends[1:], ends[begin] + CHUNK_BINS, side="right")), begin + 1)
+        yield begin, end
+        begin = end
 
 
 def _measured(

@@ -1,9 +1,7 @@
-"""What designs make of a captured scan: ranges, outliers and a surface, gated, not gated, and beside `uniform`.
+"""Designs in a captured scan: ranges, outliers and a surface, gated, not gated, and beside `uniform`, also ray by ray.
 
 Ranges are judged by the capture's true ranges where it has them; else by the median range of each pixel and its
 nearest neighbours over their whole histograms, which a single outlier does not move.
-
-What every ray measured in a capture, as CSV: one row per ray, gate and design.
 """
 
 from __future__ import annotations
@@ -47,10 +45,10 @@ from lidardesign.space import DesignSpace, angles
 from lidardesign.task import random_generator
 
 SURFACE_POINTS = 4000
-# Flatter triangles bridge depth steps.
-STEEPEST_DEG = 85.0
+STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps
 MILLIMETRES = 1000.0
 OWN, WHOLE = "own", "whole"
+# Of the CSV: one row per ray, gate and design.
 COLUMNS = (
     "design", "gate", "ray", "sensor", "captured", "pixel", "away_deg", "gate_start_m", "gate_end_m", "photons",
     "range_m", "reference_m", "outlier",

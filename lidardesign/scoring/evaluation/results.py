@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from lidardesign.scoring.baselines.cma import SearchRecord
     from lidardesign.scoring.evaluation.entries import StrongestRival
 
-
 ROW_KEYS = (
     "design", "rays", "value", "ci_low", "ci_high", "half_width", "failures", "bandwidth_mbps", "seconds",
 )  # fmt: skip
