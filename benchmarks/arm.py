@@ -1,4 +1,4 @@
-"""Tracking with the arm task: designs of 2, 4 and 8 sensors against every baseline, with the claims as verdicts.
+"""Tracking with the arm task: 2, 4 and 8 sensors, each at one place or a region, against every baseline, with verdicts.
 
 `learn`, `fit` and `evaluate` as whole processes. The claims: a lower Frechet distance than `uniform` and `random` with
 at most half their bandwidth at every number of rays; at the smallest one lower than `bounding` at no more bandwidth.
@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from common import learned, parser, report, robot_option, robot_settings, run_options, scored, verdict
+from common import REGIONS, learned, parser, report, robot_option, robot_settings, run_options, scored, verdict
 
 FURTHER = ("occupancy", "no-visibility")  # that evaluate only scores when asked
 BASELINES = ("uniform", "random", "bounding", "silhouette", "greedy", *FURTHER)
@@ -95,7 +95,11 @@ def main() -> None:
     options = made.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         run = learned("arm", Path(folder), options, robot_settings(options.robot))
-        designs = {f"benchmark-{sensors}": {"sensors": sensors} for sensors in options.sensors}
+        designs = {
+            f"{name}-{sensors}": {"sensors": sensors, "constraints": constraints}
+            for sensors in options.sensors
+            for name, constraints in {"places": None, "regions": REGIONS}.items()
+        }
         found, times, fits = scored(run, designs, options.rays, options.rounds, FURTHER)
     metric = f"{found['metric']['name']} {found['metric']['unit']}"
     columns = ["rays", "design", metric, "95 % interval", "tracked", "failures", "Mbit/s", "of uniform's"]

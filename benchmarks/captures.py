@@ -30,7 +30,6 @@ Figures = dict[tuple[str, str, str], list[tuple[float, float]]]
 def add_head(figures: Figures, scene: Any, run: Any, designs: Sequence[Path], options: Any, folder: Path) -> None:
     """Capture a head without a gate, and along every design with one; score all of them."""
     import capture as laboratory
-    from lidardesign.layouts.rays import lay_out
 
     from lidardesign.formats.designs import load_design
     from lidardesign.formats.galvo import read_galvo, write_galvo
@@ -40,7 +39,7 @@ def add_head(figures: Figures, scene: Any, run: Any, designs: Sequence[Path], op
     grid = laboratory.scanned_rays(run.config.space, options.side)
     laboratory.write_capture(scene, grid, detector, folder / "scan.npz", image=options.side)
     loaded = {path.stem: load_design(path) for path in designs}
-    rays = {name: lay_out(design) for name, design in loaded.items()}
+    rays = {name: design.rays() for name, design in loaded.items()}
     for estimator in ESTIMATORS:
         add_rows(figures, folder / "scan.npz", list(rays.items()), estimator, folder)
     for name, design in loaded.items():
@@ -99,15 +98,13 @@ def tour_rows(designs: Sequence[Path], rounds: int) -> list[list[object]]:
     """Travel of the mirrors and the median time of finding their order."""
     import statistics
 
-    from lidardesign.layouts.rays import lay_out
-
     from lidardesign.formats.designs import load_design
     from lidardesign.formats.galvo import plan, travel
 
     rows = []
     for path in designs:
         design = load_design(path)
-        rays, spent = lay_out(design), []
+        rays, spent = design.rays(), []
         for _ in range(rounds):
             started = time.thread_time()
             (position,) = plan(design, rays)
@@ -141,7 +138,7 @@ def measure(run_folder: Path, options: Any, folder: Path) -> None:
 
     run = open_run(run_folder)
     designs = [
-        fitted(run_folder, f"sensors-{count}", sensors=count, rays=laboratory.RAYS, layout="grid").path
+        fitted(run_folder, f"sensors-{count}", sensors=count, rays=laboratory.RAYS, layout="even").path
         for count in laboratory.SENSORS
     ]
     figures: Figures = {}

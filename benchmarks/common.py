@@ -32,6 +32,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FACE_MODEL = ROOT.parent / "shared" / "data" / "ict_face.h5"
 ARM_MODEL = ROOT.parent / "shared" / "data" / "iiwa14" / "iiwa14.xml"
 MEBIBYTE = 2**20
+# Rays start all over regions of any size, as on the paper's ceiling; without it every sensor stands at one place.
+REGIONS = {"origin": {"spread_m": {"max": 10.0}}}
 
 
 @dataclass(frozen=True)

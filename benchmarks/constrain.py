@@ -16,7 +16,7 @@ from pathlib import Path
 from common import ProcessResult, face_settings, lidardesign, median_ratio, model_option, parser, report, run_process
 
 # What a change of a constraint takes is the fit; choosing rays on scenes takes longer, whatever the constraints.
-GRID = ("--layout", "grid")
+EVEN = ("--layout", "even")
 SETS: dict[str, tuple[str, ...]] = {
     "none": (),
     "field of view 20 deg": ("field_of_view.horizontal_deg.max=20", "field_of_view.vertical_deg.max=20"),
@@ -29,7 +29,7 @@ SETS: dict[str, tuple[str, ...]] = {
     "10 sensors": ("sensors.count=10",),
     "gate from 0.30 to 0.55 m": ("gate.start_m.min=0.30", "gate.end_m.max=0.55"),
     "bandwidth 1 Mbit/s": ("budget.bandwidth_mbps=1.0", "gate.width_m.max=0.15"),
-    "origin spread 1 cm": ("origin.spread_m.max=0.01",),
+    "regions of 1 cm": ("origin.spread_m.max=0.01",),
     "origin pinned": ("origin.fixed_m=[0.40, 0.0, 0.0]",),
     "origin pinned, gate and view": (
         "origin.fixed_m=[0.42, 0.02, -0.03]",
@@ -42,7 +42,7 @@ SETS: dict[str, tuple[str, ...]] = {
 
 def constrain(run: Path, name: str) -> ProcessResult:
     """One whole process."""
-    words = ["constrain", run, *GRID, "--set", "sensors.count=4", "--json", "--name", "benchmark"]
+    words = ["constrain", run, *EVEN, "--set", "sensors.count=4", "--json", "--name", "benchmark"]
     for setting in SETS[name]:
         words += ["--set", setting]
     return run_process(lidardesign(*words))
@@ -59,7 +59,7 @@ def again(run: Path, folder: Path) -> dict[str, ProcessResult]:
     words = ["learn", recorded["task_name"], "--config", settings, "--seed", str(recorded["seed"])]
     words += ["--preset", recorded["preset"], "--out", folder / "again", "--json"]
     found = {"learn again": run_process(lidardesign(*words))}
-    words = ["fit", folder / "again", *GRID, "--sensors", "4", "--name", "benchmark", "--json"]
+    words = ["fit", folder / "again", *EVEN, "--sensors", "4", "--name", "benchmark", "--json"]
     found["fit"] = run_process(lidardesign(*words))
     return found
 

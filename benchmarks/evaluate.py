@@ -137,7 +137,7 @@ def main() -> None:
     made.add_argument("--preset", default="standard", help="what is learned (default %(default)s)")
     made.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="passed to learn; repeatable")
     made.add_argument("--sensors", type=int, nargs="+", default=[2, 4, 10])
-    made.add_argument("--layout", default="grid", choices=["grid", "density", "distributed"])
+    made.add_argument("--layout", default="even", choices=["even", "chosen"])
     made.add_argument("--rays", type=int, nargs="+", default=[36, 100, 196, 361, 576])
     made.add_argument("--workers", nargs="+", default=["1", "2"], help="numbers or dask schedulers, tried in turns")
     options = made.parse_args()

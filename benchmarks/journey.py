@@ -67,14 +67,12 @@ class Journey:
     Arguments:
         task, preset: Of `learn`.
         settings: Makes the keys of the task, and the files that they name in a folder.
-        layout: Words of `constrain` for a design without chosen rays.
         place: Words of `export` where rays differ from place to place.
     """
 
     task: str
     preset: str = "draft"
     settings: Callable[[Path], list[str]] = lambda _: []
-    layout: tuple[str, ...] = ("--layout", "grid", "--sensors", "2")
     place: tuple[str, ...] = ()
 
 
@@ -83,7 +81,7 @@ JOURNEYS = {
     "own meshes": Journey("meshes", settings=bottles),
     "arm": Journey("arm"),
     "robot": Journey("mujoco", settings=robot),
-    "aisle": Journey("warehouse", layout=("--layout", "scan"), place=("--at", "x_m=1")),
+    "aisle": Journey("warehouse", place=("--at", "x_m=1")),
 }
 if FACE_MODEL.exists():
     JOURNEYS["head model"] = Journey("face", "standard", lambda _: [f"model={FACE_MODEL}"])
@@ -98,7 +96,7 @@ def commands(journey: Journey, folder: Path, here: Path, seed: int, settings: li
         "learn": ["learn", journey.task, "--preset", journey.preset, "--seed", str(seed), "--out", run, *keys],
         "fit": ["fit", run],
         "constrain": [*narrow, "--sensors", "2", "--name", "narrow"],
-        "constrain, no rays chosen": [*narrow, *journey.layout, "--name", "even"],
+        "constrain, even rays": [*narrow, "--layout", "even", "--sensors", "2", "--name", "even"],
         "evaluate": ["evaluate", run, "--report", here / "report.html"],
         "export": ["export", run / "designs" / "narrow.yaml", *journey.place, "--format", "csv", "--out", rays],
     }

@@ -28,24 +28,24 @@ STAGES = ("poses", "shared rays", "returns", "choice")
 
 def chosen(options: Any, kinds: int) -> dict[str, Any]:
     """One choice, with the processor time of its stages [s]."""
-    from lidardesign.fitting.select_rays import selection_scenes
-
     from lidardesign.constraints.document import Constraints
     from lidardesign.fitting.part_design import proposed
     from lidardesign.fitting.part_sets import SetLimits, choose_set
     from lidardesign.fitting.part_shapes import PartBundle, part_table, parts_inform
     from lidardesign.parts.catalogue import named_parts
     from lidardesign.rays.information import checked_information
+    from lidardesign.rays.training import CHOICE, TrainingScenes
     from lidardesign.run_folder import RunFolder
     from lidardesign.samples import load_samples
 
     run, samples = RunFolder.open(options.run), load_samples(options.run)
+    training = TrainingScenes(run, 0)
     marks = [time.process_time()]
     placed = proposed(named_parts("catalog")[:kinds], Constraints(), samples, 0)
     marks.append(time.process_time())
-    bundle = PartBundle(placed, 60_000 // options.count, next(selection_scenes(run, 0, "choice")).frames)
+    bundle = PartBundle(placed, 60_000 // options.count, next(training.scenes(CHOICE)).frames)
     marks.append(time.process_time())
-    scenes = itertools.islice(selection_scenes(run, 0, "choice"), SCENES)
+    scenes = itertools.islice(training.scenes(CHOICE), SCENES)
     informed = parts_inform(bundle, scenes, partial(checked_information, run.task), options.count, 0)
     coverage = part_table(informed, len(placed))
     marks.append(time.process_time())

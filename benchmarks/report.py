@@ -42,7 +42,7 @@ def made_pages(options: Any, folder: Path) -> list[Path]:
 
     options.preset = options.preset or "draft"
     run = learned("face", folder, options, {})
-    designs = [fitted(run, f"benchmark-{index}", sensors=2 + index % 9, layout="grid").path for index in range(DESIGNS)]
+    designs = [fitted(run, f"benchmark-{index}", sensors=2 + index % 9, layout="even").path for index in range(DESIGNS)]
     pages = []
     for count in (1, DESIGNS):
         page = folder / f"designs-{count}.html"

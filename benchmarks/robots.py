@@ -1,8 +1,9 @@
 """Robots that nobody here made: from a model to a report and a model with sensors in it, without a line of code.
 
 Each model goes from `learn` (draft) to `export --robot`, with sensors in the world and on the robot; in random
-configurations the rangefinders of what was exported are read beside our first hits. What is in the folder is not made
-again.
+configurations the rangefinders of what was exported are read beside our first hits. In the world, where places are free
+in a box, sensors at one place each stand beside such whose rays start all over regions. What is in the folder is not
+made again.
 
     python benchmarks/robots.py --folder robots [--models FOLDER] [--set KEY=VALUE]
 """
@@ -22,6 +23,10 @@ from common import lidardesign, parser, report, run_process, verdict
 
 TOLERATED_M = 1e-4
 CONFIGURATIONS = 10
+RAYS = "64"
+WORLD = ("origin_box_m=0.3",)
+# Regions of any size
+REGIONS = "origin.spread_m.max=10"
 
 
 @dataclass(frozen=True)
@@ -45,19 +50,19 @@ HAND = "gymnasium_robotics/envs/assets"
 CASES = {
     "quadruped, height field": Case(
         "dm_control/suite/quadruped.xml", "toe*",
-        {"world": (), "torso": ("mount_body=torso", "origin_m=[0,0,-0.25]", "metric=seen")},
+        {"world": WORLD, "torso": ("mount_body=torso", "origin_m=[0,0,-0.25]", "metric=seen")},
     ),
     "humanoid": Case(
         "dm_control/suite/humanoid.xml", "*hand",
-        {"world": (), "torso": ("mount_body=torso", "origin_m=[0.15,0,0.05]", "metric=seen")},
+        {"world": WORLD, "torso": ("mount_body=torso", "origin_m=[0.15,0,0.05]", "metric=seen")},
     ),
-    "dog": Case("dm_control/suite/dog.xml", "toe_*", {"world": (), "skull": ("mount_body=skull", "metric=seen")}),
+    "dog": Case("dm_control/suite/dog.xml", "toe_*", {"world": WORLD, "skull": ("mount_body=skull", "metric=seen")}),
     "hand": Case(
-        f"{HAND}/hand/reach.xml", "*distal", {"world": (), "palm": ("mount_body=robot0:palm", "metric=seen")}, HAND
+        f"{HAND}/hand/reach.xml", "*distal", {"world": WORLD, "palm": ("mount_body=robot0:palm", "metric=seen")}, HAND
     ),
     "gripper arm": Case(
         f"{HAND}/fetch/pick_and_place.xml", "*finger_link",
-        {"world": (), "gripper": ("mount_body=robot0:gripper_link", "metric=seen")}, HAND,
+        {"world": WORLD, "gripper": ("mount_body=robot0:gripper_link", "metric=seen")}, HAND,
     ),
 }  # fmt: skip
 
@@ -85,28 +90,31 @@ def chain(case: Case, mount: str, folder: Path, options: Any) -> dict[str, Any]:
     exported = folder / "scene.xml"
     commands = {
         "learn": ("learn", "mujoco", "--preset", "draft", "--out", run, *words),
-        "fit": ("fit", run, "--layout", "grid", "--sensors", "2", "--name", "two"),
-        "evaluate": ("evaluate", run, "--rays", "64", "--report", folder / "report.html"),
+        "fit": ("fit", run, "--sensors", "2", "--rays", RAYS, "--name", "two"),
+        "regions": ("constrain", run, "--set", REGIONS, "--sensors", "2", "--rays", RAYS, "--name", "regions"),
+        "evaluate": ("evaluate", run, "--rays", RAYS, "--report", folder / "report.html"),
         "export": (
             "export",
             run / "designs" / "two.yaml",
             "--format",
             "mjcf",
-            "--rays",
-            "64",
             "--robot",
             model,
             "--out",
             exported,
         ),
     }
-    seconds = {}
+    seconds, scores = {}, {}
+    if mount != "world":
+        del commands["regions"]
     for name, command in commands.items():
         result = run_process(lidardesign(*command, "--json"))
         if result.code:
             sys.exit(f"{folder.name}: {name} ended with exit code {result.code}:\n{result.errors or result.output}")
         seconds[name] = result.wall
-    found = {"seconds": seconds, "off_m": misread_m(run, model, exported, case, options).tolist()}
+        if name == "evaluate":
+            scores = {row["design"]: row["value"] for row in result.document()["rows"]}
+    found = {"seconds": seconds, "scores": scores, "off_m": misread_m(run, model, exported, case, options).tolist()}
     kept.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return found
 
@@ -121,7 +129,7 @@ def misread_m(run: Path, model_file: Path, exported: Path, case: Case, options: 
     from lidardesign.scenes.scene import Scene, rigid
 
     design = load_design(run / "designs" / "two.yaml")
-    rays, mount = design.rays(64), design.specification.mount
+    rays, mount = design.rays(int(RAYS)), design.specification.mount
     alone, _ = load_model(model_file, folder=None if case.folder is None else found_file(case.folder, options.models))
     with_sensors = mujoco.MjModel.from_xml_path(str(exported))
     data, generator, off = mujoco.MjData(with_sensors), np.random.default_rng(0), []
@@ -153,7 +161,10 @@ def chains(options: Any) -> tuple[list[list[object]], list[str]]:
             found = chain(case, mount, folder, options)
             off_m = np.array(found["off_m"])
             seconds = [found["seconds"][step] for step in ("learn", "fit", "evaluate", "export")]
-            rows.append([name, mount, *seconds, off_m.size, int((off_m > TOLERATED_M).sum()), 1e3 * np.median(off_m)])
+            scores = [found["scores"].get(design, float("nan")) for design in ("two", "regions")]
+            rows.append(
+                [name, mount, *seconds, *scores, off_m.size, int((off_m > TOLERATED_M).sum()), 1e3 * np.median(off_m)]
+            )
     same = {f"{row[0]}, {row[1]}": not row[-2] for row in rows}
     return rows, [verdict("every rangefinder reads our first hit within 0.1 mm", same)]
 
@@ -167,7 +178,16 @@ def main() -> None:
     options = made.parse_args()
     rows, lines = chains(options)
     steps = ["learn s", "fit s", "evaluate s", "export s"]
-    columns = ["model", "sensors", *steps, "readings", "off by more than 0.1 mm", "median off mm"]
+    columns = [
+        "model",
+        "sensors",
+        *steps,
+        "score, places",
+        "score, regions",
+        "readings",
+        "off by more than 0.1 mm",
+        "median off mm",
+    ]
     report("Robots of others", {"From a model to a model with sensors": (columns, rows)}, lines, options.json)
 
 

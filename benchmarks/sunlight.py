@@ -33,12 +33,10 @@ class Tally:
 
 def request_of(run: Any, designs: list[Any], options: Any) -> Any:
     """What to evaluate, with the detector and what the scenes call for."""
-    from lidardesign.samples import load_samples
     from lidardesign.scoring.evaluation.request import EvaluationRequest
     from lidardesign.simulate.detector.files import load_detector
     from lidardesign.simulate.plan import Planner
 
-    samples = load_samples(run.folder)
     return EvaluationRequest(
         task=run.task,
         config=run.config.task,
@@ -47,7 +45,6 @@ def request_of(run: Any, designs: list[Any], options: Any) -> Any:
         designs=designs,
         rays=options.rays,
         baselines=("uniform", "bounding"),
-        samples={design.name: samples for design in designs},
         equal_bandwidth=False,
         train=run.scenes("train", run.config.seed),
         test=run.scenes("test", run.config.seed),
@@ -158,7 +155,7 @@ def measure(run_folder: Path, options: Any) -> None:
     from lidardesign.scoring.evaluation.entries import entries_of
 
     run = open_run(run_folder)
-    designs = [fitted(run_folder, f"sunlight-{n}", sensors=n, layout="grid").specification for n in options.sensors]
+    designs = [fitted(run_folder, f"sunlight-{n}", sensors=n, layout="even").specification for n in options.sensors]
     request = request_of(run, designs, options)
     entries = entries_of(request)
     tallies, called = [Tally() for _ in entries], set()

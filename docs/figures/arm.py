@@ -3,7 +3,7 @@
     python docs/figures/arm.py                 # learns a standard run first, about three minutes
     python docs/figures/arm.py --run RUN       # from an arm run that is there
 
-Everything shown is computed: arm and paths are held-out ones, and the sensors come from `lidardesign fit`.
+Everything shown is computed: arm and paths are held-out ones, and the sensors come from `lidardesign constrain`.
 """
 
 from __future__ import annotations
@@ -20,15 +20,14 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from lidardesign import open_run
-from lidardesign.layouts.rays import lay_out
-from lidardesign.samples import load_samples
+from lidardesign.formats.designs import load_design
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Rays, Returns
 from lidardesign.scenes.scene import Body, Plane, Scene
-from lidardesign.sensors.design_file import load_design
 from lidardesign.simulate.returns import simulate
 
 RAYS, SENSORS = 400, 4
+SPREAD_M = 0.5  # of the regions in which rays start
 FRAME = 26
 EYE_M, AIM_M = np.array([1.55, -2.55, 1.42]), np.array([0.36, 0.0, 0.50])
 PIXELS = (960, 700)  # of the picture, across and down
@@ -113,10 +112,10 @@ def main() -> None:
         run = options.run or Path(folder) / "run"
         if options.run is None:
             command("learn", "arm", "--out", run)
-        words = ("--layout", "distributed", "--sensors", str(SENSORS), "--rays", str(RAYS))
-        command("fit", run, *words, "--name", "picture")
+        words = ("--set", f"origin.spread_m.max={SPREAD_M}", "--sensors", str(SENSORS), "--rays", str(RAYS))
+        command("constrain", run, *words, "--name", "picture")
         opened = open_run(run)
-        rays = lay_out(load_design(run / "designs" / "picture.yaml"), RAYS, load_samples(run))
+        rays = load_design(run / "designs" / "picture.yaml").rays(RAYS)
         save(picture(opened.scenes("test", opened.config.seed), rays), options.out)
     print(f"{options.out}: {options.out.stat().st_size / 1000:.0f} kB")
 

@@ -19,12 +19,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lidardesign.errors import ConfigError
-from lidardesign.layouts.rays import own_count
+from lidardesign.formats.designs import load_design
 from lidardesign.parts.catalogue import load_library
 from lidardesign.parts.part import Part
-from lidardesign.sensors.design_file import load_design
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import angles
 
 COLOURS = {
@@ -69,10 +67,8 @@ def draw_rows(axes: list[Axes], parts: list[Part], designs: list[tuple[str, Desi
             fields.barh(at, vertical, thick, color=FITTED)
             start, end = sensor.gate_m
             gates.barh(at, end - start, thick, left=start, color=FITTED)
-        try:
-            rays.plot(own_count(design), row, "o", color=FITTED, markersize=4)
-        except ConfigError:
-            rays.plot([], [])
+        if design.count is not None:
+            rays.plot(design.count, row, "o", color=FITTED, markersize=4)
     for row, part in enumerate(parts, start=len(designs)):
         labels.append(part.name)
         colour = COLOURS[part.kind]

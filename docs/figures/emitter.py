@@ -24,11 +24,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from lidardesign import open_run
-from lidardesign.layouts.rays import lay_out
+from lidardesign.formats.designs import load_design
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Scene
-from lidardesign.sensors.design_file import load_design
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.detector.physics import IDEAL, Physics
 from lidardesign.simulate.returns import simulate
 
@@ -80,7 +79,7 @@ def draw_detector(axes: Axes, camera: Camera, scene: Scene, half_m: np.ndarray) 
 
 def draw_light(axes: Axes, camera: Camera, scene: Scene, design: DesignSpec) -> int:
     """Rays that are heard, and where they end; the number of them."""
-    rays = lay_out(design, RAYS)
+    rays = design.rays(RAYS)
     (returns,) = simulate(scene, rays, physics=Physics(IDEAL, frozenset({"shadowing"})))
     ends, sensor = camera.project(returns.points_m), rays.sensor[returns.returned]
     starts = camera.project(rays.origin_m[returns.returned])

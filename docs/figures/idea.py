@@ -28,15 +28,15 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator, Null
 from scipy.ndimage import gaussian_filter
 
 from lidardesign.config import RunConfig, load_run_config
-from lidardesign.layouts.grid import field_on_sphere
-from lidardesign.layouts.rays import lay_out
+from lidardesign.formats.designs import load_design
 from lidardesign.report.density_views import DensityView, density_view
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Outcome, Rays, Returns
 from lidardesign.scenes.scene import Scene
-from lidardesign.sensors.design_file import load_design
-from lidardesign.sensors.sensor import DesignSpec, Sensor, tangent_directions
+from lidardesign.sensors.design import DesignSpec
+from lidardesign.sensors.pattern import field_on_sphere
+from lidardesign.sensors.sensor import Sensor, tangent_directions
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import AZIMUTH, ELEVATION, angles, direction
 
@@ -48,8 +48,8 @@ OUTLINES = 12  # heads that are learned from, drawn as outlines
 PIXELS = 1000  # of the head's picture, along each side
 BINS = 210  # of the density, along each side
 SERIES = {
-    "10 sensors, density": ("#0072B2", "o", "-"),
-    "10 sensors, grid": ("#56B4E9", "s", "-"),
+    "10 sensors, chosen": ("#0072B2", "o", "-"),
+    "10 sensors, even": ("#56B4E9", "s", "-"),
     "bounding": ("#D55E00", "^", (0, (5, 2))),
     "uniform": ("#555555", "x", (0, (4, 2, 1, 2))),
     "random": ("#999999", "+", (0, (1, 1.5))),
@@ -69,10 +69,10 @@ GATES = LinearSegmentedColormap.from_list("gates", ["#f0a202", "#d5483c", "#8a2f
 
 
 def computed(run: Path, learn: bool) -> tuple[DesignSpec, dict[str, Any]]:
-    """Ten sensors with rays laid out by the density, and their evaluation beside an even layout and the baselines."""
+    """Ten sensors with chosen rays, and their evaluation beside even rays and the baselines."""
     if learn:
         command("learn", "face", "--out", run)
-    names = {"overview-density": "density", "overview-grid": "grid"}
+    names = {"overview-chosen": "chosen", "overview-even": "even"}
     for name, layout in names.items():
         command("fit", run, "--sensors", "10", "--layout", layout, "--name", name)
     paths = [run / "designs" / f"{name}.yaml" for name in names]
@@ -137,7 +137,7 @@ def outline(sensor: Sensor) -> np.ndarray:
 def draw_sensors(axes: Axes, gates: Axes, view: HeadView, design: DesignSpec) -> None:
     """Fields of view over the head, coloured by where their gates are, and the gates beside them."""
     view.draw(axes, 1.0)
-    order = sorted(design.sensors, key=lambda sensor: sensor.range_m)
+    order = sorted(design.sensors, key=lambda sensor: sum(sensor.gate_m))
     colours = dict(zip([s.name for s in order], GATES(np.linspace(0, 1, len(order))), strict=True))
     for sensor in sorted(order, key=lambda s: -np.prod(s.field_of_view_rad)):
         edge = view.degrees(outline(sensor))
@@ -158,7 +158,7 @@ def draw_sensors(axes: Axes, gates: Axes, view: HeadView, design: DesignSpec) ->
 
 def draw_scores(axes: Axes, evaluation: dict[str, Any]) -> None:
     """Score against bandwidth, with intervals, one labelled line per design and baseline."""
-    names = {"overview-density": "10 sensors, density", "overview-grid": "10 sensors, grid"}
+    names = {"overview-chosen": "10 sensors, chosen", "overview-even": "10 sensors, even"}
     for name, (colour, marker, dash) in SERIES.items():
         rows = [row for row in evaluation["rows"] if names.get(row["design"], row["design"]) == name]
         rows.sort(key=lambda row: row["rays"])
@@ -258,7 +258,7 @@ class SideView:
 def draw_rays(axes: Axes, view: HeadView, rays: Rays, design: DesignSpec) -> None:
     """Where each ray looks, coloured by its sensor as the fields of view are."""
     view.draw(axes, 1.0)
-    order = sorted(range(len(design.sensors)), key=lambda index: design.sensors[index].range_m)
+    order = sorted(range(len(design.sensors)), key=lambda index: sum(design.sensors[index].gate_m))
     colours = GATES(np.linspace(0, 1, len(order)))
     for place, index in enumerate(order):
         looking = view.degrees(rays.direction[rays.sensor == index])
@@ -299,7 +299,7 @@ def overview(
         ("scene", "simulated heads, and rays from the mark"),
         ("density", "learn: where rays are worth firing"),
         ("sensors", "fit: 10 fields of view, a time gate for each"),
-        ("rays", f"{len(rays)} of them, laid out by the density"),
+        ("rays", f"{len(rays)} of them, chosen together"),
         ("returns", "what a held-out head sends back"),
         ("score", f"evaluate: {scores['scenes']} held-out heads; lower is better"),
     ]
@@ -360,7 +360,7 @@ def main() -> None:
         head = task.scenes(config.task.model_copy(update={"test": 1}), "test", config.seed)[0]
         learned = task.scenes(config.task, "train", config.seed)[:OUTLINES]
         samples = load_samples(run)
-    rays = lay_out(design, RAYS, samples)
+    rays = design.rays(RAYS)
     side, front = SideView(config, list(learned), head), HeadView(config, head)
     figure = overview(side, front, samples, design, rays, simulate(head, rays)[0], scores)
     save(figure, options.out / "overview.png", colours=COLOURS)

@@ -1,9 +1,9 @@
-"""Draws docs/warehouse.png: what a track of 12 rays sees of a held-out shelf, and how it follows the aisle.
+"""Draws docs/warehouse.png: what a design of 12 rays sees of a held-out shelf, and how it follows the aisle.
 
     python docs/figures/warehouse.py                 # learns a standard run first, about three minutes
     python docs/figures/warehouse.py --run RUN       # from a warehouse run that is there
 
-Everything shown is computed: the shelf is a held-out one, the density is the run's weighted samples, and the track
+Everything shown is computed: the shelf is a held-out one, the density is the run's weighted samples, and the design
 comes from `lidardesign fit`.
 """
 
@@ -25,12 +25,11 @@ from matplotlib.patches import Rectangle
 from scipy.ndimage import gaussian_filter
 
 from lidardesign import open_run
-from lidardesign.layouts.rays import lay_out
+from lidardesign.formats.designs import load_design
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Scene
-from lidardesign.sensors.design_file import load_design
-from lidardesign.sensors.sensor import DesignSpec
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import AZIMUTH, ELEVATION, X
 
@@ -44,7 +43,7 @@ HEAT = LinearSegmentedColormap.from_list("paper", ["#ffffff", "#cfe0f2", "#6fa3d
 
 def draw_shelf(axes: Axes, scene: Scene, design: DesignSpec, azimuth_rad: float) -> None:
     """The plane that the sensor looks into: what stands there, the rays, and where each of them listens."""
-    rays = lay_out(design, at={"x_m": POSITION_M})
+    rays = design.rays(at={"x_m": POSITION_M})
     (returns,) = simulate(scene, rays)
     cut = cut_scene(scene, rays.origin_m[0], azimuth_rad)
     seen = set(seen_boxes(cut, returns.points_m, rays.origin_m[0], azimuth_rad).tolist())
@@ -79,13 +78,12 @@ def draw_density(axes: Axes, samples: Samples) -> None:
     axes.imshow(density.T, extent=extent, origin="lower", aspect="auto", cmap=HEAT, vmax=top, interpolation="bicubic")
 
 
-def draw_track(axes: Axes, gates: Axes, design: DesignSpec) -> None:
+def draw_pattern(axes: Axes, gates: Axes, design: DesignSpec) -> None:
     """Every ray's elevation and gate along the aisle."""
-    track = design.track
-    assert track is not None
-    knots = track.knots
-    chosen = dict(zip(np.linspace(0, track.elevation_rad.shape[1] - 1, len(CHOSEN)).astype(int), CHOSEN, strict=True))
-    for ray, elevation in enumerate(np.degrees(track.elevation_rad).T):
+    (pattern,) = design.patterns
+    knots = pattern.knots
+    chosen = dict(zip(np.linspace(0, len(pattern) - 1, len(CHOSEN)).astype(int), CHOSEN, strict=True))
+    for ray, elevation in enumerate(np.degrees(pattern.elevation_rad).T):
         axes.plot(knots, elevation, color=chosen.get(ray, INK), linewidth=2.6 if ray in chosen else 1.1)
     for place in (axes, gates):
         place.axvline(POSITION_M, color=INK, linewidth=1.1, linestyle=(0, (4, 3)))
@@ -95,7 +93,7 @@ def draw_track(axes: Axes, gates: Axes, design: DesignSpec) -> None:
     axes.set_yticks([0, 30, 60, 90])
     axes.set_ylabel("elevation [deg]", color=INK, fontsize=12)
     for ray, colour in chosen.items():
-        start, end = track.gate_m[:, ray].T
+        start, end = pattern.gate_m[:, ray].T
         gates.fill_between(knots, start, end, color=colour, alpha=0.55, linewidth=0)
     gates.set_ylabel("gate [m]", color=INK, fontsize=12)
     gates.set_xlabel("position along the aisle [m]", color=INK, fontsize=12)
@@ -106,12 +104,12 @@ def picture(scene: Scene, samples: Samples, design: DesignSpec) -> Figure:
     figure = Figure(figsize=(13.0, 6.4), dpi=90, facecolor="white")
     FigureCanvasAgg(figure)
     shelf = figure.add_axes((0.055, 0.10, 0.37, 0.78))
-    track, gates = figure.add_axes((0.50, 0.42, 0.455, 0.46)), figure.add_axes((0.50, 0.10, 0.455, 0.25))
+    along, gates = figure.add_axes((0.50, 0.42, 0.455, 0.46)), figure.add_axes((0.50, 0.10, 0.455, 0.25))
     draw_shelf(shelf, scene, design, samples.space.low[AZIMUTH])
-    draw_density(track, samples)
-    draw_track(track, gates, design)
-    track.set_xticklabels([])
-    for axes in (shelf, track, gates):
+    draw_density(along, samples)
+    draw_pattern(along, gates, design)
+    along.set_xticklabels([])
+    for axes in (shelf, along, gates):
         axes.tick_params(colors=INK, labelsize=11, length=3)
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color(QUIET)
@@ -131,7 +129,7 @@ def main() -> None:
         run = options.run or Path(folder) / "run"
         if options.run is None:
             command("learn", "warehouse", "--out", run)
-        command("fit", run, "--layout", "scan", "--rays", str(RAYS), "--name", "picture")
+        command("fit", run, "--rays", str(RAYS), "--name", "picture")
         opened = open_run(run)
         scene = opened.scenes("test", opened.config.seed)[0]
         save(picture(scene, load_samples(run), load_design(run / "designs" / "picture.yaml")), options.out)

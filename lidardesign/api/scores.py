@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.api.design import Design, collect_designs, html_table, judging_run, name_apart, named
 from lidardesign.config import with_task_settings
 from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
-from lidardesign.fitting.fit import twin_without_visibility
+from lidardesign.fitting.fit import twin_samples, twin_without_visibility
 from lidardesign.numerics import SLACK
 from lidardesign.rays.training import TrainingScenes
 from lidardesign.run.clock import Progress, outermost_clock, phase, running
@@ -449,7 +449,9 @@ def evaluation_request(
         train=run.scenes("train", seed),
         test=run.scenes("test", seed if scenes_seed is None else scenes_seed),
         scenes_seed=scenes_seed,
-        without_visibility=partial(twin_without_visibility, from_runs[0], learned) if from_runs else None,
+        without_visibility=None
+        if not from_runs
+        else partial(twin_without_visibility, from_runs[0], learned, samples=cache(partial(twin_samples, learned))),
         density=cache(lambda: load_samples(learned.folder, learned.config.space) if learned.has_samples else None),
         training=TrainingScenes(run, seed),
     )

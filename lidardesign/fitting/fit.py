@@ -378,7 +378,7 @@ def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRe
 
     run, bounds = request.run, request.constraints
     rays = request.counts[len(request.counts) // 2]
-    conditions = [request.at] if request.at else run.conditions()
+    conditions = [{**request.at, **one} for one in run.conditions(run.config.space.at(request.at))]
     casters = [build_casters(scene) for scene in scenes]
     sign = 1.0 if run.metric.better == "lower" else -1.0
     low = max(bounds.sensors.min or 1, len(bounds.each))
@@ -422,25 +422,15 @@ def _within(constraints: Constraints, mbps: float) -> Constraints:
     return Constraints.from_mapping({**document, "budget": {"bandwidth_mbps": mbps, **budget}})
 
 
-def twin_without_visibility(
-    design: DesignSpec, run: RunFolder, rays: int, bandwidth_mbps: float | None = None
-) -> DesignSpec:
-    """A design fitted to the density without its occlusion term as a given one was to its own; it is not weighted.
-
-    Arguments:
-        design: The design whose number of sensors, layout, constraints, level, gates and seed are taken.
-        run: The run that judges.
-        rays: Rays per frame.
-        bandwidth_mbps: The most that its rays may cost, by the read-out model of evaluations; None: what the design's
-            constraints say, by theirs.
+def twin_samples(run: RunFolder) -> Samples:
+    """Samples of a run's density without its occlusion term.
 
     Raises:
         DataError: No ray of the design space comes near a target.
     """
     from lidardesign.density.objective.proposals import samples_without_visibility
 
-    config, seed = run.config, design.provenance.get("seed")
-    seed = seed if isinstance(seed, int) else 0
+    config = run.config
     samples = samples_without_visibility(
         run.scenes("train", config.seed),
         config.space,
@@ -450,6 +440,32 @@ def twin_without_visibility(
     )
     if not len(samples):
         raise DataError("no ray of the design space comes near a target", where=f"--baseline {TWIN_NAME}")
+    return samples
+
+
+def twin_without_visibility(
+    design: DesignSpec,
+    run: RunFolder,
+    rays: int,
+    bandwidth_mbps: float | None = None,
+    samples: Callable[[], Samples] | None = None,
+) -> DesignSpec:
+    """A design fitted to the density without its occlusion term as a given one was to its own; it is not weighted.
+
+    Arguments:
+        design: The design whose number of sensors, layout, constraints, level, gates and seed are taken.
+        run: The run that judges.
+        rays: Rays per frame.
+        bandwidth_mbps: The most that its rays may cost, by the read-out model of evaluations; None: what the design's
+            constraints say, by theirs.
+        samples: The samples, which several twins may share; None draws them.
+
+    Raises:
+        DataError: No ray of the design space comes near a target.
+    """
+    seed = design.provenance.get("seed")
+    seed = seed if isinstance(seed, int) else 0
+    drawn = twin_samples(run) if samples is None else samples()
     document = {key: value for key, value in design.constraints.items() if key != "parts"}
     # a bandwidth is one of evaluations, whatever bits the design was made for
     budget = document.get("budget", {}) if bandwidth_mbps is None else {"bandwidth_mbps": bandwidth_mbps}
@@ -474,4 +490,4 @@ def twin_without_visibility(
         certify=False,
     )
     target = RunTarget(run, visibility="off")
-    return fit_design(request, notes=ignore, samples=samples, target=target).design
+    return fit_design(request, notes=ignore, samples=drawn, target=target).design

@@ -18,8 +18,8 @@ import numpy as np
 from lidardesign.config import with_task_settings
 from lidardesign.constraints.check import ConstraintCheck
 from lidardesign.constraints.document import MOST_FITTED, Constraints
-from lidardesign.constraints.origins import is_mounted, snap_to_space
-from lidardesign.errors import MAX_SEED, ConfigError, check_choice, check_number
+from lidardesign.constraints.origins import is_mounted, origin_box, snap_to_space
+from lidardesign.errors import MAX_SEED, ConfigError, InfeasibleError, check_choice, check_number
 from lidardesign.estimates import Estimate, as_documents
 from lidardesign.formats.designs import reach_of, read_design
 from lidardesign.formats.rig import moved_notes, rig_constraints, rig_notes
@@ -31,7 +31,9 @@ from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
 from lidardesign.run_folder import Notes, RunFolder, log_note, settings_texts
 from lidardesign.samples import Samples
 from lidardesign.sensors.design import FITTED_LAYOUTS, DesignSpec, Gates, LayoutName
+from lidardesign.sensors.pattern import TRAVELLED
 from lidardesign.sensors.sensor import LEVELS, MOST_RAYS
+from lidardesign.space import DIMENSIONS, DesignSpace
 
 if TYPE_CHECKING:
     from lidardesign.density.objective.target import Target
@@ -177,6 +179,9 @@ class FitRequest:
             notes(note)
         layout = _layout(rules, base, run, options)
         _check_layout(layout, rules, run, options)
+        at = {**(base.at if base else {}), **options.at}
+        if layout != "spinning" and rules.parts is None:
+            _check_conditions(rules, run.config.space.at(at))
         weighting = _weighting(settings_texts(options.weights), base)
         if weighting.settings:
             with_task_settings(run.task, run.config, weighting.settings, option=weighting.origin)
@@ -189,7 +194,7 @@ class FitRequest:
             seed=run.config.seed if options.seed is None else options.seed,
             constraints=rules,
             is_constrained=constraints is not None,
-            at={**(base.at if base else {}), **options.at},
+            at=at,
             sensors=_sensors(options.sensors, rules, base, layout),
             layout=layout,
             rays=_rays(options.rays, rules, base),
@@ -288,6 +293,31 @@ def _check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, 
     for (fault, where, allowed), is_found in faults.items():
         if is_found:
             raise ConfigError(fault, where=where, allowed=allowed)
+
+
+def _check_conditions(constraints: Constraints, space: DesignSpace) -> None:
+    """Refuse rays that cannot follow the conditions that are left open: they follow one place that nothing bounds.
+
+    Raises:
+        ConfigError: Several conditions, or one that is no place.
+        InfeasibleError: Constraints bound the place.
+    """
+    names = [DIMENSIONS[axis] for axis in space.conditioned]
+    hint = "give " + " ".join(f"--at {name}=VALUE" for name in names)
+    if len(names) > 1:
+        raise ConfigError(f"{' and '.join(names)} are open, and rays follow one condition", where="--at", hint=hint)
+    for name in names:
+        if name not in TRAVELLED:
+            raise ConfigError(f"rays follow where sensors stand, and {name} says no place", where="--at", hint=hint)
+        axis = DIMENSIONS.index(name)
+        for rules in constraints.rules:
+            low, high = origin_box(rules, space)
+            if is_mounted([rules]) or low[axis] > space.low[axis] or high[axis] < space.high[axis]:
+                raise InfeasibleError(
+                    f"sensors follow {name} from {space.low[axis]:g} to {space.high[axis]:g}, and origin bounds it",
+                    conflicts=[rules.path("origin"), name],
+                    hint=hint,
+                )
 
 
 def _with_rig(

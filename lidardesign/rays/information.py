@@ -84,7 +84,7 @@ def require_valid(information: Information, rays: int, frames: int, where: str =
         "weight and frame of different lengths": weight.shape != (items,),
         f"harm of shape {harm.shape}, not {(frames, rays)}": harm.shape != (frames, rays),
         "a unit that is not text": not isinstance(information.unit, str),
-        "weights that are all zero": not weight.sum() > 0,
+        "weights that are all zero": items > 0 and not weight.sum() > 0,
         f"sums up to {most:g}, above complete, {information.complete:g}": most > (1 + SLACK) * information.complete,
     }
     for name, index, count in (

@@ -292,8 +292,9 @@ def inform_enough(
     rays, visits = selection.rays, selection.visits
     # each of a few values of a condition sees little of a scene
     most_scenes = MOST_SCENES * (1 + (len(visits) > 1))
-    # how many scenes are needed hardly depends on gates, and open ones may not fit
-    selection, open_gates = replace(selection, limit_mbps=np.inf), rays.gate_m[:, None]
+    # how many scenes are needed hardly depends on gates, bits and sensors: so what is kept serves other choices too
+    selection = Selection(rays, visits, selection.gates, Bandwidth(), share=selection.share, name=selection.name)
+    open_gates = rays.gate_m[:, None]
     held_back = training.inform(HELD_BACK, rays, visits, 0, FEW_SCENES, selection.share)
     judged = selection.coverage(held_back, open_gates)
     informed: list[InformedScene] = []

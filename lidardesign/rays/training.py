@@ -181,7 +181,8 @@ class InformedScene:
             harm=harm[spoiling],
             harm_range_m=range_m[spoiling],
             sums=LARGEST if information.sums is None else np.asarray(information.sums, dtype=np.float64),
-            complete=information.complete,
+            # of a scene in which nothing is to be seen nothing is left to know
+            complete=information.complete if count else 0.0,
             is_repeated=information.seen_in is not None,
             unit=information.unit,
         )

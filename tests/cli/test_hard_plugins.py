@@ -34,7 +34,7 @@ CONDITIONS = {
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     opened = open_run(make_conditioned_run(tmp_path_factory.mktemp("runs") / "run", count=3000))
-    opened.fit(layout="scan", rays=3, name="fit").save()
+    opened.fit(sensors=1, rays=3, name="fit").save()
     return opened.folder
 
 

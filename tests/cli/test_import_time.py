@@ -46,19 +46,27 @@ def test_lists_import_nothing_heavy(arguments):
     assert not modules_after(run_program(*arguments)) & {*HEAVY}
 
 
-def test_a_fitted_mixture_is_constrained_shown_and_exported_without_heavy_libraries(tmp_path):
-    run, rays = make_run(tmp_path / "run"), tmp_path / "rays.csv"
-    # a region needs no density at any one place
-    keys = ["--set", "gate.width_m.max=0.2", "--set", "origin.spread_m.max=0.5"]
-    commands = (
-        ["constrain", run, "--layout", "even", "--sensors", 2, *keys, "--name", "narrow"],
-        ["show", run],
-        ["show", run / "designs" / "narrow.yaml"],
-        ["export", run / "designs" / "narrow.yaml", "--rays", 100, "--format", "csv", "--out", rays],
-    )
+@pytest.fixture(scope="module")
+def chosen(tmp_path_factory):
+    """A design of chosen rays in its run."""
+    run = lidardesign.open_run(make_run(tmp_path_factory.mktemp("made") / "run"))
+    return run.fit(sensors=2, rays=8, name="chosen").save()
+
+
+def test_runs_and_designs_are_shown_and_exported_without_heavy_libraries(chosen, tmp_path):
+    rays = tmp_path / "rays.csv"
+    commands = (["show", chosen.parents[1]], ["show", chosen], ["export", chosen, "--format", "csv", "--out", rays])
     loaded = modules_after("\n".join(run_program(*map(str, words)) for words in commands))
     assert not loaded & {*HEAVY}
     assert rays.exists()
+
+
+def test_sensors_of_even_rays_are_constrained_without_heavy_libraries(chosen, tmp_path):
+    run = shutil.copytree(chosen.parents[1], tmp_path / "run")
+    # a region needs no density at any one place
+    keys = ["--set", "gate.width_m.max=0.2", "--set", "origin.spread_m.max=0.5"]
+    command = ["constrain", run, "--layout", "even", "--sensors", 2, *keys, "--name", "narrow"]
+    assert not modules_after(run_program(*map(str, command))) & {*HEAVY}
 
 
 def test_threads_are_limited_before_torch_can_be_imported():

@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from support.command_line import caller, files_under, make_run
 
+from lidardesign.run.outputs import CACHE
+
 EVALUATE = ("evaluate", "mine.yaml", "--in", "run", "--rays", 9)
 EXPORT = ("export", "mine.yaml", "--format", "csv", "--rays", 9)
 LONG = 300 * "x"
@@ -30,6 +32,7 @@ def call(capsys, work, monkeypatch):
     if not (work / "run").exists():
         make_run(work / "run", count=1000)
         assert call("fit", "run", "--layout", "even", "--sensors", 1).code == 0
+        (work / "run" / CACHE).touch()
         (work / "folder").mkdir()
         (work / "file").touch()
         (work / "mine.yaml").write_bytes((work / "run/designs/fit.yaml").read_bytes())
@@ -67,6 +70,7 @@ TAKEN = [
     ("run/config.yaml", "a file of the run"),
     ("run/manifest.json", "a file of the run"),
     ("run/samples.npz", "a file of the run"),
+    (f"run/{CACHE}", "a file of the run"),
     ("run/designs/fit.yaml", "a file of the run"),
     ("folder/../run/config.yaml", "a file of the run"),
     ("link.csv", "a file of the run"),

@@ -37,7 +37,7 @@ def test_what_nobody_can_act_on_is_said_to_those_who_ask(quiet, verbose, said, c
 def test_a_fit_prints_a_line_per_sensor_and_what_limits_it(lidardesign, flat):
     fit = "constrain run --layout even --sensors 3 --rays 30 --set gate.width_m.max=0.2 --name thin"
     lines = lidardesign(fit).out.splitlines()
-    assert lines[0] == "thin: 3 sensors, 30 rays per frame (layout grid)"
+    assert lines[0] == "thin: 3 sensors, 30 rays per frame (layout even)"
     assert lines[1] == "in the world's frame"
     assert lines[2].split()[0] == "sensor"
     assert [line.split()[0] for line in lines[3:6]] == ["s0", "s1", "s2"]

@@ -13,6 +13,7 @@ from support.command_line import files_under, make_run
 from support.plugins import GOOD, install_plugins
 
 from lidardesign.cli.main import app
+from lidardesign.rays.pool import FILE_NAME as CACHE
 from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import note, read_manifest, verify
 
@@ -246,6 +247,17 @@ def test_a_score_is_of_the_design_as_it_was_scored(lidardesign, finished):
     assert lidardesign("show", finished, "--json").json["designs"][0]["score"] is not None
     lidardesign("fit", finished, "--layout", "even", "--sensors", 2)
     assert lidardesign("show", finished, "--json").json["designs"][0]["score"] is None
+
+
+def test_showing_writes_nothing_and_says_how_large_the_cache_of_fits_is(lidardesign, finished):
+    lidardesign("fit", finished, "--layout", "even", "--sensors", 1)
+    assert lidardesign("show", finished, "--json").json["cache"] is None
+    (finished / CACHE).write_bytes(bytes(1_234_567))
+    before = files_under(finished)
+    assert lidardesign("show", finished, "--json").json["cache"] == {"path": str(finished / CACHE), "bytes": 1_234_567}
+    assert f"{finished / CACHE}, 1.2 MB" in lidardesign("show", finished).out
+    assert lidardesign("show", finished / "designs" / "fit.yaml").code == 0
+    assert files_under(finished) == before
 
 
 def test_a_rough_density_says_what_would_make_it_better(lidardesign, finished):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from support.tables import each_row
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.coordinates import (
@@ -56,10 +55,10 @@ def targets(space, visibility, weighted=False):
     return host, on_device(host, CPU)
 
 
-@each_row("visibility", ["off", "quadrature"])
-@each_row("space", [FIXED, FREE], ids=["fixed origin", "free origin, in angles"])
-@each_row("sigma_m", [None, 0.1])
-@each_row("weighted", [False, True])
+@pytest.mark.parametrize("visibility", ["off", "quadrature"])
+@pytest.mark.parametrize("space", [FIXED, FREE], ids=["fixed origin", "free origin, in angles"])
+@pytest.mark.parametrize("sigma_m", [None, 0.1])
+@pytest.mark.parametrize("weighted", [False, True])
 def test_values_and_gradients_are_those_of_the_compiled_loops(space, visibility, sigma_m, weighted):
     host, device = targets(space, visibility, weighted)
     assert isinstance(device, DeviceTarget)
@@ -107,7 +106,7 @@ def test_a_step_has_the_same_loss_and_gradient(loss):
     assert (gradients[1] - gradients[0]).norm() < 2e-3 * gradients[0].norm()
 
 
-@each_row("weighted", [False, True])
+@pytest.mark.parametrize("weighted", [False, True])
 def test_columns_that_are_drawn_stand_for_all_on_the_device_too(weighted):
     host, device = targets(FIXED, "quadrature", weighted)
     chosen, unit = np.array([0, 2]), torch.zeros(4, 3, dtype=torch.float64)

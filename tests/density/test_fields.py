@@ -10,7 +10,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from support import references
 from support.meshes import icosphere
-from support.tables import each_row
 
 from lidardesign.density.fields import grids
 from lidardesign.density.fields.distance import BodyField, UnionField, build_field
@@ -158,7 +157,7 @@ SOLIDS = {
 }
 
 
-@each_row("name", SOLIDS)
+@pytest.mark.parametrize("name", SOLIDS)
 def test_the_inside_of_a_solid_is_where_its_winding_number_says(name):
     solid = trimesh.util.concatenate(SOLIDS[name])
     grid = grids.Grid(np.full(3, -0.52), 0.08, np.array([14, 14, 14]))

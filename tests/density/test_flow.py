@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch
 from support.flows import FLOWS, draw, flow_of
-from support.tables import each_row
 
 from lidardesign.density.network import DesignFlow
 
 
-@each_row("name", FLOWS)
+@pytest.mark.parametrize("name", FLOWS)
 def test_the_density_is_the_jacobian_of_sampling(name):
     flow = flow_of(name)
     base, context = draw(flow, 10)
@@ -25,7 +24,7 @@ def test_the_density_is_the_jacobian_of_sampling(name):
         assert float(log_prob[row].detach()) == pytest.approx(float(expected.detach()), abs=1e-8)
 
 
-@each_row("name", FLOWS)
+@pytest.mark.parametrize("name", FLOWS)
 def test_every_parameter_gets_a_finite_gradient(name):
     flow = flow_of(name, scale=1.0)
     base, context = draw(flow, 64)
@@ -58,7 +57,7 @@ def test_the_density_is_continuous_around_the_circle(name):
     assert max(fine) < 1e-2
 
 
-@each_row("name", FLOWS)
+@pytest.mark.parametrize("name", FLOWS)
 def test_the_density_of_held_samples_changes_with_the_weights_as_that_of_the_same_points(name):
     flow = flow_of(name, scale=1.5)
     base, context = draw(flow, 64)

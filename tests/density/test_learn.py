@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
-from support.tables import each_row
 
 from lidardesign.config import LearningSettings
 from lidardesign.density.training import learn as learning
@@ -236,8 +235,8 @@ def test_steps_of_adam_are_those_of_the_paper_with_rates_that_change_and_weights
     assert [weight in optimiser.state for weight in weights] == [True, True, False]
 
 
-@each_row("steps", [1, 2, 60, 100, 101, 5000])
-@each_row("pathwise", [0, 1, 50])
+@pytest.mark.parametrize("steps", [1, 2, 60, 100, 101, 5000])
+@pytest.mark.parametrize("pathwise", [0, 1, 50])
 def test_snapshots_are_kept_when_balancing_begins_and_after_each_doubling(pathwise, steps):
     settings = LearningSettings(steps=steps, pathwise=pathwise)
     first = max(settings.pathwise_steps, 1)

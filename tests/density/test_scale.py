@@ -12,7 +12,6 @@ import pytest
 import trimesh
 from support.command_line import caller
 from support.learning import config_of
-from support.tables import each_row
 
 from lidardesign.config import DensitySettings, resolve
 from lidardesign.density.objective.prepare import training_scenes
@@ -122,7 +121,7 @@ def test_the_sigma_that_a_note_names_needs_no_further_one(case):
     assert notes(*bodies, **{**settings, "sigma_m": named}) == []
 
 
-@each_row("factor", [1e-3, 1e3])
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
 @pytest.mark.parametrize(
     "case", ["sigma is wider than a ball", "a wire", "a plate seen edge-on", "a ball behind a wall"]
 )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numba
 import pytest
 import torch
-from support.tables import each_row
 from torch import Tensor
 
 from lidardesign.density.network import EDGE, array_splines, splines
@@ -23,9 +22,9 @@ def values_of(seed: int = 1, count: int = 400, dtype: torch.dtype = torch.float6
     return (2 * torch.rand(count, generator=generator, dtype=dtype) - 1) * 0.999
 
 
-@each_row("periodic", [False, True])
-@each_row("inverted", [False, True])
-@each_row("scale", [0.1, 1.0, 5.0])
+@pytest.mark.parametrize("periodic", [False, True])
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("scale", [0.1, 1.0, 5.0])
 def test_compiled_splines_agree_with_array_splines(scale, inverted, periodic):
     values, parameters = values_of(), parameters_of(scale)
     found = splines(values, parameters, periodic, inverted=inverted)
@@ -33,9 +32,9 @@ def test_compiled_splines_agree_with_array_splines(scale, inverted, periodic):
         torch.testing.assert_close(one, expected, rtol=1e-8, atol=1e-9)
 
 
-@each_row("periodic", [False, True])
-@each_row("inverted", [False, True])
-@each_row("scale", [0.1, 1.0, 3.0])
+@pytest.mark.parametrize("periodic", [False, True])
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("scale", [0.1, 1.0, 3.0])
 def test_their_gradients_agree_by_values_and_by_every_parameter(scale, inverted, periodic):
     weights = values_of(2), values_of(3)
     gradients = []
@@ -47,7 +46,7 @@ def test_their_gradients_agree_by_values_and_by_every_parameter(scale, inverted,
         torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-8 * float(expected.abs().max()))
 
 
-@each_row("periodic", [False, True])
+@pytest.mark.parametrize("periodic", [False, True])
 def test_log_slopes_of_held_values_change_as_those_of_the_inverse_at_them(periodic):
     weights, gradients = values_of(2), []
     out, _ = splines(values_of(), parameters_of(1.0), periodic)
@@ -82,10 +81,10 @@ def test_float32_parameters_cost_only_the_rounding_of_the_parameters():
 
 
 @pytest.mark.hard_case("24")
-@each_row("inverted", [False, True])
-@each_row("scale", [10.0, 1000.0])
-@each_row("dtype", [torch.float32, torch.float64])
-@each_row("periodic", [False, True])
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("scale", [10.0, 1000.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("periodic", [False, True])
 def test_extreme_parameters_and_edges_stay_finite_inside_the_box(scale, inverted, dtype, periodic):
     parameters = parameters_of(scale, dtype=dtype).requires_grad_()
     values = values_of(dtype=dtype)

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from support import references
-from support.tables import each_row
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.objective.target import build_target, nearby_order
@@ -59,8 +58,8 @@ def test_the_target_equals_its_naive_twin(visibility):
     np.testing.assert_allclose(target.log_density(points), expected, atol=1e-9, rtol=1e-12)
 
 
-@each_row("space", [SPACE, ANGLES], ids=["solid angle", "angles"])
-@each_row("visibility", ["off", "quadrature", "raycast"])
+@pytest.mark.parametrize("space", [SPACE, ANGLES], ids=["solid angle", "angles"])
+@pytest.mark.parametrize("visibility", ["off", "quadrature", "raycast"])
 def test_gradients_match_differences_of_the_values(visibility, space):
     target = build_target(balls(), space, SETTINGS, visibility)
     points = points_near(spread=0.15)
@@ -75,7 +74,7 @@ def test_gradients_match_differences_of_the_values(visibility, space):
     assert np.quantile(error, 0.98) < 1e-4
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("visibility", "incidence_deg"),
     # at an angle the soft edge of the quadrature reaches into the margin: T is 0.96 at 45 degrees
     [("off", 0.0), ("raycast", 0.0), ("quadrature", 0.0), ("off", 45.0), ("raycast", 45.0)],
@@ -105,7 +104,7 @@ def test_a_capsule_without_length_is_a_ball_in_moving_scenes_too():
     np.testing.assert_allclose(capsule.log_density(points), sphere.log_density(points), atol=1e-9)
 
 
-@each_row("count", [0, 1, 2, 1000])
+@pytest.mark.parametrize("count", [0, 1, 2, 1000])
 def test_every_point_is_visited_once(count):
     points = np.random.default_rng(0).normal(size=(count, 3))
     np.testing.assert_array_equal(np.sort(nearby_order(points)), np.arange(count))

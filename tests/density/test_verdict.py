@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import product
 
 import pytest
-from support.tables import each_row
 
 from lidardesign.samples import BOUNDS, Verdict
 
@@ -13,7 +12,7 @@ PERFECT = (0.0, 0.0, 1.0)
 ORDER = ("good", "usable", "poor")
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("figures", "word", "why"),
     [
         (PERFECT, "good", ""),

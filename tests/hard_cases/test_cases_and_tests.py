@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 from support.hard_cases import CASES, KEYS
-from support.tables import each_row
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parents[1]
@@ -51,7 +50,7 @@ def test_every_class_of_the_folder_is_a_case():
                 assert (node.name, module) in named, f"{module}.{node.name} belongs to no case"
 
 
-@each_row("key", KEYS)
+@pytest.mark.parametrize("key", KEYS)
 def test_a_case_has_tests_and_says_what_is_done(key):
     case = CASES[key]
     assert case.names or case.elsewhere, f"{case.tests.__name__} has no tests"

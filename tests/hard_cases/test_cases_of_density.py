@@ -12,13 +12,12 @@ import torch
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
-from lidardesign.layouts.rays import lay_out
 from scipy.spatial.transform import Rotation
 from support import references
 from support.designs import from_the_ceiling
+from support.fits import fitted
 from support.hard_cases import hard_case
 from support.learning import SMALL, BallTask
-from support.tables import each_row
 from support.visibility import along_axis, both_ways, config_of, plate, transmittance_on, wall
 
 from lidardesign.config import (
@@ -30,6 +29,7 @@ from lidardesign.config import (
     RunConfig,
     resolve,
 )
+from lidardesign.constraints.document import Constraints
 from lidardesign.density.coordinates import Coordinates
 from lidardesign.density.fields.distance import build_field
 from lidardesign.density.network import DesignFlow
@@ -41,11 +41,12 @@ from lidardesign.density.objective.visibility import MINIMUM_COSINE, Optics, Ray
 from lidardesign.density.training.learn import learn
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.errors import ConfigError
-from lidardesign.mixture.fit import fit
+from lidardesign.rays.proposals import Proposals
 from lidardesign.registry import load_task
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.sensors.pattern import even_rays
 from lidardesign.space import ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
 from lidardesign.task import TaskConfig
 
@@ -132,6 +133,11 @@ def moved_samples(samples, scale, offset):
     return Samples(points, samples.log_prob, samples.log_target, DesignSpace(*bounds))
 
 
+def alike(points):
+    """The same log p* everywhere."""
+    return np.zeros(len(points))
+
+
 def in_order(rays, scale=1.0, offset=0.0):
     rows = np.concatenate([(rays.origin_m - offset) / scale, rays.direction, rays.gate_m / scale], axis=1)
     return rows[np.lexsort(np.round(rows, 4).T)]
@@ -172,8 +178,8 @@ def learned_at_home(tmp_path_factory):
     "designs are those of the same scene at home in metres, and turn with it",
 )
 class TestScenesOfAnyScale:
-    @each_row("way", WAYS)
-    @each_row(("scale", "offset"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e7)])
+    @pytest.mark.parametrize("way", WAYS)
+    @pytest.mark.parametrize(("scale", "offset"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e7)])
     def test_densities_over_meshes_scale_and_shift_with_the_scene(self, way, scale, offset):
         mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
 
@@ -193,7 +199,7 @@ class TestScenesOfAnyScale:
         # vertices at 1e7 m are rounded to 2e-9 m; distances are float32 relative to the scene
         np.testing.assert_allclose(values(scale, offset), values(1.0, 0.0), atol=references.SCALED_NATS)
 
-    @each_row(
+    @pytest.mark.parametrize(
         ("scale", "offset", "atol"),
         [
             # rounding of distances, 1e-16 of the scene, times distance / sigma^2 of up to 30 sigma
@@ -226,18 +232,18 @@ class TestScenesOfAnyScale:
         np.testing.assert_allclose(unit, home, atol=atol)
         assert found == pytest.approx(ess, rel=10 * atol)
 
-    @each_row("layout", ["grid", "density", "distributed", "scan"])
-    @each_row(("scale", "offset", "atol"), [(1e-4, 0.0, 1e-12), (1e5, 0.0, 1e-12), (1.0, 1e7, 1e-7)])
-    def test_a_fitted_design_has_the_same_rays(self, layout, scale, offset, atol):
-        rows = []
-        for samples, factor, shift in (
-            (from_the_ceiling(2000), 1.0, 0.0),
-            (moved_samples(from_the_ceiling(2000), scale, offset), scale, offset),
-        ):
-            sensors = None if layout == "scan" else 2
-            design = fit(samples, sensors=sensors, layout=layout, rays=20, em_samples=1000, restarts=1).design
-            rows.append(in_order(lay_out(design), factor, shift))
-        np.testing.assert_allclose(rows[1], rows[0], atol=atol)
+    @pytest.mark.parametrize("rules", [{}, {"origin": {"spread_m": {"max": 1e9}}}], ids=["places", "regions"])
+    @pytest.mark.parametrize(("scale", "offset", "atol"), [(1e-4, 0.0, 1e-12), (1e5, 0.0, 1e-12), (1.0, 1e7, 1e-6)])
+    def test_fitted_sensors_have_the_same_even_rays_and_candidates(self, rules, scale, offset, atol):
+        even, candidates = [], []
+        for factor, shift in ((1.0, 0.0), (scale, offset)):
+            samples = moved_samples(from_the_ceiling(2000), factor, shift)
+            found = fitted(samples, rules, sensors=2, em_samples=1000, restarts=1, retarget=alike)
+            proposals = Proposals(found.sensors, Constraints.from_mapping(rules).rules, 0.95, samples)
+            even.append(in_order(even_rays(found.sensors, [12, 8]), factor, shift))
+            candidates.append(in_order(proposals.draw(20, {}, np.random.default_rng(0)), factor, shift))
+        np.testing.assert_allclose(even[1], even[0], atol=atol)
+        np.testing.assert_allclose(candidates[1], candidates[0], atol=atol)
 
 
 def flow_of(coordinates, dtype):
@@ -262,8 +268,8 @@ FAR_AWAY = {
     "scene",
 )
 class TestScenesFarAway:
-    @each_row("way", WAYS)
-    @each_row("kind", FAR_AWAY)
+    @pytest.mark.parametrize("way", WAYS)
+    @pytest.mark.parametrize("kind", FAR_AWAY)
     def test_values_are_finite_and_the_gradient_leads_to_the_scene(self, kind, way):
         target = build_target(FAR_AWAY[kind], SPACE, DensitySettings(field_resolution=16), way)
         values, gradient = target.log_density_and_gradient(points_near())
@@ -348,8 +354,8 @@ class TestSigmaAtBothEnds:
         assert caught.value.where == "density.sigma_m"
         assert "density.field_resolution" in caught.value.hint
 
-    @each_row("kind", MESHES)
-    @each_row(("share", "noted"), [(2 * UNRESOLVED_SHARE, True), (0.4, True), (0.8, False)])
+    @pytest.mark.parametrize("kind", MESHES)
+    @pytest.mark.parametrize(("share", "noted"), [(2 * UNRESOLVED_SHARE, True), (0.4, True), (0.8, False)])
     def test_sigma_below_half_a_step_is_noted(self, kind, share, noted):
         _, notes = prepared(kind, share * 0.02)
         assert any("below half the field's grid step" in note for note in notes) == noted
@@ -386,7 +392,7 @@ class TestSigmaAtBothEnds:
         point = DesignSpace((0, 0, 0, 0, 0, 1), (0, 0, 0, 0, 0, 1))
         assert prepared("ball", 100.0, point)[1] == []
 
-    @each_row(("key", "value"), [(key, value) for key, values in LIMITS.items() for value in values])
+    @pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in LIMITS.items() for value in values])
     def test_what_would_overflow_is_refused_by_name(self, key, value):
         with pytest.raises(ConfigError, match=key.replace(".", r"\.")) as caught:
             resolve(load_task("flatland"), overrides=[f"{key}={value}"])
@@ -452,7 +458,7 @@ class TestThinOccludersAndAnyBeta:
         assert "density.visibility=raycast" in warning
         assert target.visibility.points == 1024
 
-    @each_row("beta", [1e-9, 1e-3, 1.0, 1e3, 1e6, FASTEST_PER_M])
+    @pytest.mark.parametrize("beta", [1e-9, 1e-3, 1.0, 1e3, 1e6, FASTEST_PER_M])
     def test_ray_casting_follows_the_closed_form_for_every_beta(self, beta):
         optics = Optics(0.01, beta, 1000.0, 0.01)
         scene = Scene((plate(0.2),))
@@ -474,8 +480,8 @@ class TestThinOccludersAndAnyBeta:
         assert ((found >= 0) & (found <= 1)).all()
         assert (np.diff(found) <= 0).all()
 
-    @each_row("beta", [1e-6, 1.0, 1e3, 1e9])
-    @each_row("thing", ["thin", "thick", "mesh"])
+    @pytest.mark.parametrize("beta", [1e-6, 1.0, 1e3, 1e9])
+    @pytest.mark.parametrize("thing", ["thin", "thick", "mesh"])
     def test_integrated_transmittance_is_a_share_that_rises_by_no_more_than_its_own_step(self, beta, thing):
         mesh = ball_of_triangles((1.0, 0.1, 0), 0.6)
         body = {"thin": plate(0.002), "thick": plate(0.3), "mesh": Body(mesh)}[thing]
@@ -538,8 +544,8 @@ class TestRaysThatStartInsideOrGraze:
         assert found[0] == 1.0
         assert found[-1] < 1e-100
 
-    @each_row("name", ["ball", "box", "capsule"])
-    @each_row("inward", [True, False])
+    @pytest.mark.parametrize("name", ["ball", "box", "capsule"])
+    @pytest.mark.parametrize("inward", [True, False])
     def test_on_a_surface_it_is_met_at_once(self, name, inward):
         ranges = np.linspace(0, 1, 101)
         found = cast(Scene((Body(SOLIDS[name]),)), rays_from((0.5, 0, 0), (-1.0 if inward else 1.0, 0, 0), ranges))
@@ -560,8 +566,8 @@ class TestRaysThatStartInsideOrGraze:
         )
         np.testing.assert_allclose(found, np.exp(-1000.0 * np.maximum(rays.ranges - 0.005, 0)), atol=0.01)
 
-    @each_row("way", WAYS)
-    @each_row("name", [*SOLIDS, "plane"])
+    @pytest.mark.parametrize("way", WAYS)
+    @pytest.mark.parametrize("name", [*SOLIDS, "plane"])
     def test_no_start_gives_a_value_or_gradient_that_is_no_number(self, name, way):
         shape = SOLIDS.get(name, Plane())
         starts = [(0, 0, 0), (0.5, 0, 0), (0.5, 0.5, 0.5), (0, 0, 0.5), (0.5, -1, 0), (0.2, 0.1, 0)]
@@ -587,7 +593,7 @@ class TestRaysThatStartInsideOrGraze:
         # d hit / d dip = h / sin^2, at most range^2 / h before the limit
         assert np.abs(np.diff(found)).max() <= (3.0 * 2.0**2 / 0.1 * np.diff(dip)).max()
 
-    @each_row("dip", [0.0, 1e-300, 1e-12, 1e-6, 0.01])
+    @pytest.mark.parametrize("dip", [0.0, 1e-300, 1e-12, 1e-6, 0.01])
     def test_the_derivative_of_a_grazing_hit_is_capped(self, dip):
         scene = Scene((Body(Plane(), "floor", "occluder"), Body(Sphere(0.1), poses=rigid(translation_m=(3.0, 0, 0.1)))))
         space = DesignSpace((0, 0, 0, -1, -0.5, 0), (0, 0, 0.1, 1, 0.5, 4))

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from support import references
 from support.hard_cases import hard_case
 from support.meshes import BOX_FACES, BOX_VERTICES, write_box
-from support.tables import each_row
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields import grids
@@ -65,8 +64,8 @@ def mesh_of(shape):
     done="an error that names the file and why (exit 3), for every format; a file that loads as no faces is one",
 )
 class TestFilesWithoutAMesh:
-    @each_row("suffix", SUFFIXES)
-    @each_row("content", GARBAGE.values(), ids=GARBAGE)
+    @pytest.mark.parametrize("suffix", SUFFIXES)
+    @pytest.mark.parametrize("content", GARBAGE.values(), ids=GARBAGE)
     def test_garbage_is_refused_with_the_name_of_the_file(self, tmp_path, suffix, content):
         write_box(tmp_path / "model.gltf")  # a good neighbour must not be read in its place
         path = tmp_path / f"bad{suffix}"
@@ -98,7 +97,7 @@ class TestFilesWithoutAMesh:
     "their counts, and what is left is the mesh without them",
 )
 class TestPartsOfMeshesThatAreNone:
-    @each_row(
+    @pytest.mark.parametrize(
         ("vertices", "faces", "words"),
         [
             *((np.vstack([BOX_VERTICES[:7], [1, x, 1]]), BOX_FACES, "part: 1 of 8 vertices") for x in NOT_FINITE),
@@ -127,7 +126,7 @@ class TestPartsOfMeshesThatAreNone:
         with pytest.raises(DataError, match="away"):
             Mesh(BOX_VERTICES * scale, BOX_FACES)
 
-    @each_row("length", [0.0, -1.0, 1e-160, 1e10, 1e300, math.nan, math.inf])
+    @pytest.mark.parametrize("length", [0.0, -1.0, 1e-160, 1e10, 1e300, math.nan, math.inf])
     def test_bodies_of_absurd_sizes_are_refused_by_name(self, length):
         for make in (Sphere, lambda one: Box((1.0, one, 1.0)), lambda one: Capsule(one, 1.0)):
             with pytest.raises(DataError, match="has the length"):
@@ -233,8 +232,8 @@ class TestMeshesWithoutAnInside:
         first = [np.roll(face, -face.argmin()).tolist() for face in mesh.faces]
         assert first == [np.roll(face, -face.argmin()).tolist() for face in plain.faces]
 
-    @each_row("name", SOLIDS)
-    @each_row("made", ["as it is", "flipped at random", "inside out"])
+    @pytest.mark.parametrize("name", SOLIDS)
+    @pytest.mark.parametrize("made", ["as it is", "flipped at random", "inside out"])
     def test_signs_agree_with_the_parity_of_ray_crossings(self, name, made):
         vertices, faces = SOLIDS[name]
         faces = np.array(faces)
@@ -325,7 +324,7 @@ WAYS = ("primitive", "table", "table without kernels", "moving", "frames", "exac
     "once; every way to ask is held to a sphere, on both sides",
 )
 class TestSignConventions:
-    @each_row("way", WAYS)
+    @pytest.mark.parametrize("way", WAYS)
     def test_a_sphere_is_positive_outside_and_negative_inside(self, way):
         generator = np.random.default_rng(3)
         looking = generator.normal(size=(300, 3))
@@ -380,8 +379,8 @@ SPECIAL = {
     "sqrt(|p - q|^2 + d(q)^2) from the nearest grid point q, continuous at the faces and growing without end",
 )
 class TestQueriesAtSpecialPlaces:
-    @each_row("places", SPECIAL)
-    @each_row("shape", ["sphere", "table", "moving"])
+    @pytest.mark.parametrize("places", SPECIAL)
+    @pytest.mark.parametrize("shape", ["sphere", "table", "moving"])
     def test_values_and_gradients_are_finite(self, shape, places):
         body = {
             "sphere": Body(Sphere(0.5)),
@@ -454,8 +453,8 @@ def many_columns(count=200):
     "a field of and asked 10 million times: 5.0 GiB at most)",
 )
 class TestManyFacesAndManyQueries:
-    @each_row("way", ["off", "quadrature", "raycast"])
-    @each_row("kind", ["mesh", "primitives"])
+    @pytest.mark.parametrize("way", ["off", "quadrature", "raycast"])
+    @pytest.mark.parametrize("kind", ["mesh", "primitives"])
     def test_densities_have_the_same_bits_for_any_chunk_size_and_order(self, monkeypatch, kind, way):
         shape = mesh_of(BALL) if kind == "mesh" else Sphere(0.5)
         before = Body(Box((0.05, 0.1, 0.1)), "before", "occluder", rigid(translation_m=(0.8, 0, 0)))

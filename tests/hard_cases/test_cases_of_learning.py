@@ -16,7 +16,6 @@ from support import references
 from support.flows import FLOWS, draw, flow_of
 from support.hard_cases import hard_case
 from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
-from support.tables import each_row
 
 from lidardesign.cli.main import run as run_program
 from lidardesign.config import DensitySettings
@@ -44,7 +43,7 @@ def interrupted(run, step, **settings):
     done="points are kept inside, where densities are finite; the density is 0 outside the box and nowhere else",
 )
 class TestEdgesOfTheBox:
-    @each_row("name", FLOWS)
+    @pytest.mark.parametrize("name", FLOWS)
     def test_edges_are_finite_and_only_the_outside_has_no_density(self, name):
         flow = flow_of(name)
         _, context = draw(flow, 2)
@@ -73,7 +72,7 @@ class TestEdgesOfTheBox:
             for there in (made(x), made.inv(x)):
                 assert (there.abs() <= 1).all()
 
-    @each_row("name", FLOWS)
+    @pytest.mark.parametrize("name", FLOWS)
     def test_gradients_at_the_edge_are_finite(self, name):
         flow = flow_of(name)
         _, context = draw(flow, 2)
@@ -96,8 +95,8 @@ class TestEdgesOfTheBox:
     "is measured: above 0.01 nats the steps go on in float64, and the run notes it",
 )
 class TestSteepSplines:
-    @each_row("dtype", [torch.float32, torch.float64])
-    @each_row("scale", [10.0, 100.0, 1000.0])
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("scale", [10.0, 100.0, 1000.0])
     def test_densities_of_the_steepest_flows_stay_finite(self, scale, dtype):
         flow = flow_of("all six", scale=scale).to(dtype)
         base, _ = draw(flow.double(), 300)

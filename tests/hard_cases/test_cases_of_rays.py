@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import references
 from support.hard_cases import hard_case
-from support.tables import each_row
 
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.scenes.casting import SceneCaster
@@ -84,8 +83,8 @@ class TestRaysThroughEdgesAndVertices:
         alone = (triangles.run(np.zeros_like(vertices), vertices, limit)["primID"] < 0).mean()
         assert 0 < alone < 0.01
 
-    @each_row("start", STARTS)
-    @each_row("name", SOLIDS)
+    @pytest.mark.parametrize("start", STARTS)
+    @pytest.mark.parametrize("name", SOLIDS)
     def test_none_is_lost_and_all_are_met_where_they_aim(self, name, start):
         origins, directions, reach = aimed(SOLIDS[name], STARTS[start])
         found = SceneCaster(Scene((Body(mesh_of(SOLIDS[name])),))).first_hit(origins, directions)
@@ -180,13 +179,13 @@ ONE_OF_EACH = {
 
 def document(**boresight):
     return {
-        "schema_version": 1,
+        "schema_version": 2,
         "sensors": [
             {
                 "origin_m": {"mean": [0.0, 0.0, 0.0]},
                 "boresight": {"azimuth_rad": 0.0, "elevation_rad": 0.0, **boresight},
-                "spread": {"horizontal_rad": 0.1, "vertical_rad": 0.1, "range_m": 0.1},
-                "range_m": 1.0,
+                "field_of_view_rad": {"horizontal": 0.1, "vertical": 0.1},
+                "gate_m": {"start": 0.9, "end": 1.1},
             }
         ],
     }
@@ -199,8 +198,8 @@ def document(**boresight):
     "ray lists take unit vectors only",
 )
 class TestDirectionsThatAreNone:
-    @each_row("case", BAD_DIRECTIONS)
-    @each_row("shape", ONE_OF_EACH)
+    @pytest.mark.parametrize("case", BAD_DIRECTIONS)
+    @pytest.mark.parametrize("shape", ONE_OF_EACH)
     def test_it_is_an_error_and_never_a_silent_miss(self, case, shape):
         caster = SceneCaster(Scene((Body(ONE_OF_EACH[shape]),)))
         with pytest.raises(ConfigError, match=r"rays.*not finite, or a direction has zero length"):
@@ -224,8 +223,8 @@ class TestDirectionsThatAreNone:
         with pytest.raises(ConfigError, match="NaN or infinite"):
             Rays(np.zeros((1, 3)), np.array([[np.nan, 0.0, 0.0]]), gate, one, one)
 
-    @each_row("key", ["azimuth_rad", "elevation_rad"])
-    @each_row("value", [float("nan"), float("inf"), None, "north"])
+    @pytest.mark.parametrize("key", ["azimuth_rad", "elevation_rad"])
+    @pytest.mark.parametrize("value", [float("nan"), float("inf"), None, "north"])
     def test_a_design_whose_boresight_is_none_is_refused_with_its_place(self, key, value):
         with pytest.raises(LidardesignError, match=key):
             design_from_document(document(**{key: value}))

@@ -25,7 +25,6 @@ from lidardesign_tasks.robot.arm_motion import (
 from lidardesign_tasks.robot.arm_robot import load_robot
 from support.hard_cases import hard_case
 from support.robots import TOOL_M, mjcf, written
-from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.scenes.mujoco_models import MAX_INCLUDES, model_files, mujoco_warnings
@@ -67,7 +66,7 @@ def step_with_nan():
     "why is kept with the scene and noted; where none can be done learning is refused with the reasons",
 )
 class TestUnstableRollouts:
-    @each_row("warning", WARNINGS, ids=lambda w: w.name)
+    @pytest.mark.parametrize("warning", WARNINGS, ids=lambda w: w.name)
     def test_any_warning_of_mujoco_rejects_the_motion(self, arm, warning):
         data = mujoco.MjData(arm.robot.model)
         arm._check_state(data)
@@ -75,8 +74,8 @@ class TestUnstableRollouts:
         with pytest.raises(RejectedError, match="warned"):
             arm._check_state(data)
 
-    @each_row("name", ["qpos", "qacc", "xpos"])
-    @each_row("value", [math.nan, math.inf])
+    @pytest.mark.parametrize("name", ["qpos", "qacc", "xpos"])
+    @pytest.mark.parametrize("value", [math.nan, math.inf])
     def test_numbers_that_are_not_finite_reject_the_motion(self, arm, name, value):
         data = mujoco.MjData(arm.robot.model)
         getattr(data, name).flat[0] = value
@@ -219,7 +218,7 @@ OUTSIDE = {
     "model's folder is refused with its name",
 )
 class TestFilesOutsideTheFolder:
-    @each_row("case", OUTSIDE)
+    @pytest.mark.parametrize("case", OUTSIDE)
     def test_what_leads_out_of_the_folder_is_refused(self, tmp_path, case):
         (tmp_path / "model").mkdir()
         written(tmp_path, "<mujoco/>", "other.xml")

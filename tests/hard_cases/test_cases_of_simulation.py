@@ -19,7 +19,6 @@ from lidardesign_tasks.warehouse import WarehouseTask
 from support.hard_cases import hard_case
 from support.heads import EVERYTHING, face_rays, heads
 from support.scoring import design, make_request, rows_by_key
-from support.tables import each_row
 
 from lidardesign.density.training.learn import refuse_blind_receiver
 from lidardesign.errors import DataError
@@ -208,7 +207,7 @@ class TestEffectsNotCalledFor:
             for name in ("outcome", "range_m", "body"):
                 assert getattr(planned, name).tobytes() == getattr(everything, name).tobytes()
 
-    @each_row("effect", ["footprint", "motion", "specular", "shadowing", "atmosphere"])
+    @pytest.mark.parametrize("effect", ["footprint", "motion", "specular", "shadowing", "atmosphere"])
     def test_effects_of_geometry_leave_a_plain_scene_as_geometry_has_it(self, effect):
         (head,) = heads()[:1]
         thin = Detector("thin", pulse_sigma_s=1e-12)

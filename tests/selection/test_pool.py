@@ -213,13 +213,32 @@ def test_it_is_kept_up_to_its_largest_size(spare, run, monkeypatch):
     assert (run / FILE_NAME).is_file() == (spare == 0)
 
 
-def test_bytes_of_designs_depend_neither_on_the_pool_nor_on_earlier_fits(learned, tmp_path):
-    fresh, used = (shutil.copytree(learned[0], tmp_path / name) for name in ("fresh", "used"))
+BEFORE = {
+    "another number": {"sensors": 1, "rays": 30, "constraints": {"gate": {"end_m": {"max": 3.0}}}},
+    "gates of sensors": {"sensors": 2, "rays": 16},
+    "a bandwidth": {"sensors": 2, "rays": 16, "constraints": {"budget": {"bandwidth_mbps": 0.2}}},
+    "other bins": {"sensors": 2, "rays": 16, "constraints": {"budget": {"bin_ps": 900.0, "bits_per_bin": 4}}},
+    "sensors that may be idle": {"sensors": "best", "rays": 16},
+}
+
+
+@pytest.mark.parametrize("before", BEFORE)
+@pytest.mark.parametrize("kind", ["given", "free"])
+def test_bytes_of_designs_depend_neither_on_what_is_kept_nor_on_earlier_fits(kind, before, learned, tmp_path):
+    origin = learned[0] if kind == "given" else make_run(tmp_path / "origin")
+    fresh, used = (shutil.copytree(origin, tmp_path / name) for name in ("fresh", "used"))
 
     def document(folder):
-        return design_document(open_run(folder).fit(sensors=2, rays=36, gates="ray").specification)
+        return design_document(open_run(folder).fit(sensors=2, rays=16, gates="ray").specification)
 
-    open_run(used).fit(sensors=1, rays=100, constraints={"gate": {"end_m": {"max": 3.0}}})
+    open_run(used).fit(**BEFORE[before])
     assert (used / FILE_NAME).exists()
     first = document(used)
     assert document(fresh) == first == document(fresh)
+
+
+def test_other_gates_and_bandwidths_of_the_same_candidates_are_chosen_without_casting_again(tmp_path):
+    run = open_run(make_run(tmp_path / "free"))
+    for steps, options in (([], {}), ([], {"gates": "ray"}), ([], BEFORE["a bandwidth"])):
+        run.fit(**{"sensors": 2, "rays": 16, **options}, progress=lambda step, *_, told=steps: told.append(str(step)))
+        assert any("finding out" in step for step in steps) == (not options)

@@ -1,0 +1,164 @@
+"""Rays that are chosen on training scenes, from the command to the evaluation: seeds, scenes, files and messages."""
+
+from __future__ import annotations
+
+import functools
+import re
+
+import numpy as np
+import pytest
+from support.command_line import caller, make_run
+
+from lidardesign.api.run import open_run
+from lidardesign.constraints.check import check_design
+from lidardesign.constraints.document import Constraints
+from lidardesign.density.objective.proposals import samples_without_visibility
+from lidardesign.errors import ConfigError
+from lidardesign.formats.designs import load_design
+from lidardesign.rays import training
+from lidardesign.run_folder import RunFolder
+from lidardesign.samples import save_samples
+from lidardesign.sensors.bandwidth import Bandwidth
+from lidardesign.sensors.design_file import design_document, save_design
+from lidardesign.task import Information
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("run") / "flat")
+
+
+def chosen(run, sensors=2, **options):
+    return open_run(run).fit(sensors=sensors, name="chosen", **options)
+
+
+@functools.cache
+def spec_of(run):
+    """A design that several tests look at and none changes."""
+    return chosen(run, gates="ray").specification
+
+
+class TestDesignsWithChosenRays:
+    def test_have_a_pattern_for_each_number_of_the_task_in_which_no_two_rays_are_the_same(self, run):
+        assert spec_of(run).counts == sorted(open_run(run).task.defaults.rays)
+        for pattern in spec_of(run).patterns:
+            angles = np.stack([pattern.azimuth_rad[0], pattern.elevation_rad[0]], axis=1)
+            assert len(np.unique(np.hstack([pattern.origin_m[0], angles]), axis=0)) == len(pattern)
+
+    def test_fire_no_other_number_of_rays(self, run):
+        with pytest.raises(ConfigError, match="10 rays, which were not chosen"):
+            spec_of(run).rays(10)
+
+    def test_may_fire_a_single_ray(self, run):
+        assert len(chosen(run, sensors=1, rays=1, gates="ray").rays()) == 1
+
+    def test_are_the_same_for_the_same_seed_and_others_for_another_one(self, run):
+        first, second, other = (chosen(run, rays=9, seed=seed).rays() for seed in (0, 0, 1))
+        np.testing.assert_array_equal(first.direction, second.direction)
+        assert not np.array_equal(first.direction, other.direction)
+
+    def test_are_chosen_on_training_scenes_that_nothing_was_learned_from(self, run, monkeypatch):
+        asked, scenes = [], RunFolder.scenes
+        monkeypatch.setattr(
+            RunFolder, "scenes", lambda self, split, seed: asked.append((split, seed)) or scenes(self, split, seed)
+        )
+        # a region needs no density at any one place, and so no scene that was learned from
+        chosen(run, rays=9, constraints={"origin": {"spread_m": {"max": 0.5}}})
+        assert {split for split, _ in asked} == {"train"}
+        assert open_run(run).config.seed not in {seed for _, seed in asked}
+        # what judges is drawn apart from what is chosen on
+        assert len({seed for _, seed in asked}) >= 2
+
+    @pytest.mark.parametrize("limit", [{}, {"budget": {"bandwidth_mbps": 0.3}}])
+    def test_say_what_more_bandwidth_buys(self, run, limit):
+        certificates = chosen(run, gates="ray", constraints=limit).specification.certificates
+        for entry in certificates:
+            mbps, loss = np.array(entry["curve"]).T
+            assert (np.diff(mbps) > 0).all()
+            assert (np.diff(loss) < 0).all()
+        assert {entry["unit"] for entry in certificates} == {"m"}
+
+    @pytest.mark.parametrize("gates", ["sensor", "ray"])
+    def test_are_chosen_again_with_the_same_kind_of_gates(self, run, gates):
+        again = chosen(run, rays=9, gates=gates).constrain(constraints={"gate": {"width_m": {"max": 0.5}}})
+        assert again.specification.layout == "chosen"
+        assert again.specification.has_gates_per_ray == (gates == "ray")
+
+
+@pytest.fixture
+def fitted(lidardesign, run):
+    """A design of nine rays, fitted by the command."""
+    printed = lidardesign("fit", run, "--sensors", 2, "--rays", 9, "--name", "nine")
+    assert printed.code == 0, printed.err
+    return run / "designs" / "nine.yaml", printed.out
+
+
+class TestTheCommand:
+    def test_says_how_far_from_the_best_they_are(self, lidardesign, run, fitted):
+        words = r"^chosen among \d+ rays on \d+ training scenes; these 9 have a loss of"
+        assert re.search(words, fitted[1], re.MULTILINE)
+        again = lidardesign("fit", run, "--sensors", 2, "--rays", 9, "--name", "nine", "--json").json
+        assert again["certificates"] == lidardesign("show", fitted[0], "--json").json["certificates"]
+
+    def test_certifies_every_number_where_that_is_asked_for(self, lidardesign, run):
+        for options, counts in (((), [32]), (("--certify",), [8, 16, 32, 64])):
+            document = lidardesign("fit", run, "--sensors", 2, *options, "--json").json
+            assert [entry["rays"] for entry in document["certificates"]] == counts
+
+    def test_scores_them_at_the_numbers_that_were_chosen(self, lidardesign, fitted):
+        scored = lidardesign("evaluate", fitted[0], "--json", "--set", "test=2").json
+        assert {row["rays"] for row in scored["rows"] if row["design"] == "nine"} == {9}
+        refused = lidardesign("evaluate", fitted[0], "--rays", 10)
+        assert refused.code == 2
+        assert "rays were chosen at other numbers" in refused.err
+
+    def test_refuses_rays_that_tell_nothing(self, lidardesign, run, monkeypatch):
+        nothing = Information(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(5, int))
+        monkeypatch.setattr(training, "checked_information", lambda task, scene, returns: nothing)
+        refused = lidardesign("fit", run, "--rays", 4)
+        assert refused.code == 3
+        assert "tells anything about 5 training scenes" in refused.err
+
+    def test_needs_a_task_that_says_what_returns_tell(self, lidardesign, run, monkeypatch):
+        monkeypatch.setattr("lidardesign.fitting.request.informs_rays", lambda task: False)
+        refused = lidardesign("fit", run, "--layout", "chosen")
+        assert refused.code == 2
+        assert "has no method informs" in refused.err
+
+    def test_leaves_damaged_certificates_out(self, lidardesign, fitted):
+        spec = load_design(fitted[0])
+        spec.certificates[0]["rays"] = "nine"
+        save_design(spec, fitted[0])
+        shown = lidardesign("show", fitted[0])
+        assert shown.code == 0
+        assert "rays chosen on training scenes" not in shown.out
+
+
+@pytest.fixture(scope="module")
+def aisle(tmp_path_factory):
+    folder = make_run(tmp_path_factory.mktemp("run") / "aisle", task="warehouse")
+    config = RunFolder.open(folder).config
+    scenes = RunFolder.open(folder).scenes("train", config.seed)
+    generator = np.random.default_rng(0)
+    save_samples(samples_without_visibility(scenes, config.space, config.density, 20_000, generator), folder)
+    return folder
+
+
+def test_along_an_aisle_patterns_lead_all_the_way_and_keep_the_bandwidth_between_knots_too(aisle):
+    rules, space = {"budget": {"bandwidth_mbps": 0.2}}, open_run(aisle).config.space
+    design = chosen(aisle, constraints=rules).specification
+    assert design.counts == sorted(open_run(aisle).task.defaults.rays)
+    assert {pattern.ends for pattern in design.patterns} == {(space.low[0], space.high[0])}
+    checks = check_design(design_document(design), Constraints.from_mapping(rules), space)
+    assert all(check.satisfied for check in checks)
+    for count in design.counts:
+        for at in np.linspace(space.low[0], space.high[0], 97):
+            rays = design.rays(count, at={"x_m": float(at)})
+            assert len(rays) == count
+            assert (rays.origin_m[:, 0] == at).all()
+            assert Bandwidth().mbps(rays) <= 0.2 + 1e-12
