@@ -98,7 +98,7 @@ class Law:
 
 @dataclass(frozen=True)
 class Finding:
-    """What became of a law.
+    """The outcome of a law.
 
     Arguments:
         law: Its name.
@@ -143,7 +143,7 @@ def error_words(error: LidardesignError) -> str:
 
 
 def place_of(error: BaseException) -> str:
-    """Where in other code than this package's an error comes from, as " (task.py:52)"; empty where that is unknown.
+    """The place in other code than this package's that an error comes from, as " (task.py:52)"; empty if unknown.
 
     Of several places the last one counts that is in no installed library, unless there is none but in libraries.
     """
@@ -265,7 +265,7 @@ class Subject:
 
     @cached_property
     def metric(self) -> Metric:
-        """What scores mean."""
+        """The meaning of scores."""
         if not hasattr(self.task, "metric_of"):
             return self.task.metric
         with self.calling("metric_of"):
@@ -295,7 +295,7 @@ class Subject:
         return self._rays[number, count]
 
     def returns(self, number: int, lists: Sequence[Rays]) -> list[Returns]:
-        """What rays give in a scene that is looked at: for each condition value all frames, as `score` gets them."""
+        """Returns of rays in a scene that is looked at: for each condition value all frames, as `score` gets them."""
         scene, casters = self.looked_at[number], self.casters(number)
         return [frame for rays in lists for frame in simulate(scene, rays, casters=casters)]
 
@@ -340,7 +340,7 @@ def _add(digest: Any, value: Any, depth: int) -> None:
 
 
 def _parts(value: Any) -> list[Any]:
-    """What a value is made of, in an order that does not depend on the process."""
+    """The parts of a value, in an order that does not depend on the process."""
     if is_dataclass(value) and not isinstance(value, type):
         return [(field.name, getattr(value, field.name)) for field in fields(value)]
     if isinstance(value, BaseModel):

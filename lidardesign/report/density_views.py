@@ -65,7 +65,7 @@ class DensityView:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """How much of the density lies along one dimension, whatever the others are.
+    """The density along one dimension, whatever the others are.
 
     Arguments:
         dimension: Its name, as "azimuth_rad".
@@ -85,7 +85,7 @@ class Marginal:
 
     @property
     def top(self) -> float:
-        """Where an axis of heights ends: what stands out far beyond the density is cut off."""
+        """The end of an axis of heights: what stands out far beyond the density is cut off."""
         most = float(self.heights.max(initial=0.0))
         beside = max((float(heights.max(initial=0.0)) for heights in self.designs.values()), default=0.0)
         return 1.05 * (min(max(most, beside), HIGHEST * most) if most > 0 else max(beside, 1.0))
@@ -93,7 +93,7 @@ class Marginal:
 
 @dataclass(frozen=True, eq=False)
 class PlaneDensity:
-    """How much of the density observes each place, seen along an axis: all of it is projected onto a plane.
+    """The density that observes each place, seen along an axis: all of it is projected onto a plane.
 
     Arguments:
         axes: The world axes across and up, as (1, 2) for y and z.
@@ -179,7 +179,7 @@ def _degrees_points(points: np.ndarray, start: float | None) -> np.ndarray:
 
 
 def turn_start(azimuth_rad: np.ndarray, weights: np.ndarray, space: DesignSpace) -> float:
-    """Where an axis of azimuths is cut: opposite of the space's middle, of a full turn where it is emptiest [rad]."""
+    """The azimuth at which an axis is cut: opposite of the space's middle, or where a full turn is emptiest [rad]."""
     low, middle = space.low[AZIMUTH], (space.low[AZIMUTH] + space.high[AZIMUTH]) / 2
     if not space.full_azimuth:
         return middle - FULL_TURN / 2
@@ -284,7 +284,7 @@ def smoothed(held: np.ndarray) -> np.ndarray:
 def silhouette(
     scene: Scene, frame: int, axes: tuple[int, int], edges: tuple[np.ndarray, np.ndarray], *, targets: bool = True
 ) -> np.ndarray:
-    """Which cells targets (or the other bodies) cover in projection, shape (V, U) bool; infinite planes cover none.
+    """Cells that targets (or the other bodies) cover in projection, shape (V, U) bool; infinite planes cover none.
 
     Arguments:
         scene, frame: What is looked at.

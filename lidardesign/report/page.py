@@ -196,7 +196,7 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
 
 
 def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str:
-    """Who is better and by how much, how far chosen rays are from the best, and what a reader should know.
+    """The result: who is better and by how much, how far chosen rays are from the best, and notes.
 
     Arguments:
         evaluation: The scores.
@@ -256,7 +256,7 @@ def _about(evaluation: Evaluation) -> list[str]:
 
 
 def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list[str]:
-    """How far chosen rays are from the best, in one sentence for all designs; none where no rays were chosen."""
+    """The distance of chosen rays from the best, in one sentence for all designs; none without chosen rays."""
     rows = evaluation.headline_rows
     gaps = [
         f"{100 * entry['gap']:.1f} % ({design.name})"

@@ -52,7 +52,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def held_out_scenes(scenes: int) -> str:
-    """How many held-out scenes, in words."""
+    """A number of held-out scenes in words."""
     return counted(scenes, "held-out scene")
 
 
@@ -191,7 +191,7 @@ def table(
 
 @dataclass(frozen=True)
 class CommandTimes:
-    """Where the time of one command went.
+    """The time of one command by phase.
 
     Arguments:
         command: Its name, as `learn`.
@@ -213,7 +213,7 @@ class CommandTimes:
 
 @dataclass(frozen=True)
 class Reproduction:
-    """How to get the same figures again.
+    """Commands and facts by which anybody gets the same figures again.
 
     Arguments:
         commands: What was typed, in order, with what each is for.
@@ -336,7 +336,7 @@ def _scrolled(headings: Sequence[str], text: Sequence[int], rows: Iterable[str],
 
 
 def effects_section(evaluation: Evaluation) -> str:
-    """What could change the scores, and what of it was simulated; one sentence where nothing could."""
+    """Effects that could change the scores, and which of them were simulated; one sentence where none could."""
     effects = evaluation.effects
     detector = html.escape(evaluation.detector)
     if not any(effect.on or effect.range_m or effect.lost for effect in effects):

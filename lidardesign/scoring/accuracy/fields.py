@@ -285,7 +285,7 @@ def visibility_sweep(case: VisibilityCase, points: int, default: str, note: str 
 
 
 def _part(few: list[Scene], scenes: list[Scene]) -> str:
-    """Which part of the scenes was measured; "" where it was all of them."""
+    """The part of the scenes that was measured; "" where it was all of them."""
     if few is scenes:
         return ""
     frames = f", {few[0].frames} frames of each" if scenes[0].frames > few[0].frames else ""
@@ -343,7 +343,7 @@ class VisibilityCase:
 
     @property
     def is_blind(self) -> bool:
-        """Whether no probe reaches a surface, or none sees one."""
+        """True where no probe reaches a surface, or none sees one."""
         return bool(self.exact.max(initial=LOG_OPAQUE) < LOG_OPAQUE / 2)
 
     def quadrature(self, points: int) -> Target:
@@ -360,7 +360,7 @@ class VisibilityCase:
 
     @property
     def work(self) -> str:
-        """What is timed."""
+        """The work that is timed."""
         return f"log p* with its gradient at {min(self.batch, len(self.probes.points))} design points"
 
 

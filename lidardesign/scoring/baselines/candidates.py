@@ -1,4 +1,4 @@
-"""What a baseline may take: layouts of any number of rays, with one gate or a gate per ray, in a bandwidth.
+"""Candidates of baselines: layouts of any number of rays, with one gate or a gate per ray, in a bandwidth.
 
 A design has one list of rays. Where a task's scenes are seen from several condition values (a robot's positions), it
 has one list per value; all have the same number of rays.
@@ -52,7 +52,7 @@ def opened_gate(start_m: float | np.ndarray, end_m: float | np.ndarray) -> np.nd
 
 
 class LayoutSite(NamedTuple):
-    """Where and for which scene rays are laid out.
+    """A design space and a scene that rays are laid out for.
 
     Arguments:
         space: The design space at a condition value.

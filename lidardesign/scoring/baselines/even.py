@@ -216,7 +216,7 @@ def central(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def central_field(space: DesignSpace, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> SphereField:
-    """What holds the central 99 % of directions (K,) per axis: the smallest rectangle, or a zone past a hemisphere.
+    """A field of the central 99 % of directions (K,) per axis: the smallest rectangle, or a zone past a hemisphere.
 
     Arguments:
         space: The design space, both of whose angles are free.
@@ -307,7 +307,7 @@ def bounding(views: TrainingViews, *, gates_per_ray: bool = False) -> list[Gated
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """Where the training returns are at a condition value.
+    """The part of a design space from which training scenes return at a condition value.
 
     Arguments:
         low, high: A box of rays (x, y, z, azimuth, elevation), shape (5,).
@@ -327,7 +327,7 @@ CropOf = Callable[[TrainingViews, DesignSpace, Observed], Crop | None]
 
 
 def crop_kinds(space: DesignSpace) -> dict[str, CropOf]:
-    """How a design space can be cropped to what returns; with free origins there are two ways."""
+    """Ways to crop a design space to what returns; with free origins there are two."""
     origins = [axis for axis in space.free if axis < AZIMUTH and axis not in space.conditioned]
     return {"parallel": _parallel_crop, "cropped": box_crop} if origins else {"cropped": box_crop}
 
@@ -395,6 +395,6 @@ def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, floa
 def _dense_table(
     views: TrainingViews, low: np.ndarray, high: np.ndarray, directions: SphereField | None
 ) -> Callable[[], ReturnTable]:
-    """What dense rays in a crop return, traced when that is first asked for."""
+    """Returns of dense rays in a crop, traced when they are first asked for."""
     count = dense_rays(int((high > low).sum()))
     return cache(lambda: views.returns(even_placement(low, high, count, directions)))

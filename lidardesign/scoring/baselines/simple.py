@@ -336,7 +336,7 @@ def occupancy_grid(scenes: Sequence[Scene], space: DesignSpace, seed: int) -> Oc
 
 @dataclass(frozen=True, eq=False)
 class OccupancyGrid:
-    """How often targets' surfaces lie in the cells of a grid.
+    """A grid, and how often targets' surfaces lie in its cells.
 
     Arguments:
         low_m: Its lower corner, shape (3,).

@@ -120,7 +120,7 @@ class Capture:
 
     @property
     def gated(self) -> bool:
-        """Whether pixels begin to count at different times."""
+        """True where pixels begin to count at different times."""
         return bool((self.start_ps != self.start_ps[0]).any())
 
     @cached_property

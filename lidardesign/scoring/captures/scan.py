@@ -30,7 +30,7 @@ SAME_PLACE_M = 0.005
 
 
 class Captured(IntEnum):
-    """Whether a capture has what a ray would have measured."""
+    """Why a capture has nothing of a ray, or that it has it."""
 
     YES = 0
     OTHER_PLACE = 1
@@ -40,7 +40,7 @@ class Captured(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class CapturedScan:
-    """What rays measure in a capture, N of them.
+    """Measurements of N rays in a capture.
 
     Arguments:
         captured: Values of `Captured`, shape (N,).
@@ -70,7 +70,7 @@ class CapturedScan:
 def scan(
     capture: Capture, rays: Rays, within_rad: float, estimation: Estimation, name: str | None = None
 ) -> CapturedScan:
-    """What a list of rays measures in a capture.
+    """The measurements of a list of rays in a capture.
 
     Arguments:
         capture: The captured histograms.
@@ -95,7 +95,7 @@ def scan(
 
 
 def scan_pixels(capture: Capture, estimation: Estimation) -> CapturedScan:
-    """What every pixel measures in its whole histogram."""
+    """The measurement of every pixel in its whole histogram."""
     pixels = np.arange(len(capture))
     first, last = gate_bins(capture, pixels, np.tile(_listening_windows_m(capture), (len(capture), 1)))
     captured = np.where(first < last, Captured.YES, Captured.OUT_OF_WINDOW)
@@ -156,7 +156,7 @@ def default_within_rad(capture: Capture) -> float:
 
 @dataclass(frozen=True)
 class Estimation:
-    """How a range follows from a histogram.
+    """The way from a histogram to a range.
 
     Arguments:
         estimator: Its highest bin, or the log-matched filter with the pulse.

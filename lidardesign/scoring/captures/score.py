@@ -58,7 +58,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """How a capture is judged.
+    """Settings by which a capture is judged.
 
     Arguments:
         estimation: How ranges follow from histograms.
@@ -235,7 +235,7 @@ def _notes(capture: Capture, rows: Sequence[CaptureRow]) -> list[str]:
 
 
 def _reference_ranges(capture: Capture, estimation: Estimation) -> tuple[np.ndarray, str]:
-    """What every pixel should have measured, shape (P,) [m], and where that is from."""
+    """The range that every pixel should have measured, shape (P,) [m], and where it is from."""
     if capture.true_range_m is not None:
         return capture.true_range_m, "the capture's true ranges"
     ranges = scan_pixels(capture, estimation).range_m

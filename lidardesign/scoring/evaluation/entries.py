@@ -334,12 +334,12 @@ class EffectSummary:
 
     @property
     def on(self) -> bool:
-        """Whether it was simulated anywhere."""
+        """True where it was simulated in any scene."""
         return self.scenes_on > 0
 
     @property
     def exceeds(self) -> bool:
-        """Whether it could change more than is tolerated."""
+        """True where it could change more than is tolerated."""
         return self.range_m > self.tolerance.range_m or self.lost > self.tolerance.lost
 
     def as_dict(self) -> dict[str, Any]:
@@ -376,7 +376,7 @@ def _summary(name: str, plans: Sequence[EffectPlan]) -> EffectSummary:
 
 
 def effect_notes(effects: Sequence[EffectSummary], choice: Choice) -> list[str]:
-    """What was not simulated although it matters."""
+    """Lines on effects that were not simulated although they matter."""
     notes = [
         f"{effect.name} is not simulated ({effect.missing}): it may move ranges by up to "
         f"{MILLIMETRES * effect.range_m:.3g} mm and change {effect.lost:.2g} of the returns"
