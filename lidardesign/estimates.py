@@ -1,4 +1,4 @@
-"""How far a figure may be off: an error beside every figure that a command returns.
+"""Estimates: an error beside every figure that a command returns.
 
 Standard errors follow from the influence of single samples (delta method; Owen 2013, "Monte Carlo theory, methods and
 examples", ch. 9.2): the figure moves by the mean of what each sample moves it by. They hold for samples whose weights

@@ -1,9 +1,7 @@
-"""Weighted samples of the learned density, kept in the run so that `fit` and `constrain` need no flow.
+"""Weighted samples of the learned density, which `fit` and `constrain` use in its place, and a word for how good it is.
 
-One word for how good a learned density is: good, usable or poor.
-
-What matters is what designs lose by it. Rays are chosen among candidates that the density proposes, with a quarter of
-even ones beside them, so a rough density costs little; benchmarks/verdicts.py measures how much.
+A density is good, usable or poor by what designs lose by it. Rays are chosen among candidates that it proposes, so a
+rough density costs little; benchmarks/verdicts.py measures how much.
 """
 
 from __future__ import annotations
@@ -30,6 +28,7 @@ NUMBERS = ("points", "log_prob", "log_target")
 DAMAGED_HINT = "learn the run again"
 # The most of its mass in the wrong place, the largest KL [nats] and the least ESS of a density with this verdict.
 BOUNDS: dict[str, tuple[float, float, float]] = {"good": (0.25, 0.5, 0.2), "usable": (0.5, 2.0, 0.05)}
+# What to do next for a better one, by the preset that it was learned with.
 NEXT = {"draft": "--preset standard learns longer", "standard": "--preset fine learns longer"}
 LAST = "more learning.steps to a smaller learning.misplaced; a smaller space or a larger density.sigma_m learn faster"
 

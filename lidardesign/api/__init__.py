@@ -1,1 +1,1 @@
-"""What `import lidardesign` offers: runs, designs and scores as whole steps."""
+"""The API of `import lidardesign`: runs, designs and scores as whole steps."""

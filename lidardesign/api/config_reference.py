@@ -1,4 +1,4 @@
-"""What a configuration takes: a file to begin with, the keys of a task in words, and the schemas of files."""
+"""The reference of configurations: a file to begin with, the keys of a task in words, and the schemas of files."""
 
 from __future__ import annotations
 

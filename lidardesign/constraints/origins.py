@@ -1,4 +1,4 @@
-"""Where sensors may stand: origin boxes less excluded boxes, mounts, and the places that a design space fixes.
+"""Places of sensors: origin boxes less excluded boxes, mounts, and the places that a design space fixes.
 
 What is left is not convex, so it is described by its maximal boxes: a box avoids the interiors of all excluded boxes
 just where it lies in one of the maximal boxes between them. So an interval of origins, which is a box of its own, is

@@ -1,4 +1,4 @@
-"""How much room a design leaves under each of its constraints: what one would have to loosen to gain anything.
+"""The room that a design leaves under each of its constraints: what one would have to loosen to gain anything.
 
 Works on what the independent checker found; bounds that many sensors share are told once, by the closest sensor.
 """

@@ -75,7 +75,7 @@ class Contract:
         self._findings: dict[str, Finding] = {}
 
     def finding(self, name: str) -> Finding:
-        """What became of a law.
+        """The finding of a law.
 
         Raises:
             ConfigError: There is no law of this name.
@@ -87,7 +87,7 @@ class Contract:
         return self._findings[name]
 
     def findings(self) -> Iterator[Finding]:
-        """What became of each law, in order."""
+        """The finding of each law, in order."""
         for law in LAWS:
             yield self.finding(law.name)
 

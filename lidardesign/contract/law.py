@@ -1,8 +1,7 @@
 """Laws of the task contract, the task that they are tried on, and what became of each of them.
 
-A digest of what a value holds, whatever the process: what is equal in content has the same one.
-
-Rays that see a scene's targets, and what becomes of their returns when they are disturbed.
+What several laws need is here too: digests that are equal for equal content, whatever the process; rays that see a
+scene's targets; and their returns, disturbed.
 """
 
 from __future__ import annotations
@@ -45,18 +44,15 @@ LOADS = (
     "interface",
     "it is imported, has all members of the interface, and its configuration resolves",
 )
-
-
 # One call of a task's code may take so long, where nothing else is asked for.
 CALL_SECONDS = 60.0
 # The geometry and the scores of so many training scenes are looked at.
 LOOKED_AT = 3
-DEEPEST = 40
+DEEPEST = 40  # nesting of a value that has a digest
 # What of scenes and bodies no ray meets, or what is told apart otherwise.
 UNSEEN = ("name", "group", "notes", "truth", "bodies", "poses", "importance")
-DRAW_ROUNDS = 12
-# Of a scene that moves, so many frames are aimed at.
-MOST_FRAMES = 8
+# So often rays at targets are drawn until they are enough; of a scene that moves, so many frames are aimed at.
+DRAW_ROUNDS, MOST_FRAMES = 12, 8
 # Half the gate where the space fixes the range, as a share of it.
 HALF_GATE = 0.05
 SEED = 20_251
@@ -102,7 +98,7 @@ class Law:
 
 @dataclass(frozen=True)
 class Finding:
-    """What became of a law.
+    """The outcome of a law.
 
     Arguments:
         law: Its name.
@@ -147,7 +143,7 @@ def error_words(error: LidardesignError) -> str:
 
 
 def place_of(error: BaseException) -> str:
-    """Where in other code than this package's an error comes from, as " (task.py:52)"; empty where that is unknown.
+    """The place in other code than this package's that an error comes from, as " (task.py:52)"; empty if unknown.
 
     Of several places the last one counts that is in no installed library, unless there is none but in libraries.
     """
@@ -269,7 +265,7 @@ class Subject:
 
     @cached_property
     def metric(self) -> Metric:
-        """What scores mean."""
+        """The meaning of scores."""
         if not hasattr(self.task, "metric_of"):
             return self.task.metric
         with self.calling("metric_of"):
@@ -299,7 +295,7 @@ class Subject:
         return self._rays[number, count]
 
     def returns(self, number: int, lists: Sequence[Rays]) -> list[Returns]:
-        """What rays give in a scene that is looked at: for each condition value all frames, as `score` gets them."""
+        """Returns of rays in a scene that is looked at: for each condition value all frames, as `score` gets them."""
         scene, casters = self.looked_at[number], self.casters(number)
         return [frame for rays in lists for frame in simulate(scene, rays, casters=casters)]
 
@@ -344,7 +340,7 @@ def _add(digest: Any, value: Any, depth: int) -> None:
 
 
 def _parts(value: Any) -> list[Any]:
-    """What a value is made of, in an order that does not depend on the process."""
+    """The parts of a value, in an order that does not depend on the process."""
     if is_dataclass(value) and not isinstance(value, type):
         return [(field.name, getattr(value, field.name)) for field in fields(value)]
     if isinstance(value, BaseModel):

@@ -37,7 +37,7 @@ REFUSALS = {"config": ConfigError, "data": DataError}
 
 @dataclass(frozen=True)
 class CheckRequest:
-    """What to check.
+    """A task that is checked in a process of its own.
 
     Arguments:
         name: The task, as `learn` takes it.
@@ -55,7 +55,7 @@ class CheckRequest:
 
 
 def check_in_process(request: CheckRequest) -> Iterator[Finding]:
-    """What became of each law, as it is found; the first is that the plugin loads.
+    """The finding of each law, as soon as there is one; the first is that the plugin loads.
 
     Raises:
         ConfigError, DataError: There is no such task, or its configuration is refused.
@@ -121,7 +121,7 @@ def _next_finding(child: Child, seconds: float, *, loading: bool) -> dict[str, A
 
 
 def _finding(found: dict[str, Any]) -> Finding:
-    """What a line says; where the configuration was refused, the error that it was refused with."""
+    """The finding of a line; where the configuration was refused, the error that it was refused with."""
     if "refused" not in found:
         return Finding(**found)
     told = found["refused"]

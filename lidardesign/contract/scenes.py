@@ -1,6 +1,7 @@
-"""Laws of a task's scenes: made again they are the same, splits share none, and they travel to other processes.
+"""Laws of what a task says about itself, and of its scenes.
 
-Laws of what a task says about itself: its configuration, metric, defaults and design space.
+It has a configuration, a metric, defaults and a design space. Scenes that are made again are the same, splits share
+none, and they travel to other processes.
 """
 
 from __future__ import annotations

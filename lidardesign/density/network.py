@@ -10,15 +10,13 @@ with those they follow a surface's relief in fewer steps.
 For an azimuth that spans the full turn the outer slopes are tied and each spline starts half a turn away, so that the
 density is continuous across 0 / 2 pi; networks see its waves alone.
 
+Splines are zuko's, with learned outer slopes and circles. On the CPU compiled kernels run (`spline_kernels`): a layer's
+splines then cost about what their exponentials do, and the derivatives of the inverse are written out too. On other
+devices `BoundedSpline` runs as array operations; it is also what the kernels are tested against.
+
 References:
     Neural Spline Flows, Durkan et al. 2019. Normalizing Flows on Tori and Spheres, Rezende et al. 2020. Fourier
     Features Let Networks Learn High Frequency Functions in Low Dimensional Domains, Tancik et al. 2020.
-
-The splines of the flow: zuko's, with learned outer slopes and circles, and the same function compiled.
-
-On the CPU the compiled kernels run (`spline_kernels`): a layer's splines then cost about what their exponentials do,
-and the derivatives of the inverse are written out too. On other devices `BoundedSpline` runs as array operations; it is
-also what the kernels are tested against.
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ from lidardesign.numerics import FLOAT32_ROUNDING, safe_sqrt
 INITIAL_SCALE = 0.1
 # Whole numbers of waves over a coordinate's range, so that those of a circle close.
 WAVES = (1.0, 2.0, 4.0)
-BOUND = 1.0
+BOUND = 1.0  # of the box
 # Foreign points and base samples are kept this far inside the box, where splines are smooth.
 EDGE = FLOAT32_ROUNDING
 # The smallest slope that a stack of splines may take; its inverse is the steepest. What may be steeper has gradients

@@ -4,7 +4,8 @@ Where nobody says how many sensors it has, designs of a few and of more are fitt
 and in the bandwidth of those of most sensors. The task scores them on training scenes that were held back; the fewest
 sensors win that are no worse than the best by more than a standard error.
 
-A design's twin of the density without its occlusion term: what occlusion is worth, without learning again.
+A design's twin is fitted to the density without its occlusion term: it shows what occlusion is worth, without learning
+again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which real parts to buy, and where to mount them: `fit --parts`.
+"""Real parts to buy, and where to mount them: `fit --parts`.
 
 Parts are proposed at the mounts, or at places in the box of origins, facing what the density looks at, upright and
 turned. Training scenes that nothing was learned from say what each would tell, and the best few are chosen, with a

@@ -1,16 +1,15 @@
-"""Parts as components of fixed shape: their field of view and gate are what they are, only the pose is free.
+"""Real parts at poses: components of fixed shape, and candidates of which each tells something about scenes.
 
-A part's field of view and range cannot be narrowed; only outside the design space's range, where no task has anything,
-does its read-out stop. It may be mounted upright or turned by a quarter about its boresight. A component's roll stays
-within an eighth of a turn, so a part that is turned is a component whose two spreads are exchanged.
+A part's field of view and range cannot be narrowed, only its pose is free; only outside the design space's range, where
+no task has anything, does its read-out stop. It may be mounted upright or turned by a quarter about its boresight. A
+component's roll stays within an eighth of a turn, so a part that is turned is a component whose two spreads are
+exchanged.
 
-Real parts at poses as candidates: what each of thousands tells about scenes.
-
-To cast every part at every pose would be millions of rays. Parts at one place share rays: their directions are taken
-apart in cells of a sphere, each cell is cast once from each place, and a part at a pose tells what the cells of its
-rays tell, inside its own gate. Of dense patterns an even subset stands for all, and of many items a random draw. Cells
-are as small as the number of rays to be cast allows. The cell's ray is that of one of the parts, so that patterns in a
-plane stay in it.
+To cast every one of thousands of parts at poses would be millions of rays. Parts at one place share rays: their
+directions are taken apart in cells of a sphere, each cell is cast once from each place, and a part at a pose tells what
+the cells of its rays tell, inside its own gate. Of dense patterns an even subset stands for all, and of many items a
+random draw. Cells are as small as the number of rays to be cast allows. The cell's ray is that of one of the parts, so
+that patterns in a plane stay in it.
 """
 
 from __future__ import annotations
@@ -39,6 +38,7 @@ from lidardesign.sensors.sensor import boresight_frame, boresight_of
 from lidardesign.space import RANGE, DesignSpace, angles
 from lidardesign.task import Information, random_generator
 
+# What constraints may ask of a part, which it keeps or does not.
 BOUNDED = ("field_of_view.horizontal_deg", "field_of_view.vertical_deg", "gate.start_m", "gate.end_m", "gate.width_m")
 MOST_CAST = 60_000  # rays of a scene, over all places
 MOST_CASTS = 1_000_000  # of a scene, over all its frames

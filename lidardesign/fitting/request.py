@@ -1,8 +1,7 @@
-"""What a fit is asked for: the choices of a user, resolved by the run, an earlier design, constraints and a rig.
+"""A fit: what it is asked for, what it came to, and the target density that it fits to.
 
-What a fit or a choice came to: the design, its checks, and how far its figures may be off.
-
-The samples and the target density of a run, under settings of the task that weight them.
+The choices of a user are resolved by the run, an earlier design, constraints and a rig; settings of the task may weight
+the run's samples and its target density.
 """
 
 from __future__ import annotations
@@ -46,6 +45,7 @@ CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones w
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
 # Keys by which tasks are told where sensors may be.
 PLACE_KEYS = ("origin_m", "origin_box_m")
+# In the provenance of designs, and what to do where it cannot be understood.
 KEY = "weighting"
 FIT_AGAIN = "fit the design again: an earlier version refined it, or its file was changed by hand"
 
@@ -215,6 +215,41 @@ class FitRequest:
     def counts(self) -> list[int]:
         """The numbers of rays that are chosen, ascending."""
         return sorted({self.rays} if self.rays else set(self.run.task.defaults.rays))
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """Settings of the task to whose scenes the density of a run is weighted for a design.
+
+    Arguments:
+        settings: As KEY=VALUE; none leaves the density as it was learned.
+        origin: Where they were said: an option, or a design.
+    """
+
+    settings: tuple[str, ...] = ()
+    origin: str = "--weight"
+
+    @classmethod
+    def of(cls, design: DesignSpec) -> Weighting:
+        """What a design says about its samples.
+
+        Raises:
+            ConfigError: It says something else.
+        """
+        document, where = design.provenance.get(KEY), f"{KEY} of design {design.name}"
+        if document is None:
+            return cls()
+        if not isinstance(document, Mapping) or set(document) != {"set"}:
+            found = f"keys {', '.join(map(str, document))}" if isinstance(document, Mapping) else repr(document)
+            raise ConfigError(f"holds {found}", where=where, allowed="the key set alone", hint=FIT_AGAIN)
+        settings = document["set"]
+        if not isinstance(settings, list | tuple) or not all(isinstance(text, str) for text in settings):
+            raise ConfigError(f"set is {settings!r}", where=where, allowed="a list of KEY=VALUE", hint=FIT_AGAIN)
+        return cls(tuple(settings), f"{where}: set")
+
+    def as_document(self) -> dict[str, Any]:
+        """Plain values, as they stand in the provenance of a design."""
+        return {"set": list(self.settings)}
 
 
 def _layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, options: FitOptions) -> LayoutName:
@@ -462,41 +497,6 @@ class FitResult:
             "seconds": self.seconds,
             "error_estimates": as_documents(self.error_estimates),
         }
-
-
-@dataclass(frozen=True)
-class Weighting:
-    """Settings of the task to whose scenes the density of a run is weighted for a design.
-
-    Arguments:
-        settings: As KEY=VALUE; none leaves the density as it was learned.
-        origin: Where they were said: an option, or a design.
-    """
-
-    settings: tuple[str, ...] = ()
-    origin: str = "--weight"
-
-    @classmethod
-    def of(cls, design: DesignSpec) -> Weighting:
-        """What a design says about its samples.
-
-        Raises:
-            ConfigError: It says something else.
-        """
-        document, where = design.provenance.get(KEY), f"{KEY} of design {design.name}"
-        if document is None:
-            return cls()
-        if not isinstance(document, Mapping) or set(document) != {"set"}:
-            found = f"keys {', '.join(map(str, document))}" if isinstance(document, Mapping) else repr(document)
-            raise ConfigError(f"holds {found}", where=where, allowed="the key set alone", hint=FIT_AGAIN)
-        settings = document["set"]
-        if not isinstance(settings, list | tuple) or not all(isinstance(text, str) for text in settings):
-            raise ConfigError(f"set is {settings!r}", where=where, allowed="a list of KEY=VALUE", hint=FIT_AGAIN)
-        return cls(tuple(settings), f"{where}: set")
-
-    def as_document(self) -> dict[str, Any]:
-        """Plain values, as they stand in the provenance of a design."""
-        return {"set": list(self.settings)}
 
 
 class RunTarget:

@@ -1,17 +1,5 @@
 r"""Rays for a two-mirror scanner with a gated single-photon detector: mirror angles in the order of least travel.
 
-One row per ray, in the order in which the mirrors reach them. `lidardesign.formats.galvo` says what the angles mean: x
-and y are optical, twice the mechanical ones. A scanner has one place, so rays that start elsewhere are the rows of
-another `position`, with its own origin, boresight and tour: the scanner is moved there, or another one stands there.
-A position's boresight is the middle of its rays.
-
-The order is a short round trip. Both mirrors turn at once, so a step takes as long as the one that turns further: the
-length of a step is the larger of its two angles. A frame follows the next, so the trip leads back to where it began.
-Tours start from the nearest neighbour and from the rays' own order, and are improved by turning stretches round (2-opt,
-Croes 1958) until that helps no more. Nothing in it is random.
-
-Two-mirror scanners: the optical scan angles of a ray, and its gate as times.
-
 The beam meets the x mirror, then the y mirror. Turning a mirror by an angle turns the beam by twice that angle: the
 optical scan angles x and y here are twice the mechanical ones. The x mirror fans the beam out sideways, the y mirror
 turns that fan about the sideways axis:
@@ -22,6 +10,15 @@ with f the boresight (where x = y = 0), h the direction of growing azimuth and u
 and without roll. For mirrors at one place this is exact (two rotations by twice the mirrors' angles); on a flat screen
 at the distance D it lands at D tan(x) / cos(y) sideways and D tan(y) upwards, the known pincushion of such scanners.
 Light needs 2 range / c forth and back, so gates are two-way times.
+
+A file has one row per ray, in the order in which the mirrors reach them. A scanner has one place, so rays that start
+elsewhere are the rows of another `position`, with its own origin, boresight and tour: the scanner is moved there, or
+another one stands there. A position's boresight is the middle of its rays.
+
+The order is a short round trip. Both mirrors turn at once, so a step takes as long as the one that turns further: the
+length of a step is the larger of its two angles. A frame follows the next, so the trip leads back to where it began.
+Tours start from the nearest neighbour and from the rays' own order, and are improved by turning stretches round (2-opt,
+Croes 1958) until that helps no more. Nothing in it is random.
 """
 
 from __future__ import annotations
@@ -46,26 +43,27 @@ from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import angles
 
-NEIGHBOURS = 6
+NEIGHBOURS = 6  # of a stop, that tours may lead to next
 # Nearest-neighbour tours cost time with the square of their stops; larger ones start from the rays' own order alone.
 MOST_NEAREST = 20_000
 # Rounds of improvement: 576 stops take 40, 5000 take 200; bounds the time of ever larger tours.
 MOST_ROUNDS = 500
 # Gains below this share of the tour's extent are rounding noise, and could be taken back and forth for ever.
 LEAST_GAIN = ROUNDING
+# Columns of a file, those of whole numbers first.
 WHOLE = ("step", "position", "gate_start_ps", "gate_width_ps", "sensor", "ray")
 COLUMNS = (
     "step", "position", "origin_x_m", "origin_y_m", "origin_z_m", "boresight_azimuth_deg", "boresight_elevation_deg",
     "x_deg", "y_deg", "gate_start_ps", "gate_width_ps", "sensor", "ray",
 )  # fmt: skip
-LONGEST_SHOWN = 200
+LONGEST_SHOWN = 200  # characters of a row in a message
 # What spreadsheets put in front of UTF-8.
 BOM = b"\xef\xbb\xbf"
 # Angles at the limit come out of sines and cosines a few units in the last place off.
 ROUNDING_DEG = SLACK
 # Whole numbers up to here are exact as float64; light takes 104 days for so many picoseconds.
 MOST_WHOLE = 2**53
-LIMIT_DEG = 20.0
+LIMIT_DEG = 20.0  # optical, to each side
 SPEED_OF_LIGHT_M_PER_PS = SPEED_OF_LIGHT_M_S * 1e-12
 # Times of whole picoseconds come back from metres a few units in the last place off (1e-8 ps at 10 km).
 ROUNDING_PS = COARSE_SLACK

@@ -1,12 +1,9 @@
-"""A rig as a file of another program describes it, and the design that fires exactly its rays.
+"""A rig as a file of another program describes it: the design that fires exactly its rays, and the constraints it sets.
 
-The rays are the pattern of the layout `fixed`; boresight, field of view and gate of a sensor are those
-that hold all of its rays.
-
-Constraints that a rig sets by what it is: as many sensors at its places, none wider, as many rays.
-
-What a user asks for goes before what the rig has: of two bounds on one number theirs is taken, and where they say
-anything of where sensors are, the rig says nothing of it. Where sensors look is left to the fit.
+The rays are the pattern of the layout `fixed`; boresight, field of view and gate of a sensor are those that hold all of
+its rays. Designs that are to be like a rig have as many sensors at its places, none wider, and as many rays. What a
+user asks for goes before that: of two bounds on one number theirs is taken, and where they say anything of where
+sensors are, the rig says nothing of it. Where sensors look is left to the fit.
 """
 
 from __future__ import annotations
@@ -51,9 +48,9 @@ MOST_SENSORS = 10_000
 # Rays of one direction, or of directions that differ by rounding, have no field of view that could be a bound; those of
 # a fan have one in their plane, and this one across it.
 SMALLEST_FIELD_DEG = 1e-3
-PLACES = ("fixed_m", "low_m", "high_m", "mounts_m")
-MOST_NAMED = 4
-SHARED = tuple(SensorConstraints.model_fields)
+PLACES = ("fixed_m", "low_m", "high_m", "mounts_m")  # keys of constraints that say where sensors are
+SHARED = tuple(SensorConstraints.model_fields)  # keys of constraints on all sensors
+MOST_NAMED = 4  # sensors in a message
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,7 @@ coordinates u of the direction at the angle t = |u| from the boresight, range. W
 boresight and $g(t) = t / \sin t$ the coordinates are $u = g\,(h \cdot d, v \cdot d)$, so one matrix product
 per block of samples gives all cosines, and g multiplies after the exponential: no logarithm of it is needed.
 
-Design points as the arrays that expectation maximisation runs on.
-
-Linear features hold the free origin axes y_1..y_m and the range y_r, centred and scaled:
+Linear features of the design points hold the free origin axes y_1..y_m and the range y_r, centred and scaled:
 $\Phi = [1,\; y_i,\; y_r,\; y_i y_j (i \le j),\; y_r^2]$, so that every Gaussian exponent in them is one
 matrix product, and so are all their sufficient statistics. Directions are unit vectors.
 

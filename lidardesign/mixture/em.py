@@ -1,13 +1,11 @@
 """Expectation maximisation with restarts: the loop, its seeds, and components that lose their samples.
 
-Weighted Lloyd quantisation: a few centres that stand for many weighted points.
+Seeds are those of weighted Lloyd quantisation, a few centres that stand for many weighted points. Every step of it
+lowers the weighted sum of squared distances, so it ends.
 
-Lloyd's iteration (S. P. Lloyd, Least squares quantization in PCM, 1982) with k-means++ seeding (D. Arthur and
-S. Vassilvitskii, 2007). Every step lowers the weighted sum of squared distances, so the iteration ends.
-
-The nearest of some centres for each of many points is asked again and again while the centres move a little. A point
-whose centre is nearer than any other can have become, by how far centres moved, is not asked about again (G. Hamerly,
-Making k-means even faster, 2010). The answers are those of a search over all points.
+References:
+    Least squares quantization in PCM, Lloyd 1982. k-means++: the advantages of careful seeding, Arthur and
+    Vassilvitskii 2007. Making k-means even faster, Hamerly 2010.
 """
 
 from __future__ import annotations
@@ -265,62 +263,6 @@ def _dead(mixture: Mixture, features: Features) -> np.ndarray:
     return np.flatnonzero([effective_count(weights) < fewest for weights in own.T])
 
 
-class Nearest:
-    """Points that are asked for their nearest centres.
-
-    Arguments:
-        points: Shape (N, F).
-    """
-
-    def __init__(self, points: np.ndarray) -> None:
-        self._points = points
-        self._centres = np.empty((0, points.shape[1]))
-        self._labels = np.empty(0, dtype=np.int64)
-        # how near any other centre may be
-        self._others = np.empty(0)
-        # rounding of distances; what is nearer together than this is always asked about
-        self._slack = SLACK * float(np.ptp(points, axis=0).max(initial=0.0))
-
-    def of(self, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The distance to the nearest centre, shape (N,), and its index, shape (N,), which may be changed.
-
-        Arguments:
-            centres: Shape (K, F).
-        """
-        if len(centres) == 1 or centres.shape != self._centres.shape:
-            found, self._labels = _two_nearest(self._points, centres)
-            distance, self._others = found[:, 0].copy(), found[:, 1].copy()
-        else:
-            moved = np.sqrt(np.square(centres - self._centres).sum(axis=1))
-            farthest = int(moved.argmax())
-            others = np.full(len(centres), moved[farthest])
-            # the centre that moved farthest is not among its own others
-            others[farthest] = np.partition(moved, -2)[-2]
-            self._others -= others[self._labels]
-            distance = np.sqrt(np.square(self._points - centres[self._labels]).sum(axis=1))
-            doubtful = np.flatnonzero(distance + self._slack >= self._others)
-            if len(doubtful):
-                found, self._labels[doubtful] = _two_nearest(self._points[doubtful], centres)
-                distance[doubtful], self._others[doubtful] = found.T
-        self._centres = centres.copy()
-        return distance, self._labels.copy()
-
-
-def _two_nearest(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances to the nearest centre and to the next, shape (N, 2), and the index of the nearest, shape (N,).
-
-    Where there is one centre alone, it is the next as well.
-    """
-    if len(centres) > FEW_CENTRES:
-        from scipy.spatial import cKDTree
-
-        found, labels = cKDTree(centres).query(points, k=2)
-        return found, labels[:, 0].copy()
-    squared = np.stack([np.square(points - centre).sum(axis=1) for centre in centres], axis=1)
-    next_one = min(1, len(centres) - 1)
-    return np.sqrt(np.partition(squared, next_one, axis=1)[:, [0, next_one]]), squared.argmin(axis=1)
-
-
 def lloyd(
     features: np.ndarray,
     weights: np.ndarray,
@@ -456,3 +398,62 @@ def _assign(nearest: Nearest, weights: np.ndarray, centres: np.ndarray) -> tuple
             labels[point] = waiting.pop(0)
             counts[labels[point]] = 1
     return labels, empty
+
+
+class Nearest:
+    """Points that are asked for their nearest centres, again and again while centres move a little.
+
+    A point whose centre is nearer than any other can have become, by how far centres moved, is not asked about again
+    (Hamerly 2010). The answers are those of a search over all points.
+
+    Arguments:
+        points: Shape (N, F).
+    """
+
+    def __init__(self, points: np.ndarray) -> None:
+        self._points = points
+        self._centres = np.empty((0, points.shape[1]))
+        self._labels = np.empty(0, dtype=np.int64)
+        # how near any other centre may be
+        self._others = np.empty(0)
+        # rounding of distances; what is nearer together than this is always asked about
+        self._slack = SLACK * float(np.ptp(points, axis=0).max(initial=0.0))
+
+    def of(self, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The distance to the nearest centre, shape (N,), and its index, shape (N,), which may be changed.
+
+        Arguments:
+            centres: Shape (K, F).
+        """
+        if len(centres) == 1 or centres.shape != self._centres.shape:
+            found, self._labels = _two_nearest(self._points, centres)
+            distance, self._others = found[:, 0].copy(), found[:, 1].copy()
+        else:
+            moved = np.sqrt(np.square(centres - self._centres).sum(axis=1))
+            farthest = int(moved.argmax())
+            others = np.full(len(centres), moved[farthest])
+            # the centre that moved farthest is not among its own others
+            others[farthest] = np.partition(moved, -2)[-2]
+            self._others -= others[self._labels]
+            distance = np.sqrt(np.square(self._points - centres[self._labels]).sum(axis=1))
+            doubtful = np.flatnonzero(distance + self._slack >= self._others)
+            if len(doubtful):
+                found, self._labels[doubtful] = _two_nearest(self._points[doubtful], centres)
+                distance[doubtful], self._others[doubtful] = found.T
+        self._centres = centres.copy()
+        return distance, self._labels.copy()
+
+
+def _two_nearest(points: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances to the nearest centre and to the next, shape (N, 2), and the index of the nearest, shape (N,).
+
+    Where there is one centre alone, it is the next as well.
+    """
+    if len(centres) > FEW_CENTRES:
+        from scipy.spatial import cKDTree
+
+        found, labels = cKDTree(centres).query(points, k=2)
+        return found, labels[:, 0].copy()
+    squared = np.stack([np.square(points - centre).sum(axis=1) for centre in centres], axis=1)
+    next_one = min(1, len(centres) - 1)
+    return np.sqrt(np.partition(squared, next_one, axis=1)[:, [0, next_one]]), squared.argmin(axis=1)

@@ -1,4 +1,4 @@
-"""What a part file says: every figure with its source and the conditions that it was measured under.
+"""Statements of part files: every figure with its source and the conditions that it was measured under.
 
 A field is a list of statements. The first is the one that designs use; the others are kept so that sources which
 disagree, and ranges under other conditions, stay visible.

@@ -1,1 +1,1 @@
-"""Which of many rays to fire, and how far from the best that is: read `coverage`, `choice`, then `certificate`."""
+"""The choice of rays among many, and how far from the best it is: read `coverage`, `choice`, then `certificate`."""

@@ -1,4 +1,4 @@
-"""How much better any other choice of the same candidates could be: an upper bound of F by duality.
+"""Certificates: how much better any other choice of the same candidates could be, an upper bound of F by duality.
 
 For thresholds t >= 0 of items and a price lambda >= 0 of bandwidth, every admissible choice S has
 

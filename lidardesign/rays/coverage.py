@@ -1,4 +1,4 @@
-"""What every candidate ray tells about every item of many scenes, as one sparse table.
+"""Information of every candidate ray about every item of many scenes, as one sparse table.
 
 A candidate is a ray with one of a few gates. Items are what scenes ask about: points of a visible surface, frames of
 a track, bodies. The worth of a choice S is F(S) = sum_u w_u phi_u(S), where phi is the largest worth of the returns

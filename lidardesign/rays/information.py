@@ -1,4 +1,4 @@
-"""What returns tell about surfaces: the `informs` of tasks that reconstruct one, and the check of what tasks answer.
+"""Information of returns about surfaces: the `informs` of tasks that reconstruct one, and the check of their answers.
 
 A return tells about all points of the surface that are near it, and the more the nearer they are: to choose the rays
 with the largest mean worth is to choose those whose returns are nearest to the points of the surface, as facilities are

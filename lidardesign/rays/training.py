@@ -1,7 +1,4 @@
-"""Training scenes that nothing was learned from, and what a task says that returns tell about them.
-
-What the returns of candidate rays tell about training scenes, scene by scene.
-"""
+"""Training scenes that nothing was learned from, and what returns of candidate rays tell about them by the task."""
 
 from __future__ import annotations
 
@@ -33,7 +30,7 @@ MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes retur
 # Chosen on, and held back from the choice.
 CHOICE, HELD_BACK = "choice", "held back"
 Informs = Callable[[Scene, Sequence[Returns]], Information]
-LARGEST = np.zeros(0)  # the table of items that count the largest worth
+LARGEST = np.zeros(0)  # the table of sums of items that count the largest worth
 
 
 class TrainingScenes:
@@ -106,6 +103,27 @@ def informed_scene(
     with choosing(share):
         found = inform(scene, rays, visits, partial(checked_information, task))
     return found.with_fewer_items(MOST_ITEMS, random_generator(seed, "items", purpose, number))
+
+
+def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) -> InformedScene:
+    """What a task says of the returns of rays in a scene, through the rays' own gates.
+
+    Arguments:
+        scene: The scene.
+        rays: All candidates.
+        visits: The rays at each condition, one after the other; at the other conditions these have no returns.
+        informs: What the task says of a scene's returns.
+    """
+    fired = simulate_many(scene, [rays.subset(visit) for visit in visits])
+    returns = [pad_returns(rays, visit, frame) for visit, frames in zip(visits, fired, strict=True) for frame in frames]
+    return InformedScene.of(informs(scene, returns), returns)
+
+
+def pad_returns(rays: Rays, fired: slice, returns: Returns) -> Returns:
+    """The returns of some rays among all rays, of which the others return nothing."""
+    outcome, range_m, body = np.full(len(rays), Outcome.MISS), np.full(len(rays), np.nan), np.full(len(rays), -1)
+    outcome[fired], range_m[fired], body[fired] = returns.outcome, returns.range_m, returns.body
+    return Returns(rays, outcome, range_m, body, returns.frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,24 +226,3 @@ class InformedScene:
             range_m=self.range_m[kept],
             weight=times / most,
         )
-
-
-def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) -> InformedScene:
-    """What a task says of the returns of rays in a scene, through the rays' own gates.
-
-    Arguments:
-        scene: The scene.
-        rays: All candidates.
-        visits: The rays at each condition, one after the other; at the other conditions these have no returns.
-        informs: What the task says of a scene's returns.
-    """
-    fired = simulate_many(scene, [rays.subset(visit) for visit in visits])
-    returns = [pad_returns(rays, visit, frame) for visit, frames in zip(visits, fired, strict=True) for frame in frames]
-    return InformedScene.of(informs(scene, returns), returns)
-
-
-def pad_returns(rays: Rays, fired: slice, returns: Returns) -> Returns:
-    """The returns of some rays among all rays, of which the others return nothing."""
-    outcome, range_m, body = np.full(len(rays), Outcome.MISS), np.full(len(rays), np.nan), np.full(len(rays), -1)
-    outcome[fired], range_m[fired], body[fired] = returns.outcome, returns.range_m, returns.body
-    return Returns(rays, outcome, range_m, body, returns.frame)

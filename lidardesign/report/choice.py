@@ -74,7 +74,7 @@ def choice_section(designs: Sequence[DesignSpec], evaluation: Evaluation, looks:
 
 
 def correlation_sentence(pairs: Points, evaluation: Evaluation) -> str:
-    """Whether proxy and score order what was tried alike (Spearman); empty for too few to say.
+    """The rank correlation of proxy and score over what was tried (Spearman), in a sentence; empty for too few to say.
 
     Arguments:
         pairs: The proxy's loss and the score of each choice that was tried.

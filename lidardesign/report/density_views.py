@@ -23,9 +23,8 @@ from lidardesign.sensors.pattern import low_discrepancy
 from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, DesignSpace, angles, observed_point
 
-POINTS = 48_000  # of a design, shared by its sensors
-FEWEST = 64  # of a sensor
-PLACES = 9  # along a condition
+# Points of a design, shared by its sensors, and of a sensor at least; places along a condition.
+POINTS, FEWEST, PLACES = 48_000, 64, 9
 MOST_STEPS = 512  # along a triangle's side: beyond, it is far larger than any picture
 PERCENT = 100.0
 # What lies further out than this share, at each end, is not shown: a stray sample would stretch every axis.
@@ -42,131 +41,6 @@ LONG_M = 5.0  # axes beyond this are told per metre
 # A full turn is cut at the one of so many bins about which least lies, counting its neighbours; unless that is much.
 TURN_BINS, CUT_BINS, EMPTY = 72, 4, 0.5
 NAMES = ("x", "y", "z", "azimuth", "elevation", "range")
-
-
-def mixture_points(design: DesignSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a design's mixture and their weights, shapes (N, 6) and (N,); the weights sum to 1.
-
-    Along a condition evenly spread knots count equally.
-    """
-    moments, name = [design], design.condition
-    if name is not None:
-        knots = design.patterns[-1].knots
-        some = np.unique(np.linspace(0, len(knots) - 1, PLACES).round().astype(int))
-        moments = [design.at_condition({name: knots[index]}) for index in some]
-    sensors = [sensor for moment in moments for sensor in moment.sensors]
-    weights = np.concatenate([moment.weights for moment in moments]) / len(moments)
-    count = max(POINTS // len(sensors), FEWEST)
-    normal = ndtri(low_discrepancy(count, 6))
-    z = interval_factor(design.level)
-    points = np.concatenate([sensor_points(sensor, normal, z) for sensor in sensors])
-    return points, np.repeat(weights / count, count)
-
-
-def sensor_points(sensor: Sensor, normal: np.ndarray, z: float) -> np.ndarray:
-    """Design points of a sensor at standard normal coordinates, (N, 6) to (N, 6): origin, direction and range.
-
-    Ranges below 0 are none, and become 0.
-
-    Arguments:
-        sensor: The sensor.
-        normal: Standard normal coordinates.
-        z: Standard deviations on each side of a mean that its field of view and gate span.
-    """
-    # a with A A' = covariance, also where that is singular: origins are often fixed along an axis
-    values, vectors = np.linalg.eigh(np.asarray(sensor.covariance_m2, dtype=np.float64))
-    origin = normal[:, :3] @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-    tangent, (start, end) = normal[:, 3:5] * np.array(sensor.field_of_view_rad) / (2 * z), sensor.gate_m
-    range_m = (start + end) / 2 + (end - start) / (2 * z) * normal[:, 5]
-    azimuth, elevation = angles(tangent_directions(sensor.frame, tangent))
-    return np.column_stack([origin + sensor.origin_m, azimuth, elevation, np.maximum(range_m, 0.0)])
-
-
-def silhouette(
-    scene: Scene, frame: int, axes: tuple[int, int], edges: tuple[np.ndarray, np.ndarray], *, targets: bool = True
-) -> np.ndarray:
-    """Which cells targets (or the other bodies) cover in projection, shape (V, U) bool; infinite planes cover none.
-
-    Arguments:
-        scene, frame: What is looked at.
-        axes: The world axes across and up.
-        edges: Ends of the cells along both, evenly spaced [m], shapes (U + 1,) and (V + 1,).
-        targets: Whether targets count, or everything else.
-    """
-    covered = np.zeros((len(edges[1]) - 1, len(edges[0]) - 1), dtype=bool)
-    share, upper = drawn_share(scene), np.array(covered.shape[::-1])
-    low, cell = np.array([edge[0] for edge in edges]), np.array([edge[1] - edge[0] for edge in edges])
-    for body in scene.bodies:
-        if body.is_target == targets and not isinstance(body.shape, Plane):
-            vertices, faces = body_triangles(body, frame, np.zeros((2, 3)), share)
-            # mark the cells that hold a point of a lattice, no wider than a cell, on triangles (F, 3, 2)
-            places = (vertices[:, list(axes)][faces].astype(np.float64) - low) / cell
-            places = places[((places.max(axis=1) >= 0) & (places.min(axis=1) < upper)).all(axis=1)]
-            sides = np.abs(places - np.roll(places, 1, axis=1)).max(axis=(1, 2))
-            steps = np.minimum(2 ** np.ceil(np.log2(np.maximum(sides, 1.0))), MOST_STEPS).astype(int)
-            for count in np.unique(steps):
-                # barycentric coordinates of a lattice on a triangle with so many steps along each side
-                first, second = np.meshgrid(np.arange(count + 1), np.arange(count + 1))
-                keep = first + second <= count
-                first, second = first[keep], second[keep]
-                lattice = np.stack([first, second, count - first - second], axis=1) / count
-                for some in np.array_split(
-                    places[steps == count], max(1, (steps == count).sum() * len(lattice) // 2_000_000)
-                ):
-                    inside = np.floor(np.einsum("lc,fck->flk", lattice, some)).astype(int).reshape(-1, 2)
-                    inside = inside[((inside >= 0) & (inside < upper)).all(axis=1)]
-                    covered[inside[:, 1], inside[:, 0]] = True
-    return covered
-
-
-@dataclass(frozen=True, eq=False)
-class Marginal:
-    """How much of the density lies along one dimension, whatever the others are.
-
-    Arguments:
-        dimension: Its name, as "azimuth_rad".
-        label: For an axis, as "azimuth [deg]".
-        unit: Of the heights, as "% per deg".
-        edges: Ends of its bins in the label's unit, degrees or metres, ascending, shape (B + 1,).
-        heights: Of the density, shape (B,).
-        designs: Of each design's sensors, by name, shape (B,) each.
-    """
-
-    dimension: str
-    label: str
-    unit: str
-    edges: np.ndarray
-    heights: np.ndarray
-    designs: Mapping[str, np.ndarray]
-
-    @property
-    def top(self) -> float:
-        """Where an axis of heights ends: what stands out far beyond the density is cut off."""
-        most = float(self.heights.max(initial=0.0))
-        beside = max((float(heights.max(initial=0.0)) for heights in self.designs.values()), default=0.0)
-        return 1.05 * (min(max(most, beside), HIGHEST * most) if most > 0 else max(beside, 1.0))
-
-
-@dataclass(frozen=True, eq=False)
-class PlaneDensity:
-    """How much of the density observes each place, seen along an axis: all of it is projected onto a plane.
-
-    Arguments:
-        axes: The world axes across and up, as (1, 2) for y and z.
-        labels: Of both, as "y [m]".
-        unit: Of the heights, as "% per cm2".
-        edges: Ends of the cells along both [m], shapes (U + 1,) and (V + 1,).
-        heights: Of the density, up by across, shape (V, U).
-        targets, others: Cells that the scene's targets, and its other bodies, cover, shape (V, U) bool.
-    """
-
-    axes: tuple[int, int]
-    labels: tuple[str, str]
-    unit: str
-    edges: tuple[np.ndarray, np.ndarray]
-    heights: np.ndarray
-    targets: np.ndarray
-    others: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +61,56 @@ class DensityView:
     effective: float
     scene: str
     frame: int
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """The density along one dimension, whatever the others are.
+
+    Arguments:
+        dimension: Its name, as "azimuth_rad".
+        label: For an axis, as "azimuth [deg]".
+        unit: Of the heights, as "% per deg".
+        edges: Ends of its bins in the label's unit, degrees or metres, ascending, shape (B + 1,).
+        heights: Of the density, shape (B,).
+        designs: Of each design's sensors, by name, shape (B,) each.
+    """
+
+    dimension: str
+    label: str
+    unit: str
+    edges: np.ndarray
+    heights: np.ndarray
+    designs: Mapping[str, np.ndarray]
+
+    @property
+    def top(self) -> float:
+        """The end of an axis of heights: what stands out far beyond the density is cut off."""
+        most = float(self.heights.max(initial=0.0))
+        beside = max((float(heights.max(initial=0.0)) for heights in self.designs.values()), default=0.0)
+        return 1.05 * (min(max(most, beside), HIGHEST * most) if most > 0 else max(beside, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneDensity:
+    """The density that observes each place, seen along an axis: all of it is projected onto a plane.
+
+    Arguments:
+        axes: The world axes across and up, as (1, 2) for y and z.
+        labels: Of both, as "y [m]".
+        unit: Of the heights, as "% per cm2".
+        edges: Ends of the cells along both [m], shapes (U + 1,) and (V + 1,).
+        heights: Of the density, up by across, shape (V, U).
+        targets, others: Cells that the scene's targets, and its other bodies, cover, shape (V, U) bool.
+    """
+
+    axes: tuple[int, int]
+    labels: tuple[str, str]
+    unit: str
+    edges: tuple[np.ndarray, np.ndarray]
+    heights: np.ndarray
+    targets: np.ndarray
+    others: np.ndarray
 
 
 def density_view(
@@ -255,7 +179,7 @@ def _degrees_points(points: np.ndarray, start: float | None) -> np.ndarray:
 
 
 def turn_start(azimuth_rad: np.ndarray, weights: np.ndarray, space: DesignSpace) -> float:
-    """Where an axis of azimuths is cut: opposite of the space's middle, of a full turn where it is emptiest [rad]."""
+    """The azimuth at which an axis is cut: opposite of the space's middle, or where a full turn is emptiest [rad]."""
     low, middle = space.low[AZIMUTH], (space.low[AZIMUTH] + space.high[AZIMUTH]) / 2
     if not space.full_azimuth:
         return middle - FULL_TURN / 2
@@ -268,6 +192,44 @@ def turn_start(azimuth_rad: np.ndarray, weights: np.ndarray, space: DesignSpace)
     # of the turns from there, the one whose middle of mass is near the space's beginning or in its first three quarters
     mean = np.average(wrap_turn(azimuth_rad, cut), weights=weights)
     return float(cut + wrap_turn(mean, low - FULL_TURN / 4) - mean)
+
+
+def mixture_points(design: DesignSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a design's mixture and their weights, shapes (N, 6) and (N,); the weights sum to 1.
+
+    Along a condition evenly spread knots count equally.
+    """
+    moments, name = [design], design.condition
+    if name is not None:
+        knots = design.patterns[-1].knots
+        some = np.unique(np.linspace(0, len(knots) - 1, PLACES).round().astype(int))
+        moments = [design.at_condition({name: knots[index]}) for index in some]
+    sensors = [sensor for moment in moments for sensor in moment.sensors]
+    weights = np.concatenate([moment.weights for moment in moments]) / len(moments)
+    count = max(POINTS // len(sensors), FEWEST)
+    normal = ndtri(low_discrepancy(count, 6))
+    z = interval_factor(design.level)
+    points = np.concatenate([sensor_points(sensor, normal, z) for sensor in sensors])
+    return points, np.repeat(weights / count, count)
+
+
+def sensor_points(sensor: Sensor, normal: np.ndarray, z: float) -> np.ndarray:
+    """Design points of a sensor at standard normal coordinates, (N, 6) to (N, 6): origin, direction and range.
+
+    Ranges below 0 are none, and become 0.
+
+    Arguments:
+        sensor: The sensor.
+        normal: Standard normal coordinates.
+        z: Standard deviations on each side of a mean that its field of view and gate span.
+    """
+    # a with A A' = covariance, also where that is singular: origins are often fixed along an axis
+    values, vectors = np.linalg.eigh(np.asarray(sensor.covariance_m2, dtype=np.float64))
+    origin = normal[:, :3] @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    tangent, (start, end) = normal[:, 3:5] * np.array(sensor.field_of_view_rad) / (2 * z), sensor.gate_m
+    range_m = (start + end) / 2 + (end - start) / (2 * z) * normal[:, 5]
+    azimuth, elevation = angles(tangent_directions(sensor.frame, tangent))
+    return np.column_stack([origin + sensor.origin_m, azimuth, elevation, np.maximum(range_m, 0.0)])
 
 
 def plane_densities(samples: Samples, scene: Scene, frame: int) -> tuple[PlaneDensity, ...]:
@@ -317,6 +279,43 @@ def smoothed(held: np.ndarray) -> np.ndarray:
         padded = np.concatenate([inner[:1], inner, inner[-1:]])
         held = np.moveaxis(padded[:-2] / 4 + inner / 2 + padded[2:] / 4, 0, axis)
     return held
+
+
+def silhouette(
+    scene: Scene, frame: int, axes: tuple[int, int], edges: tuple[np.ndarray, np.ndarray], *, targets: bool = True
+) -> np.ndarray:
+    """Cells that targets (or the other bodies) cover in projection, shape (V, U) bool; infinite planes cover none.
+
+    Arguments:
+        scene, frame: What is looked at.
+        axes: The world axes across and up.
+        edges: Ends of the cells along both, evenly spaced [m], shapes (U + 1,) and (V + 1,).
+        targets: Whether targets count, or everything else.
+    """
+    covered = np.zeros((len(edges[1]) - 1, len(edges[0]) - 1), dtype=bool)
+    share, upper = drawn_share(scene), np.array(covered.shape[::-1])
+    low, cell = np.array([edge[0] for edge in edges]), np.array([edge[1] - edge[0] for edge in edges])
+    for body in scene.bodies:
+        if body.is_target == targets and not isinstance(body.shape, Plane):
+            vertices, faces = body_triangles(body, frame, np.zeros((2, 3)), share)
+            # mark the cells that hold a point of a lattice, no wider than a cell, on triangles (F, 3, 2)
+            places = (vertices[:, list(axes)][faces].astype(np.float64) - low) / cell
+            places = places[((places.max(axis=1) >= 0) & (places.min(axis=1) < upper)).all(axis=1)]
+            sides = np.abs(places - np.roll(places, 1, axis=1)).max(axis=(1, 2))
+            steps = np.minimum(2 ** np.ceil(np.log2(np.maximum(sides, 1.0))), MOST_STEPS).astype(int)
+            for count in np.unique(steps):
+                # barycentric coordinates of a lattice on a triangle with so many steps along each side
+                first, second = np.meshgrid(np.arange(count + 1), np.arange(count + 1))
+                keep = first + second <= count
+                first, second = first[keep], second[keep]
+                lattice = np.stack([first, second, count - first - second], axis=1) / count
+                for some in np.array_split(
+                    places[steps == count], max(1, (steps == count).sum() * len(lattice) // 2_000_000)
+                ):
+                    inside = np.floor(np.einsum("lc,fck->flk", lattice, some)).astype(int).reshape(-1, 2)
+                    inside = inside[((inside >= 0) & (inside < upper)).all(axis=1)]
+                    covered[inside[:, 1], inside[:, 0]] = True
+    return covered
 
 
 def _central(values: np.ndarray, weights: np.ndarray, tail: float) -> tuple[float, float]:

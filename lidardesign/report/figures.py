@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
-
 FAR_SHARE = 0.5  # of the worst design's score: rivals that are always worse by more are hidden at first
 # One hue from light to dark: it reads the same without colour vision and on paper.
 SCALE = [[0.0, "#ffffff"], [0.2, "#d6e6f4"], [0.45, "#6baed6"], [0.7, "#2171b5"], [1.0, "#08306b"]]
@@ -40,8 +39,7 @@ LAYOUT = {
     "margin": {"l": 58, "r": 12, "t": 10, "b": 46},
     "showlegend": False,
 }
-# More lines are no picture.
-MOST_DRAWN_RAYS = 2000
+MOST_DRAWN_RAYS = 2000  # of a design: more lines are no picture
 
 
 def far_rivals(evaluation: Evaluation) -> set[str]:

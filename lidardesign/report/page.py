@@ -1,11 +1,7 @@
-"""One HTML page about an evaluation, and what it is made of beside the scores.
+"""One HTML page about an evaluation: the result, designs in a scene, scores, where the time went, how to reproduce it.
 
 The page is one file that works offline and makes no network request: plotly is inside it, and its content
 security policy forbids every connection. All names are escaped.
-
-What the report of an evaluation holds beside the scores: pictures, where the time went, how to reproduce it.
-
-The report's first section: a row of every design, against the strongest rival on training scenes.
 """
 
 from __future__ import annotations
@@ -60,9 +56,9 @@ from lidardesign.task import random_generator
 CURVE_PX, SMALL_PX, PLANE_PX = 440, 250, 400
 # Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
 DENSITY_POINTS = 3000
-COMMAND = "evaluate"
-MOST_SENTENCES = 3  # of designs that have one each; a table says the same of all
-MOST_NOTES = 2  # that are not folded
+COMMAND = "evaluate"  # whose report it is, and which is not over yet
+# Of the first section: sentences of designs, which a table says of all, and notes that are not folded.
+MOST_SENTENCES, MOST_NOTES = 3, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +84,71 @@ class Report:
     constraints: Mapping[str, Sequence[ConstraintSlack]] = field(default_factory=dict)
     times: Sequence[CommandTimes] = ()
     reproduce: Reproduction = field(default_factory=Reproduction)
+
+
+@phase("report")
+def evaluation_report(
+    evaluation: Evaluation,
+    request: EvaluationRequest,
+    folder: Path,
+    config: RunConfig,
+    times: Mapping[str, Mapping[str, float]],
+    command: Sequence[str],
+) -> Report:
+    """Everything that the report of an evaluation is made of.
+
+    Arguments:
+        evaluation: The scores.
+        request: What was asked for.
+        folder, config: The run whose density the designs are of.
+        times: Where the time of each command went, as a clock tells it.
+        command: The command line that makes the page again.
+    """
+    manifest = read_manifest(folder)
+    samples, shown, view, points = request.density(), evaluated_scene(evaluation, request), None, None
+    if samples is not None:
+        view = density_view(samples, shown.scene, request.designs)
+        points = observed_point(samples.resample(DENSITY_POINTS, random_generator(config.seed, "report")))
+    learned = manifest.get("command")
+    commands = [("The run that was learned", _line(learned))] if isinstance(learned, list) and learned else []
+    commands.append(("The scores and this page", _line(command)))
+    facts = [
+        ("task", config.task_name),
+        ("seed of the scenes", str(request.held_out_seed)),
+        ("seed of the run", str(config.seed)),
+        *((f"design {design.name}", _origin(design.provenance)) for design in request.designs),
+        *((f"version of {name}", version) for name, version in versions().items()),
+    ]
+    taken = []
+    for name, phases in times.items():
+        entry = (manifest.get("timings") or {}).get(name)
+        entry = entry if isinstance(entry, dict) and name != COMMAND else {}
+        memory = entry.get("peak_memory_bytes")
+        title = f"lidardesign {name}" + (", up to this report" if name == COMMAND else "")
+        seconds = {phase: float(value) for phase, value in phases.items()}
+        memory = memory if isinstance(memory, int) else None
+        taken.append(CommandTimes(title, str(entry.get("when", "")), seconds, memory))
+    settings = folder / FILE_NAME
+    return Report(
+        evaluation,
+        shown,
+        title=f"{folder.resolve().name}: {evaluation.metric.name} on {held_out_scenes(evaluation.scenes)}",
+        density=view,
+        density_m=points,
+        constraints={design.name: constraint_slack_of(design, request.space) for design in request.designs},
+        times=taken,
+        reproduce=Reproduction(commands, facts, settings.read_text(encoding="utf-8") if settings.is_file() else ""),
+    )
+
+
+def _origin(provenance: Mapping[str, object]) -> str:
+    elsewhere = ("versions", "task", "run")
+    told = [f"{name} {value}" for name, value in provenance.items() if name not in elsewhere]
+    return ", ".join(told) or "made by hand"
+
+
+def _line(words: Sequence[object]) -> str:
+    return shlex.join(str(word) for word in words)
 
 
 def write_report(report: Report, path: Path) -> None:
@@ -132,6 +193,87 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
         ("time", "Where the time went", times_tables(report.times)),
         ("reproduce", "How to reproduce this", reproduction(report.reproduce)),
     ]
+
+
+def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str:
+    """The result: who is better and by how much, how far chosen rays are from the best, and notes.
+
+    Arguments:
+        evaluation: The scores.
+        designs: The designs, whose chosen rays may have certificates.
+    """
+    rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
+    said = [headline(evaluation, pairs[name]) for name in rows if name in pairs]
+    if not said:
+        unit = evaluation.metric.unit
+        said = [f"{row.design}: {_figures(row.value, row)[0]} {unit} at {row.rays} rays." for row in rows.values()]
+    # a long list says less than the table below it
+    said = said if len(said) <= MOST_SENTENCES else []
+    notes = [paragraphs([note], "note") for note in evaluation.notes]
+    further = folded("Further notes", "".join(notes[MOST_NOTES:]), len(notes) - MOST_NOTES)
+    return (
+        paragraphs(said, "verdict")
+        + _table(evaluation, rows, pairs)
+        + paragraphs([*_about(evaluation), *_certificates(evaluation, designs)])
+        + "".join(notes[:MOST_NOTES])
+        + further
+    )
+
+
+def headline(evaluation: Evaluation, pair: Paired) -> str:
+    """A pair in a sentence: who is better and by how much, or that no difference was found."""
+    text = difference_text(pair, evaluation.metric.better, evaluation.metric.unit)
+    return f"{text.replace('no difference', 'No difference', 1) if text.startswith('no difference') else text}."
+
+
+def _table(evaluation: Evaluation, rows: dict[str, Row], pairs: dict[str, Paired]) -> str:
+    metric, rival = evaluation.metric, evaluation.strongest_rival
+    shown = [*rows.values(), *evaluation.rival_rows]
+    headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "Mbit/s"]
+    if rival is not None:
+        headings += [f"difference to {rival.name}", "design is"]
+    lines = []
+    for row in shown:
+        value, value_interval = _figures(row.value, row)
+        cells = [row.design, str(row.rays), value, value_interval, f"{row.bandwidth_mbps:.3g}"]
+        pair = pairs.get(row.design)
+        if rival is not None:
+            cells += ["", ""] if pair is None else ["{} ({})".format(*_figures(pair.difference, pair, sign="+")), ""]
+        lines.append((cells, "" if pair is None else verdict(evaluation, pair), row.baseline))
+    return table(headings, lines, text_columns=1, caption="Designs, and the strongest rival on training scenes.")
+
+
+def _about(evaluation: Evaluation) -> list[str]:
+    metric, rival = evaluation.metric, evaluation.strongest_rival
+    about = (
+        f"Means over {held_out_scenes(evaluation.scenes)}; a scene in which too few "
+        f"rays return counts as {metric.worst:g} {metric.unit}."
+    )
+    if rival is None:
+        return [about]
+    best = f"the best of {len(rival.values)}" if len(rival.values) > 1 else "the only one"
+    return [f"{about} The strongest rival is {rival.name}, {best} on {counted(rival.scenes, 'training scene')}."]
+
+
+def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list[str]:
+    """The distance of chosen rays from the best, in one sentence for all designs; none without chosen rays."""
+    rows = evaluation.headline_rows
+    gaps = [
+        f"{100 * entry['gap']:.1f} % ({design.name})"
+        for design in designs
+        for entry in certificates_of(design)
+        if design.name in rows and entry["rays"] == rows[design.name].rays
+    ]
+    if not gaps:
+        return []
+    said = "Certificate: no other choice of as many of the same candidates lowers the loss on training scenes by more"
+    return [f"{said} than {', '.join(gaps)}."]
+
+
+def _figures(value: float, item: Row | Paired, sign: str = "") -> tuple[str, str]:
+    """A figure and its interval, which stays in one line, also where cells wrap."""
+    figure, low, high = figure_and_interval(value, item.ci_low, item.ci_high, sign=sign)
+    return figure, low if item.ci_low is None else f"{low}\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}{high}"
 
 
 def _scores(evaluation: Evaluation) -> str:
@@ -210,149 +352,3 @@ def _accuracy(sweeps: Sequence[Sweep]) -> str:
         for index, one in enumerate(pareto_figures(sweeps))
     )
     return f'<p>{read}</p><div class="tiles wide">{pictures}</div>{accuracy_tables(sweeps)}'
-
-
-@phase("report")
-def evaluation_report(
-    evaluation: Evaluation,
-    request: EvaluationRequest,
-    folder: Path,
-    config: RunConfig,
-    times: Mapping[str, Mapping[str, float]],
-    command: Sequence[str],
-) -> Report:
-    """Everything that the report of an evaluation is made of.
-
-    Arguments:
-        evaluation: The scores.
-        request: What was asked for.
-        folder, config: The run whose density the designs are of.
-        times: Where the time of each command went, as a clock tells it.
-        command: The command line that makes the page again.
-    """
-    manifest = read_manifest(folder)
-    samples, shown, view, points = request.density(), evaluated_scene(evaluation, request), None, None
-    if samples is not None:
-        view = density_view(samples, shown.scene, request.designs)
-        points = observed_point(samples.resample(DENSITY_POINTS, random_generator(config.seed, "report")))
-    learned = manifest.get("command")
-    commands = [("The run that was learned", _line(learned))] if isinstance(learned, list) and learned else []
-    commands.append(("The scores and this page", _line(command)))
-    facts = [
-        ("task", config.task_name),
-        ("seed of the scenes", str(request.held_out_seed)),
-        ("seed of the run", str(config.seed)),
-        *((f"design {design.name}", _origin(design.provenance)) for design in request.designs),
-        *((f"version of {name}", version) for name, version in versions().items()),
-    ]
-    taken = []
-    for name, phases in times.items():
-        entry = (manifest.get("timings") or {}).get(name)
-        entry = entry if isinstance(entry, dict) and name != COMMAND else {}
-        memory = entry.get("peak_memory_bytes")
-        title = f"lidardesign {name}" + (", up to this report" if name == COMMAND else "")
-        seconds = {phase: float(value) for phase, value in phases.items()}
-        memory = memory if isinstance(memory, int) else None
-        taken.append(CommandTimes(title, str(entry.get("when", "")), seconds, memory))
-    settings = folder / FILE_NAME
-    return Report(
-        evaluation,
-        shown,
-        title=f"{folder.resolve().name}: {evaluation.metric.name} on {held_out_scenes(evaluation.scenes)}",
-        density=view,
-        density_m=points,
-        constraints={design.name: constraint_slack_of(design, request.space) for design in request.designs},
-        times=taken,
-        reproduce=Reproduction(commands, facts, settings.read_text(encoding="utf-8") if settings.is_file() else ""),
-    )
-
-
-def _origin(provenance: Mapping[str, object]) -> str:
-    elsewhere = ("versions", "task", "run")
-    told = [f"{name} {value}" for name, value in provenance.items() if name not in elsewhere]
-    return ", ".join(told) or "made by hand"
-
-
-def _line(words: Sequence[object]) -> str:
-    return shlex.join(str(word) for word in words)
-
-
-def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str:
-    """Who is better and by how much, how far chosen rays are from the best, and what a reader should know.
-
-    Arguments:
-        evaluation: The scores.
-        designs: The designs, whose chosen rays may have certificates.
-    """
-    rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
-    said = [headline(evaluation, pairs[name]) for name in rows if name in pairs]
-    if not said:
-        unit = evaluation.metric.unit
-        said = [f"{row.design}: {_figures(row.value, row)[0]} {unit} at {row.rays} rays." for row in rows.values()]
-    # a long list says less than the table below it
-    said = said if len(said) <= MOST_SENTENCES else []
-    notes = [paragraphs([note], "note") for note in evaluation.notes]
-    further = folded("Further notes", "".join(notes[MOST_NOTES:]), len(notes) - MOST_NOTES)
-    return (
-        paragraphs(said, "verdict")
-        + _table(evaluation, rows, pairs)
-        + paragraphs([*_about(evaluation), *_certificates(evaluation, designs)])
-        + "".join(notes[:MOST_NOTES])
-        + further
-    )
-
-
-def headline(evaluation: Evaluation, pair: Paired) -> str:
-    """A pair in a sentence: who is better and by how much, or that no difference was found."""
-    text = difference_text(pair, evaluation.metric.better, evaluation.metric.unit)
-    return f"{text.replace('no difference', 'No difference', 1) if text.startswith('no difference') else text}."
-
-
-def _table(evaluation: Evaluation, rows: dict[str, Row], pairs: dict[str, Paired]) -> str:
-    metric, rival = evaluation.metric, evaluation.strongest_rival
-    shown = [*rows.values(), *evaluation.rival_rows]
-    headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "Mbit/s"]
-    if rival is not None:
-        headings += [f"difference to {rival.name}", "design is"]
-    lines = []
-    for row in shown:
-        value, value_interval = _figures(row.value, row)
-        cells = [row.design, str(row.rays), value, value_interval, f"{row.bandwidth_mbps:.3g}"]
-        pair = pairs.get(row.design)
-        if rival is not None:
-            cells += ["", ""] if pair is None else ["{} ({})".format(*_figures(pair.difference, pair, sign="+")), ""]
-        lines.append((cells, "" if pair is None else verdict(evaluation, pair), row.baseline))
-    return table(headings, lines, text_columns=1, caption="Designs, and the strongest rival on training scenes.")
-
-
-def _about(evaluation: Evaluation) -> list[str]:
-    metric, rival = evaluation.metric, evaluation.strongest_rival
-    about = (
-        f"Means over {held_out_scenes(evaluation.scenes)}; a scene in which too few "
-        f"rays return counts as {metric.worst:g} {metric.unit}."
-    )
-    if rival is None:
-        return [about]
-    best = f"the best of {len(rival.values)}" if len(rival.values) > 1 else "the only one"
-    return [f"{about} The strongest rival is {rival.name}, {best} on {counted(rival.scenes, 'training scene')}."]
-
-
-def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list[str]:
-    """How far chosen rays are from the best, in one sentence for all designs; none where no rays were chosen."""
-    rows = evaluation.headline_rows
-    gaps = [
-        f"{100 * entry['gap']:.1f} % ({design.name})"
-        for design in designs
-        for entry in certificates_of(design)
-        if design.name in rows and entry["rays"] == rows[design.name].rays
-    ]
-    if not gaps:
-        return []
-    said = "Certificate: no other choice of as many of the same candidates lowers the loss on training scenes by more"
-    return [f"{said} than {', '.join(gaps)}."]
-
-
-def _figures(value: float, item: Row | Paired, sign: str = "") -> tuple[str, str]:
-    """A figure and its interval, which stays in one line, also where cells wrap."""
-    figure, low, high = figure_and_interval(value, item.ci_low, item.ci_high, sign=sign)
-    return figure, low if item.ci_low is None else f"{low}\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}{high}"

@@ -1,8 +1,6 @@
-"""Designs in a scene and what becomes of their rays, for the 3D view.
+"""Designs in a scene and what becomes of their rays, and their shapes as float32 triangles and lines, for the 3D view.
 
 As many rays, positions and frames are kept as a page can hold; `SceneFigure` says which are left out.
-
-Shapes, sensors and rays as plain float32 triangles and line segments, for the report's 3D view.
 """
 
 from __future__ import annotations
@@ -35,20 +33,18 @@ from lidardesign.space import DesignSpace
 if TYPE_CHECKING:
     from lidardesign.simulate.plan import Planner
 
-
 MOST_STEPS = 25  # positions, and frames, that a slider goes through
 MOST_RAYS = 2000  # drawn per design
 MOST_PLACED_RAYS = 30_000  # rays of all designs at all positions: 24 bytes each
 MOST_RAY_STEPS = 120_000  # the same at all frames: 5 bytes each
 FEWEST_RAYS = 300  # of a design, for which frames are given up
-
-Conditions = Mapping[str, float]
 MOST_FACES = 40_000  # of a scene's meshes, and of its round bodies; more would make the page large and slow to open
 STEPS = 24  # round a round body
 FEWEST_STEPS = 4  # where a scene has very many of them
 SHELL_STEPS = 8  # along each side of a gate's shell
 SMALLEST_SPREAD_M = 1e-3  # of origins; less looks like one place
 PLANE_MARGIN = 0.1  # of the scene's extent, beyond which an infinite plane is not drawn
+Conditions = Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)

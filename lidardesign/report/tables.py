@@ -26,9 +26,8 @@ from lidardesign.sensors.design import DesignSpec
 
 MOST_SENSORS = 60  # listed in a table
 TINY = 1e-4  # from here on the limit is shown
-# Phases of a smaller share of their command are left out; `other` has what they took.
-LEAST_SHARE = 0.005
-DEEPEST = 2
+# Phases of a smaller share of their command, or deeper, are left out; `other` has what they took.
+LEAST_SHARE, DEEPEST = 0.005, 2
 MEBIBYTE = 1024**2
 PERCENT = 100.0
 SHORT_S = 0.01  # costs from here on are shown as their limit
@@ -53,7 +52,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def held_out_scenes(scenes: int) -> str:
-    """How many held-out scenes, in words."""
+    """A number of held-out scenes in words."""
     return counted(scenes, "held-out scene")
 
 
@@ -192,7 +191,7 @@ def table(
 
 @dataclass(frozen=True)
 class CommandTimes:
-    """Where the time of one command went.
+    """The time of one command by phase.
 
     Arguments:
         command: Its name, as `learn`.
@@ -214,7 +213,7 @@ class CommandTimes:
 
 @dataclass(frozen=True)
 class Reproduction:
-    """How to get the same figures again.
+    """Commands and facts by which anybody gets the same figures again.
 
     Arguments:
         commands: What was typed, in order, with what each is for.
@@ -337,7 +336,7 @@ def _scrolled(headings: Sequence[str], text: Sequence[int], rows: Iterable[str],
 
 
 def effects_section(evaluation: Evaluation) -> str:
-    """What could change the scores, and what of it was simulated; one sentence where nothing could."""
+    """Effects that could change the scores, and which of them were simulated; one sentence where none could."""
     effects = evaluation.effects
     detector = html.escape(evaluation.detector)
     if not any(effect.on or effect.range_m or effect.lost for effect in effects):

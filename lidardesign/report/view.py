@@ -131,12 +131,12 @@ def _drawn_points(one: DrawnDesign) -> list[np.ndarray]:
 
 
 def is_flat(directions: np.ndarray) -> bool:
-    """Whether all rays lie in planes of constant z: a world that is looked at as a map."""
+    """True where all rays lie in planes of constant z: a world that is looked at as a map."""
     return bool(len(directions)) and float(np.abs(directions[:, 2]).max()) < EPSILON_FLOAT32
 
 
 def camera(directions: np.ndarray) -> dict[str, Any]:
-    """Where the first view is from [rad]: beside the sensors, a little behind and above them.
+    """The direction of the first view [rad]: from beside the sensors, a little behind and above them.
 
     A world in the plane z = 0 is looked at from above, as on paper.
     """
@@ -258,7 +258,7 @@ def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndar
 
 
 def view_notes(shown: SceneFigure) -> list[str]:
-    """Which scene is shown, how to read it, and what is left out."""
+    """Lines on the scene that is shown, how to read it, and what is left out."""
     how = (
         f"Held-out scene {shown.scene.name}. Lines run from where each ray starts to its first hit, or to the end of "
         "its gate; frusta are the sensors' fields of view, tinted shells their gates, ellipses where their rays start."

@@ -1,4 +1,4 @@
-"""Where a command's time goes: seconds by phase, phases inside of phases.
+"""The time of a command: seconds by phase, phases inside of phases.
 
 A clock runs for as long as a command, or a library call that reports its own times. Code anywhere below marks what it
 does with `phase`, as a context or a decorator; where no clock runs, that does nothing. Clocks that run inside of each

@@ -1,4 +1,4 @@
-"""What input files may be: one table of their sizes, and one way to open them.
+"""Limits of input files: one table of their sizes, and one way to open them.
 
 Only regular files are opened: a pipe, a device or a socket could be waited for or read for ever. Sizes are looked at
 before memory is taken.

@@ -1,8 +1,6 @@
-"""Values of files, checked: errors name file, line and column, what was found and what is allowed.
+"""Values of files and of `--set KEY=VALUE`, checked: errors say where, what was found and what is allowed.
 
 Booleans and quoted text are no numbers, and names do not steer terminals.
-
-Single values that are given beside files, as `--set KEY=VALUE`: read, and set in a document.
 """
 
 from __future__ import annotations

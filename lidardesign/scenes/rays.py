@@ -1,9 +1,7 @@
-"""Rays that a design fires, what they meet, and the returns that its receiver reports.
+"""Rays that a design fires, what they meet, the returns that its receiver reports, and rotation matrices.
 
-Rotation matrices of angles and quaternions, what a fixed receiver looks at, and ranges from a path of light.
-
-The receiver stands upright: its lateral axis is horizontal, wherever it looks. A field of view is the pyramid of the
-points whose two angles, about its upright and its lateral axis, are both within half of its extents, as behind the
+A fixed receiver stands upright: its lateral axis is horizontal, wherever it looks. A field of view is the pyramid of
+the points whose two angles, about its upright and its lateral axis, are both within half of its extents, as behind the
 rectangular stop of a camera.
 
 Light that leaves o along v, meets a surface at range r and goes on to a receiver at x has the path

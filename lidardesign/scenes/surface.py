@@ -1,7 +1,4 @@
-"""Points uniform in area on meshes and primitives.
-
-What compiled loops need to know of shapes: their kinds, their lengths, and how far they reach.
-"""
+"""Points uniform in area on meshes and primitives, and what compiled loops know of shapes: kind, lengths, reach."""
 
 from __future__ import annotations
 
@@ -20,9 +17,7 @@ SPHERE, BOX, CAPSULE, PLANE, GRID, CYLINDER, ELLIPSOID = range(7)
 KINDS: dict[type, int] = {
     Sphere: SPHERE, Box: BOX, Capsule: CAPSULE, Plane: PLANE, Mesh: GRID, Cylinder: CYLINDER, Ellipsoid: ELLIPSOID,
 }  # fmt: skip
-# Relative rounding of squared distances, doubled many times over: bounding balls are never missed.
-BALL_SLACK = ROUNDING
-# Their lengths, as compiled loops take them; planes and meshes have none.
+# Lengths of shapes, as compiled loops take them; planes and meshes have none.
 SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
     Sphere: lambda shape: (shape.radius_m, 0.0, 0.0),
     Box: lambda shape: shape.half_extents_m,
@@ -32,6 +27,8 @@ SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
     Plane: lambda shape: (0.0, 0.0, 0.0),
     Mesh: lambda shape: (0.0, 0.0, 0.0),
 }
+# Relative rounding of squared distances, doubled many times over: bounding balls are never missed.
+BALL_SLACK = ROUNDING
 
 
 class Sampled(NamedTuple):
@@ -127,29 +124,6 @@ def _on_body(body: Body, space: DesignSpace, count: int, generator: np.random.Ge
     return Sampled(points, np.repeat(points[:, None], 3, axis=1))
 
 
-def grid_faces(rows: int, columns: int) -> np.ndarray:
-    """Two triangles per cell of a grid of vertices, shape (2 (rows - 1) (columns - 1), 3)."""
-    first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
-    right, up = first + 1, first + columns
-    return np.concatenate([np.stack([first, right, up], axis=1), np.stack([right, up + 1, up], axis=1)])
-
-
-def round_triangles(shape: Round, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) [m] and outward faces (F, 3) of a round shape with so many steps round its z axis."""
-    turn = np.linspace(0.0, 2 * np.pi, steps + 1)
-    half = np.linspace(0.0, np.pi / 2, steps // 4 + 1)
-    latitude = np.concatenate([half[::-1], -half])
-    radius, height = np.cos(latitude), np.sin(latitude)
-    if isinstance(shape, Cylinder):
-        radius, height = np.array([0.0, 1.0, 1.0, 0.0]), np.array([1.0, 1.0, -1.0, -1.0])
-    ring = np.stack([np.outer(radius, np.cos(turn)), np.outer(radius, np.sin(turn)), np.outer(height, turn**0)], axis=2)
-    vertices = ring * half_extents_m(shape)
-    if isinstance(shape, Capsule):
-        ends = np.repeat([shape.half_length_m, -shape.half_length_m], len(half))
-        vertices[..., 2] = shape.radius_m * height[:, None] + ends[:, None]
-    return vertices.reshape(-1, 3), grid_faces(len(radius), len(turn))
-
-
 def _on_primitive(shape: Round | Box, count: int, generator: np.random.Generator) -> np.ndarray:
     if isinstance(shape, Box):
         half = np.array(shape.half_extents_m)
@@ -182,6 +156,29 @@ def _on_primitive(shape: Round | Box, count: int, generator: np.random.Generator
     side = np.stack([shape.radius_m * np.cos(turn), shape.radius_m * np.sin(turn), height], axis=1)
     on_side = generator.random(count) * (shape.radius_m + shape.half_length_m) < shape.half_length_m
     return np.where(on_side[:, None], side, ends)
+
+
+def grid_faces(rows: int, columns: int) -> np.ndarray:
+    """Two triangles per cell of a grid of vertices, shape (2 (rows - 1) (columns - 1), 3)."""
+    first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, up = first + 1, first + columns
+    return np.concatenate([np.stack([first, right, up], axis=1), np.stack([right, up + 1, up], axis=1)])
+
+
+def round_triangles(shape: Round, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) [m] and outward faces (F, 3) of a round shape with so many steps round its z axis."""
+    turn = np.linspace(0.0, 2 * np.pi, steps + 1)
+    half = np.linspace(0.0, np.pi / 2, steps // 4 + 1)
+    latitude = np.concatenate([half[::-1], -half])
+    radius, height = np.cos(latitude), np.sin(latitude)
+    if isinstance(shape, Cylinder):
+        radius, height = np.array([0.0, 1.0, 1.0, 0.0]), np.array([1.0, 1.0, -1.0, -1.0])
+    ring = np.stack([np.outer(radius, np.cos(turn)), np.outer(radius, np.sin(turn)), np.outer(height, turn**0)], axis=2)
+    vertices = ring * half_extents_m(shape)
+    if isinstance(shape, Capsule):
+        ends = np.repeat([shape.half_length_m, -shape.half_length_m], len(half))
+        vertices[..., 2] = shape.radius_m * height[:, None] + ends[:, None]
+    return vertices.reshape(-1, 3), grid_faces(len(radius), len(turn))
 
 
 def half_extents_m(shape: Shape) -> tuple[float, float, float]:

@@ -135,7 +135,7 @@ class SurfaceCloud:
 
 
 def ray_spacing(directions: np.ndarray) -> np.ndarray:
-    """How far apart rays are where each of them looks: the mean distance to its neighbours on the unit sphere.
+    """The spacing of rays where each of them looks: the mean distance to its neighbours on the unit sphere.
 
     Neighbours are those of the Delaunay triangulation of all rays: the rings of a spinning scanner have neighbours in
     other rings, although many rays of their own are nearer.
@@ -297,7 +297,7 @@ def trial_origins(space: DesignSpace, generator: np.random.Generator) -> np.ndar
 
 
 def is_visible(caster: SceneCaster, space: DesignSpace, origins: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Which points an admissible ray from one of the origins sees first, (O, 3) and (N, 3) to (N,) bool."""
+    """True for points that an admissible ray from one of the origins sees first, (O, 3), (N, 3) to (N,)."""
     visible = np.zeros(len(points), dtype=bool)
     for origin in origins:
         left = np.flatnonzero(~visible)
@@ -310,7 +310,7 @@ def is_visible(caster: SceneCaster, space: DesignSpace, origins: np.ndarray, poi
 
 
 def is_received(caster: SceneCaster, receiver: Receiver | None, points: np.ndarray) -> np.ndarray:
-    """Which points (N, 3) a fixed receiver has in its view with nothing in front, shape (N,); all without one."""
+    """True for points (N, 3) in the view of a fixed receiver with nothing in front, (N,); all without one."""
     if receiver is None:
         return np.ones(len(points), dtype=bool)
     received = in_view(receiver, points)

@@ -96,7 +96,7 @@ def _groups(jobs: Sequence[RaysPerCondition], frames: int) -> Iterator[list[Rays
 
 @phase("metric")
 def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
-    """What a task makes of returns in a scene; a failure has the metric's worst value.
+    """The score that a task gives to returns in a scene; a failure has the metric's worst value.
 
     A value beyond the worst one counts as the worst, so that failing is never the better choice.
 
@@ -138,7 +138,7 @@ def _is_number(value: object) -> bool:
 
 
 def silent_notes(scenes: Sequence[Scene], fired: Mapping[str, RaysPerCondition]) -> list[str]:
-    """Which sets of rays have no return from any target in most of a few scenes and frames.
+    """Lines on sets of rays that have no return from any target in most of a few scenes and frames.
 
     Arguments:
         scenes: The scenes, of which some are looked at, without effects.
@@ -193,7 +193,7 @@ class ScenePass:
 
 @dataclass(frozen=True, eq=False)
 class SceneScores:
-    """What came of a scene.
+    """Scores of all sets of rays in a scene, and the effects that it was simulated with.
 
     Arguments:
         plan: What was simulated.

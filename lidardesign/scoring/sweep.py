@@ -110,13 +110,13 @@ class Sweep:
 
     @property
     def falls(self) -> bool:
-        """Whether errors fall from measurement to measurement, within their own uncertainty."""
+        """True where errors fall from measurement to measurement, within their own uncertainty."""
         pairs = zip(self.measurements, self.measurements[1:], strict=False)
         return all(finer.error <= rougher.error + _sure_difference(finer, rougher) for rougher, finer in pairs)
 
     @property
     def verdict(self) -> str:
-        """How the chosen setting compares with the run's own, in one line; whether chance had a part in it."""
+        """The chosen setting beside the run's own, in one line; whether chance had a part in it."""
         return self._comparison + ("" if self.falls else "; but errors do not fall here: by chance, perhaps")
 
     @property

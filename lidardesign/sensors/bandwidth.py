@@ -1,4 +1,4 @@
-"""How rays are shared out, and what a design costs to read out: bins, bits and frames per second (paper, section 6).
+"""Shares of rays, and what a design costs to read out: bins, bits and frames per second (paper, section 6).
 
 A gate of width w listens for the round-trip time 2 w / c, cut into bins of one fixed duration. Every bin
 of every ray is read out once per frame, so the bandwidth is sum(bins) * bits * rate.

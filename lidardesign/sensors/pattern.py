@@ -1,10 +1,10 @@
-"""A pattern: the rays that a design fires for one number of rays, at one place or along a condition.
+"""A pattern: the rays that a design fires for one number of rays, at one place or along a condition; and even rays.
 
 Along a condition, as the position of a robot, a pattern is given at knots. Ray n is the same ray at all of them; in
 between its origin, its angles and its gate are linear. So it passes through the knots exactly, and keeps every bound
 on elevation, azimuth, start, end and width that both neighbouring knots keep: each is a convex set per ray.
 
-Even rays: a cell-centred grid of any number in a field of view, points that fill a cube, and subsets of points.
+Even rays are a cell-centred grid of any number in a field of view, points that fill a cube, or subsets of points.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from lidardesign.space import DIMENSIONS
 
 # Conditions that a sensor can travel along: where a ray starts, not where it looks.
 TRAVELLED = DIMENSIONS[:3]
-RECURRENCE_AXES = 2
-PRIMES = (2, 3, 5, 7, 11, 13)
+# Of low-discrepancy points: so many axes have an additive recurrence, more of them the first primes.
+RECURRENCE_AXES, PRIMES = 2, (2, 3, 5, 7, 11, 13)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +164,41 @@ def _assigned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return linear_sum_assignment(np.square(before[:, None] - after[None]).sum(axis=2))[1]
 
 
+def even_rays(sensors: Sequence[Sensor], counts: Sequence[int]) -> Rays:
+    """A grid of so many rays in the field of view of each sensor, with its gate, from its place."""
+    tangents = [grid_tangent(*field_on_sphere(one), int(n)) for one, n in zip(sensors, counts, strict=True)]
+    sensor = np.repeat(np.arange(len(sensors)), counts)
+    looking = [tangent_directions(one.frame, tangent) for one, tangent in zip(sensors, tangents, strict=True)]
+    origin_m = np.array([one.origin_m for one in sensors], dtype=np.float64)[sensor]
+    gate_m = np.array([one.gate_m for one in sensors], dtype=np.float64)[sensor]
+    times = fire_times(len(sensor), DEFAULT_RATE_HZ)
+    return Rays(origin_m, np.concatenate(looking), gate_m, sensor, times)
+
+
+def field_on_sphere(sensor: Sensor) -> tuple[float, float]:
+    """The field of view, shrunk in proportion where its corner would lie beyond the antipode [rad].
+
+    Past the angle pi the tangent plane covers the sphere a second time, so rays there would point elsewhere.
+    """
+    horizontal, vertical = sensor.field_of_view_rad
+    corner = math.hypot(horizontal, vertical) / 2
+    scale = math.pi / corner if corner > math.pi else 1.0
+    return scale * horizontal, scale * vertical
+
+
+def grid_tangent(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:
+    """Angles of an even grid in a field of view, row by row upwards, shape (count, 2) [rad].
+
+    Cell-centred: ray i of n in a row stands at -FoV/2 + FoV * (i + 1/2) / n, never on the field's edge.
+    """
+    rows = grid_rows(horizontal_rad, vertical_rad, count)
+    if not rows.size:
+        return np.zeros((0, 2))
+    across = np.concatenate([(np.arange(n) + 0.5) / n - 0.5 for n in rows])
+    up = np.repeat((np.arange(len(rows)) + 0.5) / len(rows) - 0.5, rows)
+    return np.stack([horizontal_rad * across, vertical_rad * up], axis=1)
+
+
 def grid_rows(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:
     """Rays per row of an even grid, int64 (rows,), summing to `count`.
 
@@ -188,19 +223,6 @@ def _row_count(horizontal_rad: float, vertical_rad: float, count: int) -> int:
         return count
     fewer = max(math.floor(ideal), 1)
     return fewer if ideal**2 <= fewer * (fewer + 1) else min(fewer + 1, count)
-
-
-def grid_tangent(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:
-    """Angles of an even grid in a field of view, row by row upwards, shape (count, 2) [rad].
-
-    Cell-centred: ray i of n in a row stands at -FoV/2 + FoV * (i + 1/2) / n, never on the field's edge.
-    """
-    rows = grid_rows(horizontal_rad, vertical_rad, count)
-    if not rows.size:
-        return np.zeros((0, 2))
-    across = np.concatenate([(np.arange(n) + 0.5) / n - 0.5 for n in rows])
-    up = np.repeat((np.arange(len(rows)) + 0.5) / len(rows) - 0.5, rows)
-    return np.stack([horizontal_rad * across, vertical_rad * up], axis=1)
 
 
 def low_discrepancy(count: int, axes: int) -> np.ndarray:
@@ -229,28 +251,6 @@ def _radical_inverse(count: int, base: int) -> np.ndarray:
         left, digit = np.divmod(left, base)
         total += place * digit
     return total
-
-
-def field_on_sphere(sensor: Sensor) -> tuple[float, float]:
-    """The field of view, shrunk in proportion where its corner would lie beyond the antipode [rad].
-
-    Past the angle pi the tangent plane covers the sphere a second time, so rays there would point elsewhere.
-    """
-    horizontal, vertical = sensor.field_of_view_rad
-    corner = math.hypot(horizontal, vertical) / 2
-    scale = math.pi / corner if corner > math.pi else 1.0
-    return scale * horizontal, scale * vertical
-
-
-def even_rays(sensors: Sequence[Sensor], counts: Sequence[int]) -> Rays:
-    """A grid of so many rays in the field of view of each sensor, with its gate, from its place."""
-    tangents = [grid_tangent(*field_on_sphere(one), int(n)) for one, n in zip(sensors, counts, strict=True)]
-    sensor = np.repeat(np.arange(len(sensors)), counts)
-    looking = [tangent_directions(one.frame, tangent) for one, tangent in zip(sensors, tangents, strict=True)]
-    origin_m = np.array([one.origin_m for one in sensors], dtype=np.float64)[sensor]
-    gate_m = np.array([one.gate_m for one in sensors], dtype=np.float64)[sensor]
-    times = fire_times(len(sensor), DEFAULT_RATE_HZ)
-    return Rays(origin_m, np.concatenate(looking), gate_m, sensor, times)
 
 
 def even_subset(points: np.ndarray, count: int) -> np.ndarray:

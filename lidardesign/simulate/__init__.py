@@ -1,1 +1,1 @@
-"""What a design sees: first hits, gates and outcomes of every ray."""
+"""The returns of a design: first hits, gates and outcomes of every ray."""

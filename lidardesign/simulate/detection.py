@@ -1,4 +1,4 @@
-"""What a detector reports: the strongest echo, or the return that it finds among the photons that it counts."""
+"""Detection: the strongest echo, or the return that it finds among the photons that it counts."""
 
 from __future__ import annotations
 

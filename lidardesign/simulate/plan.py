@@ -3,24 +3,12 @@
 Each effect's `bound` (`simulate.effects`) says what it could change at most. The smallest are skipped as long as all
 that is skipped stays within a tolerance together: errors of range add up in the worst case, and so do shares of
 returns. That is promised of what a detector reports, rounded and from the photons that chance brings, ray by ray with
-the same random numbers (`effects.steps`; tests/soak/promise.py tries it). Where nothing calls for an effect that is
+the same random numbers (`with_steps`; tests/soak/promise.py tries it). Where nothing calls for an effect, that is
 seen without casting a ray.
 
 What simulating an effect takes is predicted per ray and frame, as measured on one core (2.5 GHz) with a face of 20,000
 triangles, some hundred photons per ray and a gate of 1 m, each effect added to photon noise alone. Elsewhere the
 relation between effects holds roughly; full sunlight and wide gates take several times as much.
-
-What a detector makes of small changes: a step over the edge of a bin, or none, and another chance for photons.
-
-Behind rounding, what moves a range by little moves it by a whole bin, or not at all. An edge that is nearer than the
-shift s is passed; beyond, at the distance d, with P(shift > d), taken as normal. What else moves ranges moves that
-edge too: with the scale t of all of it, unknown but at most as bounded, the density at the edge is at most max over t
-of phi(d / t) / t = 0.24 / d, and the mean shift 0.8 s, so that it is passed with at most 0.2 s / d. The matched filter
-averages: its edges are as wide as a pulse, its steps lower, and each of n photons passes edges by itself.
-
-A photon that goes to another bin, which one of n does with at most n s / bin, may make another bin the highest, and
-others the ones that a dead time hides: the range strays once more, as chance has it. Multipath is left out of this: it
-takes a thousand times as long as other effects, and one chance is as good as another.
 """
 
 from __future__ import annotations
@@ -88,14 +76,14 @@ EFFECT_MODULES = {
     "pile_up": pile_up,
     "quantisation": quantisation,
 }
+# Effects by a word, or by name.
+CHOICES = ("auto", "all", "none")
 Choice = Literal["auto", "all", "none"] | frozenset[str]
 # Ranges may be off by this share of a bin, or by this where there are none [m].
-TOLERATED_BIN_SHARE = 0.1
-TOLERATED_RANGE_M = 0.001
-TOLERATED_RETURNS = 0.001
+TOLERATED_BIN_SHARE, TOLERATED_RANGE_M = 0.1, 0.001
+TOLERATED_RETURNS = 0.001  # a share of them
 # Units of metrics that are lengths [m].
 LENGTHS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
-CHOICES = ("auto", "all", "none")
 # What `--effects` takes besides names; the audit is not a choice of effects.
 WORDS = (*CHOICES, "audit")
 # Scenes that move are looked at in so many frames, evenly spread: bounds are means over time.
@@ -402,7 +390,19 @@ class _BoundSum:
 
 
 def with_steps(counts: Counts, bounds: dict[str, EffectBound]) -> dict[str, EffectBound]:
-    """What effects change of what a detector reports, by what they change of the light; names to bounds."""
+    """What effects change of what a detector reports, by what they change of the light; names to bounds.
+
+    Behind rounding, what moves a range by little moves it by a whole bin, or not at all. An edge that is nearer than
+    the shift s is passed; beyond, at the distance d, with P(shift > d), taken as normal. What else moves ranges moves
+    that edge too: with the scale t of all of it, unknown but at most as bounded, the density at the edge is at most
+    max over t of phi(d / t) / t = 0.24 / d, and the mean shift 0.8 s, so that it is passed with at most 0.2 s / d. The
+    matched filter averages: its edges are as wide as a pulse, its steps lower, and each of n photons passes edges by
+    itself.
+
+    A photon that goes to another bin, which one of n does with at most n s / bin, may make another bin the highest, and
+    others the ones that a dead time hides: the range strays once more, as chance has it. Multipath is left out of this:
+    it takes a thousand times as long as other effects, and one chance is as good as another.
+    """
     detector = counts.first_hits.detector
     if not detector.bin_m and detector.photons is None:
         return bounds

@@ -1,4 +1,4 @@
-"""What a list of rays returns in a scene: exact first hits, or what a detector makes of them where effects are on.
+"""Returns of a list of rays in a scene: exact first hits, or what a detector makes of them where effects are on.
 
 Rays are traced from the sensor, not from the start of the gate, so whatever stands between the sensor and the
 gate hides what is behind it.

@@ -1,1 +1,1 @@
-"""What commands share: options, output, progress, and the shell around them."""
+"""Shared by commands: options, output, progress, and the shell around them."""

@@ -1,4 +1,4 @@
-"""What `show`, `fit` and `constrain` print of designs: sensors, tracks, constraints, and parts that sensors became."""
+"""Tables of designs for `show`, `fit` and `constrain`: sensors, constraints, and parts that sensors became."""
 
 from __future__ import annotations
 

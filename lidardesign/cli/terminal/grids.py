@@ -1,6 +1,6 @@
-"""Figures as text, tables of text, and tables of figures that stay in one piece on narrow terminals.
+"""Figures and tables as text that stays in one piece on narrow terminals, and progress.
 
-How far work has come: a bar that changes on a terminal, a line now and then elsewhere.
+Progress is a bar that changes on a terminal, and a line now and then elsewhere.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ RichConsole: TypeAlias = "Console"
 
 # Wider than any terminal: what a table takes where nothing limits it.
 UNBOUNDED = 10_000
-# Between two lines away from a terminal: such a share of all the time that it takes, but so long at least and at most.
-SHARE = 0.2
-LEAST_S, MOST_S = 10.0, 600.0
+# Between two lines of progress: such a share of all the time that the work takes, but so long at least and at most.
+SHARE, LEAST_S, MOST_S = 0.2, 10.0, 600.0
 
 
 def number(value: Any, digits: int = 4) -> str:

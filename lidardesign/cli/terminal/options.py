@@ -1,7 +1,4 @@
-"""Options that several subcommands share.
-
-Values that a shell may offer for arguments and options; files and folders it lists itself.
-"""
+"""Options that several subcommands share, and the values that a shell may offer for them; files it lists itself."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""Output of commands: one JSON document or text for people, messages, exit codes.
+"""Output of commands: one JSON document or text for people, messages, exit codes, and the files that they write.
 
-What the process needs before anything heavy is imported: threads, streams and signals.
-
-Files that a command will write: pages, devices, and folders that are not there yet.
+Threads, streams and signals of the process are here too: they are set before anything heavy is imported.
 """
 
 from __future__ import annotations
@@ -34,7 +32,6 @@ from lidardesign.run.outputs import check_outputs
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
-
 SCHEMA_VERSION = 1
 EXIT_SYSTEM = 3
 EXIT_INTERNAL = 70
@@ -58,7 +55,7 @@ THREAD_DEFAULTS = {
     "MKL_NUM_THREADS": "1",
     "OMP_WAIT_POLICY": "PASSIVE",
 }
-PAGE_SUFFIXES = (".html", ".htm")
+PAGE_SUFFIXES = (".html", ".htm")  # of reports
 
 
 def plain_json(value: Any) -> Any:

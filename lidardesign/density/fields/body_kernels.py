@@ -1,16 +1,11 @@
 """Compiled loops over bodies in their own frames: columns that matter at a point, distances, importance, first hits.
 
 Every loop takes the arrays of bodies (`bodies.BodyArrays`): sorted by column, `starts` tells where each column begins,
-and for each body its world bounding box, which decides whether it is looked at at all. Primitives are crossed by rays
-in closed form; meshes only tell which rays pass their boxes.
+and for each body its world bounding box, which decides whether it is looked at at all. Primitives have signed distances
+in closed form, and are crossed by rays in closed form; meshes only tell which rays pass their boxes.
 
-What is called once per body takes points as tuples and at most the arrays of a pose: each further array that is handed
-on costs as much as the arithmetic.
-
-Compiled closed forms of signed distances of single primitives in their own frames, and their gradients.
-
-Points, directions and sizes are tuples of three numbers: compiled loops keep them in registers, where arrays would cost
-as much as the arithmetic.
+What is called once per body takes points, directions and sizes as tuples of three numbers, which compiled loops keep in
+registers, and at most the arrays of a pose: each further array that is handed on costs as much as the arithmetic.
 """
 
 from __future__ import annotations
@@ -39,7 +34,7 @@ BOXES = {"nnan", "nsz"}
 # A point is taken to be at least so far from the middle plane of an ellipsoid, as a share of its smallest semi-axis:
 # below it the two nearest points, above and below the plane, are one.
 OFF_MIDDLE = EPSILON
-MOST_NEWTON_STEPS = 60
+MOST_NEWTON_STEPS = 60  # to the nearest point of an ellipsoid
 
 
 @njit(cache=True, nogil=True)

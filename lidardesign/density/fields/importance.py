@@ -1,4 +1,4 @@
-"""How much surfaces count in the target density: log w at the nearest surface point, in the form of `distance`.
+"""The weight of surfaces in the target density: log w at the nearest surface point, in the form of `distance`.
 
 Meshes at rest share one table of log weights on the grid of their distances; primitives and moving bodies have theirs
 in their own frames. As with distances (`grids`) the nearest surface point is exact in a narrow band around the surface;

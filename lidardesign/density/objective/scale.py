@@ -1,4 +1,4 @@
-"""Whether lengths fit together: the targets, where sensors are, how far they reach, and sigma. Needs no torch.
+"""A check that lengths fit together: the targets, where sensors are, how far they reach, and sigma. Needs no torch.
 
 Rays are aimed from random origins of the design space at points that are uniform in area on the targets of a few scenes
 and frames, and cast. What they meet tells, before anything is learned, that the space looks past the targets or ends

@@ -1,1 +1,1 @@
-"""What accuracy costs in time: sweeps over the settings of every numerical choice."""
+"""Accuracy and its cost in time: sweeps over the settings of every numerical choice."""

@@ -1,6 +1,6 @@
-"""Accuracy and cost of an evaluation: rays that stand for a beam, effects of light, and held-out scenes.
+"""Accuracy and cost of every numerical choice, for a task and a run on this machine: sweeps over their settings.
 
-What accuracy costs in time: sweeps over the settings of every numerical choice, for a task and a run, here.
+Those of an evaluation are here: rays that stand for a beam, effects of light, and held-out scenes.
 """
 
 from __future__ import annotations
@@ -45,11 +45,38 @@ RAYS, MOST_SCENES = 60_000, 20
 MOST_THIN_RAYS = 6_000_000
 # Effects that take longer than this in one pass over the scenes are left out of all passes [s].
 MOST_SECONDS = 2.0
+# The baseline that numbers of held-out scenes are tried on, and those that are tried where there are more.
 RIVAL = "bounding"
-# Numbers of scenes that are tried where there are more.
 COUNTS = (5, 10, 20, 50, 100, 200)
 # So many sets of scenes are drawn for each; a mean half-width is then known to a few percent beside the scenes' own.
 DRAWS = 32
+
+
+def physics_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
+    """The footprint's sweep where beams have a width, and that of the effects that the scenes have."""
+    asked = request.request
+    if not asked.designs:
+        return []
+    design, planner, own = asked.designs[0], asked.planner, asked.planner.detector
+    first_hits = own.photons is None and own.bin_s is None and own.divergence_rad == 0 and own.timing_sigma_s == 0
+    if first_hits:
+        planner = Planner(load_detector(STAND_IN))
+        planner = replace(planner, tolerance=planner.tolerated.within(asked.metric))
+    count, positions = _rays(asked, design)
+    most = max(RAYS // max(sum(len(rays) for rays in positions) * asked.test[0].frames, 1), 1)
+    bench = Bench(asked, planner, positions, asked.test[: min(most, MOST_SCENES)])
+    several = len(bench.scenes) > 1
+    note = f"{design.name} with {count} rays in {len(bench.scenes)} scene{'s' if several else ''}"
+    note += "" if several else ", so that differences between scenes are not known"
+    if first_hits:
+        note += f", measured by {STAND_IN}: the detector of this evaluation, {own.name}, asks for nothing"
+        try:
+            for rays in positions:
+                check_windows(path_windows(rays, asked.test[0].receiver), planner.detector)
+        except ConfigError:
+            return []
+    footprint = [_footprint(bench, note, own)] if planner.detector.divergence_rad > 0 else []
+    return [*footprint, *_effects(bench, note, own)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,33 +123,6 @@ class Bench:
     def scores(self, effects: frozenset[str], detector: Detector) -> np.ndarray:
         """The scores in all scenes, shape (S,)."""
         return np.array([self.score(number, effects, detector) for number in range(len(self.scenes))])
-
-
-def physics_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """The footprint's sweep where beams have a width, and that of the effects that the scenes have."""
-    asked = request.request
-    if not asked.designs:
-        return []
-    design, planner, own = asked.designs[0], asked.planner, asked.planner.detector
-    first_hits = own.photons is None and own.bin_s is None and own.divergence_rad == 0 and own.timing_sigma_s == 0
-    if first_hits:
-        planner = Planner(load_detector(STAND_IN))
-        planner = replace(planner, tolerance=planner.tolerated.within(asked.metric))
-    count, positions = _rays(asked, design)
-    most = max(RAYS // max(sum(len(rays) for rays in positions) * asked.test[0].frames, 1), 1)
-    bench = Bench(asked, planner, positions, asked.test[: min(most, MOST_SCENES)])
-    several = len(bench.scenes) > 1
-    note = f"{design.name} with {count} rays in {len(bench.scenes)} scene{'s' if several else ''}"
-    note += "" if several else ", so that differences between scenes are not known"
-    if first_hits:
-        note += f", measured by {STAND_IN}: the detector of this evaluation, {own.name}, asks for nothing"
-        try:
-            for rays in positions:
-                check_windows(path_windows(rays, asked.test[0].receiver), planner.detector)
-        except ConfigError:
-            return []
-    footprint = [_footprint(bench, note, own)] if planner.detector.divergence_rad > 0 else []
-    return [*footprint, *_effects(bench, note, own)]
 
 
 def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, RaysPerCondition]:

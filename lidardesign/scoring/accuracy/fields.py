@@ -1,10 +1,8 @@
-"""Accuracy and cost of distance fields of meshes by their grid points along the longest side.
+"""Accuracy and cost of the density's geometry: distance fields of meshes, and visibility.
 
-Bodies that are primitives have exact distances at any cost and need no field.
-
-Accuracy and cost of visibility: none, quadrature or ray casting against opaque geometry.
-
-Opaque geometry is the closed form, without a gradient: T = 1 up to the margin in front of the first hit, 0 behind it.
+Fields of meshes are measured by their grid points along the longest side, against exact distances; bodies that are
+primitives have those at any cost and need no field. Visibility is none, a quadrature or ray casting, against opaque
+geometry in closed form, without a gradient: T = 1 up to the margin in front of the first hit, 0 behind it.
 """
 
 from __future__ import annotations
@@ -32,23 +30,152 @@ from lidardesign.scoring.accuracy.probes import AccuracyRequest, Probes, density
 from lidardesign.scoring.sweep import Measurement, Sweep, timed
 from lidardesign.space import DesignSpace
 
-RESOLUTIONS = (16, 24, 32, 48, 64, 96, 128)
-# The more scenes, the more their errors average out; so many can be built anew at every resolution.
-COLUMNS = 12
-PROBES = 16_384
+# Grid points of fields. The more scenes, the more their errors average out; so many can be built at every resolution.
+RESOLUTIONS, COLUMNS, PROBES = (16, 24, 32, 48, 64, 96, 128), 12, 16_384
 # Resolutions beyond the run's own are measured where building them for all these scenes takes at most so long.
 LONGEST_SECONDS = 20.0
 # A coarse field has its surfaces elsewhere: probes must meet them there too.
 WIDENING = 3.0
-# log T of hidden points: far below anything that counts, and finite
+# log T of hidden points: far below anything that counts, and finite.
 LOG_OPAQUE = -1e4
-# Errors of cheap ways, of the quadrature on a common table, and of that over bodies one by one.
+# Of visibility: for cheap ways, for the quadrature on a common table, and for that over bodies one by one.
 VISIBILITY_PROBES, TABLE_PROBES, BODY_PROBES = 32_768, 8192, 2048
 BODY_BATCH = 256
 # A quadrature over bodies without a common table evaluates every body at every midpoint of every probe.
 MOST_BODIES = 120
 # Compiled loops are loaded before anything is timed.
 WARM_UP_PROBES = 32
+
+
+def field_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
+    """One sweep; empty where no target is a mesh, or no ray meets one."""
+    scenes, config = list(request.request.train), request.config
+    if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
+        return []
+    visibility = request.decided_visibility or config.density.visibility
+    case = FieldCase.of(scenes, config.space, config.density, config.seed, visibility)
+    return [] if case is None else [resolution_sweep(case)]
+
+
+def resolution_sweep(case: FieldCase) -> Sweep:
+    """Grid points along the longest side of a field, against exact distances."""
+    own, measurements, left_out = case.settings.field_resolution, [], ""
+    for count in sorted({*RESOLUTIONS, own}):
+        # the time grows like the volume
+        if count > own:
+            last = measurements[-1]
+            if last.seconds * (count / int(last.setting)) ** 3 * len(case.few) > LONGEST_SECONDS:
+                left_out = f"; {count} and more points would take long to measure"
+                break
+        started = time.perf_counter()
+        field = fresh(case.few, case.scenes, count, case.settings)
+        seconds = (time.perf_counter() - started) / len(case.few)
+        error, uncertainty, values = case.errors(field)
+        of_all = _bytes(field, case)
+        measurements.append(Measurement(str(count), error, uncertainty, seconds, of_all, count == own, values=values))
+    return density_sweep(
+        knob="density.field_resolution",
+        against="exact distances to the triangles",
+        work="building the field of one scene",
+        measurements=measurements,
+        note=f"measured on {len(case.few)} of {len(case.scenes)} training scenes; memory is that of all scenes' "
+        f"fields{left_out}",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FieldCase:
+    """A few scenes of meshes, and what their fields are compared by.
+
+    Arguments:
+        few: These scenes.
+        scenes: All scenes that share a grid with them.
+        settings: Of the density.
+        target: Their p* with the run's own field.
+        probes: Around their surfaces.
+        observed: The scene points of these, shape (N, 3).
+        log_transmittance: Their log T, shape (N, columns).
+        exact: Their exact distances, shape (N, columns) [m].
+    """
+
+    few: list[Scene]
+    scenes: list[Scene]
+    settings: DensitySettings
+    target: Target
+    probes: Probes
+    observed: np.ndarray
+    log_transmittance: np.ndarray
+    exact: np.ndarray
+
+    @classmethod
+    def of(
+        cls, scenes: list[Scene], space: DesignSpace, settings: DensitySettings, seed: int, visibility: str
+    ) -> FieldCase | None:
+        """A case of training scenes; None where no probe reaches a surface."""
+        few = few_columns(scenes, COLUMNS)
+        frames = np.array([few[index].frames for index, _ in scene_columns(few)], dtype=np.float64)
+        field = fresh(few, scenes, settings.field_resolution, settings)
+        surfaces = SceneTable(field, -np.log(frames), build_log_weights(few, field))
+        way = NoVisibility() if visibility == "off" else surfaces.raycast(few)
+        target = Target(
+            tuple(few), surfaces, way, Optics.of(settings), space, settings.surface_tolerance_nats
+        ).with_visibility(way)
+        probes = draw_probes(target, PROBES, seed, "fields", widening=WIDENING)
+        if not len(probes.points):
+            return None
+        rays = RayBatch.of(probes.points)
+        everywhere = np.ones((len(probes.points), len(frames)), dtype=bool)
+        passed = target.visibility.transmittance(rays, everywhere, target.optics, differentiable=False)
+        exact = ExactField(few, lambda body: body.is_target).distances(rays.observed)
+        return cls(few, scenes, settings, target, probes, rays.observed, passed.log_values, exact)
+
+    def log_density(self, distances: np.ndarray) -> np.ndarray:
+        """log p* at the probes from their distances (N, columns)."""
+        terms = self.target.surfaces.terms(self.observed, distances, self.target.optics.sigma_m)
+        return logsumexp(terms + self.log_transmittance, axis=1)
+
+    def errors(self, field: Field) -> tuple[float, float, dict[str, float]]:
+        """The share of mass in the wrong place, its standard error, and the error of distances near surfaces."""
+        distances = np.asarray(field.distances(self.observed), dtype=np.float64)
+        near = np.abs(self.exact) < 2.0 * self.target.optics.sigma_m
+        apart_m = math.sqrt(np.square((distances - self.exact)[near]).mean()) if near.any() else 0.0
+        return (
+            *self.probes.misplaced(self.log_density(distances), self.log_density(self.exact)),
+            {"distance_error_mm": 1e3 * apart_m},
+        )
+
+
+def _bytes(field: Field, case: FieldCase) -> int:
+    """The memory of the fields of all scenes; moving meshes have one each, however many scenes they are in."""
+    if isinstance(field, TableField):
+        return field.table.nbytes // field.columns * len(scene_columns(case.scenes))
+    return field.bodies.grids.values.nbytes * _meshes(case.scenes) // max(_meshes(case.few), 1)
+
+
+def _meshes(scenes: list[Scene]) -> int:
+    bodies = [body for scene in scenes for body in scene.bodies if body.is_target]
+    return len({body.shape.content_hash for body in bodies if isinstance(body.shape, Mesh)})
+
+
+def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: DensitySettings) -> Field:
+    """The field of a few scenes as the run would build it, whatever is cached."""
+    padding_m = PADDING_SIGMAS * settings.sigma_m
+    bodies = [(scene, body) for scene in scenes for body in scene.bodies if body.is_target]
+    if all(isinstance(body.shape, Mesh) and scene.frames == 1 for scene, body in bodies):
+        return fresh_table(few, scenes, resolution, padding_m)
+
+    def build(mesh: Mesh) -> tuple:
+        grid = grid_around(mesh.bounds_m, resolution, padding_m)
+        return grid, distance_grid(mesh, grid)
+
+    columns = scene_columns(few)
+    entries = [
+        (column, body, frame)
+        for column, (index, frame) in enumerate(columns)
+        for body in few[index].bodies
+        if body.is_target
+    ]
+    return BodyField(place_bodies(entries, len(columns), build))
 
 
 class ExactField:
@@ -119,160 +246,58 @@ def target_meshes(scene: Scene) -> list[Mesh]:
     return [b.shape.transformed(b.pose()) for b in scene.bodies if b.is_target and isinstance(b.shape, Mesh)]
 
 
-@dataclass(frozen=True, eq=False)
-class FieldCase:
-    """A few scenes of meshes, and what their fields are compared by.
+def visibility_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
+    """One sweep; empty where no ray sees a target."""
+    scenes, config = list(request.request.train), request.config
+    few = affordable_scenes(scenes)
+    case = VisibilityCase.of(few, config.space, config.density, config.seed, config.learning.batch)
+    if case.is_blind:
+        return []
+    # what the run's probe decided, and the points of its quadrature, refined as they were
+    default, points = request.decided_visibility or config.density.visibility, config.density.quadrature_points
+    if default == "quadrature":
+        points = request.target.visibility.one_way.points
+    return [visibility_sweep(case, points, default, _part(few, scenes))]
+
+
+def visibility_sweep(case: VisibilityCase, points: int, default: str, note: str = "") -> Sweep:
+    """No visibility, the quadrature with its own points, and ray casting.
 
     Arguments:
-        few: These scenes.
-        scenes: All scenes that share a grid with them.
-        settings: Of the density.
-        target: Their p* with the run's own field.
-        probes: Around their surfaces.
-        observed: The scene points of these, shape (N, 3).
-        log_transmittance: Their log T, shape (N, columns).
-        exact: Their exact distances, shape (N, columns) [m].
+        case: What they are measured on.
+        points: Of the quadrature.
+        default: off, quadrature or raycast: what the run uses.
+        note: What a reader should know.
     """
-
-    few: list[Scene]
-    scenes: list[Scene]
-    settings: DensitySettings
-    target: Target
-    probes: Probes
-    observed: np.ndarray
-    log_transmittance: np.ndarray
-    exact: np.ndarray
-
-    @classmethod
-    def of(
-        cls, scenes: list[Scene], space: DesignSpace, settings: DensitySettings, seed: int, visibility: str
-    ) -> FieldCase | None:
-        """A case of training scenes; None where no probe reaches a surface."""
-        few = few_columns(scenes, COLUMNS)
-        frames = np.array([few[index].frames for index, _ in scene_columns(few)], dtype=np.float64)
-        field = fresh(few, scenes, settings.field_resolution, settings)
-        surfaces = SceneTable(field, -np.log(frames), build_log_weights(few, field))
-        way = NoVisibility() if visibility == "off" else surfaces.raycast(few)
-        target = Target(
-            tuple(few), surfaces, way, Optics.of(settings), space, settings.surface_tolerance_nats
-        ).with_visibility(way)
-        probes = draw_probes(target, PROBES, seed, "fields", widening=WIDENING)
-        if not len(probes.points):
-            return None
-        rays = RayBatch.of(probes.points)
-        everywhere = np.ones((len(probes.points), len(frames)), dtype=bool)
-        passed = target.visibility.transmittance(rays, everywhere, target.optics, differentiable=False)
-        exact = ExactField(few, lambda body: body.is_target).distances(rays.observed)
-        return cls(few, scenes, settings, target, probes, rays.observed, passed.log_values, exact)
-
-    def log_density(self, distances: np.ndarray) -> np.ndarray:
-        """log p* at the probes from their distances (N, columns)."""
-        terms = self.target.surfaces.terms(self.observed, distances, self.target.optics.sigma_m)
-        return logsumexp(terms + self.log_transmittance, axis=1)
-
-    def errors(self, field: Field) -> tuple[float, float, dict[str, float]]:
-        """The share of mass in the wrong place, its standard error, and the error of distances near surfaces."""
-        distances = np.asarray(field.distances(self.observed), dtype=np.float64)
-        near = np.abs(self.exact) < 2.0 * self.target.optics.sigma_m
-        apart_m = math.sqrt(np.square((distances - self.exact)[near]).mean()) if near.any() else 0.0
-        return (
-            *self.probes.misplaced(self.log_density(distances), self.log_density(self.exact)),
-            {"distance_error_mm": 1e3 * apart_m},
-        )
-
-
-def field_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """One sweep; empty where no target is a mesh, or no ray meets one."""
-    scenes, config = list(request.request.train), request.config
-    if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
-        return []
-    visibility = request.decided_visibility or config.density.visibility
-    case = FieldCase.of(scenes, config.space, config.density, config.seed, visibility)
-    return [] if case is None else [resolution_sweep(case)]
-
-
-def resolution_sweep(case: FieldCase) -> Sweep:
-    """Grid points along the longest side of a field, against exact distances."""
-    own, measurements, left_out = case.settings.field_resolution, [], ""
-    for count in sorted({*RESOLUTIONS, own}):
-        # the time grows like the volume
-        if count > own:
-            last = measurements[-1]
-            if last.seconds * (count / int(last.setting)) ** 3 * len(case.few) > LONGEST_SECONDS:
-                left_out = f"; {count} and more points would take long to measure"
-                break
-        started = time.perf_counter()
-        field = fresh(case.few, case.scenes, count, case.settings)
-        seconds = (time.perf_counter() - started) / len(case.few)
-        error, uncertainty, values = case.errors(field)
-        of_all = _bytes(field, case)
-        measurements.append(Measurement(str(count), error, uncertainty, seconds, of_all, count == own, values=values))
+    exact = case.exact
+    ways = {
+        "off": (case.cast.with_visibility(NoVisibility()), exact),
+        "quadrature": (case.quadrature(points), exact[: case.few]),
+        "raycast": (case.cast, exact),
+    }
     return density_sweep(
-        knob="density.field_resolution",
-        against="exact distances to the triangles",
-        work="building the field of one scene",
-        measurements=measurements,
-        note=f"measured on {len(case.few)} of {len(case.scenes)} training scenes; memory is that of all scenes' "
-        f"fields{left_out}",
+        knob="density.visibility",
+        against="opaque geometry, by exact first hits",
+        work=case.work,
+        measurements=[case.measure(name, *way, default=name == default) for name, way in ways.items()],
+        note=note,
     )
 
 
-def _bytes(field: Field, case: FieldCase) -> int:
-    """The memory of the fields of all scenes; moving meshes have one each, however many scenes they are in."""
-    if isinstance(field, TableField):
-        return field.table.nbytes // field.columns * len(scene_columns(case.scenes))
-    return field.bodies.grids.values.nbytes * _meshes(case.scenes) // max(_meshes(case.few), 1)
+def _part(few: list[Scene], scenes: list[Scene]) -> str:
+    """The part of the scenes that was measured; "" where it was all of them."""
+    if few is scenes:
+        return ""
+    frames = f", {few[0].frames} frames of each" if scenes[0].frames > few[0].frames else ""
+    return f"measured on {len(few)} of {len(scenes)} training scenes{frames}"
 
 
-def _meshes(scenes: list[Scene]) -> int:
-    bodies = [body for scene in scenes for body in scene.bodies if body.is_target]
-    return len({body.shape.content_hash for body in bodies if isinstance(body.shape, Mesh)})
-
-
-def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: DensitySettings) -> Field:
-    """The field of a few scenes as the run would build it, whatever is cached."""
-    padding_m = PADDING_SIGMAS * settings.sigma_m
-    bodies = [(scene, body) for scene in scenes for body in scene.bodies if body.is_target]
-    if all(isinstance(body.shape, Mesh) and scene.frames == 1 for scene, body in bodies):
-        return fresh_table(few, scenes, resolution, padding_m)
-
-    def build(mesh: Mesh) -> tuple:
-        grid = grid_around(mesh.bounds_m, resolution, padding_m)
-        return grid, distance_grid(mesh, grid)
-
-    columns = scene_columns(few)
-    entries = [
-        (column, body, frame)
-        for column, (index, frame) in enumerate(columns)
-        for body in few[index].bodies
-        if body.is_target
-    ]
-    return BodyField(place_bodies(entries, len(columns), build))
-
-
-def opaque_target(target: Target) -> Target:
-    """The same target with opaque occluders."""
-    return target.with_visibility(Opaque(target.surfaces.raycast(target.scenes)))
-
-
-class Opaque(Visibility):
-    """Exact first hits on opaque scenes."""
-
-    name = "opaque"
-
-    def __init__(self, exact: Visibility) -> None:
-        self._exact, self.rows_at_once = exact, exact.rows_at_once
-
-    def transmittance(
-        self, rays: RayBatch, columns: Columns, optics: Optics, *, differentiable: bool = True
-    ) -> Unmoved:
-        """See `Visibility`; its gradient is 0 wherever there is one."""
-        exact = self._exact.transmittance(rays, columns, optics, differentiable=False)
-        return Unmoved(np.where(exact.log_values < 0, LOG_OPAQUE, 0.0), len(rays.ranges))
-
-    def take(self, columns: np.ndarray) -> Opaque:
-        """See `Visibility`."""
-        return Opaque(self._exact.take(columns))
+def affordable_scenes(scenes: list[Scene]) -> list[Scene]:
+    """All scenes where their occluders share a table, else as many as a fine quadrature can evaluate."""
+    occluders = [[body for body in scene.bodies if body.is_occluder] for scene in scenes]
+    if all(isinstance(body.shape, Mesh) and body.poses.ndim == 2 for bodies in occluders for body in bodies):
+        return scenes
+    return few_columns(scenes, max(MOST_BODIES // max(1, *map(len, occluders)), 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,7 +343,7 @@ class VisibilityCase:
 
     @property
     def is_blind(self) -> bool:
-        """Whether no probe reaches a surface, or none sees one."""
+        """True where no probe reaches a surface, or none sees one."""
         return bool(self.exact.max(initial=LOG_OPAQUE) < LOG_OPAQUE / 2)
 
     def quadrature(self, points: int) -> Target:
@@ -335,59 +360,30 @@ class VisibilityCase:
 
     @property
     def work(self) -> str:
-        """What is timed."""
+        """The work that is timed."""
         return f"log p* with its gradient at {min(self.batch, len(self.probes.points))} design points"
 
 
-def visibility_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """One sweep; empty where no ray sees a target."""
-    scenes, config = list(request.request.train), request.config
-    few = affordable_scenes(scenes)
-    case = VisibilityCase.of(few, config.space, config.density, config.seed, config.learning.batch)
-    if case.is_blind:
-        return []
-    # what the run's probe decided, and the points of its quadrature, refined as they were
-    default, points = request.decided_visibility or config.density.visibility, config.density.quadrature_points
-    if default == "quadrature":
-        points = request.target.visibility.one_way.points
-    return [visibility_sweep(case, points, default, _part(few, scenes))]
+def opaque_target(target: Target) -> Target:
+    """The same target with opaque occluders."""
+    return target.with_visibility(Opaque(target.surfaces.raycast(target.scenes)))
 
 
-def visibility_sweep(case: VisibilityCase, points: int, default: str, note: str = "") -> Sweep:
-    """No visibility, the quadrature with its own points, and ray casting.
+class Opaque(Visibility):
+    """Exact first hits on opaque scenes."""
 
-    Arguments:
-        case: What they are measured on.
-        points: Of the quadrature.
-        default: off, quadrature or raycast: what the run uses.
-        note: What a reader should know.
-    """
-    exact = case.exact
-    ways = {
-        "off": (case.cast.with_visibility(NoVisibility()), exact),
-        "quadrature": (case.quadrature(points), exact[: case.few]),
-        "raycast": (case.cast, exact),
-    }
-    return density_sweep(
-        knob="density.visibility",
-        against="opaque geometry, by exact first hits",
-        work=case.work,
-        measurements=[case.measure(name, *way, default=name == default) for name, way in ways.items()],
-        note=note,
-    )
+    name = "opaque"
 
+    def __init__(self, exact: Visibility) -> None:
+        self._exact, self.rows_at_once = exact, exact.rows_at_once
 
-def _part(few: list[Scene], scenes: list[Scene]) -> str:
-    """Which part of the scenes was measured; "" where it was all of them."""
-    if few is scenes:
-        return ""
-    frames = f", {few[0].frames} frames of each" if scenes[0].frames > few[0].frames else ""
-    return f"measured on {len(few)} of {len(scenes)} training scenes{frames}"
+    def transmittance(
+        self, rays: RayBatch, columns: Columns, optics: Optics, *, differentiable: bool = True
+    ) -> Unmoved:
+        """See `Visibility`; its gradient is 0 wherever there is one."""
+        exact = self._exact.transmittance(rays, columns, optics, differentiable=False)
+        return Unmoved(np.where(exact.log_values < 0, LOG_OPAQUE, 0.0), len(rays.ranges))
 
-
-def affordable_scenes(scenes: list[Scene]) -> list[Scene]:
-    """All scenes where their occluders share a table, else as many as a fine quadrature can evaluate."""
-    occluders = [[body for body in scene.bodies if body.is_occluder] for scene in scenes]
-    if all(isinstance(body.shape, Mesh) and body.poses.ndim == 2 for bodies in occluders for body in bodies):
-        return scenes
-    return few_columns(scenes, max(MOST_BODIES // max(1, *map(len, occluders)), 1))
+    def take(self, columns: np.ndarray) -> Opaque:
+        """See `Visibility`."""
+        return Opaque(self._exact.take(columns))

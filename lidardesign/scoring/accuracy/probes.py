@@ -34,7 +34,7 @@ DRAWN_AT_ONCE = 4096
 
 @dataclass(frozen=True, eq=False)
 class AccuracyRequest:
-    """What sweeps are measured on.
+    """A run and an evaluation that sweeps are measured on.
 
     Arguments:
         config: The run's configuration.
@@ -55,7 +55,7 @@ class AccuracyRequest:
 
     @property
     def decided_visibility(self) -> str | None:
-        """What the run's own probe decided; None where it left no word of it."""
+        """The visibility that the run's own probe decided on; None where it left no word of it."""
         return read_manifest(self.run).get("visibility")
 
 

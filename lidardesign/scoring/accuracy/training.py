@@ -178,7 +178,7 @@ def frames_sweep(steps: LearningSteps, seed: int) -> Sweep:
 
 
 def counts(columns: int, default: int) -> list[int]:
-    """How many scenes and frames are tried: powers of four up to all of them, and the run's own number."""
+    """Numbers of scenes and frames to try: powers of four up to all of them, and the run's own number."""
     return sorted({*(count for count in POWERS if count < columns), default, columns})
 
 

@@ -1,1 +1,1 @@
-"""The rivals of every design."""
+"""The baselines of every design."""

@@ -1,4 +1,4 @@
-"""What a baseline may take: layouts of any number of rays, with one gate or a gate per ray, in a bandwidth.
+"""Candidates of baselines: layouts of any number of rays, with one gate or a gate per ray, in a bandwidth.
 
 A design has one list of rays. Where a task's scenes are seen from several condition values (a robot's positions), it
 has one list per value; all have the same number of rays.
@@ -23,9 +23,8 @@ from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 # A gate without width hears nothing, since gates are open at their end. Ranges that never vary get the width
 # of the default 100 ps bin around them.
 SMALLEST_GATE_M = 0.015
-FIRST_GUESS = 64
 # Bandwidth grows almost in proportion to the number of rays: a few steps find the largest number that fits.
-MOST_STEPS = 8
+FIRST_GUESS, MOST_STEPS = 64, 8
 
 
 def rays_at(points: np.ndarray, gate_m: np.ndarray) -> Rays:
@@ -53,7 +52,7 @@ def opened_gate(start_m: float | np.ndarray, end_m: float | np.ndarray) -> np.nd
 
 
 class LayoutSite(NamedTuple):
-    """Where and for which scene rays are laid out.
+    """A design space and a scene that rays are laid out for.
 
     Arguments:
         space: The design space at a condition value.

@@ -1,21 +1,9 @@
-"""Even rays: over boxes of origins and angles, and over parts of the sphere, where a pole is no special place.
+"""Even rays over boxes of origins and angles and over parts of the sphere, and the baseline `bounding` of such rays.
 
 A `Zone` is a box of azimuths and elevations: its rows are even in elevation and have rays in proportion to their
 length. A `Patch` is a rectangle in the azimuthal equal-area projection about a middle direction (J. H. Lambert 1772),
 which for narrow fields is the tangent plane: areas keep their ratio however wide it is, and no direction is singular
 but the one opposite to its middle. What looks over more than a hemisphere is a zone, anything else a patch.
-
-The baseline `bounding`: what an engineer would build in five minutes from where the training returns are.
-
-One even layout, cropped to the central 99 % of the training returns in direction and range. Where both angles are
-free, the crop is the smallest rectangle about their mean direction (see `lidardesign.scoring.baselines.even`), else an
-interval of the angle. With free origins it is the better of two, on training scenes: parallel rays (vertical where the
-space allows it) from an even grid over the returns' box, and a low-discrepancy set in the central 99 % of origins and
-directions. Where the density has conditions, it is cropped anew at each of their values; at one where nothing
-returns, the crop over all of them stands.
-
-All rays of a value have one gate. Where any design beside it has gates per ray, each layout stands to choice a second
-time, with the central 99 % of what dense rays return that are nearer to each ray than to any other.
 """
 
 from __future__ import annotations
@@ -46,7 +34,7 @@ SMALLEST_SHARE = 0.1
 SHARE_POINTS = 1024
 GOLDEN_TURN = FULL_TURN * (1.0 - 2.0 / (1.0 + math.sqrt(5.0)))
 SIXTH = math.sqrt(3.0) / 2  # height of an equilateral triangle
-# an origin axis within 45 degrees of parallel rays only moves them along themselves
+# An origin axis within 45 degrees of parallel rays only moves them along themselves.
 ALIGNED = math.cos(math.pi / 4)
 TAIL = 0.005  # of the returns are left out at either end of a gate
 
@@ -228,7 +216,7 @@ def central(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def central_field(space: DesignSpace, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> SphereField:
-    """What holds the central 99 % of directions (K,) per axis: the smallest rectangle, or a zone past a hemisphere.
+    """A field of the central 99 % of directions (K,) per axis: the smallest rectangle, or a zone past a hemisphere.
 
     Arguments:
         space: The design space, both of whose angles are free.
@@ -296,9 +284,30 @@ def even_placement(low: np.ndarray, high: np.ndarray, count: int, field: SphereF
     return np.clip(points, low, high)
 
 
+def bounding(views: TrainingViews, *, gates_per_ray: bool = False) -> list[GatedLayout]:
+    """The layouts of the baseline: what an engineer would build in five minutes from where training scenes return.
+
+    One even layout, cropped to the central 99 % of the returns in direction and range. Where both angles are free, the
+    crop is the smallest rectangle about their mean direction, else an interval of the angle. With free origins it is
+    the better of two, on training scenes: parallel rays (vertical where the space allows it) from an even grid over the
+    returns' box, and a low-discrepancy set in the central 99 % of origins and directions. Where the density has
+    conditions, it is cropped anew at each of their values; at one where nothing returns, the crop over all of them
+    stands. No layout where dense rays return nothing.
+
+    All rays of a value have one gate. Where any design beside it has gates per ray, each layout stands to choice a
+    second time, with the central 99 % of what dense rays return that are nearer to each ray than to any other.
+
+    Arguments:
+        views: The training scenes.
+        gates_per_ray: Whether there is a layout of each kind whose rays have gates of their own, too.
+    """
+    kinds = crop_kinds(views.space)
+    return [layout for name, crop_of in kinds.items() for layout in _cropped(name, views, crop_of, gates_per_ray)]
+
+
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """Where the training returns are at a condition value.
+    """The part of a design space from which training scenes return at a condition value.
 
     Arguments:
         low, high: A box of rays (x, y, z, azimuth, elevation), shape (5,).
@@ -314,22 +323,11 @@ class Crop:
     table: Callable[[], ReturnTable]
 
 
-def bounding(views: TrainingViews, *, gates_per_ray: bool = False) -> list[GatedLayout]:
-    """The layouts to choose from; none where dense rays return nothing.
-
-    Arguments:
-        views: The training scenes.
-        gates_per_ray: Whether there is a layout of each kind whose rays have gates of their own, too.
-    """
-    kinds = crop_kinds(views.space)
-    return [layout for name, crop_of in kinds.items() for layout in _cropped(name, views, crop_of, gates_per_ray)]
-
-
 CropOf = Callable[[TrainingViews, DesignSpace, Observed], Crop | None]
 
 
 def crop_kinds(space: DesignSpace) -> dict[str, CropOf]:
-    """How a design space can be cropped to what returns; with free origins there are two ways."""
+    """Ways to crop a design space to what returns; with free origins there are two."""
     origins = [axis for axis in space.free if axis < AZIMUTH and axis not in space.conditioned]
     return {"parallel": _parallel_crop, "cropped": box_crop} if origins else {"cropped": box_crop}
 
@@ -387,16 +385,16 @@ def _parallel_crop(views: TrainingViews, space: DesignSpace, observed: Observed)
     return Crop(low, high, None, opened_gate(*central(ranges)), table)
 
 
-def _dense_table(
-    views: TrainingViews, low: np.ndarray, high: np.ndarray, directions: SphereField | None
-) -> Callable[[], ReturnTable]:
-    """What dense rays in a crop return, traced when that is first asked for."""
-    count = dense_rays(int((high > low).sum()))
-    return cache(lambda: views.returns(even_placement(low, high, count, directions)))
-
-
 def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, float]:
     """Straight down where the space allows it, else straight up, else the median direction of the returns."""
     middle = np.median(observed.points[:, AZIMUTH])
     vertical = [end for end in (-math.pi / 2, math.pi / 2) if space.low[ELEVATION] <= end <= space.high[ELEVATION]]
     return float(middle), vertical[0] if vertical else float(np.median(observed.points[:, ELEVATION]))
+
+
+def _dense_table(
+    views: TrainingViews, low: np.ndarray, high: np.ndarray, directions: SphereField | None
+) -> Callable[[], ReturnTable]:
+    """Returns of dense rays in a crop, traced when they are first asked for."""
+    count = dense_rays(int((high > low).sum()))
+    return cache(lambda: views.returns(even_placement(low, high, count, directions)))

@@ -57,14 +57,14 @@ def greedy_rays(task: Task, positions: int, counts: Iterable[int]) -> tuple[list
 
 
 class Fired(NamedTuple):
-    """What a design beside it fires: a number of rays in a bandwidth [Mbit/s]."""
+    """A number of rays that a design beside it fires, and their bandwidth [Mbit/s]."""
 
     rays: int
     mbps: float
 
 
 class _Table(NamedTuple):
-    """What all candidates tell about the training scenes through each of their gates, (N, G, 2) [m]."""
+    """Information of all candidates about the training scenes through each of their gates, (N, G, 2) [m]."""
 
     selection: Selection
     coverage: Coverage

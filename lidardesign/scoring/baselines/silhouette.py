@@ -44,7 +44,7 @@ PROBABILITY_POWER, AREA_POWER = 0.75, 1.5
 
 
 class Survey(NamedTuple):
-    """What dense rays from one place return, and over which box and directions they are even."""
+    """Returns of dense rays from one place, and over which box and directions they are even."""
 
     low: np.ndarray
     high: np.ndarray

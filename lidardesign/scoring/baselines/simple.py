@@ -11,23 +11,12 @@ more candidate layouts; where there are several, the best on training scenes is 
 - `silhouette` and `lloyd`: rays and gates by what training scenes return, see
   `lidardesign.scoring.baselines.silhouette`.
 - `greedy`: rays chosen on training scenes without a density, see `lidardesign.scoring.baselines.greedy`.
-- `occupancy`: see `lidardesign.scoring.baselines.simple`.
+- `occupancy`: rays towards the cells of a grid that targets occupy, by how often they do, see `occupancy`.
 - `no-visibility`: the first design fitted anew to the density without its occlusion term; the number of sensors, the
   layout, the constraints, the level and the seed stay. It is not weighted, even where the design is.
 - `cma`: see `lidardesign.scoring.baselines.cma`.
 
 Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
-
-The baseline `occupancy`: rays towards the cells of a grid that targets occupy, by how often they do.
-
-The grid's cells are cubes; a cell's probability is the share of training scenes and frames in which a target's
-surface lies in it. A ray starts at a uniform admissible origin and is aimed at a uniform point of a cell that is drawn
-by its probability, among all such pairs that the design space admits; nothing asks whether anything stands in
-between. The gate is the central 99 % of the distances to these points. Rays are drawn anew for every scene.
-
-Where an angle is fixed, no ray could be aimed at a given point. Uniform design points are weighted instead: by the
-probability of the cell that they end in, and by the volume that a ray's end sweeps there, which grows with the range
-where one angle is free and not at all where none is.
 """
 
 from __future__ import annotations
@@ -63,7 +52,8 @@ NONE = "none"
 # What stands beside every design, asked for or not.
 ALWAYS = ("uniform", "random", "bounding", "silhouette", GREEDY)
 FEWER_RAYS = 0.9  # of those that did not fit in a bandwidth
-CELLS = 64  # along the longest side of the box round all surface points
+# Of `occupancy`: cells along the longest side of the box round all surface points.
+CELLS = 64
 MOST_VIEWS = 4096  # scenes times frames that enter the grid, evenly spread where there are more
 SURFACE_POINTS = 400_000  # over all views, between these numbers in each
 FEWEST_POINTS, MOST_POINTS = 256, 4096
@@ -297,9 +287,56 @@ class TwinCandidate:
         return self._known[count, limit_mbps]
 
 
+def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> BaselineLayout | None:
+    """The layout of the baseline; None where no admissible ray ends in an occupied cell.
+
+    The grid's cells are cubes; a cell's probability is the share of training scenes and frames in which a target's
+    surface lies in it. A ray starts at a uniform admissible origin and is aimed at a uniform point of a cell that is
+    drawn by its probability, among all such pairs that the design space admits; nothing asks whether anything stands in
+    between. The gate is the central 99 % of the distances to these points. Rays are drawn anew for every scene. At a
+    condition value where none ends in an occupied cell, rays are uniform in what is left of the space.
+    """
+    if not train:
+        return None
+    grid = occupancy_grid(train, space, seed)
+    points, weights = AimedPoints(grid, space, seed, 0).first(GATE_POINTS)
+    if not len(points):
+        return None
+    drawn = random_generator(seed, "occupancy gate").choice(len(points), GATE_POINTS, p=weights / weights.sum())
+    nearest, furthest = central(points[drawn, RANGE])
+    known: dict[int, AimedPoints] = {}
+
+    def place(count: int, site: LayoutSite) -> np.ndarray:
+        aimed = known.setdefault(site.number, AimedPoints(grid, site.space, seed, 1 + site.number))
+        generator = random_generator(seed, "occupancy baseline", count, site.scene, site.number)
+        found, weights = aimed.first(POINTS_PER_RAY * count)
+        if not len(found):
+            return site.space.sample(count, generator)
+        return found[generator.choice(len(found), count, p=weights / weights.sum())]
+
+    return BaselineLayout("occupancy", place, opened_gate(float(nearest), float(furthest)), drawn_anew=True)
+
+
+def occupancy_grid(scenes: Sequence[Scene], space: DesignSpace, seed: int) -> OccupancyGrid:
+    """The grid of all scenes and frames, from points sampled on the surfaces of the targets."""
+    views = spread_frames(scenes, MOST_VIEWS)
+    generator = random_generator(seed, "occupancy grid")
+    count = int(np.clip(SURFACE_POINTS // len(views), FEWEST_POINTS, MOST_POINTS))
+    targets = [[body for body in scene.bodies if body.is_target] for scene in scenes]
+    points = [sample_body(targets[scene], space, count, generator, frame).points for scene, frame in views]
+    everything = np.concatenate(points)
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    # one cell more than fits, so that the highest point has one too
+    edge = float((high - low).max()) / CELLS or 1.0
+    times = np.zeros(np.floor((high - low) / edge).astype(np.int64) + 1)
+    for view in points:
+        times[tuple(np.unique(np.floor((view - low) / edge).astype(np.int64), axis=0).T)] += 1
+    return OccupancyGrid(low, edge, times / len(views))
+
+
 @dataclass(frozen=True, eq=False)
 class OccupancyGrid:
-    """How often targets' surfaces lie in the cells of a grid.
+    """A grid, and how often targets' surfaces lie in its cells.
 
     Arguments:
         low_m: Its lower corner, shape (3,).
@@ -327,25 +364,12 @@ class OccupancyGrid:
         return self.low_m + self.edge_m * (cell + generator.random((count, 3)))
 
 
-def occupancy_grid(scenes: Sequence[Scene], space: DesignSpace, seed: int) -> OccupancyGrid:
-    """The grid of all scenes and frames, from points sampled on the surfaces of the targets."""
-    views = spread_frames(scenes, MOST_VIEWS)
-    generator = random_generator(seed, "occupancy grid")
-    count = int(np.clip(SURFACE_POINTS // len(views), FEWEST_POINTS, MOST_POINTS))
-    targets = [[body for body in scene.bodies if body.is_target] for scene in scenes]
-    points = [sample_body(targets[scene], space, count, generator, frame).points for scene, frame in views]
-    everything = np.concatenate(points)
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    # one cell more than fits, so that the highest point has one too
-    edge = float((high - low).max()) / CELLS or 1.0
-    times = np.zeros(np.floor((high - low) / edge).astype(np.int64) + 1)
-    for view in points:
-        times[tuple(np.unique(np.floor((view - low) / edge).astype(np.int64), axis=0).T)] += 1
-    return OccupancyGrid(low, edge, times / len(views))
-
-
 class AimedPoints:
     """Design points that end in occupied cells, with weights that make their ends uniform in volume.
+
+    Where an angle is fixed, no ray could be aimed at a given point. Uniform design points are weighted instead: by the
+    probability of the cell that they end in, and by the volume that a ray's end sweeps there, which grows with the
+    range where one angle is free and not at all where none is.
 
     Arguments:
         grid: The cells.
@@ -387,29 +411,3 @@ class AimedPoints:
         weights = self._grid.at(observed_point(points)) * points[:, RANGE] ** self._free_angles
         aimed = weights > 0
         return points[aimed], weights[aimed]
-
-
-def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> BaselineLayout | None:
-    """The layout; None where no admissible ray ends in an occupied cell.
-
-    At a condition value where none does, rays are uniform in what is left of the space.
-    """
-    if not train:
-        return None
-    grid = occupancy_grid(train, space, seed)
-    points, weights = AimedPoints(grid, space, seed, 0).first(GATE_POINTS)
-    if not len(points):
-        return None
-    drawn = random_generator(seed, "occupancy gate").choice(len(points), GATE_POINTS, p=weights / weights.sum())
-    nearest, furthest = central(points[drawn, RANGE])
-    known: dict[int, AimedPoints] = {}
-
-    def place(count: int, site: LayoutSite) -> np.ndarray:
-        aimed = known.setdefault(site.number, AimedPoints(grid, site.space, seed, 1 + site.number))
-        generator = random_generator(seed, "occupancy baseline", count, site.scene, site.number)
-        found, weights = aimed.first(POINTS_PER_RAY * count)
-        if not len(found):
-            return site.space.sample(count, generator)
-        return found[generator.choice(len(found), count, p=weights / weights.sum())]
-
-    return BaselineLayout("occupancy", place, opened_gate(float(nearest), float(furthest)), drawn_anew=True)

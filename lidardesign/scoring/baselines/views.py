@@ -30,7 +30,7 @@ MOST_VIEWS = 128  # scenes times frames that are looked at: evenly spread where 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What rays return on targets.
+    """Returns of rays on targets.
 
     Arguments:
         points: Design points with a return, the azimuth unrolled to one arc, shape (K, 6).
@@ -45,7 +45,7 @@ FLATTEST_COSINE = 0.1  # a surface counts as seen no more flatly
 
 
 class ReturnTable:
-    """What each of M rays returns on targets in each of V views.
+    """Returns of each of M rays on targets in each of V views.
 
     Arguments:
         space: The design space, whose range all gates keep to.
@@ -71,7 +71,7 @@ class ReturnTable:
 
     @cached_property
     def sigma_m(self) -> float:
-        """How much ranges along one ray vary from view to view: the median standard deviation [m]."""
+        """Spread of ranges along one ray from view to view: the median standard deviation [m]."""
         several = self.returned.sum(axis=0) > 1
         return float(np.median(np.nanstd(self.range_m[:, several], axis=0, ddof=1))) if several.any() else 0.0
 
@@ -130,13 +130,13 @@ class ReturnTable:
 
 
 def _scales(points: np.ndarray) -> tuple[float, float]:
-    """What directions and origins are divided by, so that both extend over about 1."""
+    """Units of directions and origins in which both extend over about 1."""
     looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
     return tuple(float(np.ptp(part, axis=0).max()) or 1.0 for part in (looking, points[:, :3]))
 
 
 def _features(points: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
-    """Where rays are near each other, so are these, (N, 5) to (N, 6)."""
+    """Coordinates that are near each other where rays are, (N, 5) to (N, 6)."""
     looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
     return np.column_stack([looking / scale[0], points[:, :3] / scale[1]])
 
@@ -159,13 +159,13 @@ class TrainingViews:
         return [(self.train[i], SceneCaster(self.train[i], frame)) for i, frame in spread_frames(self.train)]
 
     def observed(self, space: DesignSpace) -> Observed:
-        """What dense rays over a part of the design space return, traced once."""
+        """Returns of dense rays over a part of the design space, traced once."""
         if space not in self._observed:
             self._observed[space] = self.hits(dense_points(space))
         return self._observed[space]
 
     def hits(self, points: np.ndarray) -> Observed:
-        """What rays at (N, 5 or 6) return on targets inside the space's range, over all views."""
+        """Returns of rays (N, 5 or 6) on targets inside the space's range, over all views."""
         table = self.returns(points)
         view, ray = np.nonzero(table.returned)
         design = np.column_stack([table.points[ray], table.range_m[view, ray]])
@@ -212,7 +212,7 @@ def spread_frames(scenes: Sequence[Scene], most: int = MOST_VIEWS) -> list[tuple
 
 
 def dense_rays(axes: int) -> int:
-    """How many rays are dense over so many axes."""
+    """The number of rays that are dense over so many axes."""
     return DENSE_RAYS if axes > 1 else DENSE_RAYS_ON_A_LINE
 
 

@@ -1,1 +1,1 @@
-"""What a lab captured, and designs scored by it."""
+"""Captures of a lab, and designs scored by them."""

@@ -12,11 +12,9 @@ A capture is a `.npz` or MATLAB `.mat` file with these keys; the pixels are a li
 - optional `true_range_m` (P) or (H, W): the true one-way range [m], NaN where nothing is;
 - optional `pulse_fwhm_ps`: full width at half maximum of the whole system's response [ps], for the matched filter.
 
-The arrays of a `.npz` or MATLAB `.mat` file, read without running anything that is in it.
-
-Names, types and sizes are looked at before any data is read: objects, cells and structures are refused, and so is more
-data than a stated size, packed or not. SciPy reads MATLAB files of versions 4 to 7 in a process of its own, which
-damaged ones may crash.
+Nothing that is in a file is run. Names, types and sizes are looked at before any data is read: objects, cells and
+structures are refused, and so is more data than a stated size, packed or not. SciPy reads MATLAB files of versions 4 to
+7 in a process of its own, which damaged ones may crash.
 """
 
 from __future__ import annotations
@@ -62,12 +60,12 @@ CHUNK = 1 << 22
 NUMBERS = {"double": "f8", "single": "f4", "logical": "?"} | {
     f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)
 }
+# The function that reads them in a process of its own. A file of the largest size takes some seconds.
 CONVERTER = f"{__name__}:convert"
-# A file of the largest size takes some seconds.
 PATIENCE_SECONDS = 120.0
 # Memory of the process, in times of the largest size: packed data, the same unpacked, the array, and the libraries.
 MEMORY_SHARE = 4
-MOST_ARRAYS = 1000
+MOST_ARRAYS = 1000  # in a file
 SUFFIXES = (".npz", ".mat")
 
 
@@ -122,7 +120,7 @@ class Capture:
 
     @property
     def gated(self) -> bool:
-        """Whether pixels begin to count at different times."""
+        """True where pixels begin to count at different times."""
         return bool((self.start_ps != self.start_ps[0]).any())
 
     @cached_property
@@ -311,58 +309,6 @@ def _check_values(capture: Capture, where: str) -> None:
         )
 
 
-def read_matlab(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of a file by name, at least two-dimensional, in MATLAB's shapes.
-
-    Raises:
-        DataError: It is damaged, too large, or holds other things than full real arrays of numbers.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "arrays.npz"
-        request = {"source": str(path), "target": str(target), "most": CAPTURE.unpacked_bytes}
-        try:
-            found = ask(CONVERTER, request, PATIENCE_SECONDS, "while it is read")
-        except ChildError as error:
-            hint = "write it again with save or savemat"
-            raise DataError("is not a MATLAB file, or is damaged", where=str(path), hint=hint) from error
-        if "refused" in found:
-            raise refused(*found["refused"], str(path))
-        check_bytes(found["bytes"], CAPTURE, str(path), unpacked=True)
-        stored = read_npz(target, CAPTURE)
-        return {name: stored[f"array_{number}"] for number, name in enumerate(found["names"])}
-
-
-def refused(name: str, kind: str, where: str) -> DataError:
-    """The error that something in a file is no full array of real numbers."""
-    allowed, hint = "full numeric arrays", "save arrays, not structures"
-    return DataError(f"{name!r} is a MATLAB {kind}", where=where, allowed=allowed, hint=hint)
-
-
-def convert(request: dict[str, Any], _: object) -> dict[str, Any]:
-    """In that process: write the arrays of a file into another, and say their names and sizes, or what was refused."""
-    from scipy.io import loadmat, whosmat
-
-    source, target, most = request["source"], request["target"], request["most"]
-    with contextlib.suppress(ImportError, ValueError, OSError):
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_SHARE * max(most, 1 << 29), resource.RLIM_INFINITY))
-    listed = whosmat(source)
-    for name, _, kind in listed:
-        if kind not in NUMBERS:
-            return {"refused": [name, kind]}
-    size = sum(math.prod(shape) * np.dtype(NUMBERS[kind]).itemsize for _, shape, kind in listed)
-    if size <= most:
-        read = loadmat(source)
-        for name, _, _ in listed:
-            if read[name].dtype.kind == "c":
-                return {"refused": [name, "complex array"]}
-        # numbers may be stored in less space, and in the other byte order
-        arrays = [read[name].astype(NUMBERS[kind]) for name, _, kind in listed]
-        np.savez(target, **{f"array_{number}": array for number, array in enumerate(arrays)})
-    return {"names": [name for name, _, _ in listed], "bytes": size}
-
-
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """All arrays of a file by name, numbers only; MATLAB's come as MATLAB shows them, at least two-dimensional.
 
@@ -418,3 +364,55 @@ def _check_dataset(name: str, dataset: Any, where: str) -> None:
     check_kind(dataset.dtype, name, where)
     if dataset.is_virtual or dataset.external:
         raise DataError(f"{name!r} keeps its data in another file", where=where)
+
+
+def read_matlab(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of a file by name, at least two-dimensional, in MATLAB's shapes.
+
+    Raises:
+        DataError: It is damaged, too large, or holds other things than full real arrays of numbers.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "arrays.npz"
+        request = {"source": str(path), "target": str(target), "most": CAPTURE.unpacked_bytes}
+        try:
+            found = ask(CONVERTER, request, PATIENCE_SECONDS, "while it is read")
+        except ChildError as error:
+            hint = "write it again with save or savemat"
+            raise DataError("is not a MATLAB file, or is damaged", where=str(path), hint=hint) from error
+        if "refused" in found:
+            raise refused(*found["refused"], str(path))
+        check_bytes(found["bytes"], CAPTURE, str(path), unpacked=True)
+        stored = read_npz(target, CAPTURE)
+        return {name: stored[f"array_{number}"] for number, name in enumerate(found["names"])}
+
+
+def convert(request: dict[str, Any], _: object) -> dict[str, Any]:
+    """In that process: write the arrays of a file into another, and say their names and sizes, or what was refused."""
+    from scipy.io import loadmat, whosmat
+
+    source, target, most = request["source"], request["target"], request["most"]
+    with contextlib.suppress(ImportError, ValueError, OSError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_SHARE * max(most, 1 << 29), resource.RLIM_INFINITY))
+    listed = whosmat(source)
+    for name, _, kind in listed:
+        if kind not in NUMBERS:
+            return {"refused": [name, kind]}
+    size = sum(math.prod(shape) * np.dtype(NUMBERS[kind]).itemsize for _, shape, kind in listed)
+    if size <= most:
+        read = loadmat(source)
+        for name, _, _ in listed:
+            if read[name].dtype.kind == "c":
+                return {"refused": [name, "complex array"]}
+        # numbers may be stored in less space, and in the other byte order
+        arrays = [read[name].astype(NUMBERS[kind]) for name, _, kind in listed]
+        np.savez(target, **{f"array_{number}": array for number, array in enumerate(arrays)})
+    return {"names": [name for name, _, _ in listed], "bytes": size}
+
+
+def refused(name: str, kind: str, where: str) -> DataError:
+    """The error that something in a file is no full array of real numbers."""
+    allowed, hint = "full numeric arrays", "save arrays, not structures"
+    return DataError(f"{name!r} is a MATLAB {kind}", where=where, allowed=allowed, hint=hint)

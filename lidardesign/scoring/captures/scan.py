@@ -1,12 +1,9 @@
 """A captured scan seen through a list of rays: of each ray the nearest pixel, and its histogram inside the ray's gate.
 
-What a design would have measured is cut out of what was captured: a ray takes the pixel that looks its way, and hears
-only the bins whose middles lie in its gate.
-
-Ranges from captured histograms, cut to the bins that each ray hears.
-
-They are found as `lidardesign.simulate.detector.kernels` finds them in simulated histograms. Where a gate
-holds too few photons to tell the background, its threshold takes the level that is usual in the whole capture.
+A design would have measured what is cut out of what was captured: a ray takes the pixel that looks its way, and hears
+only the bins whose middles lie in its gate. Ranges are found as `lidardesign.simulate.detector.kernels` finds them in
+simulated histograms. Where a gate holds too few photons to tell the background, its threshold takes the level that is
+usual in the whole capture.
 """
 
 from __future__ import annotations
@@ -32,9 +29,134 @@ CHUNK_BINS = 1 << 22
 SAME_PLACE_M = 0.005
 
 
+class Captured(IntEnum):
+    """Why a capture has nothing of a ray, or that it has it."""
+
+    YES = 0
+    OTHER_PLACE = 1
+    OUT_OF_FIELD = 2
+    OUT_OF_WINDOW = 3
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedScan:
+    """Measurements of N rays in a capture.
+
+    Arguments:
+        captured: Values of `Captured`, shape (N,).
+        pixel: The pixel that each ray takes, -1 where it was not captured, shape (N,).
+        away_rad: The angle between the ray and its pixel, or the nearest one, shape (N,).
+        first_bin, last_bin: The bins that it hears, the last one excluded, shape (N,).
+        photons: Counts in them, shape (N,).
+        range_m: The measured one-way range [m], NaN without a return, shape (N,).
+        points_m: Measured points along the pixels, NaN without a return, shape (N, 3).
+    """
+
+    captured: np.ndarray
+    pixel: np.ndarray
+    away_rad: np.ndarray
+    first_bin: np.ndarray
+    last_bin: np.ndarray
+    photons: np.ndarray
+    range_m: np.ndarray
+    points_m: np.ndarray
+
+    @property
+    def returned(self) -> np.ndarray:
+        """Mask of the rays with a return, shape (N,)."""
+        return np.isfinite(self.range_m)
+
+
+def scan(
+    capture: Capture, rays: Rays, within_rad: float, estimation: Estimation, name: str | None = None
+) -> CapturedScan:
+    """The measurements of a list of rays in a capture.
+
+    Arguments:
+        capture: The captured histograms.
+        rays: The rays; their gates are one-way ranges.
+        within_rad: The largest angle between a ray and the pixel that it takes [rad].
+        estimation: How ranges follow from histograms.
+        name: Whose rays they are, for the message.
+
+    Raises:
+        DataError: Not one ray was captured.
+    """
+    chord, nearest = cKDTree(capture.direction).query(rays.direction)
+    away = 2 * np.arcsin(np.minimum(np.asarray(chord) / 2, 1.0))
+    first, last = gate_bins(capture, nearest, rays.gate_m)
+    offset = np.linalg.norm(rays.origin_m - capture.origin_m, axis=1)
+    captured = np.full(len(rays), Captured.YES, dtype=np.int64)
+    captured[last <= first] = Captured.OUT_OF_WINDOW
+    captured[away > within_rad] = Captured.OUT_OF_FIELD
+    captured[offset > SAME_PLACE_M] = Captured.OTHER_PLACE
+    _refuse_nothing_captured(capture, rays, captured, away, offset, name)
+    return _measured(capture, captured, nearest, away, first, last, estimation)
+
+
+def scan_pixels(capture: Capture, estimation: Estimation) -> CapturedScan:
+    """The measurement of every pixel in its whole histogram."""
+    pixels = np.arange(len(capture))
+    first, last = gate_bins(capture, pixels, np.tile(_listening_windows_m(capture), (len(capture), 1)))
+    captured = np.where(first < last, Captured.YES, Captured.OUT_OF_WINDOW)
+    return _measured(capture, captured, pixels, np.zeros(len(capture)), first, last, estimation)
+
+
+def gate_bins(capture: Capture, pixel: np.ndarray, gate_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The bins of pixels (N,) whose middles lie in gates (N, 2) [m], start <= middle < end.
+
+    First and last (excluded), each of shape (N,).
+    """
+    places = (gate_m - capture.start_m[pixel, None]) / capture.bin_m - 0.5
+    bins = np.clip(np.ceil(places), 0, capture.bins).astype(np.int64)
+    return bins[:, 0], bins[:, 1]
+
+
+def whole_window(rays: Rays, capture: Capture) -> Rays:
+    """The same rays without gates: they hear all that was captured."""
+    return replace(rays, gate_m=np.tile(_listening_windows_m(capture), (len(rays), 1)))
+
+
+def _listening_windows_m(capture: Capture) -> np.ndarray:
+    """The captured window from the pulse on: what is counted before it left the scanner comes from no surface."""
+    return np.maximum(capture.window_m, 0.0)
+
+
+def uniform_rays(capture: Capture, count: int) -> Rays:
+    """So many rays even over the field of a capture, without gates: what a scanner without a design would fire.
+
+    A cell-centred grid in scan angles over all pixels and half a pixel round them.
+    """
+    frame = degree_frame(*middle_boresight_deg(capture.direction))
+    seen = scan_angles_deg(frame, capture.direction)
+    half = np.degrees(capture.spacing_rad or 0.0) / 2
+    low, high = seen.min(axis=0) - half, seen.max(axis=0) + half
+    # a scan along a line, or of a single pixel, has no extent across it
+    extents = np.maximum(high - low, EPSILON)
+    looking = scan_directions(frame, low + even_unit(count, extents) * (high - low))
+    none = np.zeros(count)
+    gates_m = np.tile(_listening_windows_m(capture), (count, 1))
+    return Rays(np.tile(capture.origin_m, (count, 1)), looking, gates_m, none, none)
+
+
+def default_within_rad(capture: Capture) -> float:
+    """The angle within which a pixel stands for a ray: as far as neighbouring pixels are apart.
+
+    Raises:
+        ConfigError: All pixels look one way.
+    """
+    if capture.spacing_rad is None:
+        raise ConfigError(
+            "all pixels point the same way, so they have no spacing",
+            where="--within-deg",
+            allowed="an angle in degrees",
+        )
+    return capture.spacing_rad
+
+
 @dataclass(frozen=True)
 class Estimation:
-    """How a range follows from a histogram.
+    """The way from a histogram to a range.
 
     Arguments:
         estimator: Its highest bin, or the log-matched filter with the pulse.
@@ -93,131 +215,6 @@ def _chunks(lengths: np.ndarray) -> Iterator[tuple[int, int]]:
         end = max(int(np.searchsorted(ends[1:], ends[begin] + CHUNK_BINS, side="right")), begin + 1)
         yield begin, end
         begin = end
-
-
-class Captured(IntEnum):
-    """Whether a capture has what a ray would have measured."""
-
-    YES = 0
-    OTHER_PLACE = 1
-    OUT_OF_FIELD = 2
-    OUT_OF_WINDOW = 3
-
-
-@dataclass(frozen=True, eq=False)
-class CapturedScan:
-    """What rays measure in a capture, N of them.
-
-    Arguments:
-        captured: Values of `Captured`, shape (N,).
-        pixel: The pixel that each ray takes, -1 where it was not captured, shape (N,).
-        away_rad: The angle between the ray and its pixel, or the nearest one, shape (N,).
-        first_bin, last_bin: The bins that it hears, the last one excluded, shape (N,).
-        photons: Counts in them, shape (N,).
-        range_m: The measured one-way range [m], NaN without a return, shape (N,).
-        points_m: Measured points along the pixels, NaN without a return, shape (N, 3).
-    """
-
-    captured: np.ndarray
-    pixel: np.ndarray
-    away_rad: np.ndarray
-    first_bin: np.ndarray
-    last_bin: np.ndarray
-    photons: np.ndarray
-    range_m: np.ndarray
-    points_m: np.ndarray
-
-    @property
-    def returned(self) -> np.ndarray:
-        """Mask of the rays with a return, shape (N,)."""
-        return np.isfinite(self.range_m)
-
-
-def scan(
-    capture: Capture, rays: Rays, within_rad: float, estimation: Estimation, name: str | None = None
-) -> CapturedScan:
-    """What a list of rays measures in a capture.
-
-    Arguments:
-        capture: The captured histograms.
-        rays: The rays; their gates are one-way ranges.
-        within_rad: The largest angle between a ray and the pixel that it takes [rad].
-        estimation: How ranges follow from histograms.
-        name: Whose rays they are, for the message.
-
-    Raises:
-        DataError: Not one ray was captured.
-    """
-    chord, nearest = cKDTree(capture.direction).query(rays.direction)
-    away = 2 * np.arcsin(np.minimum(np.asarray(chord) / 2, 1.0))
-    first, last = gate_bins(capture, nearest, rays.gate_m)
-    offset = np.linalg.norm(rays.origin_m - capture.origin_m, axis=1)
-    captured = np.full(len(rays), Captured.YES, dtype=np.int64)
-    captured[last <= first] = Captured.OUT_OF_WINDOW
-    captured[away > within_rad] = Captured.OUT_OF_FIELD
-    captured[offset > SAME_PLACE_M] = Captured.OTHER_PLACE
-    _refuse_nothing_captured(capture, rays, captured, away, offset, name)
-    return _measured(capture, captured, nearest, away, first, last, estimation)
-
-
-def scan_pixels(capture: Capture, estimation: Estimation) -> CapturedScan:
-    """What every pixel measures in its whole histogram."""
-    pixels = np.arange(len(capture))
-    first, last = gate_bins(capture, pixels, np.tile(_listening_windows_m(capture), (len(capture), 1)))
-    captured = np.where(first < last, Captured.YES, Captured.OUT_OF_WINDOW)
-    return _measured(capture, captured, pixels, np.zeros(len(capture)), first, last, estimation)
-
-
-def gate_bins(capture: Capture, pixel: np.ndarray, gate_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The bins of pixels (N,) whose middles lie in gates (N, 2) [m], start <= middle < end.
-
-    First and last (excluded), each of shape (N,).
-    """
-    places = (gate_m - capture.start_m[pixel, None]) / capture.bin_m - 0.5
-    bins = np.clip(np.ceil(places), 0, capture.bins).astype(np.int64)
-    return bins[:, 0], bins[:, 1]
-
-
-def whole_window(rays: Rays, capture: Capture) -> Rays:
-    """The same rays without gates: they hear all that was captured."""
-    return replace(rays, gate_m=np.tile(_listening_windows_m(capture), (len(rays), 1)))
-
-
-def _listening_windows_m(capture: Capture) -> np.ndarray:
-    """The captured window from the pulse on: what is counted before it left the scanner comes from no surface."""
-    return np.maximum(capture.window_m, 0.0)
-
-
-def uniform_rays(capture: Capture, count: int) -> Rays:
-    """So many rays even over the field of a capture, without gates: what a scanner without a design would fire.
-
-    A cell-centred grid in scan angles over all pixels and half a pixel round them.
-    """
-    frame = degree_frame(*middle_boresight_deg(capture.direction))
-    seen = scan_angles_deg(frame, capture.direction)
-    half = np.degrees(capture.spacing_rad or 0.0) / 2
-    low, high = seen.min(axis=0) - half, seen.max(axis=0) + half
-    # a scan along a line, or of a single pixel, has no extent across it
-    extents = np.maximum(high - low, EPSILON)
-    looking = scan_directions(frame, low + even_unit(count, extents) * (high - low))
-    none = np.zeros(count)
-    gates_m = np.tile(_listening_windows_m(capture), (count, 1))
-    return Rays(np.tile(capture.origin_m, (count, 1)), looking, gates_m, none, none)
-
-
-def default_within_rad(capture: Capture) -> float:
-    """The angle within which a pixel stands for a ray: as far as neighbouring pixels are apart.
-
-    Raises:
-        ConfigError: All pixels look one way.
-    """
-    if capture.spacing_rad is None:
-        raise ConfigError(
-            "all pixels point the same way, so they have no spacing",
-            where="--within-deg",
-            allowed="an angle in degrees",
-        )
-    return capture.spacing_rad
 
 
 def _measured(

@@ -1,9 +1,7 @@
-"""What designs make of a captured scan: ranges, outliers and a surface, gated, not gated, and beside `uniform`.
+"""Designs in a captured scan: ranges, outliers and a surface, gated, not gated, and beside `uniform`, also ray by ray.
 
 Ranges are judged by the capture's true ranges where it has them; else by the median range of each pixel and its
 nearest neighbours over their whole histograms, which a single outlier does not move.
-
-What every ray measured in a capture, as CSV: one row per ray, gate and design.
 """
 
 from __future__ import annotations
@@ -47,10 +45,10 @@ from lidardesign.space import DesignSpace, angles
 from lidardesign.task import random_generator
 
 SURFACE_POINTS = 4000
-# Flatter triangles bridge depth steps.
-STEEPEST_DEG = 85.0
+STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps
 MILLIMETRES = 1000.0
 OWN, WHOLE = "own", "whole"
+# Of the CSV: one row per ray, gate and design.
 COLUMNS = (
     "design", "gate", "ray", "sensor", "captured", "pixel", "away_deg", "gate_start_m", "gate_end_m", "photons",
     "range_m", "reference_m", "outlier",
@@ -60,7 +58,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """How a capture is judged.
+    """Settings by which a capture is judged.
 
     Arguments:
         estimation: How ranges follow from histograms.
@@ -237,7 +235,7 @@ def _notes(capture: Capture, rows: Sequence[CaptureRow]) -> list[str]:
 
 
 def _reference_ranges(capture: Capture, estimation: Estimation) -> tuple[np.ndarray, str]:
-    """What every pixel should have measured, shape (P,) [m], and where that is from."""
+    """The range that every pixel should have measured, shape (P,) [m], and where it is from."""
     if capture.true_range_m is not None:
         return capture.true_range_m, "the capture's true ranges"
     ranges = scan_pixels(capture, estimation).range_m

@@ -1,7 +1,5 @@
-"""What a design is worth on held-out scenes, against the rivals an engineer would build.
+"""Scores of designs on held-out scenes, against the baselines that an engineer would build.
 
-In reading order: `request` says what is asked for; `score` lays out designs and rivals (`baselines`, `cma`);
-`scene_scores` hands rays and returns to the task, which scores them with the distances of `metrics`; `results` and
-`statistics` make rows and intervals; `figures` and `report` show them. `accuracy` measures what numerical settings cost
-in time.
+In reading order: `request` says what is asked for; `entries` lays out designs and baselines; `score` hands their rays
+to `scoring.scene_scores`, which scores what they return; `results` and `seeds` make rows and intervals.
 """

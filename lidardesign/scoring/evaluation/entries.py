@@ -1,8 +1,7 @@
-"""The rows of an evaluation: which rays every design and baseline fires, at equal rays and at equal bandwidth.
+"""The rows of an evaluation: the rays of every design and baseline, at equal rays and at equal bandwidth.
 
-Baselines are built from training scenes alone. The one to be held against is the strongest of them there.
-
-Which effects an evaluation simulated, and why: every effect over all scenes.
+Baselines are built from training scenes alone. The one to be held against is the strongest of them there. Which effects
+all rows were simulated with, and why, is summed up over scenes.
 """
 
 from __future__ import annotations
@@ -238,6 +237,28 @@ def _judge(request: EvaluationRequest, lists: Sequence[RaysPerCondition]) -> lis
     return objective.values(lists).mean(axis=0).tolist()
 
 
+@phase("strongest rival")
+def strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: int) -> StrongestRival | None:
+    """The best of all baselines at a number of rays, under the effects of the evaluation; None without baselines.
+
+    Arguments:
+        request: The evaluation.
+        entries: All its rows to be.
+        rays: The number of rays.
+    """
+    rivals = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
+    if not rivals or not request.train:
+        return None
+    fired = sum(entry.rays for entry in entries) * len(request.test)
+    affordable = int(LARGEST_RIVAL_SHARE * fired / (rays * len(rivals)))
+    scenes = held_back_scenes(request, min(max(affordable, FEWEST_RIVAL_SCENES), MOST_RIVAL_SCENES))
+    scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in rivals], request.planner)
+    found = score_scenes(replace(scene_pass, scenes=scenes))
+    means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
+    values = dict(zip((entry.name for entry in rivals), means, strict=True))
+    return StrongestRival.best_of(values, request.metric.better, rays, len(scenes))
+
+
 @dataclass(frozen=True)
 class StrongestRival:
     """The best of all baselines at one number of rays.
@@ -265,28 +286,6 @@ class StrongestRival:
         return {"name": self.name, "rays": self.rays, "scenes": self.scenes, "values": dict(self.values)}
 
 
-@phase("strongest rival")
-def strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: int) -> StrongestRival | None:
-    """The best of all baselines at a number of rays, under the effects of the evaluation; None without baselines.
-
-    Arguments:
-        request: The evaluation.
-        entries: All its rows to be.
-        rays: The number of rays.
-    """
-    rivals = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
-    if not rivals or not request.train:
-        return None
-    fired = sum(entry.rays for entry in entries) * len(request.test)
-    affordable = int(LARGEST_RIVAL_SHARE * fired / (rays * len(rivals)))
-    scenes = held_back_scenes(request, min(max(affordable, FEWEST_RIVAL_SCENES), MOST_RIVAL_SCENES))
-    scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in rivals], request.planner)
-    found = score_scenes(replace(scene_pass, scenes=scenes))
-    means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
-    values = dict(zip((entry.name for entry in rivals), means, strict=True))
-    return StrongestRival.best_of(values, request.metric.better, rays, len(scenes))
-
-
 def held_back_scenes(request: EvaluationRequest, count: int) -> list[Scene]:
     """Training scenes that no rival's rays were chosen on; the first ones where a request has no others."""
     scenes = iter(request.train) if request.training is None else request.training.scenes(HELD_BACK)
@@ -302,6 +301,11 @@ def mean_rival(found: Iterable[StrongestRival | None], better: str) -> Strongest
     names = [name for name in known[0].values if all(name in one.values for one in known)]
     values = {name: float(np.mean([one.values[name] for one in known])) for name in names}
     return StrongestRival.best_of(values, better, known[0].rays, sum(one.scenes for one in known))
+
+
+def effect_summaries(plans: Sequence[EffectPlan]) -> list[EffectSummary]:
+    """One line per effect, in the order in which light meets them."""
+    return [_summary(name, plans) for name in EFFECTS]
 
 
 @dataclass(frozen=True)
@@ -330,12 +334,12 @@ class EffectSummary:
 
     @property
     def on(self) -> bool:
-        """Whether it was simulated anywhere."""
+        """True where it was simulated in any scene."""
         return self.scenes_on > 0
 
     @property
     def exceeds(self) -> bool:
-        """Whether it could change more than is tolerated."""
+        """True where it could change more than is tolerated."""
         return self.range_m > self.tolerance.range_m or self.lost > self.tolerance.lost
 
     def as_dict(self) -> dict[str, Any]:
@@ -355,11 +359,6 @@ class EffectSummary:
         }
 
 
-def effect_summaries(plans: Sequence[EffectPlan]) -> list[EffectSummary]:
-    """One line per effect, in the order in which light meets them."""
-    return [_summary(name, plans) for name in EFFECTS]
-
-
 def _summary(name: str, plans: Sequence[EffectPlan]) -> EffectSummary:
     tolerance = plans[0].tolerance
     decisions = [decision for plan in plans for decision in plan.decisions if decision.name == name]
@@ -377,7 +376,7 @@ def _summary(name: str, plans: Sequence[EffectPlan]) -> EffectSummary:
 
 
 def effect_notes(effects: Sequence[EffectSummary], choice: Choice) -> list[str]:
-    """What was not simulated although it matters."""
+    """Lines on effects that were not simulated although they matter."""
     notes = [
         f"{effect.name} is not simulated ({effect.missing}): it may move ranges by up to "
         f"{MILLIMETRES * effect.range_m:.3g} mm and change {effect.lost:.2g} of the returns"

@@ -19,7 +19,7 @@ SCORES = "scores"
 
 @dataclass(frozen=True)
 class LastScore:
-    """What a design scored the last time, at one number of rays: see `Evaluation.headline_rows`.
+    """The last score of a design, at one number of rays: see `Evaluation.headline_rows`.
 
     Arguments:
         sha256: Of the design's file as it was scored.

@@ -1,4 +1,4 @@
-"""What careless mounting costs: sensors that stand and look a little off, in the same scenes.
+"""The cost of careless mounting: sensors that stand and look a little off, in the same scenes.
 
 Every sensor is off by a normal draw of its own in every scene, along each axis and about each. Draws belong to a scene
 and the number of a sensor, so all designs are mounted by the same hands. A sensor keeps its rays, their gates and its

@@ -1,4 +1,4 @@
-"""What an evaluation is asked for.
+"""The request of an evaluation.
 
 At which numbers of rays which designs are evaluated: a fixed pattern fires all its rays, or where only fewer are asked
 for an even subset of them.
@@ -35,7 +35,7 @@ MOST_SHARED = 2000
 
 @dataclass(frozen=True, eq=False)
 class EvaluationRequest:
-    """What to evaluate.
+    """Everything that an evaluation needs.
 
     Arguments:
         task: The task whose score is taken.
@@ -90,7 +90,7 @@ class EvaluationRequest:
 
     @cached_property
     def metric(self) -> Metric:
-        """What scores mean."""
+        """The meaning of scores."""
         with plugin_guard(self.task.name):
             return metric_of(self.task, self.config)
 
@@ -184,7 +184,7 @@ def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[
 
 
 def left_out(designs: Sequence[DesignSpec], counts: Iterable[int], alone: Sequence[int] = ()) -> list[str]:
-    """Which designs have no row at which numbers of rays, one line each, for people."""
+    """Lines for people on numbers of rays at which designs have no row."""
     asked = sorted(set(counts))
     lines = []
     for design in designs:

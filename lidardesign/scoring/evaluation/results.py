@@ -1,4 +1,4 @@
-"""What an evaluation found: rows, paired differences, and an audit of the effects that were skipped.
+"""Results of an evaluation: rows, paired differences, and an audit of the effects that were skipped.
 
 A mean over scenes says little where scenes differ more than designs do. Differences are therefore taken scene
 by scene, and their intervals are the ones that tell two designs apart. The audit has every row under all effects and
@@ -28,7 +28,6 @@ from lidardesign.task import Metric
 if TYPE_CHECKING:
     from lidardesign.scoring.baselines.cma import SearchRecord
     from lidardesign.scoring.evaluation.entries import StrongestRival
-
 
 ROW_KEYS = (
     "design", "rays", "value", "ci_low", "ci_high", "half_width", "failures", "bandwidth_mbps", "seconds",
@@ -89,7 +88,7 @@ class Row(_WithInterval):
 
     @property
     def drawn_interval(self) -> tuple[float, float]:
-        """What pictures show: the interval, without width where there is none."""
+        """The interval for pictures, without width where there is none."""
         return self._drawn(self.value)
 
     def as_dict(self) -> dict[str, Any]:
@@ -124,7 +123,7 @@ class Paired(_WithInterval):
 
     @property
     def drawn_interval(self) -> tuple[float, float]:
-        """What pictures show: the interval, without width where there is none."""
+        """The interval for pictures, without width where there is none."""
         return self._drawn(self.difference)
 
     def as_dict(self) -> dict[str, Any]:
@@ -309,7 +308,7 @@ def verdict(evaluation: Evaluation, pair: Paired) -> str:
 
 @dataclass(frozen=True)
 class AuditRow:
-    """What the skipped effects are worth to one row.
+    """The difference that skipped effects make to one row.
 
     Arguments:
         design: Its name.
@@ -343,7 +342,7 @@ class AuditRow:
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """Whether what was skipped changes the metric.
+    """Effects that were skipped, and whether they change the metric.
 
     Arguments:
         tolerance: The metric's own: differences below it do not matter.

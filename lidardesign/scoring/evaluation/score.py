@@ -265,7 +265,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
 
 
 def group_notes(scenes: Sequence[Scene]) -> list[str]:
-    """What intervals are over, where that are not just the held-out scenes."""
+    """Lines on intervals that are not just over the held-out scenes."""
     groups = int(group_numbers(scenes).max()) + 1
     if len(scenes) == 1:
         return ["only one held-out scene, so there are no intervals"]
@@ -280,7 +280,7 @@ def group_notes(scenes: Sequence[Scene]) -> list[str]:
 
 
 def worst_notes(rows: Sequence[Row], metric: Metric) -> list[str]:
-    """How many scenes score the worst value: what they differ in beyond it is not seen.
+    """A line on scenes that score the worst value: what they differ in beyond it is not seen.
 
     The row that is named is a design's, if one of them has such scenes, and has the most of them; rows without rays
     have a note of their own.
@@ -301,7 +301,7 @@ def worst_notes(rows: Sequence[Row], metric: Metric) -> list[str]:
 
 
 def slipped_notes(casts: SecondCasts) -> list[str]:
-    """How many rays slipped between the triangles of meshes, where that are more than pass their outlines."""
+    """A line on rays that slipped between the triangles of meshes, where they are more than pass outlines."""
     if casts.found <= OUTLINE_SHARE * casts.rays:
         return []
     note = f"{casts.found:,} of {casts.rays:,} rays ({casts.found / casts.rays:.2%}) had slipped between triangles, as "

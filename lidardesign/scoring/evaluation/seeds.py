@@ -155,7 +155,7 @@ def _mean_pair(pair: Paired, first: Sequence[Row], second: Sequence[Row]) -> Pai
 
 
 def _joint_notes(evaluations: Sequence[Evaluation], seeds: Sequence[int]) -> list[str]:
-    """What all say, then what single ones say."""
+    """Notes of all evaluations, then those of single ones."""
     shared = [note for note in evaluations[0].notes if all(note in each.notes for each in evaluations)]
     own = [
         type(note)(f"seed {seed}: {note}")

@@ -1,1 +1,1 @@
-"""What a receiver and its laser do to light."""
+"""A receiver and its laser."""

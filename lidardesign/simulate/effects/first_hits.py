@@ -1,4 +1,4 @@
-"""What all rays of a scene's frame meet first, and what an effect could change of it: what bounds start from."""
+"""First hits of all rays of a scene's frame, and what an effect could change of them: bounds start from here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""What `effects.multipath.bound` rests on: how much light may come back by way of other surfaces, without simulation.
+r"""The bound of `effects.multipath`: how much light may come back by way of other surfaces, without simulation.
 
 From a matt point P some directions lead to other surfaces Q: F is their share of P's view, weighted with the cosine.
 All that a flood sends to P by way of them, relative to what it sends P directly, is
