@@ -180,8 +180,9 @@ class FitRequest:
         layout = _layout(rules, base, run, options)
         _check_layout(layout, rules, run, options)
         at = {**(base.at if base else {}), **options.at}
+        space = run.config.space.at(at)
         if layout != "spinning" and rules.parts is None:
-            _check_conditions(rules, run.config.space.at(at))
+            _check_conditions(rules, space)
         weighting = _weighting(settings_texts(options.weights), base)
         if weighting.settings:
             with_task_settings(run.task, run.config, weighting.settings, option=weighting.origin)
@@ -198,7 +199,7 @@ class FitRequest:
             sensors=_sensors(options.sensors, rules, base, layout),
             layout=layout,
             rays=_rays(options.rays, rules, base),
-            gates=_gates(options.gates, base, run, layout),
+            gates=_gates(options.gates, base, space, layout),
             level=_level(options.level, base, run, layout),
             weighting=weighting,
             channels=channels,
@@ -389,13 +390,13 @@ def _rays(asked: int | None, constraints: Constraints, base: DesignSpec | None) 
     return base.count if base is not None and base.counts in (None, [base.count]) else None
 
 
-def _gates(asked: str | None, base: DesignSpec | None, run: RunFolder, layout: LayoutName) -> Gates:
+def _gates(asked: str | None, base: DesignSpec | None, space: DesignSpace, layout: LayoutName) -> Gates:
     """The user's, then the design's; usually one per sensor, and along a condition one per ray."""
     if asked is not None:
         return asked
     if base is not None and layout == base.layout == "chosen":
         return "ray" if base.has_gates_per_ray else "sensor"
-    return "ray" if layout == "chosen" and run.config.space.conditioned else "sensor"
+    return "ray" if layout == "chosen" and space.conditioned else "sensor"
 
 
 def _level(asked: float | None, base: DesignSpec | None, run: RunFolder, layout: LayoutName) -> float:

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.command_line import make_run
-from support.tables import each_row
 
 import lidardesign as package
 from lidardesign.config import load_run_config, save_run_config, with_task_settings
@@ -78,7 +77,7 @@ def test_names_choose_among_designs_of_one_run_too(lidardesign, runs):
     assert "allowed: one, two" in refused.err
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ("1 2 1", "flat-1 is named twice"),

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.command_line import make_run
-from support.tables import each_row
 
 import lidardesign as package
 from lidardesign.config import load_run_config, save_run_config, with_task_settings
@@ -18,6 +17,7 @@ from lidardesign.formats.designs import load_design
 from lidardesign.scenes.rays import Rays
 from lidardesign.scoring.evaluation.thresholds import difference_text
 from lidardesign.sensors.compare import outside_space
+from lidardesign.sensors.pattern import Pattern
 from lidardesign.space import DIMENSIONS, direction
 
 LAYOUTS = ("even", "chosen")
@@ -71,18 +71,18 @@ def test_scores_are_those_of_a_run_that_was_learned_there(runs, layout):
 
 def test_the_command_takes_the_run_that_is_named(lidardesign, runs):
     own, other = runs
-    design = own / "designs" / "grid.yaml"
+    design = own / "designs" / "even.yaml"
     found = lidardesign("evaluate", design, "--in", other, "--rays", 8, "--json")
     assert found.code == 0, found.err
-    assert f"grid of {own} is scored in the scenes of {other}" in " ".join(found.err.split())
+    assert f"even of {own} is scored in the scenes of {other}" in " ".join(found.err.split())
     scores = package.open_run(other).evaluate([design], rays=[8])
     assert without_times(json.loads(found.out)) == without_times(json.loads(json.dumps(scores.as_dict())))
     # the run that judges has a design of the name, too
-    package.open_run(other).fit(layout="even", sensors=1, rays=8, name="grid").save()
+    package.open_run(other).fit(layout="even", sensors=1, rays=8, name="even").save()
     both = lidardesign("evaluate", other, design, "--in", other, "--rays", 8, "--json").json
     values = {row["design"]: row["value"] for row in both["rows"]}
-    assert values["own/grid"] == found.json["rows"][0]["value"]
-    assert "other/grid" in values
+    assert values["own/even"] == found.json["rows"][0]["value"]
+    assert "other/even" in values
 
 
 def test_without_baselines_designs_score_and_pair_as_beside_them(lidardesign, runs):
@@ -104,7 +104,7 @@ def test_without_baselines_designs_score_and_pair_as_beside_them(lidardesign, ru
 def test_designs_of_two_runs_need_one_that_judges(lidardesign, runs):
     own, other = runs
     package.open_run(other).fit(layout="even", sensors=1, rays=8, name="flat").save()
-    files = own / "designs" / "grid.yaml", other / "designs" / "flat.yaml"
+    files = own / "designs" / "even.yaml", other / "designs" / "flat.yaml"
     for named in (files, (own, other)):
         refused = lidardesign("evaluate", *named)
         assert refused.code == 2
@@ -115,7 +115,7 @@ def test_designs_of_two_runs_need_one_that_judges(lidardesign, runs):
 def test_runs_that_differ_in_their_seed_alone_have_no_note(runs, tmp_path):
     notes = []
     twin = package.open_run(make_run(tmp_path / "twin", seed=9))
-    twin.evaluate([runs[0] / "designs" / "grid.yaml"], rays=[8], notes=notes.append)
+    twin.evaluate([runs[0] / "designs" / "even.yaml"], rays=[8], notes=notes.append)
     assert notes == []
 
 
@@ -123,26 +123,26 @@ def test_a_design_of_another_task_is_scored_where_it_can_be(runs, tmp_path):
     own, _ = runs
     aisle = package.open_run(make_run(tmp_path / "aisle", task="warehouse", seed=3))
     notes = []
-    design = own / "designs" / "grid.yaml"
+    design = own / "designs" / "even.yaml"
     scores = aisle.evaluate([design], rays=[4], settings={"test": 2, "train": 4}, notes=notes.append)
-    assert scores.rows[0].design == "grid"
-    assert notes[0].startswith("grid of ")
+    assert scores.rows[0].design == "even"
+    assert notes[0].startswith("even of ")
     assert notes[0].endswith("; 2 of 2 sensors start, point or listen outside its design space")
 
 
-def test_a_track_is_refused_where_nothing_is_followed(runs, tmp_path):
+def test_rays_that_follow_a_condition_are_refused_where_nothing_is_followed(runs, tmp_path):
     aisle = package.open_run(make_run(tmp_path / "aisle", task="warehouse", seed=3))
-    track = aisle.fit(layout="scan", rays=4, name="track")
+    along = aisle.fit(sensors=1, rays=4, name="along")
     with pytest.raises(ConfigError, match="its rays follow x_m, which the task flatland does not have"):
-        package.open_run(runs[0]).evaluate([track], rays=[4])
+        package.open_run(runs[0]).evaluate([along], rays=[4])
 
 
-@each_row(
+@pytest.mark.parametrize(
     ("axis", "moved"),
     [("x_m", 0.2), ("y_m", 0.01), ("z_m", -0.5), ("azimuth_rad", 1.0), ("elevation_rad", 0.1), ("range_m", 1.3)],
 )
 def test_what_lies_outside_a_design_space_is_counted(made, axis, moved):
-    run, design = package.open_run(made / "own"), load_design(made / "own" / "designs" / "selected.yaml")
+    run, design = package.open_run(made / "own"), load_design(made / "own" / "designs" / "chosen.yaml")
     space = run.config.space
     generator = np.random.default_rng(6)
     points = space.sample(50, generator)
@@ -153,7 +153,7 @@ def test_what_lies_outside_a_design_space_is_counted(made, axis, moved):
     def told(points):
         gates = np.column_stack([points[:, 5] - 0.02, points[:, 5] + 0.02])
         table = Rays(points[:, :3], direction(points[:, 3], points[:, 4]), gates, np.zeros(50, int), np.zeros(50))
-        return outside_space(replace(design, ray_table=table), space)
+        return outside_space(replace(design, patterns=(Pattern.of(table),)), space)
 
     assert told(points) == f"{(~space.contains(points)).sum()} of 50 rays start, point or listen outside"
     points[::3] = points[1]

@@ -9,17 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.command_line import make_run
-from support.tables import each_row
+from support.sensors import normal_sensor
 
 from lidardesign.api.run import open_run
-from lidardesign.errors import InfeasibleError
-from lidardesign.fitting import fit as fit_design
-from lidardesign.fitting import request as fit_choices
+from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.fitting import fit as fits
+from lidardesign.fitting import request as requests
 from lidardesign.fitting.fit import Trial, best_of, trials_of
 from lidardesign.fitting.request import BEST, CHOSEN_LEVEL, FitOptions, FitRequest
-from lidardesign.mixture.fit import fit
 from lidardesign.run_folder import RunFolder
-from lidardesign.samples import load_samples
+from lidardesign.sensors.design import DesignSpec
 
 MOUNTS = {"origin": {"mounts_m": [[0.2, 0, 0], [0.8, 0, 0]]}}
 
@@ -35,83 +34,111 @@ def aisle(tmp_path_factory):
 
 
 def resolved(run, base=None, **options):
-    return FitRequest.resolve(RunFolder.open(run), FitOptions(**options), base).choices
+    return FitRequest.resolve(RunFolder.open(run), FitOptions(**options), base)
 
 
 class TestWhatIsLeftOpen:
-    @each_row(
-        "options, layout, sensors",
+    @pytest.mark.parametrize(
+        ("options", "layout", "sensors"),
         [
-            ({}, "selected", BEST),
-            ({"constraints": {"gate": {"width_m": {"max": 0.3}}}}, "selected", BEST),
-            ({"constraints": {"sensors": {"min": 2, "max": 3}}}, "selected", BEST),
-            ({"constraints": {"sensors": {"count": 3}}}, "selected", 3),
-            ({"constraints": MOUNTS}, "selected", None),
-            ({"constraints": {**MOUNTS, "sensors": {"count": 1}}}, "selected", 1),
-            ({"constraints": {"parts": {"names": "catalog", "count": 2}}}, "grid", 2),
-            ({"parts": ["vl53l8cx"], "sensors": 3}, "grid", 3),
-            ({"weights": ["variation=0.5"]}, "grid", BEST),
-            ({"layout": "grid"}, "grid", BEST),
-            ({"layout": "scan"}, "scan", None),
-            ({"sensors": 2}, "selected", 2),
-            ({"sensors": 2, "layout": "density"}, "density", 2),
+            ({}, "chosen", BEST),
+            ({"constraints": {"gate": {"width_m": {"max": 0.3}}}}, "chosen", BEST),
+            ({"constraints": {"sensors": {"min": 2, "max": 3}}}, "chosen", BEST),
+            ({"constraints": {"sensors": {"count": 3}}}, "chosen", 3),
+            ({"constraints": MOUNTS}, "chosen", None),
+            ({"constraints": {**MOUNTS, "sensors": {"count": 1}}}, "chosen", 1),
+            ({"constraints": {"parts": {"names": "catalog", "count": 2}}}, "even", 2),
+            ({"parts": ["vl53l8cx"], "sensors": 3}, "even", 3),
+            ({"weights": ["variation=0.5"]}, "chosen", BEST),
+            ({"layout": "even"}, "even", BEST),
+            ({"layout": "spinning"}, "spinning", 1),
+            ({"sensors": 2}, "chosen", 2),
+            ({"sensors": 2, "layout": "even"}, "even", 2),
         ],
     )
     def test_follows_from_what_is_asked_for(self, flat, options, layout, sensors):
-        choices = resolved(flat, **options)
-        assert (choices["layout"], choices["sensors"]) == (layout, sensors)
+        request = resolved(flat, **options)
+        assert (request.layout, request.sensors) == (layout, sensors)
 
-    @each_row(
-        "options, layout",
-        [({}, "selected"), ({"at": {"x_m": 0.5}}, "scan"), ({"at": {"x_m": 0.5}, "layout": "grid"}, "grid")],
-    )
-    def test_along_a_condition_rays_are_chosen_but_not_for_one_place(self, aisle, options, layout):
-        assert resolved(aisle, **options)["layout"] == layout
+    @pytest.mark.parametrize(("at", "gates"), [({}, "ray"), ({"x_m": 0.5}, "sensor")])
+    def test_rays_that_follow_a_condition_have_gates_of_their_own(self, aisle, at, gates):
+        request = resolved(aisle, at=at)
+        assert (request.layout, request.gates) == ("chosen", gates)
 
-    def test_a_task_that_does_not_say_what_returns_tell_is_fitted_with_grids(self, flat, monkeypatch):
-        monkeypatch.setattr(fit_choices, "informs_rays", lambda task: False)
-        assert resolved(flat)["layout"] == "grid"
+    def test_a_task_that_does_not_say_what_returns_tell_has_even_rays(self, flat, monkeypatch):
+        monkeypatch.setattr(requests, "informs_rays", lambda task: False)
+        assert resolved(flat).layout == "even"
 
-    @each_row(
-        "options, level",
+    @pytest.mark.parametrize(
+        ("options", "level"),
         [
             ({}, CHOSEN_LEVEL),
-            ({"layout": "grid"}, 0.95),
+            ({"layout": "even"}, 0.95),
             ({"level": 0.8}, 0.8),
-            ({"level": 0.8, "layout": "grid"}, 0.8),
+            ({"level": 0.8, "layout": "even"}, 0.8),
         ],
     )
     def test_chosen_rays_lie_in_wide_fields(self, flat, options, level):
-        assert resolved(flat, **options)["level"] == level
+        assert resolved(flat, **options).level == level
 
-    @each_row("layout", ["grid", "density", "selected"])
+    @pytest.mark.parametrize(
+        ("options", "counts"), [({}, [8, 16, 32, 64]), ({"rays": 9}, [9]), ({"layout": "even"}, [8, 16, 32, 64])]
+    )
+    def test_the_tasks_numbers_of_rays_are_chosen_where_nobody_names_one(self, flat, options, counts):
+        assert resolved(flat, **options).counts == counts
+
+    @pytest.mark.parametrize("layout", ["even", "chosen", "spinning"])
     def test_is_the_designs_where_one_is_fitted_again(self, flat, layout):
-        base = open_run(flat).fit(layout=layout, sensors=2, rays=9, level=0.9).specification
+        channels = {"channels": 1} if layout == "spinning" else {"level": 0.9}
+        base = open_run(flat).fit(layout=layout, sensors=2, rays=12, **channels).specification
         again = resolved(flat, base)
-        assert (again["layout"], again["sensors"], again["rays"], again["level"]) == (layout, 2, 9, 0.9)
-        assert resolved(flat, base, constraints={"sensors": {"min": 3}})["sensors"] == 3
-        assert resolved(flat, base, constraints={"sensors": {"max": 1}})["sensors"] == 1
+        assert (again.layout, again.sensors, again.rays) == (layout, 2, 12)
+        assert (again.channels, again.level) == ((1, again.level) if layout == "spinning" else (None, 0.9))
+        assert resolved(flat, base, constraints={"sensors": {"min": 3}}).sensors == 3
+        assert resolved(flat, base, constraints={"sensors": {"max": 1}}).sensors == 1
+
+
+# What excludes each other: options, and the argument that is named.
+CONTRADICTIONS = [
+    ({"layout": "even", "gates": "ray"}, "gates"),
+    ({"layout": "spinning", "gates": "ray"}, "gates"),
+    ({"channels": 4}, "channels"),
+    ({"layout": "even", "channels": 4}, "channels"),
+    ({"layout": "spinning", "sensors": BEST}, "sensors"),
+    ({"layout": "spinning", "weights": ["variation=0.5"]}, "layout"),
+    ({"parts": ["vl53l8cx"]}, "parts"),
+    ({"parts": ["vl53l8cx"], "sensors": BEST}, "parts"),
+    ({"parts": ["vl53l8cx"], "sensors": 1, "layout": "even"}, "parts"),
+    ({"parts": ["vl53l8cx"], "sensors": 1, "gates": "sensor"}, "parts"),
+    ({"parts": ["vl53l8cx"], "sensors": 1, "weights": ["variation=0.5"]}, "parts"),
+    ({"parts": ["vl53l8cx"], "sensors": 1, "constraints": {"each": [{}]}}, "parts"),
+]
+
+
+@pytest.mark.parametrize(("options", "argument"), CONTRADICTIONS)
+def test_options_that_exclude_each_other_are_refused_by_name(flat, options, argument):
+    with pytest.raises(ConfigError) as refused:
+        open_run(flat).fit(**options)
+    assert refused.value.where.split()[0] == argument
 
 
 @pytest.fixture(scope="module")
 def trying(flat):
     """Which numbers of sensors are tried, in which bandwidth, where some of them are infeasible."""
-    samples = load_samples(flat)
-    some = fit(samples, sensors=1, layout="grid", rays=8, restarts=1, em_samples=1000)
+    some = DesignSpec("some", (normal_sensor(origin_m=(0.5, 0, 0), azimuth_rad=1.6, range_m=0.7),))
     scenes = RunFolder.open(flat).scenes("train", 5)[:2]
 
     def tried(infeasible=(), **options):
         asked, limits = [], []
 
         def fitted(request):
-            asked.append(request.choices["sensors"])
-            limits.append(request.constraints and request.constraints.budget.bandwidth_mbps)
+            asked.append(request.sensors)
+            limits.append(request.constraints.budget.bandwidth_mbps)
             if asked[-1] in infeasible:
                 raise InfeasibleError(f"not {asked[-1]}", conflicts=["sensors.count"])
             return some
 
-        request = FitRequest.resolve(RunFolder.open(flat), FitOptions(rays=8, **options))
-        trials = trials_of(request, samples, scenes, fitted)
+        trials = trials_of(resolved(flat, rays=8, **options), scenes, fitted)
         return SimpleNamespace(asked=asked, limits=limits, trials=trials)
 
     return tried
@@ -119,13 +146,13 @@ def trying(flat):
 
 @pytest.fixture
 def all_counts(monkeypatch):
-    monkeypatch.setattr(fit_choices, "COUNTS", (1, 2, 3, 4, 6, 8))
+    monkeypatch.setattr(fits, "COUNTS", (1, 2, 3, 4, 6, 8))
 
 
 @pytest.mark.usefixtures("all_counts")
 class TestNumbersOfSensorsThatAreTried:
-    @each_row(
-        "rules, counts",
+    @pytest.mark.parametrize(
+        ("rules", "counts"),
         [
             ({}, [1, 2, 3, 4, 6, 8]),
             ({"sensors": {"min": 3}}, [3, 4, 6, 8]),
@@ -210,8 +237,8 @@ class TestTheCommand:
         def never(*_):
             raise AssertionError("numbers of sensors were tried")
 
-        monkeypatch.setattr(fit_design, "trials_of", never)
-        for options in (("--sensors", 1), ("--set", "sensors.count=1"), ("--layout", "scan")):
+        monkeypatch.setattr(fits, "trials_of", never)
+        for options in (("--sensors", 1), ("--set", "sensors.count=1"), ("--layout", "spinning", "--channels", 1)):
             command = "constrain" if "--set" in options else "fit"
             done = lidardesign(command, flat, *options, "--rays", 4)
             assert done.code == 0, done.err

@@ -1,4 +1,4 @@
-"""`--weight` of fit and constrain: what users see, what designs keep, and what evaluate makes of it."""
+"""`--weight` of fit and constrain: what users see, what designs keep, and where sensors look then."""
 
 from __future__ import annotations
 
@@ -7,30 +7,21 @@ import shutil
 import numpy as np
 import pytest
 import yaml
-from lidardesign.layouts.rays import lay_out
 from support.command_line import make_run
 
 from lidardesign import open_run
 from lidardesign.config import resolve, save_run_config
-from lidardesign.fitting.request import RunTarget, Weighting, weighted_samples
+from lidardesign.fitting.request import RunTarget, Weighting
 from lidardesign.formats.designs import load_design
-from lidardesign.mixture.fit import fit
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
 from lidardesign.samples import Samples, load_samples, save_samples
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.scene_scores import checked_score
 from lidardesign.simulate.returns import simulate
 from lidardesign.space import RANGE, direction
 from lidardesign.task import scenes_of
 
 SEED = 3
-
-
-@pytest.fixture(autouse=True)
-def few_restarts(monkeypatch):
-    """Fits try fewer seeds than usual, which is quick."""
-    monkeypatch.setitem(fit.__kwdefaults__, "restarts", 2)
 
 
 def traced_run(folder, name, overrides, count=900):
@@ -84,34 +75,30 @@ SETTING = "variation=1.5"
 @pytest.fixture
 def weighted(lidardesign, flat):
     """A design that was weighted with a setting."""
-    layout = ("--layout", "density", "--gates", "ray", "--sensors", 2, "--rays", 12)
-    succeeded(lidardesign, "fit", flat, *layout, "--weight", SETTING, "--name", "w")
+    succeeded(lidardesign, "fit", flat, "--sensors", 2, "--rays", 12, "--weight", SETTING, "--name", "w")
     return flat / "designs" / "w.yaml"
 
 
-def by_hand(path, run, count):
-    """The rays of a weighted design at a number of rays."""
-    design = load_design(path)
-    weighting = Weighting.of(design)
-    assert weighting.settings == (SETTING,)
-    return lay_out(design, count, weighted_samples(open_run(run), weighting, _target(run, design)), gates="ray")
+@pytest.mark.parametrize("layout", ["even", "chosen"])
+def test_a_setting_that_changes_nothing_changes_no_byte_but_what_says_so(lidardesign, flat, layout):
+    samples, designs = load_samples(flat), []
+    save_samples(samples.retargeted(RunTarget(open_run(flat))(samples.points)), flat)
+    for weights in ((), ("--weight", "variation=1.0")):
+        fit = ("fit", flat, "--layout", layout, "--sensors", 2, "--rays", 12, "--name", "same")
+        succeeded(lidardesign, *fit, *weights)
+        designs.append(yaml.safe_load((flat / "designs" / "same.yaml").read_text()))
+    assert designs[1]["provenance"].pop("weighting") == {"set": ["variation=1.0"]}
+    assert designs[0] == designs[1]
 
 
-@pytest.mark.parametrize("count", [12, 20])
-def test_evaluate_lays_a_weighted_design_out_by_the_same_weighted_samples(lidardesign, flat, weighted, count):
-    rows = succeeded(lidardesign, "evaluate", weighted, "--rays", count, "--effects", "none")["rows"]
-    run = open_run(flat)
-    rays = by_hand(weighted, flat, count)
-    scenes = run.scenes("test", SEED)
-    scores = [checked_score(run.task, run.metric, scene, simulate(scene, rays)).value for scene in scenes]
-    own = [row for row in rows if row["design"] == "w"]
-    assert own[0]["value"] == pytest.approx(np.mean(scores), rel=1e-9)
-    plain = lay_out(load_design(weighted), 20, load_samples(flat), gates="ray")
-    assert not np.allclose(plain.direction, by_hand(weighted, flat, 20).direction)
+def test_rays_are_chosen_for_the_other_setting(lidardesign, flat, weighted):
+    succeeded(lidardesign, "fit", flat, "--sensors", 2, "--rays", 12, "--name", "plain")
+    plain, other = (load_design(flat / "designs" / f"{name}.yaml").rays() for name in ("plain", "w"))
+    assert not np.allclose(plain.direction, other.direction)
 
 
 def test_constrain_keeps_how_a_design_was_weighted(lidardesign, flat, weighted):
-    found = succeeded(lidardesign, "constrain", weighted, "--gates", "ray", "--set", "gate.width_m.max=0.6")
+    found = succeeded(lidardesign, "constrain", weighted, "--set", "gate.width_m.max=0.6")
     assert found["satisfied"]
     one, other = (Weighting.of(load_design(flat / "designs" / f"{name}.yaml")) for name in ("w", "constrained"))
     assert other.as_document() == one.as_document()
@@ -124,29 +111,24 @@ OTHER_VERSIONS = {
 
 
 @pytest.mark.parametrize("name", OTHER_VERSIONS)
-def test_what_an_earlier_version_refined_is_refused_wherever_samples_are_needed(lidardesign, weighted, name):
+def test_a_weighting_that_cannot_be_is_refused_where_samples_are_needed(lidardesign, weighted, name):
     document = yaml.safe_load(weighted.read_text())
     document["provenance"]["weighting"] = OTHER_VERSIONS[name]
     weighted.write_text(yaml.safe_dump(document))
-    for command in (
-        ("evaluate", weighted),
-        ("constrain", weighted),
-        ("export", weighted, "--format", "csv", "--rays", 20),
-    ):
-        result = lidardesign(*command)
-        assert result.code == 2, command
-        assert "weighting of design w" in result.err
-        assert "fit the design again: an earlier version refined it" in result.err
-        assert "Traceback" not in result.err
+    result = lidardesign("constrain", weighted)
+    assert result.code == 2
+    assert "weighting of design w" in result.err
+    assert "fit the design again" in result.err
+    # its rays are known without
+    assert lidardesign("export", weighted, "--format", "csv").code == 0
     assert lidardesign("constrain", weighted, "--weight", SETTING).code == 0
 
 
-@pytest.mark.parametrize("command", ["evaluate", "constrain"])
-def test_settings_in_a_design_that_cannot_be_are_not_blamed_on_an_option(lidardesign, flat, weighted, command):
+def test_settings_in_a_design_that_cannot_be_are_not_blamed_on_an_option(lidardesign, weighted):
     document = yaml.safe_load(weighted.read_text())
     document["provenance"]["weighting"] = {"set": ["colour=3"]}
     weighted.write_text(yaml.safe_dump(document))
-    result = lidardesign(command, weighted, "--rays", "7")
+    result = lidardesign("constrain", weighted, "--rays", "7")
     assert result.code == 2
     assert "weighting of design w: set colour=3: unknown key" in result.err
     assert "--weight" not in result.err
@@ -182,15 +164,13 @@ def test_a_density_is_weighted_towards_other_scenes(lidardesign, runs, tmp_path)
     design = load_design(run / "designs" / "discs.yaml")
     assert design.provenance["weighting"] == {"set": ["scene=discs", "train=3"]}
     # discs are at x of 0.30 and 0.68 and y of 0.65 and 0.80, each seen from both sides
-    samples = weighted_samples(open_run(run), Weighting.of(design), _target(run, design))
+    target = RunTarget(open_run(run), weighting=Weighting.of(design))
+    samples = load_samples(run)
+    samples = samples.retargeted(target(samples.points))
     assert (samples.weights[_on_disc(samples.points)].sum()) > 0.9
     found = succeeded(lidardesign, "constrain", run / "designs" / "discs.yaml", "--name", "again")
     assert found["satisfied"]
     assert load_design(run / "designs" / "again.yaml").provenance["weighting"] == design.provenance["weighting"]
-
-
-def _target(run, design):
-    return RunTarget(open_run(run), weighting=Weighting.of(design))
 
 
 def _on_disc(points):
