@@ -17,7 +17,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -80,19 +80,17 @@ def rays_needed(rays: Sequence[int], distance_m: Sequence[float], reached_m: flo
     return Needed(rays[first - 1] * (rays[first] / rays[first - 1]) ** share)
 
 
-def curves(run_folder: Path, kind: str, counts: Sequence[int], seed: int) -> tuple[Curve, Curve]:
-    """Of designs fitted with a seed, and of their twins."""
-    from lidardesign import open_run
-    from lidardesign.fitting.fit import TWIN_NAME, twin_samples, twin_without_visibility
+def curves(run: Any, samples: Callable[[], Any], kind: str, counts: Sequence[int], seed: int) -> tuple[Curve, Curve]:
+    """Of designs fitted with a seed, and of their twins, which are fitted to other samples."""
+    from lidardesign.fitting.fit import TWIN_NAME, twin_without_visibility
     from lidardesign.scoring.evaluation.request import EvaluationRequest
     from lidardesign.scoring.evaluation.score import evaluate
 
-    run, started, rows = open_run(run_folder), time.perf_counter(), []
+    started, rows = time.perf_counter(), []
     config, name = run.config, f"benchmark-{kind}"
     train, test = (run.scenes(split, config.seed) for split in ("train", "test"))
-    samples = cache(partial(twin_samples, run))
     for count in counts:
-        design = fitted(run_folder, name, rays=count, seed=seed, **KINDS[kind]).specification
+        design = fitted(run.folder, name, rays=count, seed=seed, **KINDS[kind]).specification
         request = EvaluationRequest(
             task=run.task,
             config=config.task,
@@ -170,10 +168,14 @@ def main() -> None:
     settings = robot_settings(options.robot) | (HORIZON if options.horizon else {})
     tried = sorted({*options.rays, *options.further_rays})
     rows, lines = [], []
+    from lidardesign import open_run
+    from lidardesign.fitting.fit import twin_samples
+
     with tempfile.TemporaryDirectory() as folder:
-        run = learned("arm", Path(folder), options, settings)
+        run = open_run(learned("arm", Path(folder), options, settings))
+        samples = cache(partial(twin_samples, run))
         for kind in options.kind or list(KINDS):
-            found = [curves(run, kind, tried, seed) for seed in range(options.rounds)]
+            found = [curves(run, samples, kind, tried, seed) for seed in range(options.rounds)]
             aware, twin = (median_curve([pair[side] for pair in found]) for side in range(2))
             of_kind, factors = kind_rows(kind, aware, twin, max(options.rays))
             rows += of_kind
