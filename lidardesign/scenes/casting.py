@@ -105,7 +105,7 @@ def first_hits(casters: Sequence[SceneCaster], origins: np.ndarray, directions: 
 
     Arguments:
         casters: One per frame, with the same bodies.
-        origins, directions: As `checked_rays` returned them, shapes (N, 3).
+        origins, directions: Rays from `checked_rays`, shapes (N, 3).
     """
     at_once = max(RAYS_AT_ONCE // max(len(origins), 1), 1)
     for start in range(0, len(casters), at_once):

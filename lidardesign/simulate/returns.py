@@ -36,10 +36,10 @@ from lidardesign.simulate.effects.specular import detours
 def simulate(
     scene: Scene, rays: Rays, *, casters: Sequence[SceneCaster] | None = None, physics: Physics | None = None
 ) -> list[Returns]:
-    """The returns of rays in every time frame of a scene.
+    """Simulate the returns of rays in every time frame of a scene.
 
     Arguments:
-        scene: What the rays meet; targets and occluders both stop them.
+        scene: The scene; targets and occluders both stop rays.
         rays: The rays, fired anew in each frame, N of them.
         casters: One caster per frame, as `build_casters` makes them; None builds them here.
         physics: A detector and the effects that are on; None, or none on: geometry alone.
@@ -62,12 +62,12 @@ def simulate_many(
     physics: Physics | None = None,
     repeats: Sequence[int] | None = None,
 ) -> list[list[Returns]]:
-    """The returns of several lists of rays in every time frame of a scene, each as `simulate` gives them.
+    """Simulate the returns of several lists of rays in every time frame of a scene, each as in `simulate`.
 
     All lists are traced together: over many frames, most of the time of short lists goes into the calls.
 
     Arguments:
-        scene: What the rays meet; targets and occluders both stop them.
+        scene: The scene; targets and occluders both stop rays.
         lists: Lists of rays, each fired anew in each frame.
         casters: One caster per frame; None builds them here.
         physics: A detector and the effects that are on; each list shares the emitter's energy among its own rays.
@@ -117,10 +117,10 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
     """Returns of rays in a frame of a scene, as a detector reports them.
 
     Arguments:
-        scene: What the rays meet.
+        scene: The scene.
         frame: The time frame.
         rays: The rays that share the emitter's energy, N of them.
-        caster: Of this frame.
+        caster: Caster of this frame.
         physics: The detector and at least one effect.
     """
     # it loads compiled loops, which geometry alone does without
@@ -178,7 +178,7 @@ class PhotonHistograms:
     """Photon histograms of N rays.
 
     Arguments:
-        start_m: Where each ray's first bin starts, as half the whole path, shape (N,) [m]. The first and the last bin
+        start_m: Start of each ray's first bin in half path, shape (N,) [m]. The first and the last bin
             hold only what lies within the ray's gate.
         width_m: Width of a bin in half path [m].
         number: Number of bins of each ray, shape (N,).
@@ -197,11 +197,11 @@ def photon_histograms(scene: Scene, frame: int, rays: Rays, caster: SceneCaster,
     """Photon histograms in which `simulate` detects the returns of rays, with the same random numbers.
 
     Arguments:
-        scene: What the rays meet.
+        scene: The scene.
         frame: The time frame.
         rays: The rays that share the emitter's energy, N of them.
-        caster: Of this frame.
-        physics: A detector that counts photons, and the effects that are on.
+        caster: Caster of this frame.
+        physics: A detector that counts photons, and the simulated effects.
 
     Raises:
         ConfigError: The detector counts no photons, or its histogram does not cover a gate.

@@ -37,7 +37,7 @@ class Photons:
     """The light budget of a detector that counts photons.
 
     Arguments:
-        wavelength_m: Of the laser [m].
+        wavelength_m: Wavelength of the laser [m].
         pulse_energy_j: Energy of one pulse of the emitter, over all rays that share it [J].
         pulses_per_frame: Pulses in a frame, over all rays.
         emission: Whether rays share the pulses in time (`scanned`) or each pulse in energy (`flood`).

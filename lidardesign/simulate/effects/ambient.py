@@ -54,10 +54,10 @@ def add_ambient(
     Arguments:
         scene: Its light and its bodies' reflectances.
         rays: N rays.
-        beams: The thin beams that they consist of.
-        hits: What those meet first.
-        detector: One that does not count photons sees no background.
-        background: What is counted besides.
+        beams: The thin beams of the rays.
+        hits: First hits of the beams.
+        detector: The detector; one that does not count photons has no background.
+        background: The background so far.
     """
     photons = detector.photons
     if photons is None:

@@ -58,10 +58,10 @@ def through_air(
     Arguments:
         scene: Its medium; without one, nothing changes.
         rays: The rays that share the emitter's energy, N of them.
-        beams: The thin beams that they consist of.
-        hits: What those meet first.
+        beams: The thin beams of the rays.
+        hits: First hits of the beams.
         windows_m: The rays' gates as half paths, shape (N, 2) [m].
-        echoes: What surfaces send back.
+        echoes: Echoes of surfaces.
         detector: Backscatter is counted only by a detector that counts photons.
         background: The background so far.
     """

@@ -101,8 +101,8 @@ def visible_echoes(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, trace
     Arguments:
         scene: Its receiver and its bodies' transmissions.
         beams: Beams of light, B of them.
-        hits: What they meet first.
-        echoes: One for each of those hits, in their order.
+        hits: First hits of the beams.
+        echoes: One echo for each of these hits, in their order.
         tracer: First hits of any rays at any time within the frame.
     """
     if scene.receiver is None:
