@@ -228,7 +228,7 @@ class ArrivingLight:
 def count_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physics) -> np.ndarray:
     """Simulated counts per bin of the rays of `light`, flat with the offsets of its bins."""
     counts = np.zeros(light.bins.offset[-1], np.int64)
-    # ray by ray: in differences of running sums a blinding echo would drown those of other rays
+    # ray by ray: differences of running sums would lose other rays next to a very strong echo
     ray = np.repeat(np.arange(len(light.bins)), np.diff(light.echo_offset))
     total = np.bincount(ray, weights=light.expected, minlength=len(light.bins))
     few = np.flatnonzero((total <= PHOTONS_ONE_BY_ONE) & (total > 0))

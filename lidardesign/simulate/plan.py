@@ -339,9 +339,9 @@ def _bounds(
 
 
 def _frame_bounds(counts: Counts, present: Sequence[str]) -> dict[str, EffectBound]:
-    """Bound of each effect in a frame; unlimited where mirrors and glass lead light beyond first hits."""
+    """Bound of each effect in a frame; rays whose first hit is on mirrors or glass count as lost."""
     bounds = {name: EFFECT_MODULES[name].bound(counts.first_hits, counts) for name in present}
-    # of ranges, where an echo takes a longer or shorter way to a receiver that stands elsewhere
+    # errors of half path become errors of range with a bistatic receiver
     stretched = 1 / counts.first_hits.path_per_range**2
     bounds = {
         name: replace(bound, squared_m2=bound.squared_m2 * stretched)

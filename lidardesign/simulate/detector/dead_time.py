@@ -174,7 +174,7 @@ def alive_shares(counts, pulses, dead, period):  # noqa: ANN001, ANN201
     alive = np.empty(size)
     for b in range(size):
         blind = running[b] - running[min(max(math.floor(b - dead) + 1, 0), b)]
-        # earlier pulses of which every count still blinds, then those of which only the late ones do
+        # earlier pulses whose counts all reach here by dead time, then those of which only the late ones do
         back = max(math.ceil((dead - b) / period) - 1, 0)
         blind += back * running[size]
         since = b + (back + 1) * period - dead

@@ -9,14 +9,14 @@ A metre of range lasts 2 / c. Rays without a hit receive no ambient light: a sce
 
 Bound of its effect (`bound`), by false peaks, hidden echoes, and returns where there is none: with mean counts b per
 bin, B bins and s counts in the echo's bin, another bin wins with at most (B - 1) exp(-(sqrt(s + b) - sqrt(b))^2): the
-union over bins of Chernoff's bound. A threshold that lets background pass with the probability `false_alarm` hides
-echoes below it, and a ray that has no return invents one as often as that. Counts under the echo make its range stray:
-in much background, b per metre, n photons of a Gaussian are placed with the variance (sigma^2 / n) (4 sqrt(pi) sigma b
-/ n) (Cramer and Rao's bound), which is added to that without; the highest bin strays (1 + b / s)^(1/4) times as far. By
-the level of background the matched filter's place between bins moves too, half a step at most (`FirstHits.step_m`).
+union over bins of Chernoff's bound. A detection threshold with the probability `false_alarm` hides echoes below it, and
+rays without a return have false alarms with this probability. Counts under the echo add to its range error: in strong
+background, b per metre, n photons of a Gaussian have the additional variance (sigma^2 / n) (4 sqrt(pi) sigma b / n)
+(Cramer and Rao's bound); the error of the highest bin grows by the factor (1 + b / s)^(1/4). The level of background
+also shifts the matched filter between bins, by at most half a step (`FirstHits.step_m`).
 
-No false peak can be where no count arrives: it is at most 1 - exp(-B b). Where a detector is blind after a count, light
-before an echo leaves less of it (see `Blindness`), and is uneven, so that more of it is taken for returns.
+A false peak needs a count: its probability is at most 1 - exp(-B b). With dead time, light before an echo reduces its
+counts (see `Blindness`), and the background is uneven, so that more of it is taken for returns.
 """
 
 from __future__ import annotations

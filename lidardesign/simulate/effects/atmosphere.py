@@ -4,17 +4,17 @@ Light fades as exp(-alpha * length) over its whole way, twice the half path (Bee
 sends back, per metre, beta times the solid angle of the aperture there times exp(-alpha (r + b)), with b the way from
 there to the receiver: b = r at the emitter's own place (the lidar equation; Measures 1984, chapter 7).
 
-There a pixel looks along the ray, sharp at the range f of what the ray meets, or far away. Haze at r is blurred on it
+There a pixel looks along the ray, focused at the range f of the ray's hit, or at infinity. Haze at r is blurred on it
 to the solid angle A (1 / r - 1 / f)^2, as an aperture A seen from r is wider than from f; a pixel of a smaller solid
-angle catches its share of that (the overlap of an ideal lens). So haze right before the sensor counts no more than a
-pixel's solid angle, and not 1 / r^2. A fixed receiver elsewhere receives all haze in its view.
+angle receives its share of that (the overlap of an ideal lens). So haze right before the sensor is limited by the
+pixel's solid angle, instead of 1 / r^2. A fixed receiver elsewhere receives all haze in its view.
 
 Bound of its effect (`bound`): over a range R the air leaves exp(-2 alpha R) of an echo's photons: range errors grow
 and returns are lost, as from fewer photons. Haze sends h counts into a bin, most at the gate's start; it is taken
-for the echo with at most (B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and raises the level that an echo
-has to stand out from. A ray without a return may take it for one where any of it is counted: 1 - exp(-all of its
-counts), as one count is enough in the dark. Where a detector is blind after a count, haze before an echo leaves less of
-it (see `Blindness`), and times the first photon of a pulse, which comes later where there are fewer.
+for the echo with at most (B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and raises the detection
+threshold. A ray without a return may take any count of it for one: 1 - exp(-all of its counts), as one count is enough
+in the dark. With dead time, haze before an echo reduces its counts (see `Blindness`), and the detector times the first
+photon of a pulse, which comes later where there are fewer.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def through_air(
 
 
 def _stops(rays: Rays, beams: Beams, hits: Hits, receiver: Receiver | None) -> np.ndarray:
-    """Half paths at which beams end, infinite where they meet nothing, shape (B,) [m]."""
+    """Half paths at which beams end, infinite without a hit, shape (B,) [m]."""
     if receiver is None:
         return hits.range_m
     hit = np.isfinite(hits.range_m)
@@ -172,7 +172,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     blind, without = Blindness.of(counts), Blindness.of(counts, haze=False)
     clear, left = counts.signal, blind.left
     haze, fullest = (counts.pulses * part for part in counts.haze_per_pulse)
-    # haze raises the level of background that a return has to stand out from
+    # haze raises the detection threshold
     fewer = counts.more_missed(Echo(clear, sigma_m), Echo(left, sigma_m, haze / counts.bins))
     any_count = -np.expm1(-haze)
     own = counts.per_bin * blind.under

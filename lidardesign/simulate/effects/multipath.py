@@ -4,23 +4,23 @@ The indirect light that a receiver gets depends on the emission and on what its 
 
 - A *flood* lights all rays' spots at once, and each pixel sees its own: light goes from the emitter to Q, to P and
   back, and pixel n sees its spot P, which all other spots Q light too. The spots are the lights, matt points with the
-  power of what they reflect (Keller 1997, Instant radiosity), so that light goes where the design's rays go and nowhere
-  else. Where pixels overlap, each receives the part that is its own ray's, of detours as of direct light.
+  power that they reflect (Keller 1997, Instant radiosity), so that only the design's rays emit light. Where pixels
+  overlap, each receives its own ray's part of indirect light, as of direct light.
 - A *scanned* beam lights one spot P, and its pixel sees a cone around the beam: light comes back by P, Q, P and, where
-  Q lies in that cone, by P, Q. The beam's own spot is the only light, looked at along rays spread in the cone. A pixel
-  without a solid angle receives no detours.
-- A *fixed receiver* gets a scanned beam's detours P, Q from all Q that lie in its field of view. By reciprocity light
-  is sent from the receiver instead, and what is seen along the beam is its gain.
+  Q lies in that cone, by P, Q. The beam's own spot is the only light, viewed along rays spread in the cone. A pixel
+  without a solid angle receives no indirect light.
+- A *fixed receiver* gets a scanned beam's paths P, Q from all Q in its field of view. By reciprocity light is sent from
+  the receiver instead, and the radiance along the beam is its gain.
 
-A detector that resolves everything and counts nothing (`ideal`) takes no late light for an echo, not even where no
-direct one arrives.
+A detector with perfect resolution that counts no photons (`ideal`) takes no late light for an echo, even without a
+direct one.
 
 Paths have up to `MOST_SURFACES` surfaces. A spot has a size, within which its light grows no stronger: without it, the
-few paths that end next to a spot in a crease would be worth any amount; light within a spot's own size is not told from
-its direct echo. Beams are thin, and nothing moves within a frame. Mirrors and glass are left to `specular`: here they
-swallow what they do not scatter, so that no light is received twice. What arrives earlier than a ray's direct echo by
-more than the emitters are apart (from nearer surfaces at the edge of its pixel) is left out. Estimates are unbiased up
-to that; their noise falls with the root of `PATHS`, which all rays share.
+few paths that end next to a spot in a crease would have unbounded weights; light within a spot's own size is part of
+its direct echo. Beams are thin, and bodies are static within a frame. Mirrors and glass are left to `specular`: here
+they absorb all light that they do not scatter, so that none is received twice. Light that is earlier than a ray's
+direct echo by more than the distance between emitters (from nearer surfaces at the edge of its pixel) is left out.
+Estimates are unbiased up to that; their noise falls with the root of `PATHS`, which all rays share.
 
 Echoes are the simulator's bins of half path, a quarter of the detector's resolution where no more than `MOST_CELLS` of
 them reach to the gates' ends. They name the body of the ray's first hit, whose echo they disturb.
@@ -144,7 +144,7 @@ class _View:
         width_m = 10 ** (math.ceil(math.log10(finest_m) * WIDTHS_PER_DECADE) / WIDTHS_PER_DECADE)
         count = math.ceil(2 * reach_m / width_m) + 1
         bins = PathBins(width_m, 1 << (count - 1).bit_length())
-        # a pixel without a solid angle of its own sees that of its beam
+        # a pixel without a solid angle of its own has that of its beam
         photons, beam_sr = physics.detector.photons, math.pi * (physics.detector.divergence_rad / 2) ** 2
         pixel_sr = beam_sr if photons is None else photons.field_of_view_sr
         return cls(
@@ -323,7 +323,7 @@ def _detours(first_hits: FirstHits, rows: np.ndarray) -> Detours:
         beam_sr = math.pi * (first_hits.detector.divergence_rad / 2) ** 2
         pixel_sr = beam_sr if photons is None else max(photons.field_of_view_sr, beam_sr)
         return pixel_bound(first_hits.scene, rays, hits, first_hits.caster, pixel_sr, first_hits.resolution_m)
-    # a flood's pixels look at spots that its emitters light; a receiver alone gets what is sent anywhere in its view
+    # a flood's pixels see spots lit by its emitters; a fixed receiver gets light from anywhere in its view
     lamp_m = None if flood or receiver is None else np.asarray(receiver.origin_m)
     return lamp_bound(first_hits.scene, rays, hits, first_hits.caster, lamp_m, first_hits.resolution_m)
 

@@ -91,7 +91,7 @@ def lamp_bound(
     own = np.maximum(np.einsum("kj,kj->k", start.normal, lamp - place), 0.0) / direct_m**3
     first = _next(scene, caster, start, DIRECTIONS)
     second = _next(scene, caster, first, FURTHER_DIRECTIONS)
-    # a pixel that looks at a flood's spots sees them wherever they are; a receiver gets what is in its view
+    # a flood's pixels see spots anywhere; a fixed receiver only those in its view
     viewed = scene if lamp_m is not None else None
     lit = [_lit(ends, lamp[ends.point], caster, viewed) for ends in (first, second)]
     brightest = max([own.max(initial=0.0), *(light.max(initial=0.0) for light, _ in lit)])
