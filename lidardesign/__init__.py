@@ -73,7 +73,7 @@ def _import(name: str) -> Any:
 
 
 if not TYPE_CHECKING:
-    # to a type checker any name would be there
+    # a type checker would accept any name
     __getattr__ = _import
 
 
@@ -92,7 +92,7 @@ def _is_cache(folder: str) -> bool:
 def _make_cache() -> str:
     """Path of a cache folder below the temporary files, the same for all processes of one user.
 
-    Its name is no secret and a cache holds code: what others made, or can open, is not used.
+    Its name is no secret and a cache holds code: a folder that others made, or can open, is not used.
     """
     import tempfile
 

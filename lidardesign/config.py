@@ -1,7 +1,7 @@
 """The configuration of a run: defaults, preset, file and `--set`, in that order, checked with positions.
 
-The document has the sections task, space, density and learning. Every value remembers where it came from, so
-that an error can point at file, line and column, or at the `--set KEY=VALUE` that brought it.
+The document has the sections task, space, density and learning. The origin of every value is kept, so that an error
+can point at file, line and column, or at the option `--set KEY=VALUE`.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ class DensitySettings(BaseModel):
 
 
 class LearningSettings(BaseModel):
-    """The flow, its optimiser and what is measured after training.
+    """The flow, its optimiser and the measurements after training.
 
-    The largest numbers are what a large computer might bear; what is beyond them is a typing error.
+    Upper limits are what a large computer might handle; larger numbers are typing errors.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -119,16 +119,16 @@ FILE_NAME = "config.yaml"
 SCHEMA_VERSION = 1
 SECTIONS = ("task", "space", "density", "learning")
 HEADER = ("schema_version", "task_name", "seed", "preset")
-# Keys that runs of earlier versions have and nothing reads any more.
+# Keys in runs of earlier versions that are ignored.
 RETIRED = ("anneal", "balance")
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Everything that decides what a run computes.
+    """The whole configuration of a run.
 
     Arguments:
-        task_name: The task plugin's name.
+        task_name: Name of the task plugin.
         seed: Seed of all random numbers.
         preset: draft, standard or fine.
         task: The task's own configuration.
@@ -146,7 +146,7 @@ class RunConfig:
     learning: LearningSettings
 
     def as_document(self) -> dict[str, Any]:
-        """The form that config.yaml has."""
+        """Content of config.yaml."""
         return {
             "schema_version": SCHEMA_VERSION,
             "task_name": self.task_name,
@@ -190,20 +190,20 @@ class _Layers:
     keys: dict[KeyPath, str] = field(default_factory=dict)
 
     def merge(self, section: str, values: Mapping[str, Any], origin: str) -> None:
-        """Lay values over a section."""
+        """Merge values into a section, and keep their origin."""
         _merge(self.values.setdefault(section, {}), values)
         for path, _ in leaves(dict(values)):
             self.origins[(section, *path)] = origin
 
     def forget(self, path: KeyPath) -> None:
-        """Drop the origins of a path, of all it holds, and of what holds it, before it is replaced."""
+        """Drop the origins of a path, its children and its parents, before it is replaced."""
         for known in list(self.origins):
             if known[: len(path)] == path or path[: len(known)] == known:
                 del self.origins[known]
                 self.keys.pop(known, None)
 
     def origin(self, path: KeyPath, *, key: bool = False) -> str:
-        """Where the value (or key) of a path came from: its own origin, a parent's, or of what it holds."""
+        """Origin of the value (or key) at a path, else of its nearest parent, else of its first child."""
         if key and path in self.keys:
             return self.keys[path]
         for length in range(len(path), 0, -1):
@@ -247,7 +247,7 @@ def resolve(
 
 
 def with_task_settings(task: Task, config: RunConfig, overrides: Sequence[str], *, option: str = "--set") -> RunConfig:
-    """A run's configuration with other values of the task's own keys, to judge its designs by.
+    """A run's configuration with other values of the task's own keys, to evaluate its designs with.
 
     Raises:
         ConfigError: At the option; also where the value would change the design space.
@@ -280,7 +280,7 @@ def load_run_config(run: Path) -> tuple[Task, RunConfig]:
     """The task and configuration of a run folder, checked against the manifest.
 
     Raises:
-        DataError: There is no such run, or its configuration was damaged or changed.
+        DataError: There is no such run, or its configuration is damaged or changed.
         ConfigError: It is of another version of this program, or its task is not installed.
         PluginError: The task is installed but broken.
     """
@@ -302,7 +302,7 @@ def load_run_config(run: Path) -> tuple[Task, RunConfig]:
 
 
 def config_of(document: Document) -> tuple[Task, RunConfig]:
-    """The task and configuration of a whole document, as `RunConfig.as_document` makes it.
+    """The task and configuration of a complete document, as from `RunConfig.as_document`.
 
     Raises:
         ConfigError: It is of another version of this program.
@@ -316,7 +316,7 @@ def config_of(document: Document) -> tuple[Task, RunConfig]:
 
 
 def save_run_config(config: RunConfig, run: Path) -> None:
-    """Write config.yaml into a run folder, with its hash in the manifest at every moment."""
+    """Write config.yaml into a run folder, with its hash always in the manifest."""
     write_recorded(run, FILE_NAME, dump_yaml(config.as_document()).encode())
 
 
@@ -401,7 +401,7 @@ def _models(task: Task) -> dict[str, type[BaseModel]]:
 
 
 def _meant(task: Task, key: str, section: str = "") -> str | None:
-    """A hint at the section that has a key, or the one most like it, better than the given section does."""
+    """Hint at a similar key of another section or a section's name, if it is closer than any of the given section."""
     models = _models(task)
     own = list(models[section].model_fields) if section else []
     keys = {name: f"{owner}.{name}" for owner, model in models.items() for name in model.model_fields}
@@ -412,7 +412,7 @@ def _meant(task: Task, key: str, section: str = "") -> str | None:
 
 
 def _check_keys(task: Task, layers: _Layers) -> None:
-    """Refuse a key that belongs to another section, and name that.
+    """Refuse a key that belongs to another section, and name that section.
 
     Raises:
         ConfigError: At the key.

@@ -1,4 +1,4 @@
-"""The error tree of lidardesign: every error says where, what was found, what is allowed, and what to do.
+"""The error tree of lidardesign: every error has a location, a finding, the allowed values and a hint.
 
 Exit codes (design contract): 0 ok, 1 threshold missed, 2 usage or config, 3 bad input data,
 4 infeasible constraints, 5 numerical failure, 6 plugin failure, 130 interrupted.
@@ -15,12 +15,12 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
-# What files and options say may be quoted; nobody reads more of it than this.
+# Longest part of a message, which may quote files and options.
 LONGEST_PART = 1500
 Text = TypeVar("Text", str, None)
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
-# Options in messages, and arguments that are not called as their option.
+# Options in messages, and arguments with other names than their options.
 OPTION = re.compile(r"(?<!\S)--([a-z][a-z-]*)")
 ARGUMENTS = {
     "baseline": "baselines",
@@ -30,16 +30,16 @@ ARGUMENTS = {
 }
 # The largest seed.
 MAX_SEED = 2**63 - 1
-# What to do where an option or a key has nothing behind it.
+# Hint for an option or a key without a value.
 UNSET_HINT = "a shell variable that is not set expands to nothing: give a value, or leave it out"
-# Where the documentation is: in a checkout, or where an installation puts it (pyproject.toml, data-files).
+# Folders of the documentation: of a checkout, or of an installation (pyproject.toml, data-files).
 _ROOT = Path(__file__).parents[1]
 _SHARED = Path("share", "doc", "lidardesign")
 DOCS_FOLDERS = (_ROOT / "docs", _ROOT, _ROOT / _SHARED, sys.prefix / _SHARED, site.getuserbase() / _SHARED)
 
 
 class BackgroundNote(str):
-    """A note on what was decided, which asks nobody to do anything: commands say it with --verbose only."""
+    """A note that requires no action, which commands print only with --verbose."""
 
     __slots__ = ()
 
@@ -48,10 +48,10 @@ class LidardesignError(Exception):
     """The root of every error that a user can meet.
 
     Arguments:
-        message: What was found, in one sentence.
+        message: The finding, in one sentence.
         where: File, line, field or option that it concerns.
-        allowed: What would have been accepted.
-        hint: What to do next.
+        allowed: The accepted values.
+        hint: The next step.
     """
 
     exit_code = 2
@@ -64,7 +64,7 @@ class LidardesignError(Exception):
         super().__init__(self.render())
 
     def render(self) -> str:
-        """The whole message: location, finding, what is allowed, next step."""
+        """The whole message: location, finding, allowed values, next step."""
         text = f"{self.where}: {self.message}" if self.where else self.message
         if self.allowed:
             text += f"\n  allowed: {self.allowed}"
@@ -73,13 +73,13 @@ class LidardesignError(Exception):
         return text
 
     def name_arguments(self) -> None:
-        """Name arguments of functions where options of commands are named."""
+        """Replace names of command options in the message by names of function arguments."""
         texts = (self.message, self.where, self.allowed, self.hint)
         self.message, self.where, self.allowed, self.hint = map(_as_argument, texts)
         self.args = (self.render(),)
 
     def as_dict(self) -> dict[str, object]:
-        """The same content for `--json`."""
+        """Content of the error for `--json`."""
         fields = {"where": self.where, "allowed": self.allowed, "hint": self.hint}
         return {"kind": self.kind, "message": self.message, **{k: v for k, v in fields.items() if v}}
 
@@ -93,13 +93,13 @@ def _short(text: Text) -> Text:
 
 def _as_argument(text: Text) -> Text:
     if text is None or "lidardesign " in text:
-        # a command line stays one
+        # command lines are left as they are
         return text
     return OPTION.sub(lambda option: ARGUMENTS.get(option[1], option[1].replace("-", "_")), text)
 
 
 def names_arguments(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """A function of the Python interface, whose errors name its arguments instead of options."""
+    """Decorate a function of the Python interface so that its errors name arguments instead of options."""
 
     @functools.wraps(function)
     def called(*arguments: Parameters.args, **options: Parameters.kwargs) -> Result:
@@ -148,12 +148,12 @@ class InfeasibleError(LidardesignError):
         super().__init__(message, where=where, allowed=allowed, hint=hint)
 
     def name_arguments(self) -> None:
-        """Name arguments of functions where options of commands are named, in conflicts too."""
+        """Replace names of command options by names of function arguments, in conflicts too."""
         self.conflicts = tuple(map(_as_argument, self.conflicts))
         super().name_arguments()
 
     def as_dict(self) -> dict[str, object]:
-        """The same content for `--json`, with the conflicting names and the measured mass."""
+        """Content of the error for `--json`, with the conflicting names and the measured mass."""
         fields: dict[str, object] = {**super().as_dict(), "conflicts": list(self.conflicts)}
         if self.admissible_mass is not None:
             fields["admissible_mass"] = self.admissible_mass
@@ -161,7 +161,7 @@ class InfeasibleError(LidardesignError):
 
 
 class NumericalError(LidardesignError):
-    """A computation that left the numbers it can trust (exit 5)."""
+    """A numerical failure of a computation (exit 5)."""
 
     exit_code, kind = 5, "numerical"
 
@@ -183,10 +183,10 @@ class ThresholdError(LidardesignError):
 
 
 def check_number(value: float, where: str, low: float, high: float, *, whole: bool = False) -> None:
-    """Refuse a number outside of its limits, both of which are allowed, and what is no number.
+    """Refuse a value that is no number, or outside of its limits, both of which are allowed.
 
     Raises:
-        ConfigError: It is outside.
+        ConfigError: Such a value.
     """
     kinds = Integral if whole else Real
     if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
@@ -195,7 +195,7 @@ def check_number(value: float, where: str, low: float, high: float, *, whole: bo
 
 
 def check_choice(value: str, where: str, allowed: Sequence[str]) -> str:
-    """A value that must be one of a few words.
+    """The value, which must be one of a few words.
 
     Raises:
         ConfigError: It is none of them.
@@ -206,9 +206,9 @@ def check_choice(value: str, where: str, allowed: Sequence[str]) -> str:
 
 
 def page(name: str) -> Path:
-    """A page of the documentation that can be opened here; by its name in the checkout where none is there.
+    """Path of a page of the documentation on this machine, or its path in a checkout if it is not installed.
 
     Arguments:
-        name: As `constraints.md`, or `constraints.txt` for the versions that the tests ran with.
+        name: File name, as `constraints.md`, or `constraints.txt` for the tested versions of dependencies.
     """
     return next((folder / name for folder in DOCS_FOLDERS if (folder / name).is_file()), Path("docs", name))

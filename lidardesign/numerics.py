@@ -1,8 +1,8 @@
-"""Log-space and safe primitives: every guard against rounding lives here, with its reason.
+"""Log-space and safe primitives, and all guards against rounding, each with its reason.
 
-Functions take and give numpy arrays or torch tensors, and keep float32 and float64; everything else becomes float64.
-Where one selects between two formulas, each sees only input that it can bear: a derivative of the formula that is not
-taken would else be NaN times zero.
+Functions take and return numpy arrays or torch tensors, and keep float32 and float64; everything else becomes float64.
+Where one selects between two formulas, each gets only input in its domain: the derivative of the other formula would
+otherwise be NaN times zero.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ ARCSINE_OVER_SINE = (1.0, 1 / 6, 3 / 40, 5 / 112)
 SINE_OVER_ANGLE = (1.0, -1 / 6, 1 / 120, -1 / 5040)
 COSINE = (1.0, -1 / 2, 1 / 24, -1 / 720)
 
-# Guards, from the finest to the coarsest. A module gives one a name of its own where that says more.
-# The smallest float64 that keeps all its digits: what is divided by at least this is finite if it is below 1e308 of it.
+# Guards, from the finest to the coarsest. Modules rename them where another name is clearer.
+# The smallest normal float64: a quotient by at least this is finite for numerators of up to about 1.
 TINY = float(np.finfo(np.float64).tiny)
 TINY_FLOAT32 = float(np.finfo(np.float32).tiny)
-# Numbers below this have squares that are lost.
+# Squares of numbers below this underflow.
 SQUARABLE = 1e-150
-# One rounding of a number near 1; what float32 leaves of it is a little more than the second.
+# Relative spacing of float64 and of float32 near 1, and an upper bound of rounding to float32, which is half of that.
 EPSILON = float(np.finfo(np.float64).eps)
 EPSILON_FLOAT32 = float(np.finfo(np.float32).eps)
 FLOAT32_ROUNDING = 1e-7
-# Relative difference of two float64 results that took different ways of some hundred operations.
+# Relative difference of two float64 results by different sequences of about a hundred operations.
 ROUNDING = 1e-12
-# Relative slack of conditions that hold by construction: sums, differences and conversions cost a few more digits.
+# Relative slack of conditions that hold by construction: sums, differences and conversions cost a few digits.
 SLACK = 1e-9
-# Half of the digits: what is left of a difference of squares, or where a cosine stops telling angles apart.
+# Half of the digits, as of a difference of squares or of an angle from its cosine near 1.
 HALF_DIGITS = 1e-8
-# Relative slack of what went through float32 or through decimals that a person wrote.
+# Relative slack of values from float32 or from handwritten decimals.
 COARSE_SLACK = 1e-6
 
 
@@ -50,7 +50,7 @@ def logsumexp(values: Any, axis: int | None = None, weights: Any | None = None) 
 
     Arguments:
         values: Exponents a, any shape.
-        axis: The axis that is summed; None sums all.
+        axis: Axis of the sum; None sums all.
         weights: Factors w >= 0 that broadcast with `values`.
     """
     xp, values = _floats(values)
@@ -115,12 +115,12 @@ def unit_vectors(vectors: Any, axis: int = -1) -> Any:
 
 
 def wrap_angle(angle_rad: Any) -> Any:
-    """The same angle in [-pi, pi) [rad]; an angle that lies there is not changed."""
+    """Equivalent angle in [-pi, pi) [rad]; an angle in the interval is not changed."""
     return wrap_turn(angle_rad, -math.pi)
 
 
 def wrap_turn(angle_rad: Any, start_rad: float = 0.0) -> Any:
-    """The same angle in [start, start + 2 pi) [rad]; an angle that lies there is not changed."""
+    """Equivalent angle in [start, start + 2 pi) [rad]; an angle in the interval is not changed."""
     xp, angle = _floats(angle_rad)
     past = angle - start_rad
     turned = xp.remainder(past, FULL_TURN)
@@ -130,7 +130,7 @@ def wrap_turn(angle_rad: Any, start_rad: float = 0.0) -> Any:
 
 
 def circular_difference(first_rad: Any, second_rad: Any) -> Any:
-    """The turn from the second angle to the first one, in [-pi, pi) [rad]."""
+    """Signed difference from the second angle to the first one, in [-pi, pi) [rad]."""
     _, first, second = _floats(first_rad, second_rad)
     return wrap_angle(first - second)
 
@@ -153,7 +153,7 @@ def sphere_log(local: Any) -> Any:
 
 
 def sphere_exp(tangent: Any) -> Any:
-    """Unit vectors at tangent coordinates at the pole (1, 0, 0): (..., 2) [rad] to (..., 3); undoes `sphere_log`."""
+    """Unit vectors from tangent coordinates at the pole (1, 0, 0), (..., 2) [rad] to (..., 3); inverts `sphere_log`."""
     xp, tangent = _floats(tangent)
     squared = xp.sum(tangent * tangent, axis=-1)
     near = squared < _series_limit(squared)
@@ -168,7 +168,7 @@ def angle_over_sine(angle_rad: Any) -> Any:
     xp, angle = _floats(angle_rad)
     squared = angle * angle
     near = squared < _series_limit(squared)
-    # not of pi - t, where pi is the rounded one: of t itself it is exact up to the antipode
+    # the sine of t, not of pi - t with a rounded pi, is exact up to the antipode
     sine = xp.sin(xp.where(near, xp.ones_like(angle), angle))
     least = xp.finfo(angle.dtype).eps
     far = angle / xp.where(sine < least, xp.full_like(sine, least), sine)
@@ -190,7 +190,7 @@ def normalised_weights(log_weights: Any) -> np.ndarray:
 
 
 def effective_count(weights: Any) -> float:
-    r"""The number of equal weights that are worth as much: $(\sum w)^2 / \sum w^2$; 0 where all are 0."""
+    r"""Effective number of weights, $(\sum w)^2 / \sum w^2$; 0 where all are 0."""
     weights = np.asarray(weights, dtype=np.float64)
     largest = weights.max(initial=0.0)
     if largest <= 0:
@@ -208,7 +208,7 @@ def effective_sample_size(log_weights: Any) -> float:
 
 
 def systematic_draw(weights: Any, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Indices of `count` draws in proportion to weights (N,), ascending: one in each of equal shares of their sum.
+    """Ascending indices of `count` draws in proportion to weights (N,), one in each of equal shares of their sum.
 
     Every index is drawn its expected number of times, rounded up or down (systematic resampling; Kitagawa 1996).
     """
@@ -218,10 +218,10 @@ def systematic_draw(weights: Any, count: int, generator: np.random.Generator) ->
 
 
 def clipped_eigenvalues(matrices: np.ndarray, low: Any, high: Any = np.inf, smallest: Any = np.inf) -> np.ndarray:
-    """Symmetric matrices (..., n, n) with their eigenvalues moved into [low, high], each (...).
+    """Symmetric matrices (..., n, n) with their eigenvalues clipped to [low, high], each (...).
 
-    The least eigenvalue is lowered to at most `smallest` (...) besides. It is the maximiser of the Gaussian
-    log-likelihood under these bounds, not a mere repair: lowering the least eigenvalue costs least.
+    The least eigenvalue is also lowered to at most `smallest` (...). The result maximises the Gaussian log-likelihood
+    under these bounds, as lowering the least eigenvalue costs least.
     """
     symmetric = (matrices + np.swapaxes(matrices, -1, -2)) / 2
     values, vectors = np.linalg.eigh(symmetric)
@@ -236,7 +236,7 @@ def box_quadratic_minimum(
 ) -> np.ndarray:
     r"""Minimisers of $(x - c)^T P (x - c)$ in boxes, by exact coordinate descent: (K, n, n), (K, n) to (K, n).
 
-    Convex, so coordinate descent converges to the one minimum; boxes that hold their centre are exact at once.
+    Convex, so coordinate descent converges to the minimum; boxes that contain their centre are exact at once.
     """
     point = np.clip(centre, low, high)
     if np.array_equal(point, centre):
@@ -269,7 +269,7 @@ def _floats(*values: Any) -> tuple[Any, ...]:
 
 
 def _namespace(array: Any) -> Any:
-    """The functions of an array's library by their standard names, which numpy's own have since version 2."""
+    """Array API namespace of an array, for numpy from version 2 on numpy itself."""
     if isinstance(array, np.ndarray) and hasattr(np, "__array_namespace_info__"):
         return np  # its twin in array_api_compat imports all parts of numpy, and their tests
     return array_namespace(array)
@@ -283,17 +283,17 @@ def _as(value: Any, like: Any) -> Any:
 
 
 def _constant(values: Any) -> Any:
-    """The same numbers, without a derivative."""
+    """The values without derivatives."""
     return values.detach() if is_torch_array(values) else values
 
 
 def _scalar(values: Any) -> Any:
-    """A numpy scalar for an array without axes; everything else as it is."""
+    """A numpy scalar for an array without axes; everything else unchanged."""
     return values[()] if isinstance(values, np.ndarray) else values
 
 
 def _series_limit(values: Any) -> float:
-    """Squares of angles below which four terms of a series in the square, and their derivative, are exact."""
+    """Squared angle below which four terms of a series in the square, and their derivative, are exact."""
     return float(_namespace(values).finfo(values.dtype).eps) ** 0.25
 
 

@@ -1,7 +1,7 @@
-"""Task plugins found through the entry-point group `lidardesign.tasks`; a broken one affects only itself.
+"""Task plugins of the entry-point group `lidardesign.tasks`; a broken one affects only itself.
 
-Plugins of other packages are imported in a process of their own first: one that hangs in compiled code, where no signal
-reaches Python, or crashes, ends that process and not this one.
+Plugins of other packages are first imported in a child process: one that crashes, or hangs in compiled code where no
+signal reaches Python, affects only that process.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from lidardesign.run.child import START_SECONDS, Child, ChildError
 from lidardesign.run.clock import phase
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
 
-# In the environment of a probing process, so that a plugin that asks for tasks does not start further ones.
+# Environment variable of a probing process, so that a plugin that loads tasks starts no further ones.
 PROBING = "LIDARDESIGN_PROBING"
 
 
 @dataclass(frozen=True)
 class Probe:
-    """What was found.
+    """Result of importing a plugin in a child process.
 
     Arguments:
-        summary: The task's one-line summary, where it keeps the contract.
-        error: Why it cannot be used, or None.
+        summary: The task's one-line summary, if it fulfils the contract.
+        error: Reason why it cannot be used, or None.
         contained: Whether importing it here would hang or crash this process.
     """
 
@@ -44,11 +44,11 @@ class Probe:
 
 
 def probe_plugins(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:
-    """What each of some plugins does, found out side by side; None where no process could tell.
+    """Import plugins in child processes side by side; None for one whose process could not be started.
 
     Arguments:
-        offers: Their entry points.
-        seconds: How long each import may take.
+        offers: Entry points of the plugins.
+        seconds: Time limit of each import [s].
     """
     running: list[Child] = []
     try:
@@ -75,19 +75,19 @@ def _probe_of(child: Child, seconds: float) -> Probe | None:
 GROUP = "lidardesign.tasks"
 IMPORT_SECONDS = 30.0
 AUTHOR_HINT = "report it to its author"
-# Plugins that are imported elsewhere at the same time.
+# Child processes at the same time.
 SIDE_BY_SIDE = 8
 
 
 @dataclass(frozen=True)
 class TaskListing:
-    """One line of `tasks list`.
+    """A line of `tasks list`.
 
     Arguments:
-        name: The entry point's name, as `learn` takes it.
+        name: Name of the entry point, for `learn`.
         summary: The task's own one-line summary, empty where it is broken.
         distribution: The installed package that offers it.
-        error: Why it cannot be used, or None.
+        error: Reason why it cannot be used, or None.
     """
 
     name: str
@@ -98,7 +98,7 @@ class TaskListing:
 
 @phase("tasks")
 def list_tasks() -> list[TaskListing]:
-    """Every installed task by name, broken ones with their reason."""
+    """All installed tasks by name, broken ones with the reason."""
     found = sorted(_entry_points_by_name().items())
     foreign = [offers[0] for _, offers in found if len(offers) == 1 and _is_foreign(offers[0])]
     probes: dict[str, Probe | None] = {}
@@ -119,11 +119,11 @@ def list_tasks() -> list[TaskListing]:
 
 @phase("tasks")
 def load_task(name: str) -> Task:
-    """The task of a name, ready to use.
+    """Load the task of a name.
 
     Raises:
-        ConfigError: No installed package offers it; the message lists what there is.
-        PluginError: The plugin cannot be loaded, or does not keep the contract.
+        ConfigError: No installed package offers it; the message lists all tasks.
+        PluginError: The plugin cannot be loaded, or breaks the contract.
     """
     return _load(name, _known(name))
 
@@ -147,9 +147,9 @@ def _known(name: str) -> list[EntryPoint]:
 
 @contextlib.contextmanager
 def plugin_guard(name: str) -> Iterator[None]:
-    """Run a plugin's code; whatever it raises becomes a PluginError, but for errors of this program and of files.
+    """Run a plugin's code; its exceptions become PluginErrors, except errors of this program and of files.
 
-    Whatever it prints goes to stderr, so that it cannot spoil a command's output.
+    Its output goes to stderr, so that it cannot corrupt a command's output.
     """
     try:
         with contextlib.redirect_stdout(sys.stderr):
@@ -170,7 +170,7 @@ def plugin_guard(name: str) -> Iterator[None]:
 
 
 def text_of(error: BaseException) -> str:
-    """What an error says, on one line, whatever its class makes of that."""
+    """Message of an error in one line, even if its class fails to make one."""
     try:
         return " ".join(str(error).split()) or "no message"
     except Exception:
@@ -178,7 +178,7 @@ def text_of(error: BaseException) -> str:
 
 
 def _entry_points_by_name() -> dict[str, list[EntryPoint]]:
-    """Entry points by name; one that is found twice on the path (an editable install) counts once."""
+    """Entry points by name; duplicates on the path (an editable install) count once."""
     try:
         offers = list(entry_points(group=GROUP))
     except Exception:  # importlib reads those of all packages, and one broken file ends it
@@ -213,10 +213,10 @@ def _unique_entry_point(name: str, offers: list[EntryPoint]) -> EntryPoint:
 
 
 def import_task(offer: EntryPoint, seconds: float) -> Task:
-    """The task of an entry point, imported here and now.
+    """Import the task of an entry point in this process.
 
     Raises:
-        PluginError: It cannot be loaded in time, or does not keep the contract.
+        PluginError: It cannot be loaded in time, or breaks the contract.
     """
     with plugin_guard(offer.name), _time_limit(offer.name, seconds):
         plugin = offer.load()
@@ -226,13 +226,13 @@ def import_task(offer: EntryPoint, seconds: float) -> Task:
 
 
 def _is_foreign(offer: EntryPoint) -> bool:
-    """Whether a plugin is none of this package's own, and this is not the process that finds out about it."""
+    """True if a plugin is of another package and this is not a probing process."""
     return PROBING not in os.environ and (offer.dist is None or offer.dist.name != "lidardesign")
 
 
 @functools.cache
 def _check_containable(name: str, value: str, path: tuple[str, ...]) -> None:
-    """Import a plugin elsewhere first; what it raises there, it raises here as well, and can be shown where.
+    """Import a plugin in a child process, and refuse one that hangs or crashes; other errors recur in this process.
 
     Raises:
         PluginError: It hangs, or ends the process.
@@ -243,29 +243,29 @@ def _check_containable(name: str, value: str, path: tuple[str, ...]) -> None:
 
 
 def distribution_of(name: str) -> str:
-    """The installed package that a task comes with, and its version; empty where that is not known."""
+    """Name and version of the installed package of a task; empty if unknown."""
     offers = _entry_points_by_name().get(name, [])
     return _distribution(offers[0]) if len(offers) == 1 and offers[0].dist else ""
 
 
 def task_names() -> list[str]:
-    """The names of all installed tasks, with nothing imported."""
+    """Names of all installed tasks, without importing any."""
     return sorted(_entry_points_by_name())
 
 
 def offer_of(name: str) -> EntryPoint:
-    """The one entry point of a name, with nothing imported.
+    """The unique entry point of a name, without importing it.
 
     Raises:
-        ConfigError: No installed package offers it; the message lists what there is.
+        ConfigError: No installed package offers it; the message lists all tasks.
         PluginError: Several do.
     """
     return _unique_entry_point(name, _known(name))
 
 
 def answer_probe(request: dict[str, Any], _: object) -> dict[str, Any]:
-    """In the process of a probe: import the plugin that is asked about, and say what came of it."""
-    # ends this process even where nobody is left to do it, and long after whoever asked has stopped waiting
+    """Import the requested plugin in a probing process, and return its summary or error."""
+    # ends this process even if the parent has gone, well after the parent's time limit
     faulthandler.dump_traceback_later(request["seconds"] + START_SECONDS, exit=True)
     offer = EntryPoint(request["name"], request["value"], GROUP)
     try:
@@ -296,10 +296,10 @@ def _time_limit(name: str, seconds: float) -> Iterator[None]:
 
 
 def check_interface(name: str, task: Any) -> None:
-    """Check that an object keeps the task contract.
+    """Check that an object fulfils the task contract.
 
     Raises:
-        PluginError: Naming the first member that is missing or of the wrong type.
+        PluginError: The first member that is missing or of the wrong type.
     """
     version = getattr(task, "api_version", None)
     if version != API_VERSION:

@@ -1,4 +1,4 @@
-"""Run folders and the designs in and beside them: opened, read, and traced back to where they came from."""
+"""Run folders: their task, configuration, scenes, designs and inputs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 DESIGN_FOLDER = "designs"
 CONFIGURATION, MANIFEST, SAMPLES = "config.yaml", "manifest.json", "samples.npz"
-# Where the manifest has what a task read, with its SHA-256.
+# Key of the manifest for the task's input files, with their SHA-256.
 INPUTS = "inputs"
 MOST_NAMED = 6
 
@@ -36,17 +36,17 @@ Notes = Callable[[str], None]
 
 
 def ignore(step: str) -> None:
-    """Where steps of the work go when nobody asks for them."""
+    """Default callback for progress messages, which ignores them."""
 
 
 def log_note(text: str) -> None:
-    """Where notes go when nobody asks for them: to the log of this package."""
+    """Default callback for notes, which writes them to the log of this package."""
     logging.getLogger("lidardesign").info(text)
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run folder that was opened: its task and configuration."""
+    """An open run folder with its task and configuration."""
 
     folder: Path
     task: Task
@@ -63,17 +63,17 @@ class RunFolder:
         return cls(folder, *load_run_config(folder))
 
     def design_path(self, name: str) -> Path:
-        """Where a design of this run is written."""
+        """Path of a design file of this run."""
         return self.folder / DESIGN_FOLDER / f"{name}.yaml"
 
     @property
     def metric(self) -> Metric:
-        """What scores mean."""
+        """Metric of the task's scores with the run's configuration."""
         with plugin_guard(self.task.name):
             return metric_of(self.task, self.config.task)
 
     def conditions(self, space: DesignSpace | None = None) -> list[dict[str, float]]:
-        """The condition values that designs are for, in the run's design space or a part of it; see `conditions_of`.
+        """Condition values that designs are evaluated at, in the run's design space or a part; see `conditions_of`.
 
         Raises:
             PluginError: The task's own code failed.
@@ -83,7 +83,7 @@ class RunFolder:
 
     @phase("scenes")
     def scenes(self, split: Split, seed: int) -> list[Scene]:
-        """The scenes of a split, judged by the run's own design space.
+        """The scenes of a split for the run's own design space.
 
         Raises:
             PluginError: The task's own code failed.
@@ -92,7 +92,7 @@ class RunFolder:
             return list(scenes_of(self.task, self.config.task, split, seed, self.config.space))
 
     def input_notes(self) -> list[str]:
-        """Lines on what the task reads, where it is no longer as it was when the run was learned."""
+        """Notes on input files that changed or were added since the run was learned."""
         task, before = self.config.task, read_manifest(self.folder).get(INPUTS) or {}
         now = input_hashes(task) if before else {}
         moved = {name: digest for name, digest in before.items() if now.get(name) != digest}
@@ -100,7 +100,7 @@ class RunFolder:
         def is_kept(name: str) -> bool:
             return isinstance(task, FolderConfig) and task.reads(Path(name))
 
-        # files of folders are known by their content, whatever they are called now
+        # files of folders are identified by content, under any name
         renamed = {digest for name, digest in moved.items() if is_kept(name)} & {*now.values()}
         changed = [name for name, digest in moved.items() if digest not in renamed]
         notes = []
@@ -119,12 +119,12 @@ class RunFolder:
         return notes
 
     def design_paths(self) -> list[Path]:
-        """The files of this run's designs by name."""
+        """Paths of this run's design files, sorted by name."""
         return sorted((self.folder / DESIGN_FOLDER).glob("*.yaml"))
 
     @property
     def has_samples(self) -> bool:
-        """Whether learning has left samples of the density."""
+        """True if the run has samples of the density."""
         return (self.folder / SAMPLES).exists()
 
     def command_times(self) -> dict[str, dict[str, float]]:
@@ -140,7 +140,7 @@ class RunFolder:
 
 
 def input_paths(config: BaseModel) -> list[Path]:
-    """The paths that a task's configuration names."""
+    """Paths in a task's configuration."""
 
     def within(value: Any) -> list[Path]:
         if isinstance(value, dict):
@@ -155,23 +155,23 @@ def input_paths(config: BaseModel) -> list[Path]:
 
 
 def input_hashes(config: BaseModel) -> dict[str, str]:
-    """SHA-256 of the files that a task's configuration names, of those in its folders, and of its robots, by path."""
+    """SHA-256 of a task's input files by path: named files, and files of named folders and robots."""
     files = [file for path in input_paths(config) for file in files_of(path)]
     return {str(file): sha256_file(file) for file in files if file.is_file() and file.stat().st_size <= MESH.most_bytes}
 
 
 def files_of(path: Path) -> list[Path]:
-    """The files of a folder, or those that a robot's model names, or the one file."""
+    """Files of a folder, files of a robot's model, or the single file."""
     if path.suffix.lower() in (".xml", ".urdf"):
         from lidardesign.scenes.mujoco_models import model_files
 
-        with contextlib.suppress(LidardesignError):  # whoever reads the model says what is wrong with it
+        with contextlib.suppress(LidardesignError):  # errors are reported when the model is read
             return [Path(name) for name, *_ in model_files(path, Path(path.anchor))]
     return sorted(path.iterdir()) if path.is_dir() else [path]
 
 
 def settings_texts(settings: Sequence[str] | Mapping[str, Any]) -> tuple[str, ...]:
-    """Settings as KEY=VALUE: as they are, or of a mapping of dotted keys."""
+    """Settings as KEY=VALUE texts, from such texts or from a mapping of dotted keys."""
     if not isinstance(settings, Mapping):
         return tuple(settings)
     texts = {key: value if isinstance(value, str | Path) else json.dumps(value) for key, value in settings.items()}

@@ -1,7 +1,7 @@
-"""Weighted samples of the learned density, which `fit` and `constrain` use in its place, and a word for how good it is.
+"""Weighted samples of the learned density, which `fit` and `constrain` use in its place, and a verdict on its quality.
 
-A density is good, usable or poor by what designs lose by it. Rays are chosen among candidates that it proposes, so a
-rough density costs little; benchmarks/verdicts.py measures how much.
+Learning mixes flow samples with independent points in the share that is most effective (`learn.mix_samples`). A rough
+density costs designs little, as rays are chosen among candidates (benchmarks/verdicts.py measures it).
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from lidardesign.space import DesignSpace
 FILE_NAME = "samples.npz"
 NUMBERS = ("points", "log_prob", "log_target")
 DAMAGED_HINT = "learn the run again"
-# The most of its mass in the wrong place, the largest KL [nats] and the least ESS of a density with this verdict.
+# Largest misplaced mass, largest KL [nats] and smallest ESS of a density with each verdict.
 BOUNDS: dict[str, tuple[float, float, float]] = {"good": (0.25, 0.5, 0.2), "usable": (0.5, 2.0, 0.05)}
-# What to do next for a better one, by the preset that it was learned with.
+# Advice for a better density, by the preset that it was learned with.
 NEXT = {"draft": "--preset standard learns longer", "standard": "--preset fine learns longer"}
 LAST = "more learning.steps to a smaller learning.misplaced; a smaller space or a larger density.sigma_m learn faster"
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Samples of the flow with what is needed to weight them to the target.
+    """Samples of a flow, or of its mixture with independent points, with both densities for importance weights.
 
     Arguments:
         points: Design points, shape (N, 6).
-        log_prob: The density that they were drawn from, per chart volume, shape (N,).
-        log_target: log p* at them, unnormalised, shape (N,).
+        log_prob: Logarithm of the density that they were drawn from, per chart volume, shape (N,).
+        log_target: log p* at the points, unnormalised, shape (N,).
         space: The design space of both densities.
 
     Raises:
-        DataError: Values that are no numbers; log p* alone may be -inf.
+        DataError: Values that are not finite; log p* alone may be -inf.
     """
 
     points: np.ndarray
@@ -80,7 +80,7 @@ class Samples:
 
     @cached_property
     def independent(self) -> float:
-        """How many samples of equal weight they are worth, those counted once that are at one point of the space."""
+        """Effective number of samples, with repeated points merged into one."""
         places = np.round(self.space.to_unit(self.points) / COARSE_SLACK)
         _, same = np.unique(places, axis=0, return_inverse=True)
         return float(1.0 / np.square(np.bincount(same.reshape(-1), self.weights)).sum())
@@ -90,7 +90,7 @@ class Samples:
         return Samples(self.points[keep], self.log_prob[keep], self.log_target[keep], self.space)
 
     def retargeted(self, log_target: np.ndarray) -> Samples:
-        """The samples with another log p*, shape (N,), which they may have where the old one is -inf."""
+        """The samples with another log p*, shape (N,)."""
         return replace(self, log_target=log_target)
 
     def resample(self, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -99,7 +99,7 @@ class Samples:
 
 
 def save_samples(samples: Samples, run: Path) -> None:
-    """Write the samples into a run folder, atomically, with their hash in the manifest at every moment."""
+    """Write the samples into a run folder, atomically, with their hash always in the manifest."""
     buffer = io.BytesIO()
     np.savez(
         buffer,
@@ -117,7 +117,7 @@ def load_samples(run: Path, expected: DesignSpace | None = None) -> Samples:
 
     Arguments:
         run: The folder.
-        expected: The run's design space, where that is known.
+        expected: The run's design space, to compare with; None: no comparison.
 
     Raises:
         DataError: The file is missing, damaged, of another design space, or holds values that are not finite.
@@ -156,11 +156,11 @@ def load_samples(run: Path, expected: DesignSpace | None = None) -> Samples:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a density is worth.
+    """Quality of a learned density.
 
     Arguments:
         word: good, usable or poor.
-        why: The figure that keeps it from being better, and what that asks for; empty where it is good.
+        why: The first figure beyond the bound of a better verdict, and that bound; empty where it is good.
     """
 
     word: Literal["good", "usable", "poor"]
@@ -182,9 +182,9 @@ class Verdict:
         return cls("poor", reasons["usable"][0]) if reasons["usable"] else cls("usable", reasons["good"][0])
 
     def text(self, preset: str) -> str:
-        """The verdict in a line, with what to do next for a density that was learned with a preset."""
+        """The verdict in a line, with advice for a density that was learned with a preset."""
         return f"{self.word}: {self.advice(preset)}" if self.why else self.word
 
     def advice(self, preset: str) -> str:
-        """Why it is no better, and what to do next."""
+        """Reason for the verdict, and advice for a better density."""
         return f"{self.why}; {NEXT.get(preset, LAST)}"

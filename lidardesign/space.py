@@ -1,4 +1,4 @@
-"""The six-dimensional design space: rays with the one distance they listen at.
+"""The six-dimensional design space of rays: origin, direction and range.
 
 A design point is d = (x, y, z, azimuth, elevation, range) in metres and radians
 (Behari et al. 2026, section 3). Densities are stated per *chart volume*: with the
@@ -26,14 +26,14 @@ X, Y, Z, AZIMUTH, ELEVATION, RANGE = range(6)
 
 Measure = Literal["solid_angle", "angles"]
 MEASURES = ("solid_angle", "angles")
-# A million kilometres: what is further is a slip of units, and fourth powers of lengths must stay numbers.
+# A million kilometres: larger lengths are wrong units, and fourth powers of lengths must stay finite.
 FARTHEST_M = 1e9
-# Between these all squares and products that densities are made of are numbers, in float32 too.
+# Between these limits all squares and products in densities are finite, in float32 too.
 SHORTEST_M = 1 / FARTHEST_M
-# Of an angle of many turns ever fewer digits are left; nobody needs more than one.
+# Angles of many turns lose digits; nobody needs more than one.
 MOST_TURNS = 100
 LARGEST_ANGLE_RAD = MOST_TURNS * FULL_TURN
-# Bounds such as 2 pi are written with some ten digits.
+# Bounds such as 2 pi are written with about ten digits.
 ROUNDING_RAD = SLACK
 
 
@@ -74,7 +74,7 @@ class DesignSpace:
         low: Lower bounds in the order of `DIMENSIONS` [m, m, m, rad, rad, m].
         high: Upper bounds. The azimuth interval may start anywhere and spans at most a full turn.
         condition: Names of the dimensions that the density is conditioned on (uniform over their bounds).
-        measure: What densities are per; see the module docstring.
+        measure: Chart measure of densities; see the module docstring.
 
     Raises:
         ConfigError: Bounds that are not finite, reversed, or outside their physical range.
@@ -134,7 +134,7 @@ class DesignSpace:
 
     @cached_property
     def free(self) -> tuple[int, ...]:
-        """Indices of the dimensions that are not fixed; elevations whose sines are one number are."""
+        """Indices of the dimensions that are not fixed; elevation bounds with equal sines count as fixed."""
         return tuple(i for i in range(6) if self.low[i] < self.high[i] and self.chart_low[i] < self.chart_high[i])
 
     @cached_property
@@ -144,7 +144,7 @@ class DesignSpace:
 
     @cached_property
     def full_azimuth(self) -> bool:
-        """Whether the azimuth covers the full turn, so that it is periodic."""
+        """True if the azimuth covers the full turn, so that it is periodic."""
         return self.high[AZIMUTH] - self.low[AZIMUTH] >= FULL_TURN - ROUNDING_RAD
 
     @cached_property
@@ -201,7 +201,7 @@ class DesignSpace:
         return np.clip(points, self.low, self.high)
 
     def wrap(self, points: np.ndarray) -> np.ndarray:
-        """A copy with an azimuth outside the bounds moved by whole turns to where it is nearest to them."""
+        """A copy with azimuths outside the bounds moved by whole turns to be nearest to them."""
         points = np.array(points, dtype=np.float64)
         azimuth = points[..., AZIMUTH]
         low, high = self.low[AZIMUTH], self.high[AZIMUTH]
@@ -211,7 +211,7 @@ class DesignSpace:
         return points
 
     def contains(self, points: np.ndarray, tolerance: float = SLACK) -> np.ndarray:
-        """Which design points lie in the box, (..., 6) to (...) bool; the azimuth counts modulo a turn."""
+        """Mask of design points inside the box, (..., 6) to (...); the azimuth is periodic."""
         wrapped = self.wrap(points)
         inside = (wrapped >= np.array(self.low) - tolerance) & (wrapped <= np.array(self.high) + tolerance)
         return inside.all(axis=-1)
@@ -245,7 +245,7 @@ class DesignSpace:
         return self.from_unit(generator.uniform(-1.0, 1.0, (count, len(self.free))))
 
     def as_dict(self) -> dict[str, Any]:
-        """Bounds by name, as they stand in configuration files."""
+        """Bounds by name, as in configuration files."""
         bounds: dict[str, Any] = {
             name: [low, high] for name, low, high in zip(DIMENSIONS, self.low, self.high, strict=True)
         }

@@ -1,4 +1,4 @@
-"""The task plugin contract: scenes of a task, and what a set of returns is worth there.
+"""The task plugin contract: scenes of a task, and scores of returns.
 
 A plugin is a class with the members of `Task`, registered under the entry-point group
 `lidardesign.tasks`. It is instantiated without arguments.
@@ -26,22 +26,22 @@ API_VERSION = 1
 Split = Literal["train", "test"]
 
 
-# Numbers of configurations: beyond these they are slips of units.
+# Lengths in configurations: larger ones are wrong units.
 Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 Vector = tuple[Metres, Metres, Metres]
 Interval = tuple[Metres, Metres]
 
 
 class TaskConfig(BaseModel):
-    """The base of a task's configuration: unknown keys are errors, values are frozen."""
+    """Base of a task's configuration: unknown keys are errors, values are frozen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class FolderConfig(TaskConfig):
-    """The base of the configuration of a task that reads all files of a folder: a run keeps which there were.
+    """Base of the configuration of a task that reads all files of a folder; a run records the files that it had.
 
-    `folders` has the keys that name folders, each with the endings, in small letters, of the files that are read there.
+    `folders` has the keys of folders, each with the suffixes, in lower case, of the files that are read there.
     """
 
     folders: ClassVar[Mapping[str, Sequence[str]]]
@@ -49,22 +49,22 @@ class FolderConfig(TaskConfig):
     inputs: dict[str, str] = Field({}, description="set by learn: SHA-256 of each file that was there, by its path")
 
     def reads(self, path: Path) -> bool:
-        """Whether a file is one of those that are read in the folders."""
+        """True if a file is one of those that are read in the folders."""
         keys = [key for key, endings in self.folders.items() if path.suffix.lower() in endings]
         return not path.name.startswith(".") and any(path.parent == getattr(self, key) for key in keys)
 
     def learned_files(self, files: Sequence[Path]) -> dict[str, Path | None]:
-        """Files of a folder by the names that they had when the run was learned, in that order; None for those gone.
+        """Files of a folder by the names that they had when the run was learned, in that order; None for missing ones.
 
-        Splits and random streams follow these names, so that a file that came since moves no other to another split:
-        it is left out. A file is known by its content wherever it is called otherwise now, and by its name where it
-        was changed. All files are known as long as nothing was learned.
+        Splits and random streams follow these names, so that an added file moves no other to another split: it is left
+        out. A renamed file is recognised by its content, a changed one by its name. Before learning, all files are
+        included.
 
         Arguments:
-            files: Those of one of the folders now.
+            files: The present files of one of the folders.
 
         Raises:
-            DataError: Nothing is left of what was learned from.
+            DataError: None of the files that the run was learned from is left.
         """
         folder = files[0].parent
         recorded = {Path(path): digest for path, digest in self.inputs.items()}
@@ -93,14 +93,14 @@ def _digest(path: Path, changed_ns: int, size: int) -> str:
 
 @dataclass(frozen=True)
 class Metric:
-    """What a task's score means.
+    """Name, unit and limits of a task's score.
 
     Arguments:
-        name: For tables, as "Chamfer distance".
-        unit: As "mm".
+        name: Name in tables, as "Chamfer distance".
+        unit: Unit, as "mm".
         better: Whether lower or higher values are better.
-        worst: The value of a scene in which a design fails.
-        tolerance: Differences below this one do not matter to the task.
+        worst: Value of a scene in which a design fails.
+        tolerance: Differences below this do not matter to the task.
     """
 
     name: str
@@ -115,7 +115,7 @@ class Score:
     """The score of one design in one scene.
 
     Arguments:
-        value: In the metric's unit; the metric's worst value where `failed`.
+        value: Score in the metric's unit; the metric's worst value where `failed`.
         failed: Whether the returns were too few to compute the metric.
         details: Further figures by name (with their unit), for the report.
     """
@@ -127,25 +127,25 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What returns tell about a scene: pairs of a ray and an item, as a point of the surface, a frame or a body.
+    """Information of returns about items of a scene (points of a surface, frames, bodies), as pairs of ray and item.
 
-    A task states it for choosing rays: what is chosen is worth the weighted mean, over items, of the largest worth of
-    its returns, or of what the sum of their worths counts.
+    Tasks provide it for choosing rays. The value of a choice is the weighted mean, over items, of the largest worth of
+    its returns, or of the function `sums` of the sum of their worths.
 
     Arguments:
-        ray: The ray of each pair, int (E,).
-        item: The item of each pair, int (E,); without `seen_in` no pair comes twice.
-        worth: How much the return tells about the item, 0 or more, (E,).
-        frame: Which of the `Returns` shows each item, int (U,).
-        weight: What items count, 0 or more, (U,); None: all alike.
-        harm: What each return spoils, as one of an occluder that is taken for a target, in the unit of worth,
-            (frames, N); None: nothing.
-        sums: None, or what sums of worths 0, 1, 2, ... count, linear in between: 0 at first, rising ever less.
-        complete: What an item counts of which nothing is left to know; the loss of a choice is what lacks of it.
-        unit: Of `worth` and `complete`, as `m`; `1` for shares.
-        seen_in: Which of the `Returns` each pair is from, int (E,), where returns of one frame tell about another, as
-            about where a path goes on; a pair then comes once per frame, and its largest worth counts. None: those that
-            show the item.
+        ray: Index of each pair's ray, int (E,).
+        item: Index of each pair's item, int (E,); without `seen_in` every pair is unique.
+        worth: Information of the return about the item, 0 or more, (E,).
+        frame: Index of the `Returns` that shows each item, int (U,).
+        weight: Weights of items, 0 or more, (U,); None: equal weights.
+        harm: Loss by each return, as by one of an occluder that is taken for a target, in the unit of worth,
+            (frames, N); None: none.
+        sums: None, or the value at sums of worths 0, 1, 2, ..., linear in between: 0 at first, increasing and concave.
+        complete: Value of an item about which everything is known; the loss of a choice is the difference from it.
+        unit: Unit of `worth` and `complete`, as `m`; `1` for shares.
+        seen_in: Index of the `Returns` that each pair is from, int (E,), where returns of one frame inform about
+            another, as about the continuation of a path; a pair then occurs once per frame, and its largest worth
+            counts. None: those that show the item.
     """
 
     ray: np.ndarray
@@ -161,17 +161,17 @@ class Information:
 
     @property
     def source(self) -> np.ndarray:
-        """Which of the `Returns` each pair is from, int (E,)."""
+        """Index of the `Returns` that each pair is from, int (E,)."""
         return self.frame[self.item] if self.seen_in is None else self.seen_in
 
 
 @dataclass(frozen=True)
 class Defaults:
-    """What a task suggests where the user says nothing.
+    """A task's default settings.
 
     Arguments:
         rays: Ray budgets per frame to evaluate at; where the density has conditions, per condition value.
-        level: The share of each marginal that fields of view and gates hold.
+        level: Share of each marginal inside fields of view and gates.
         density: Overrides of the `density` configuration section (for example {"sigma_m": 0.005}).
         learning: Overrides of the `learning` section, by preset name.
     """
@@ -184,7 +184,7 @@ class Defaults:
 
 @runtime_checkable
 class Task(Protocol):
-    """What a task plugin provides; see the module docstring.
+    """Interface of a task plugin; see the module docstring.
 
     `scenes` is deterministic in (config, split, seed), and the splits are disjoint, also those of two seeds: more
     training scenes are drawn with other seeds. `score` may use
@@ -194,21 +194,21 @@ class Task(Protocol):
     evaluated at, as [{"x_m": 0.0}, {"x_m": 1.2}]. `score` then gets one `Returns` per condition value (and, within
     each, per time frame), in this order.
 
-    A task may name `weighing_keys`, keys of its configuration that only say what counts more in the density: designs
+    A task may name `weighing_keys`, keys of its configuration that only weight parts of the density: designs
     of runs that differ only in them are scored side by side.
 
-    A task may also give `informs(scene, returns) -> Information`, what returns tell about a scene, for choosing rays;
+    A task may also give `informs(scene, returns) -> Information`, the information of returns for choosing rays;
     `returns` are as in `score`, of all candidate rays through open gates. Rays of a task without it are not chosen.
 
-    A task may also give `metric_of(config) -> Metric`, where the worst value or the tolerance follow from its
-    configuration; `metric` then has those that are usual. Name, unit and direction are those of `metric`, or of one of
-    `metrics`, further ones that a key of the configuration chooses.
+    A task may also give `metric_of(config) -> Metric`, where the worst value or the tolerance depend on its
+    configuration; `metric` then has the usual ones. Name, unit and direction are those of `metric`, or of one of
+    `metrics`, further ones that a key of the configuration selects.
 
-    A task may also give `mount_of(config) -> str | None`, the body of a robot that sensors are on, in whose frame its
-    scenes are; designs keep it.
+    A task may also give `mount_of(config) -> str | None`, the body of a robot that carries the sensors, in whose frame
+    its scenes are; designs keep it.
 
-    A task may also give `notes(config, space) -> Sequence[str]`, what a user should know of a configuration before
-    anything is learned of it: lengths that look like another unit, splits that share their objects.
+    A task may also give `notes(config, space) -> Sequence[str]`, notes to the user on a configuration before learning:
+    lengths that look like another unit, splits that share their objects.
 
     Example:
         >>> task = run.task
@@ -234,25 +234,25 @@ class Task(Protocol):
         ...
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
-        """The score of one design's returns in a scene, one `Returns` per time frame of the scene."""
+        """The score of a design's returns in a scene, one `Returns` per time frame of the scene."""
         ...
 
 
 def random_generator(seed: int, *labels: str | int) -> np.random.Generator:
-    """An independent generator per purpose, so that adding a draw to one never changes another."""
+    """An independent generator for each purpose, so that adding draws to one never changes another."""
     return np.random.default_rng(
         np.random.SeedSequence([seed, *[int.from_bytes(str(label).encode(), "little") % (2**63) for label in labels]])
     )
 
 
 def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpace) -> Sequence[Scene]:
-    """The scenes of a split, judged by what a run's own design space can see.
+    """The scenes of a split, with ground truth for a run's own design space.
 
     A task whose `scenes` takes a keyword `space` gets it; its truth then follows a space set in the run's
-    configuration. Other tasks judge by the space of their configuration.
+    configuration. Other tasks use the space of their configuration.
 
     Raises:
-        PluginError: The task gave something else.
+        PluginError: The task returned something else.
     """
     takes_space = "space" in inspect.signature(task.scenes).parameters
     scenes = list(task.scenes(config, split, seed, **({"space": space} if takes_space else {})))
@@ -267,10 +267,10 @@ def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpa
 
 
 def metric_of(task: Task, config: Any) -> Metric:
-    """What a task's scores mean with a configuration; that of every configuration where it has no `metric_of`.
+    """Metric of a task with a configuration: of its `metric_of`, or else its `metric`.
 
     Raises:
-        PluginError: The task gave something else, or another quantity than its `metric` and `metrics`.
+        PluginError: The task returned something else, or another quantity than its `metric` and `metrics`.
     """
     if not hasattr(task, "metric_of"):
         return task.metric
@@ -287,10 +287,10 @@ def metric_of(task: Task, config: Any) -> Metric:
 
 
 def mount_of(task: Task, config: Any) -> str | None:
-    """The body of a robot that a task's sensors are on; None: in the world, as where it has no `mount_of`.
+    """Name of the robot's body that carries a task's sensors; None: sensors in the world, as without `mount_of`.
 
     Raises:
-        PluginError: The task gave no name.
+        PluginError: The task returned no name.
     """
     found = task.mount_of(config) if hasattr(task, "mount_of") else None
     if not isinstance(found, str | None) or found == "":
@@ -303,10 +303,10 @@ def _quantity(metric: Metric) -> str:
 
 
 def notes_of(task: Task, config: Any, space: DesignSpace) -> list[str]:
-    """What a task says of its configuration in a design space, one line each; nothing where it has no `notes`.
+    """Notes of a task on its configuration in a design space, one line each; none without `notes`.
 
     Raises:
-        PluginError: The task gave something else.
+        PluginError: The task returned something else.
     """
     if not hasattr(task, "notes"):
         return []
@@ -317,16 +317,16 @@ def notes_of(task: Task, config: Any, space: DesignSpace) -> list[str]:
 
 
 def scoring_settings(task: Task, config: Any) -> dict[str, Any]:
-    """The settings of a task that decide its scenes and scores: all but its `weighing_keys`."""
+    """Settings of a task that decide its scenes and scores: all but its `weighing_keys`."""
     return config.model_dump(mode="json", exclude=set(getattr(task, "weighing_keys", ())))
 
 
-# Conditions that a task does not name are evaluated at so many even places.
+# Number of even condition values where a task gives none.
 EVEN_CONDITIONS = 9
 
 
 def conditions_of(task: Task, config: Any, space: DesignSpace) -> list[dict[str, float]]:
-    """The condition values that designs are evaluated at; one empty mapping where the density has no conditions.
+    """Condition values that designs are evaluated at; one empty mapping where the density has no conditions.
 
     Raises:
         ConfigError: The task names a value outside the design space.

@@ -1,7 +1,7 @@
-"""Scenes looked at by worker processes of this machine, or by the workers of a dask scheduler.
+"""Processing of scenes by worker processes of this machine, or by the workers of a dask scheduler.
 
-A scene is sent with its rays, and the same function works on it as in this process: the results are the same for any
-number of workers. Seconds that they report are their own, so they add up to more than the time that passed.
+A scene is sent with its rays, and the same function runs on it as in this process: the results are the same for any
+number of workers. Workers report their own times, which add up to more than the elapsed time.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from lidardesign.task import Task
 ADDRESS = re.compile(r"tcp://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):([0-9]{1,5})")
 MOST_PROCESSES = 1024
 OPTION = "--workers"
-# A scheduler that listens answers at once; workers of a batch system may still be waiting for their machines.
+# A running scheduler answers at once; workers of a batch system may still be waiting for their machines.
 SCHEDULER_SECONDS, WORKER_SECONDS = 10.0, 60.0
 SAME_HINT = "install the same versions of lidardesign and of the task for the scheduler and all workers"
-# Scenes beyond what runs, so that no worker waits for this process.
+# Scenes submitted beyond the running ones, so that no worker waits for this process.
 AHEAD = 2
 _one_at_a_time = threading.Lock()
 Result = TypeVar("Result")
 
 
 class Starmap(Protocol):
-    """Calls a function with each of some tuples of arguments; results in their order, as `itertools.starmap`."""
+    """Calls a function with each tuple of arguments; results in their order, as `itertools.starmap`."""
 
     def __call__(self, function: Callable[..., Result], asked: Iterable[tuple[Any, ...]]) -> Iterable[Result]:
-        """The results."""
+        """The results, in order."""
         ...
 
 
@@ -68,12 +68,12 @@ def check_workers(text: str) -> int | str:
 
 @contextlib.contextmanager
 def opened_workers(workers: int | str, task: Task, scenes: int) -> Iterator[Starmap]:
-    """Calls by a number of processes, or by a scheduler's address; processes end with the context.
+    """Open workers, as a number of processes or a scheduler's address; processes end with the context.
 
     Arguments:
-        workers: As `check_workers` gives it.
-        task: Whose scenes are looked at.
-        scenes: How many there are at least; no more processes are started.
+        workers: As from `check_workers`.
+        task: The task of the scenes.
+        scenes: Number of scenes, an upper limit of the processes.
 
     Raises:
         ConfigError: No scheduler answers, it has no workers, or the task is not the installed one of its name.
@@ -100,7 +100,7 @@ def _map_there(
     function: Callable[..., Result],
     asked: Iterable[tuple[Any, ...]],
 ) -> Iterator[Result]:
-    """Results in the order of what was asked, so of several errors the first one is raised."""
+    """Results in the order of the calls, so that the first of several errors is raised."""
     asked, waiting, versions = iter(asked), deque[Future[Result]](), _versions(task)
     while True:
         for arguments in islice(asked, max(threads() + AHEAD - len(waiting), 0)):
@@ -114,14 +114,14 @@ def _map_there(
 
 
 def _call(versions: str, task: Task, function: Callable[..., Result], *arguments: Any) -> Result:
-    """A call in a worker, whose threads take turns: tasks need not be safe to be called twice at a time."""
+    """Call a function in a worker, one thread at a time: tasks need not be thread-safe."""
     _check_versions(versions, task)
     with _one_at_a_time:
         return function(*arguments)
 
 
 def _versions(task: Task) -> str:
-    """Of this program and of a task's package."""
+    """Versions of this program and of a task's package, as text."""
     return f"lidardesign {__version__} with {distribution_of(task.name) or 'no such task'}"
 
 
@@ -132,13 +132,13 @@ def _check_versions(wanted: str, task: Task) -> None:
 
 @contextlib.contextmanager
 def _processes(count: int) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """Worker processes of this machine, all started at once and killed at the end, whatever they are doing."""
+    """Worker processes of this machine, all started at once and killed at the end, even while busy."""
     others = multiprocessing.active_children()
     executor = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_end_with_parent)
     try:
         with _undisturbed():
             for _ in range(count):
-                # a process is started where none is idle, and none is before it is up
+                # a process is started if none is idle, and none is idle before it is up
                 executor.submit(os.getpid)
         yield executor, lambda: count
     except BlockingIOError as error:
@@ -157,7 +157,7 @@ def _processes(count: int) -> Iterator[tuple[Executor, Callable[[], int]]]:
 
 
 def _end_with_parent() -> None:
-    """Let a worker end at once where the process that asks has gone, in the middle of a scene too."""
+    """End a worker as soon as its parent process has gone, even during a scene."""
 
     def watch() -> None:
         multiprocessing.parent_process().join()
@@ -168,7 +168,7 @@ def _end_with_parent() -> None:
 
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Processes started in here never see a terminal's Ctrl-C, and do not run the user's script again."""
+    """Start processes that never receive a terminal's Ctrl-C and do not run the user's script again."""
     script = sys.modules["__main__"]
     sys.modules["__main__"] = types.ModuleType("__main__")
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -181,13 +181,13 @@ def _undisturbed() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _cluster(address: str, task: Task) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """The workers of a scheduler that is running already; it hands scenes of lost workers to others.
+    """Workers of a running scheduler, which gives the scenes of lost workers to others.
 
-    What dask.distributed would log about lost connections is left to the errors that are raised.
+    Logs of dask.distributed about lost connections are silenced in favour of the errors raised here.
     """
     try:
         with warnings.catch_warnings():
-            # packages announce their own removals
+            # deprecation warnings of packages
             warnings.simplefilter("ignore")
             from distributed import Client, KilledWorker
     except ImportError:
@@ -203,7 +203,7 @@ def _cluster(address: str, task: Task) -> Iterator[tuple[Executor, Callable[[], 
     with contextlib.ExitStack() as opened:
         opened.callback(logger.setLevel, level)
         opened.enter_context(warnings.catch_warnings())
-        # many rays make a long message, which the work on them outweighs
+        # many rays make a long message, which is short compared with their simulation
         warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
         try:
             client = _answered(lambda: Client(address, timeout=SCHEDULER_SECONDS, set_as_default=False))
@@ -231,22 +231,22 @@ def _cluster(address: str, task: Task) -> Iterator[tuple[Executor, Callable[[], 
 
 
 def _check_cluster(client: Any, task: Task) -> None:
-    """Refuse a scheduler or workers without these versions: they would only die of what they are sent."""
+    """Refuse a scheduler or workers with other versions, which would fail on the tasks sent to them."""
     try:
         for ask in (client.run_on_scheduler, client.run):
             ask(_check_versions, _versions(task), task)
     except LidardesignError:
         raise
     except Exception as error:
-        # an ImportError, in whatever dask makes of it
+        # an ImportError, as wrapped by dask
         raise ConfigError(f"the cluster cannot run this program: {error}", where=OPTION, hint=SAME_HINT) from error
 
 
 def _answered(connect: Callable[[], Any]) -> Any:
-    """The result of a connection; the client itself waits for ever where something else than a scheduler listens.
+    """Result of a connection with a time limit; the client itself waits for ever if no scheduler is at the address.
 
     Raises:
-        TimeoutError: Nothing came of it.
+        TimeoutError: No answer in time.
     """
     answer: Future[Any] = Future()
 
@@ -254,9 +254,9 @@ def _answered(connect: Callable[[], Any]) -> Any:
         try:
             answer.set_result(connect())
         except Exception as error:
-            # raised where it was asked for
+            # raised in the calling thread
             answer.set_exception(error)
 
     threading.Thread(target=work, daemon=True).start()
-    # its own time comes first where nothing listens
+    # the client's own time limit comes first where nothing listens
     return answer.result(1.5 * SCHEDULER_SECONDS)

@@ -1,6 +1,6 @@
-"""Designs from files: design files, the research code's tables, and rigs of others, told apart by their content.
+"""Designs from files: design files, the research code's tables, and rigs of other programs, recognised by content.
 
-Files whose content is nothing of what their name says are refused with what is wrong, before YAML is tried.
+Files whose content does not match their suffix are refused before YAML is tried.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ OTHER_ROOTS = {
     "robot": "URDF has no sensors of its own; give the SDF file of the simulation, or the rays as CSV",
     "mujocoinclude": "give the model that includes this file",
 }
-# An archive with members, and one without any.
+# ZIP archives with and without members.
 ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
-# In UTF-16 with its mark the sign stands beside a zero byte.
+# "<" in UTF-8, and in UTF-16 with its byte order mark.
 XML_BEGINNINGS = (b"<", b"\xff\xfe<\x00", b"\xfe\xff\x00<")
 UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # A mapping of YAML begins with a key, a document mark or a brace.
@@ -62,16 +62,16 @@ HEADER_HINT = "as in origin_x_m,origin_y_m,origin_z_m,azimuth_deg,elevation_deg,
 
 @phase("designs")
 def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
-    """Read a design from a design file, the research code's sensor CSV or a rig of others.
+    """Read a design from a design file, the research code's sensor CSV or a rig of another program.
 
     The design takes the file's stem as its name, as tables name designs by their files.
 
     Arguments:
         path: The file.
-        reach_m: How far the rays of a rig are heard where its file does not say so [m].
+        reach_m: End of a rig's gates without one in its file [m].
 
     Raises:
-        DataError: The file cannot be read, or a CSV, an NPZ or an XML file holds what cannot be used (exit 3).
+        DataError: The file cannot be read, or is a CSV, NPZ or XML file with invalid content (exit 3).
         ConfigError: The file is not YAML, or not a design (exit 2).
     """
     path = Path(path)
@@ -92,14 +92,14 @@ def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
 
 
 def read_rig(path: Path, head: bytes) -> Rig | None:
-    """The rig that a file describes; None where it is a design file or the research code's sensor table.
+    """The rig in a file; None for a design file or the research code's sensor table.
 
     Arguments:
         path: The file.
         head: Its first bytes.
 
     Raises:
-        DataError: It is a rig's file that cannot be used.
+        DataError: It is an invalid file of a rig.
     """
     if head.startswith(ZIP_BEGINNINGS):
         return read_ray_npz(path)
@@ -116,7 +116,7 @@ def read_rig(path: Path, head: bytes) -> Rig | None:
         _check_text(path, texts)
         return None
     _, first = texts[0]
-    # the commas may be those of numbers, between columns that something else separates
+    # the commas may be decimal commas between columns with another separator
     separator = next((mark for mark in SEPARATORS if first.count(mark) >= max(first.count(","), 2)), None)
     if separator is not None:
         raise _wrong_separator(separator, f"{path}:1")
@@ -132,7 +132,7 @@ def read_rig(path: Path, head: bytes) -> Rig | None:
 
 
 def _check_bytes(path: Path, head: bytes) -> None:
-    """Refuse a file of a known name that is empty, or that is no text where it should be; it may be zipped."""
+    """Refuse a file with a known suffix that is empty, or is not text where it should be; ZIP archives pass."""
     kind = KINDS.get(path.suffix.lower())
     if kind is None or head.startswith(b"PK"):
         return
@@ -155,7 +155,7 @@ def _check_bytes(path: Path, head: bytes) -> None:
 
 
 def _check_text(path: Path, texts: list[tuple[int, str]]) -> None:
-    """Refuse a text of a known name, as numbered lines, that neither its reader nor YAML takes."""
+    """Refuse a text with a known suffix, as numbered lines, that neither its reader nor YAML accepts."""
     kind = KINDS.get(path.suffix.lower())
     plain = next((line.strip() for _, line in texts if not line.strip().startswith("#")), "")
     if kind is None or YAML_LINE.match(plain):
@@ -181,15 +181,15 @@ def _wrong_separator(separator: str, where: str) -> DataError:
 
 
 def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = None) -> DesignSpec:
-    """A design file or a rig of others.
+    """Read a design file or a rig of another program, with notes.
 
-    One of a run that is not as it was written says so: it may be cut, or mended by hand. A rig says what its file
-    does not.
+    Notes say if a run's design differs from the one that was written, truncated or edited by hand, and which values
+    the file of a rig is missing.
 
     Arguments:
         path: The file.
         notes: Called with every note.
-        reach_m: How far the rays of a rig are heard where its file does not say so [m].
+        reach_m: End of a rig's gates without one in its file [m].
 
     Raises:
         ConfigError, DataError: It cannot be read.
@@ -212,10 +212,10 @@ def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = Non
 
 
 def _difference(path: Path) -> str | None:
-    """In what a design differs from the one that its run's manifest has, where it lies in a run."""
+    """Difference of a run's design from the one in the run's manifest, or None."""
     folder, run = path.absolute().parent, path.absolute().parent.parent
     if folder.name == DESIGN_FOLDER and path.is_file() and (run / MANIFEST).is_file():
-        with contextlib.suppress(DataError):  # whatever needs the manifest says that it is damaged
+        with contextlib.suppress(DataError):  # a damaged manifest is reported where it is needed
             return changed_since_recorded(run, f"{DESIGN_FOLDER}/{path.name}")
     return None
 
@@ -238,16 +238,16 @@ def open_target(path: Path, notes: Notes = log_note) -> tuple[RunFolder | None, 
 
 
 def run_of(design: DesignSpec, path: Path) -> RunFolder | None:
-    """The run that a design came from, if it is there."""
+    """The run that a design came from, or None if it is missing."""
     folder = folder_of(design, path)
     return None if folder is None else RunFolder.open(folder)
 
 
 def folder_of(design: DesignSpec, path: Path) -> Path | None:
-    """The folder of the run that a design came from, if it is there: its provenance names it relative to its file."""
+    """Folder of the run in a design's provenance, relative to its file, or None if it is missing."""
     named = design.provenance.get("run")
     folder = Path(os.path.normpath(path.parent / named)) if isinstance(named, str) else None
-    # a design that was copied elsewhere names a folder that is none of its run's
+    # the path in a design that was copied elsewhere leads to no run
     return folder if folder is not None and (folder / MANIFEST).is_file() else None
 
 
@@ -267,21 +267,21 @@ def need_run(run: RunFolder | None, path: Path | str) -> RunFolder:
 
 
 def relative_folder(folder: Path, path: Path) -> str:
-    """How the file of a design names the folder of its run."""
+    """Path of a run's folder relative to the file of a design."""
     return os.path.relpath(folder.absolute(), path.parent.absolute())
 
 
 def reach_of(runs: Sequence[RunFolder]) -> float | None:
-    """How far any ray of the first run's design space may be heard [m]; None without a run."""
+    """Largest range of the first run's design space [m]; None without a run."""
     return runs[0].config.space.high[RANGE] if runs else None
 
 
 def reach_beside(files: Iterable[Path], runs: Sequence[RunFolder]) -> float | None:
-    """How far rays may be heard in the first of the runs, or in that of the first design that came from one [m]."""
+    """Largest range of the first run's design space, or of the first design's run [m]; None without any."""
     if runs:
         return reach_of(runs)
     for path in files:
-        # whoever reads it for good says what is wrong with it
+        # errors are reported when the design itself is read
         with contextlib.suppress(LidardesignError):
             run = run_of(load_design(path), path)
             if run is not None:

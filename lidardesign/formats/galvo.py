@@ -11,14 +11,14 @@ and without roll. For mirrors at one place this is exact (two rotations by twice
 at the distance D it lands at D tan(x) / cos(y) sideways and D tan(y) upwards, the known pincushion of such scanners.
 Light needs 2 range / c forth and back, so gates are two-way times.
 
-A file has one row per ray, in the order in which the mirrors reach them. A scanner has one place, so rays that start
-elsewhere are the rows of another `position`, with its own origin, boresight and tour: the scanner is moved there, or
-another one stands there. A position's boresight is the middle of its rays.
+A file has one row per ray, in the order in which the mirrors reach them. A scanner has one origin, so rays with another
+origin are the rows of another `position`, with its own origin, boresight and tour: the scanner is moved there, or a
+second one is placed there. A position's boresight is the middle of its rays.
 
 The order is a short round trip. Both mirrors turn at once, so a step takes as long as the one that turns further: the
-length of a step is the larger of its two angles. A frame follows the next, so the trip leads back to where it began.
-Tours start from the nearest neighbour and from the rays' own order, and are improved by turning stretches round (2-opt,
-Croes 1958) until that helps no more. Nothing in it is random.
+length of a step is the larger of its two angles. Frames follow each other, so the tour is closed. Tours start from the
+nearest neighbour and from the rays' own order, and are improved by reversing segments (2-opt, Croes 1958) until none
+shortens them. The result is deterministic.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.sensor import boresight_frame
 from lidardesign.space import angles
 
-NEIGHBOURS = 6  # of a stop, that tours may lead to next
+NEIGHBOURS = 6  # nearest stops to which 2-opt may connect a stop
 # Nearest-neighbour tours cost time with the square of their stops; larger ones start from the rays' own order alone.
 MOST_NEAREST = 20_000
 # Rounds of improvement: 576 stops take 40, 5000 take 200; bounds the time of ever larger tours.
 MOST_ROUNDS = 500
-# Gains below this share of the tour's extent are rounding noise, and could be taken back and forth for ever.
+# Gains below this share of the tour's extent are rounding noise, and could alternate for ever.
 LEAST_GAIN = ROUNDING
 # Columns of a file, those of whole numbers first.
 WHOLE = ("step", "position", "gate_start_ps", "gate_width_ps", "sensor", "ray")
@@ -57,7 +57,7 @@ COLUMNS = (
     "x_deg", "y_deg", "gate_start_ps", "gate_width_ps", "sensor", "ray",
 )  # fmt: skip
 LONGEST_SHOWN = 200  # characters of a row in a message
-# What spreadsheets put in front of UTF-8.
+# Byte order mark that spreadsheets put in front of UTF-8.
 BOM = b"\xef\xbb\xbf"
 # Angles at the limit come out of sines and cosines a few units in the last place off.
 ROUNDING_DEG = SLACK
@@ -74,9 +74,9 @@ CENTRING_STEPS = 20
 
 
 def short_tour(points: np.ndarray) -> np.ndarray:
-    """The order of stops (N, 2) along a short round trip, indices of shape (N,).
+    """Order of stops (N, 2) along a short closed tour, indices of shape (N,).
 
-    It begins behind the longest step, which the way back then is.
+    It begins after the longest step, which closes the tour.
     """
     count = len(points)
     if count < 4:
@@ -97,7 +97,7 @@ def short_tour(points: np.ndarray) -> np.ndarray:
 
 
 def travel(stops: np.ndarray) -> float:
-    """The length of the round trip over stops (N, 2) in their order, with the way back to the first."""
+    """Length of the closed tour over stops (N, 2) in their order."""
     return float(_lengths(stops, np.roll(stops, -1, axis=0)).sum())
 
 
@@ -106,7 +106,7 @@ def _lengths(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _nearest(points: np.ndarray) -> np.ndarray:
-    """From the lowest corner always on to the nearest stop that is left."""
+    """Nearest-neighbour tour from the stop at the lowest corner, indices of shape (N,)."""
     left, here = np.arange(len(points)), int((points - points.min(axis=0)).sum(axis=1).argmin())
     order = []
     while len(left):
@@ -120,7 +120,7 @@ def _nearest(points: np.ndarray) -> np.ndarray:
 
 
 def _improved(points: np.ndarray, near: np.ndarray, tour: np.ndarray) -> np.ndarray:
-    """The tour after all turns that shorten it, as far as `MOST_ROUNDS` go."""
+    """The tour after up to `MOST_ROUNDS` rounds of 2-opt."""
     least, rounds = LEAST_GAIN * float(np.ptp(points, axis=0).max()), 0
     while rounds < MOST_ROUNDS and _turned(points, near, tour, least):
         rounds += 1
@@ -128,10 +128,10 @@ def _improved(points: np.ndarray, near: np.ndarray, tour: np.ndarray) -> np.ndar
 
 
 def _turned(points: np.ndarray, near: np.ndarray, tour: np.ndarray, least: float) -> bool:
-    """One round of 2-opt, in place: stretches that do not overlap are turned round, the best first."""
+    """Do one round of 2-opt in place, reversing segments without overlap, the best first; True if any shortens it."""
     count, place = len(tour), np.argsort(tour)
     here, there = np.repeat(place, near.shape[1]), place[near.ravel()]
-    # an edge is named by the place of its first end; a stop is the first end of one edge and the last of another
+    # an edge is indexed by its first end; a stop is the first end of one edge and the last of another
     edges = np.concatenate([np.stack([here, there]), np.stack([here - 1, there - 1]) % count], axis=1)
     first, last = edges.min(axis=0), edges.max(axis=0)
     stops = points[tour]
@@ -149,14 +149,14 @@ def _turned(points: np.ndarray, near: np.ndarray, tour: np.ndarray, least: float
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """Where a scanner stands, and its rays in the order of their steps.
+    """Origin and boresight of a scanner, and its rays in firing order.
 
     Arguments:
-        origin_m: Its place [m], shape (3,).
-        boresight_deg: Azimuth and elevation of where both mirrors are at zero [deg].
+        origin_m: Origin [m], shape (3,).
+        boresight_deg: Azimuth and elevation with both mirrors at zero [deg].
         ray: Indices into the design's rays, shape (K,).
         angles_deg: Optical scan angles x and y, shape (K, 2).
-        own_travel_deg: The length of the round trip in the design's own order [deg].
+        own_travel_deg: Length of the closed tour in the design's own order [deg].
     """
 
     origin_m: np.ndarray
@@ -167,7 +167,7 @@ class Position:
 
 
 def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
-    """Write the file, atomically; returns what it came to and notes of what the format cannot hold.
+    """Write the file, atomically; returns a summary and notes of what the format cannot hold.
 
     Raises:
         ConfigError: Rays of one sensor start at several places, or look beyond what the mirrors reach.
@@ -187,7 +187,7 @@ def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
 
 
 def plan(design: DesignSpec, rays: Rays) -> list[Position]:
-    """The positions of a scanner that fires all rays, in the order of the rays that need them first.
+    """Positions of a scanner that fires all rays, in the order of their first rays.
 
     Raises:
         ConfigError: Rays of one sensor start at several places, or look beyond what the mirrors reach.
@@ -215,13 +215,13 @@ def plan(design: DesignSpec, rays: Rays) -> list[Position]:
 
 
 def read_galvo(path: Path) -> Rays:
-    """The rays of a file that `write_galvo` made, in the design's own order.
+    """Read the rays of a file of `write_galvo`, in the design's own order.
 
-    They fire at the times of their steps, 10 frames a second. Directions come back to rounding, gates to the whole
-    picoseconds that hold them.
+    They fire at the times of their steps, 10 frames a second. Directions are exact to rounding, gates are rounded
+    outward to whole picoseconds.
 
     Raises:
-        DataError: The file is not there, no such table, or has values out of their range.
+        DataError: The file is missing, is no such table, or has values out of range.
     """
     table = _columns(path)
     count = len(table["ray"])
@@ -242,7 +242,7 @@ def read_galvo(path: Path) -> Rays:
 
 
 def is_galvo_file(path: Path) -> bool:
-    """Whether a file begins as `write_galvo` begins one."""
+    """True if a file has the header of `write_galvo`."""
     try:
         return read_head(path, RAY_TABLE).removeprefix(BOM).startswith(",".join(COLUMNS).encode())
     except DataError:
@@ -301,7 +301,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
 
 
 def _numbers(row: list[str], where: str) -> list[float]:
-    """The values of a row: finite, and whole and not negative where they count or time something."""
+    """Checked values of a row: finite, within limits, and whole and not negative in the columns `WHOLE`."""
     try:
         found = [plain_number(cell) for cell in row]
     except ValueError as error:
@@ -335,7 +335,7 @@ def degree_frame(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
 
 
 def middle_boresight_deg(directions: np.ndarray) -> tuple[float, float]:
-    """Azimuth and elevation [deg] of the boresight from which the largest scan angle of rays (N, 3) is least.
+    """Azimuth and elevation [deg] of the boresight with the smallest largest scan angle of rays (N, 3).
 
     From the mean direction, the boresight is moved to the middle of the rays' extent in x and y until it stays there.
     """

@@ -1,12 +1,12 @@
 """Designs as PLY and STL files, for CloudCompare, Blender, MeshLab and CAD; metres in the task's own frame.
 
-`rays.ply` has a point per ray: where it starts, its direction as the normal, its gate, time and sensor as properties.
+`rays.ply` has a point per ray: its origin, its direction as the normal, its gate, time and sensor as properties.
 `beams.ply` has the part of each ray inside its gate as an edge, `frusta.ply` the fields of view between start and end
-of their gates as surfaces. Numbers are float64, colours tell sensors apart.
+of their gates as surfaces. Numbers are float64, colours distinguish sensors.
 
-Mounting positions as STL: per sensor a small solid with its tip where the sensor stands, opening where it looks.
+Mounting positions as STL: per sensor a small solid with its tip at the sensor's origin, widening along the boresight.
 
-STL has no units and CAD programs take its numbers as millimetres, so that is what is written. The solid is a pyramid
+STL has no units and CAD programs take its numbers as millimetres, so the file is in millimetres. The solid is a pyramid
 of 20 mm along the boresight; its far face is 16 mm wide at the bottom and 8 mm at the top, so the roll can be seen.
 """
 
@@ -29,7 +29,7 @@ RAYS, BEAMS, FRUSTA = "rays.ply", "beams.ply", "frusta.ply"
 PLACE = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
 COLOUR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 NORMAL = [("nx", "<f8"), ("ny", "<f8"), ("nz", "<f8")]
-# CloudCompare reads properties of these names as scalar fields without being asked, and leaves their beginning out.
+# CloudCompare reads properties with this prefix as scalar fields, named without it.
 RAY = [
     (f"scalar_{name}", kind)
     for name, kind in (("gate_start", "<f8"), ("gate_end", "<f8"), ("time", "<f8"), ("sensor", "<i4"))
@@ -37,7 +37,7 @@ RAY = [
 FACE = [("corners", "u1"), ("vertex_indices", "<i4", (4,))]
 EDGE = [("vertex1", "<i4"), ("vertex2", "<i4")]
 TYPES = {"f8": "double", "u1": "uchar", "i4": "int"}
-# Told apart in every kind of colour vision (Okabe and Ito 2008).
+# Distinguishable with every kind of colour vision (Okabe and Ito 2008).
 COLOURS = np.array(
     [(0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0), (240, 228, 66)]
 )
@@ -83,7 +83,7 @@ def _properties(kinds: np.dtype) -> list[str]:
 
 
 def _points(places: np.ndarray, sensor: np.ndarray, kinds: list[tuple[str, str]]) -> np.ndarray:
-    """Points with the colours of their sensors, and room for more."""
+    """Table of points with the colours of their sensors, its other columns zero."""
     table = np.zeros(len(places), dtype=kinds)
     columns = (*places.T, *COLOURS[sensor % len(COLOURS)].T)
     for (name, _), column in zip(PLACE + COLOUR, columns, strict=True):
@@ -100,7 +100,7 @@ def _ray_points(rays: Rays) -> np.ndarray:
 
 
 def _beams(rays: Rays, comments: list[str]) -> bytes:
-    """Two points per ray, where its gate starts and ends, and the edge between them."""
+    """PLY file with two points per ray, at the start and end of its gate, and the edge between them."""
     places = rays.origin_m[:, None] + rays.gate_m[:, :, None] * rays.direction[:, None]
     edges = np.zeros(len(rays), dtype=EDGE)
     edges["vertex1"], edges["vertex2"] = np.arange(2 * len(rays)).reshape(-1, 2).T
@@ -108,7 +108,7 @@ def _beams(rays: Rays, comments: list[str]) -> bytes:
 
 
 def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
-    """Fields of view between the gates' ends: two shells and four sides each, as quadrilaterals."""
+    """PLY file of fields of view between the gates' ends: two shells and four sides each, as quadrilaterals."""
     # Corners of the faces of `_frustum`, seen from outside against the clock, shape (F, 4)
     side = PARTS + 1
     near = np.arange(side * side).reshape(side, side)
@@ -129,7 +129,7 @@ def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
 
 
 def _frustum(sensor: Sensor) -> np.ndarray:
-    """Points of the shell at the gate's start, then of that at its end, row by row upwards: 2 (PARTS + 1)^2."""
+    """Points of the shell at the gate's start, then of that at its end, row by row upwards, (2 (PARTS + 1)^2, 3)."""
     across, up = (np.linspace(-extent / 2, extent / 2, PARTS + 1) for extent in field_on_sphere(sensor))
     looking = tangent_directions(sensor.frame, np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2))
     return np.concatenate([np.asarray(sensor.origin_m) + end * looking for end in sensor.gate_m])
@@ -158,7 +158,7 @@ def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
 
 
 def _solid(index: int, sensor: Sensor) -> str:
-    # A name that no reader takes for a word of the format
+    # a name that contains no keyword of the format
     word = identifier(sensor.name)
     name = f"sensor_{index}" if any(key in word.lower() for key in KEYWORDS) else f"sensor_{index}_{word}"
     corners = MM_PER_M * np.asarray(sensor.origin_m) + CORNERS_MM @ sensor.frame

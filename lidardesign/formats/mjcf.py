@@ -1,12 +1,12 @@
 """The rangefinders of a MuJoCo model (MJCF): each is one ray along the +z axis of its site.
 
-Rangefinders of one body that start at one place are one sensor, and so are those of a body that carries the sensor's
-name and whose sites are its rays, NAME_r0, NAME_r1, ..., as `export --format mjcf` writes them; these keep the starts
-of their gates in the rangefinders' user data. Rays stand where the model's bodies do when a simulation begins.
+Rangefinders of one body with the same origin are one sensor, and so are those of a body that has the sensor's name and
+sites NAME_r0, NAME_r1, ... for its rays, as `export --format mjcf` writes them; these keep the starts of their gates in
+the rangefinders' user data. Rays are at the initial poses of the model's bodies.
 
-MuJoCo compiles only what says where rangefinders are, as a model of its own that reads nothing from disk and runs
-nothing: bodies, frames, sites and their defaults are kept; shapes, joints, meshes, actuators and plugins are left out.
-Without joints bodies stand where the model puts them, which is where they are when a simulation begins.
+MuJoCo compiles only the elements that define poses of rangefinders, as a model of its own that reads nothing from disk
+and runs nothing: bodies, frames, sites and their defaults are kept; shapes, joints, meshes, actuators and plugins are
+left out. Without joints bodies have the initial poses of a simulation.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ KEPT = {
 MOST_INCLUDES = 100
 # MuJoCo takes seconds for a thousand copies with sensors, and four times as long for twice as many.
 MOST_COPIES = 1000
-# It takes ten seconds for so many sites and sensors, and four times as long for twice as many.
+# MuJoCo takes ten seconds for so many sites and sensors, and four times as long for twice as many.
 MOST_KEPT = 120_000
 
 
 def stripped_model(path: Path) -> ElementTree.Element:
-    """The model of a file as it is left, with what it includes from its own folder.
+    """The model of a file reduced to the elements `KEPT`, with includes from its own folder.
 
     Raises:
-        DataError: A file is not XML, lies outside the model's folder, or the model is one that cannot be read so.
+        DataError: A file is not XML or outside the model's folder, or the model has unsupported or too many elements.
     """
     root = read_xml(path, ALLOWED)
     model = ElementTree.Element("mujoco", {"model": "rig"})
@@ -60,12 +60,12 @@ def stripped_model(path: Path) -> ElementTree.Element:
 
 @dataclass
 class _Copier:
-    """Copies what is kept of a model and of what it includes.
+    """Copies the kept elements of a model and of its includes.
 
     Arguments:
         seen: The files that were read, the model's own first.
-        copies: How many elements `replicate` makes.
-        kept: How many elements are kept.
+        copies: Number of elements that `replicate` makes.
+        kept: Number of kept elements.
     """
 
     seen: list[Path]
@@ -75,7 +75,7 @@ class _Copier:
     def copy_children(
         self, source: ElementTree.Element, target: ElementTree.Element, path: Path, *, depth: int, times: int = 1
     ) -> None:
-        """Append what is kept of an element's children; `times` is how often it is replicated."""
+        """Append the kept children of an element, which is replicated `times` times."""
         for child in source:
             where = f"{path}:{child.line if isinstance(child, Element) else 1}"
             if depth >= DEEPEST:
@@ -112,7 +112,7 @@ class _Copier:
             )
 
     def included_file(self, name: str, where: str) -> Path:
-        """An included file, which lies in the first file's folder, links followed, and is included once."""
+        """Resolved path of an included file; refuses one outside the first file's folder, or included before."""
         folder = self.seen[0].parent
         file = (folder / name).resolve()
         if not name or not file.is_relative_to(folder):
@@ -126,9 +126,9 @@ class _Copier:
         return file
 
 
-# Rays of one sensor that were written with few digits start within this of one another [m].
+# Largest distance between origins of one sensor's rays in files of few digits [m].
 SAME_PLACE_M = 1e-4
-# What is left of a sensor's name when its rays are counted: `front_r12` and `front_r13` are of `front`.
+# Suffixes of the names of a sensor's rays: `front_r12` and `front_r13` are of `front`.
 EXPORTED = re.compile(r"_r\d+")
 COUNTED = re.compile(r"[\s_.-]+(r|ray)?[\s_.-]*\d*$|\d+$")
 
@@ -138,13 +138,13 @@ class _Ray:
     """One rangefinder of the compiled model, in the world's frame.
 
     Arguments:
-        name: Its own, or its site's.
-        site_name: Its site's.
-        body: The body that it is on; 0 is the world.
-        body_name: That body's name.
-        origin_m, direction: Shape (3,).
-        cutoff_m: How far it is heard; infinite where that is not said.
-        user: Its user data.
+        name: Name of the rangefinder, or of its site.
+        site_name: Name of its site.
+        body: Index of its body; 0 is the world.
+        body_name: Name of its body.
+        origin_m, direction: Origin and direction, shape (3,).
+        cutoff_m: End of its gate; infinite if missing.
+        user: User data.
     """
 
     name: str
@@ -158,19 +158,19 @@ class _Ray:
 
     @property
     def is_exported(self) -> bool:
-        """Whether it is named as a ray that was exported of the sensor that its body is."""
+        """True if its site is named as a ray that `export` wrote for the sensor of its body."""
         named = self.body > 0 and self.body_name and self.site_name.startswith(self.body_name)
         return bool(named) and EXPORTED.fullmatch(self.site_name, len(self.body_name)) is not None
 
     @property
     def start_m(self) -> float | None:
-        """The start of its gate, where its export left it beside the end."""
+        """Start of its gate in an export's user data [m], or None."""
         start, end = (*self.user, 0.0, 0.0)[:2]
         return start if self.is_exported and 0 <= start <= end == self.cutoff_m else None
 
 
 def read_mjcf(path: Path) -> Rig:
-    """The sensors of a model.
+    """Read the rangefinders of a model as a rig.
 
     Raises:
         DataError: The file is no model, MuJoCo refuses it, or it has no rangefinder.
@@ -235,9 +235,9 @@ def _rays(stripped: ElementTree.Element, path: Path) -> list[_Ray]:
 
 
 def _groups(rays: Sequence[_Ray]) -> list[list[int]]:
-    """The rays of each sensor, by body and place, in order of appearance."""
+    """Indices of the rays of each sensor, grouped by body and origin, in order of appearance."""
     groups: list[list[int]] = []
-    # groups by the body and the cell of their first ray
+    # groups by body and cell of their first ray
     near: dict[tuple[int, ...], list[list[int]]] = {}
     exported: dict[int, list[int]] = {}
     for index, ray in enumerate(rays):
@@ -260,13 +260,13 @@ def _groups(rays: Sequence[_Ray]) -> list[list[int]]:
 
 
 def _name(own: Sequence[_Ray], *, alone: bool) -> str:
-    """What the names of a sensor's rays have in common, or the name of the body that has no other sensor."""
+    """Common prefix of the names of a sensor's rays, or the name of its body if it has no other sensor."""
     if own[0].is_exported:
         return own[0].body_name
     if len(own) == 1 and own[0].name:
         return own[0].name
     names = [ray.name for ray in own]
-    # what the first and the last in order share, all share
+    # the common prefix of the first and the last in order is that of all
     pairs = takewhile(lambda letters: letters[0] == letters[1], zip(min(names), max(names), strict=False))
     common = COUNTED.sub("", "".join(letter for letter, _ in pairs))
     return common or (own[0].body_name if alone and own[0].body else "")

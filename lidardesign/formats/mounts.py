@@ -1,11 +1,11 @@
-"""Sensors and rays as other programs hold them: at mounting poses, or by the places where rays start.
+"""Sensors with their rays at mounting poses or by ray origin, and their approximation by even grids.
 
-A mount has the sensor's place and boresight frame: x forward, y to the left (growing azimuth), z up. By fixed axes
+A mount has the sensor's position and boresight frame: x forward, y to the left (growing azimuth), z up. By fixed axes
 (URDF, SDF) its rotation is roll = the sensor's roll, pitch = -elevation, yaw = azimuth. The rays are given in that
-frame. What formats lose becomes notes (`*_losses`).
+frame. Losses of formats become notes (`*_losses`).
 
 Simulators of scanning sensors fire even grids of azimuth and elevation in the sensor's frame: rays of any layout are
-replaced by the grid of about as many rays that is nearest to them.
+replaced by the nearest grid with about as many rays.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ SAME_M = SLACK
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """One sensor where it is mounted, and what it fires.
+    """A sensor at its mounting pose, with its rays.
 
     Arguments:
         name: An identifier, unique in the design.
-        sensor: What is mounted.
-        origin_m: The mean of where its rays start, shape (3,).
+        sensor: The sensor.
+        origin_m: Mean origin of its rays [m], shape (3,).
         ray: Indices of its rays, shape (N,), N >= 1.
-        azimuth_rad, elevation_rad: Of its rays in its frame, azimuths from -pi to pi, shape (N,).
-        gate_m: The narrowest gate that holds those of all its rays, start and end.
-        spread_m: How far from its place its rays start at most.
-        gate_excess_m: How much wider than a ray's own gate `gate_m` is at most.
+        azimuth_rad, elevation_rad: Angles of its rays in its frame, azimuths from -pi to pi, shape (N,).
+        gate_m: Start and end of the narrowest gate that contains those of all its rays [m].
+        spread_m: Largest distance of a ray's origin from `origin_m` [m].
+        gate_excess_m: Largest excess of `gate_m` at an end over a ray's own gate [m].
     """
 
     name: str
@@ -61,17 +61,17 @@ class Mount:
 
     @property
     def roll_pitch_yaw_rad(self) -> tuple[float, float, float]:
-        """About the fixed axes x, y, z, in this order."""
+        """Rotation angles about the fixed axes x, y, z, in this order [rad]."""
         return self.sensor.roll_rad, -self.sensor.elevation_rad, self.sensor.azimuth_rad
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
-        """The rotation from its frame to the world as (w, x, y, z)."""
+        """Rotation from its frame to the world as a quaternion (w, x, y, z)."""
         return quaternion(*self.roll_pitch_yaw_rad)
 
 
 def mounts(design: DesignSpec, rays: Rays) -> list[Mount]:
-    """The sensors of a design that fire rays, in their order."""
+    """Mounts of the sensors of a design that fire rays, in their order."""
     names = distinct([identifier(sensor.name) for sensor in design.sensors], "_")
     order = np.argsort(rays.sensor, kind="stable")
     edges = np.searchsorted(rays.sensor[order], np.arange(len(design.sensors) + 1))
@@ -103,7 +103,7 @@ def _mount(name: str, sensor: Sensor, rays: Rays, ray: np.ndarray) -> Mount:
 
 
 def quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> tuple[float, float, float, float]:
-    """The unit quaternion (w, x, y, z) of rotations about the fixed axes x, y, z, in this order."""
+    """Unit quaternion (w, x, y, z) of rotations about the fixed axes x, y, z, in this order."""
     cos_r, sin_r = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
     cos_p, sin_p = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
     cos_y, sin_y = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
@@ -116,12 +116,12 @@ def quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> tuple[float
 
 
 def fire_times_s(rays: Rays, rate_hz: float) -> np.ndarray:
-    """When rays fire in a frame of another rate than they were laid out for [s]."""
+    """Firing times of rays, rescaled from the default to another frame rate, shape (N,) [s]."""
     return rays.time_s * (DEFAULT_RATE_HZ / rate_hz)
 
 
 def design_losses(design: DesignSpec, mounted: Sequence[Mount]) -> list[str]:
-    """What no format of mounted sensors holds of a design, and sensors that fire nothing."""
+    """Notes of the losses of every format of mounted sensors, and of sensors without rays."""
     notes = ["weights, fields of view and origin covariances of the sensors are lost"]
     silent = len(design.sensors) - len(mounted)
     if silent:
@@ -130,7 +130,7 @@ def design_losses(design: DesignSpec, mounted: Sequence[Mount]) -> list[str]:
 
 
 def origin_losses(mounted: Sequence[Mount]) -> list[str]:
-    """What formats lose in which all rays of a sensor start at one place."""
+    """Notes of the losses of formats with a single origin per sensor."""
     spread = [one for one in mounted if one.spread_m > SAME_M]
     if not spread:
         return []
@@ -141,7 +141,7 @@ def origin_losses(mounted: Sequence[Mount]) -> list[str]:
 
 
 def gate_losses(mounted: Sequence[Mount]) -> list[str]:
-    """What formats lose in which all rays of a sensor have one gate."""
+    """Notes of the losses of formats with a single gate per sensor."""
     wider = [one for one in mounted if one.gate_excess_m > SAME_M]
     if not wider:
         return []
@@ -154,12 +154,12 @@ def gate_losses(mounted: Sequence[Mount]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Rays of one sensor that start at one place.
+    """Rays of one sensor with the same origin.
 
     Arguments:
-        name: An identifier, unique in the design: that of the sensor, numbered where it has several places.
+        name: An identifier, unique in the design: that of the sensor, numbered where it has several origins.
         mount: The sensor.
-        origin_m: The place [m], shape (3,).
+        origin_m: The origin [m], shape (3,).
         ray: Indices of its rays in their order, shape (K,).
     """
 
@@ -170,7 +170,7 @@ class Place:
 
 
 def places(mounted: Sequence[Mount], rays: Rays) -> list[Place]:
-    """The places of all sensors, by sensor and then in the order in which they first fire."""
+    """Rays of all sensors grouped by origin, by sensor and then in the order in which they first fire."""
     found = []
     for mount in mounted:
         origins, first, place = np.unique(rays.origin_m[mount.ray], axis=0, return_index=True, return_inverse=True)
@@ -183,7 +183,7 @@ def places(mounted: Sequence[Mount], rays: Rays) -> list[Place]:
 
 
 def require_rays(design: DesignSpec, rays: Rays, what: str) -> None:
-    """Refuse a design without rays, for a format that is made of them.
+    """Refuse a design without rays, for a format that needs them.
 
     Raises:
         DataError: There are none.
@@ -192,11 +192,11 @@ def require_rays(design: DesignSpec, rays: Rays, what: str) -> None:
         raise DataError(f"has no rays, and {what} holds nothing else", where=design.name, hint="give --rays N")
 
 
-# Rays nearer to a grid than this are on it: files hold some seven digits.
+# Rays nearer to a grid than this are on it: files have about seven digits.
 ON_GRID_RAD = COARSE_SLACK
-# A grid has up to a tenth more or fewer rays than what it stands for.
+# A grid has up to a tenth more or fewer rays than the list that it replaces.
 MOST_CHANGED = 10
-# Numbers of rows around that of square cells that are tried.
+# Numbers of rows to try around that of square cells.
 TRIED_ROWS = 24
 
 
@@ -205,7 +205,7 @@ class EvenGrid:
     """Rows at even elevations, each with the same even azimuths; first and last rays are on the bounds.
 
     Arguments:
-        columns, rows: How many azimuths and elevations.
+        columns, rows: Numbers of azimuths and elevations.
         azimuth_rad: The first and the last azimuth.
         elevation_rad: The lowest and the highest elevation.
     """
@@ -225,7 +225,7 @@ class EvenGrid:
         return direction(np.tile(azimuth, self.rows), np.repeat(elevation, self.columns))
 
     def distance_rad(self, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> np.ndarray:
-        """How far rays are from the grid's ray in whose cell they lie, shape (N,)."""
+        """Angle between rays and the grid rays of their cells, shape (N,) [rad]."""
         nearest = direction(
             _nearest(cut_behind(azimuth_rad), self.azimuth_rad, self.columns),
             _nearest(elevation_rad, self.elevation_rad, self.rows),
@@ -234,7 +234,7 @@ class EvenGrid:
 
 
 def nearest_grid(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> EvenGrid:
-    """The grid of about as many rays that is nearest to given ones in the mean square; at least one ray."""
+    """The nearest grid to given rays in the mean square, with about as many rays and at least one."""
     azimuth_rad = cut_behind(azimuth_rad)
     count = len(azimuth_rad)
     shapes = [(rows, max(round(count / rows), 1)) for rows in _row_counts(azimuth_rad, elevation_rad)]
@@ -247,22 +247,22 @@ def nearest_grid(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> EvenGrid
 
     def misfit(grid: EvenGrid) -> float:
         square = float(np.square(grid.distance_rad(azimuth_rad, elevation_rad)).mean())
-        # rounding is no reason for another number of rays
+        # rounding must not change the number of rays
         return square + ON_GRID_RAD**2 * abs(len(grid) - count)
 
     return min(grids, key=misfit)
 
 
 def cut_behind(azimuth_rad: np.ndarray) -> np.ndarray:
-    """Azimuths from -pi up to below pi; what is straight behind to rounding is at -pi."""
+    """Azimuths from -pi up to below pi; azimuths straight behind to rounding become -pi."""
     start = -np.pi - ON_GRID_RAD
     there = (azimuth_rad >= start) & (azimuth_rad < start + 2 * np.pi)
-    # what already exists stays as it is, to the last bit
+    # azimuths in the interval are kept to the last bit
     return np.where(there, azimuth_rad, np.mod(azimuth_rad - start, 2 * np.pi) + start)
 
 
 def _row_counts(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> list[int]:
-    """Numbers of rows that are tried: around square cells, and as many as there are distinct elevations."""
+    """Numbers of rows to try: around square cells, and as many as there are distinct elevations."""
     count = len(azimuth_rad)
     width = float(np.ptp(azimuth_rad) * np.cos(np.mean(elevation_rad)))
     square = math.sqrt(count * float(np.ptp(elevation_rad)) / width) if width > 0 else float(count)
@@ -275,7 +275,7 @@ def _row_counts(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> list[int]
 
 
 def _fitted(values: np.ndarray, count: int) -> tuple[float, float]:
-    """The first and last of `count` even values that are nearest to given ones in the mean square."""
+    """First and last of `count` even values that fit given ones in the least squares."""
     low, high = float(values.min()), float(values.max())
     if count == 1 or low == high:
         middle = float(values.mean())
@@ -296,12 +296,12 @@ def _nearest(values: np.ndarray, bounds: tuple[float, float], count: int) -> np.
 
 
 def grid_of(mount: Mount) -> EvenGrid:
-    """The even grid that stands for the rays of a mount."""
+    """The even grid that replaces the rays of a mount."""
     return nearest_grid(mount.azimuth_rad, mount.elevation_rad)
 
 
 def channel_mounts(design: DesignSpec, rays: Rays) -> tuple[DesignSpec, Rays, list[Mount]]:
-    """A design with its mounts; one of sensors that spin has a sensor for each channel, whose ring is an even grid."""
+    """A design, its rays and mounts; spinning sensors are split into one per channel, whose ring is an even grid."""
     if design.layout != "spinning":
         return design, rays, mounts(design, rays)
     rings = np.column_stack([rays.sensor, rays.elevation_rad])
@@ -313,7 +313,7 @@ def channel_mounts(design: DesignSpec, rays: Rays) -> tuple[DesignSpec, Rays, li
 
 
 def grid_sensor_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
-    """Notes of what sensors with one place, one gate and an even grid of rays cannot hold."""
+    """Notes of the losses of formats with one origin, one gate and an even grid per sensor."""
     notes = [
         *design_losses(design, mounted),
         *grid_losses(mounted, rays),
@@ -326,7 +326,7 @@ def grid_sensor_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays)
 
 
 def grid_losses(mounted: Sequence[Mount], rays: Rays) -> list[str]:
-    """Notes of rays that are not on an even grid: how many, what replaces them, and how far off that is."""
+    """Note of the rays that are not on an even grid, with their number and the largest angular error."""
     pairs = [(mount, grid_of(mount)) for mount in mounted]
     off = np.array([one for mount, grid in pairs for one in grid.distance_rad(mount.azimuth_rad, mount.elevation_rad)])
     count, fired = int((off > ON_GRID_RAD).sum()), sum(len(grid) for _, grid in pairs)

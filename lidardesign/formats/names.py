@@ -1,4 +1,4 @@
-"""Names, folders and XML as other programs take them."""
+"""Names, folders and XML for files of other programs."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from xml.etree.ElementTree import Element
 from lidardesign.errors import DataError
 from lidardesign.run.files import write_atomic
 
-# Of what a name becomes; topics and prim paths are built of several.
+# Longest identifier; topics and prim paths are built of several.
 LONGEST_NAME = 64
-# So many changed names are quoted in a note.
+# Most changed names quoted in a note.
 QUOTED = 3
 # Names of SDF's and MuJoCo's own frame, and xacro's own macros.
 RESERVED = {
     "world", "arg", "attribute", "call", "element", "else", "if", "include", "insert_block", "macro", "property",
     "unless",
 }  # fmt: skip
-# What XML 1.0 cannot hold, not even escaped.
+# Characters that XML 1.0 cannot hold, not even escaped.
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -36,12 +36,12 @@ def identifier(name: str) -> str:
 
 
 def distinct(names: Sequence[str], between: str, taken: Iterable[str] = ()) -> list[str]:
-    """Names, no two alike whatever their case, nor like one that is taken: the next number follows where they are.
+    """Names made distinct regardless of case, and from taken ones, by appended numbers.
 
     Arguments:
         names: The names.
-        between: What stands between a name and its number.
-        taken: Names that none may have.
+        between: Text between a name and its number.
+        taken: Names that are not available.
     """
     used = {name.lower() for name in taken}
     numbers: dict[str, int] = {}
@@ -71,15 +71,15 @@ def xml_text(text: str) -> str:
     return _NOT_XML.sub("\ufffd", text)
 
 
-# So many names of other files are told, the rest is counted.
+# Most names of other files in a note; the rest is counted.
 MOST_NAMED = 5
 
 
 def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
-    """Write a folder of files, each atomically; returns a note where it also holds others, as of an earlier export.
+    """Write a folder of files, each atomically; returns a note if it has other files, as of an earlier export.
 
     Raises:
-        DataError: There is a file of that name, or the system reports anything else.
+        DataError: A file has that name, or the folder cannot be written.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
@@ -98,7 +98,7 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> list[str]:
 def element(
     tag: str, attributes: Mapping[str, str] | None = None, children: Iterable[Element] = (), text: str | None = None
 ) -> Element:
-    """An element of its attributes, children and text, all of which may be any text."""
+    """XML element with attributes, children and text; invalid characters are replaced."""
     made = Element(tag, {name: xml_text(value) for name, value in (attributes or {}).items()})
     made.text = None if text is None else xml_text(text)
     made.extend(children)
@@ -106,7 +106,7 @@ def element(
 
 
 def number(value: float) -> str:
-    """A number with all its digits, as XML formats take it."""
+    """A number with all its digits, as text."""
     return repr(float(value))
 
 
@@ -130,6 +130,6 @@ def _plain(value: object) -> str:
 
 
 def document(root: Element) -> bytes:
-    """The content of a file: the declaration, then the root, indented."""
+    """Content of an XML file: the declaration, then the root, indented."""
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"

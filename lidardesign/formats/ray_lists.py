@@ -1,7 +1,7 @@
 """Rays and sensors as tables (CSV and NPZ), as `export` and other programs write them.
 
-A ray needs a direction: azimuth and elevation, or a vector of any length. Where it starts, when it listens and which
-sensor fires it may be left out; how far it is heard only where that is known from elsewhere.
+A ray needs a direction: azimuth and elevation, or a vector of any length. Origin, start of the gate and sensor are
+optional; the end of the gate only where a reach is given otherwise.
 
 The research code's sensor table: one sensor per row, 16 columns, metres and radians.
 
@@ -39,22 +39,22 @@ START, END, SENSOR, TIME = "gate_start_m", "gate_end_m", "sensor", "time_s"
 NAMES = "sensor_names"
 COLUMNS = (*ORIGIN, *VECTOR, *RADIANS, *DEGREES, START, END, SENSOR, TIME)
 LOOKS = (VECTOR, RADIANS, DEGREES)
-# Directions that are given twice may differ by what rounding to six digits leaves [rad].
+# Directions that are given twice may differ by rounding to six digits [rad].
 AGREEMENT_RAD = 10 * COARSE_SLACK
-# Firing times that are even within this share of their span are what every design has.
+# Firing times within this share of their span from even ones count as even.
 EVEN_TIMES = COARSE_SLACK
 LONGEST_CELL = 100
 
 
 @dataclass(frozen=True, eq=False)
 class RayColumns:
-    """Columns of a file, checked to be there and of one length.
+    """Columns of a ray table, checked to be complete and of one length.
 
     Arguments:
         numbers: Finite numbers by column, shape (N,) each.
-        sensor: The index of each ray's sensor, shape (N,), from 0 without gaps.
-        names: The sensors' names.
-        locate: The position of a row in a column, as `file:line:column`.
+        sensor: Index of each ray's sensor, shape (N,), from 0 without gaps.
+        names: Names of the sensors.
+        locate: Location of a row in a column, as `file:line:column`.
     """
 
     numbers: Mapping[str, np.ndarray]
@@ -72,10 +72,10 @@ class RayColumns:
 
 
 def check_names(names: tuple[str, ...], where: str) -> None:
-    """Refuse columns that are no ray's, and a choice of them that leaves a direction or a place half said.
+    """Refuse unknown or repeated columns, and an incomplete direction or origin.
 
     Raises:
-        DataError: See above.
+        DataError: Such columns.
     """
     unknown = [name for name in names if name not in COLUMNS]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -97,10 +97,10 @@ def check_names(names: tuple[str, ...], where: str) -> None:
 
 
 def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
-    """The sensors of a ray list.
+    """The rig of a ray table.
 
     Raises:
-        DataError: Numbers that no ray has, or directions that contradict each other.
+        DataError: Invalid numbers, or directions that contradict each other.
     """
     azimuth, elevation = _angles(columns)
     unsaid = {
@@ -128,7 +128,7 @@ def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
 
 
 def _angles(columns: RayColumns) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth and elevation of every ray (N,) [rad], those in radians bit for bit where they are given."""
+    """Azimuth and elevation of every ray (N,) [rad]; given radians are kept to the last bit."""
     found: dict[tuple[str, ...], tuple[np.ndarray, np.ndarray]] = {}
     numbers = columns.numbers
     for names, unit, right, in_rad in (
@@ -155,7 +155,7 @@ def _angles(columns: RayColumns) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_ray_csv(path: Path) -> Rig:
-    """The sensors of a ray list; a column `sensor` of whole numbers counts from 0, any other holds names.
+    """Read the rig of a CSV ray table; a column `sensor` of whole numbers has indices from 0, any other has names.
 
     Raises:
         DataError: The file cannot be read, or a cell cannot be used; with file, line and column.
@@ -205,7 +205,7 @@ def read_ray_csv(path: Path) -> Rig:
 
 
 def read_ray_npz(path: Path) -> Rig:
-    """The sensors of a ray list; `sensor` holds indices into `sensor_names`, where there are names.
+    """Read the rig of an NPZ ray table; `sensor` has indices into `sensor_names`, if there are names.
 
     Raises:
         DataError: The file cannot be read, or an array cannot be used.
@@ -247,7 +247,7 @@ def read_ray_npz(path: Path) -> Rig:
     return rig_of_columns(RayColumns(numbers, sensor.reshape(-1), sensor_names, locate), "rays NPZ")
 
 
-# Of sensors, in every list of rays.
+# Losses of every list of rays.
 LOST = ["names, weights, fields of view and origin covariances of the sensors are lost: rows have their numbers"]
 
 
@@ -287,7 +287,7 @@ WEIGHT_SUM_TOLERANCE = SLACK
 
 
 def begins_as_sensor_csv(head: bytes) -> bool:
-    """Whether a file begins with a line of comma-separated cells that no YAML mapping begins with."""
+    """True if a file begins with a line of comma-separated cells, unlike any YAML mapping."""
     text = head.decode("utf-8-sig", errors="replace")
     first = next((line.strip() for line in text.splitlines() if line.strip()), "")
     return "," in first and ":" not in first and not first.startswith(("{", "[", "- ", "#", "%"))
@@ -296,7 +296,7 @@ def begins_as_sensor_csv(head: bytes) -> bool:
 def read_sensor_csv(path: Path) -> DesignSpec:
     """Read a sensor table; the header is optional, weights are normalised (noted in the provenance).
 
-    The variant with a first column x_query describes a moving robot; it is read where it has one position.
+    The variant with a first column x_query describes a moving robot; it is read if it has a single position.
 
     Raises:
         DataError: The file cannot be read, or a cell cannot be used; with file, line and column (exit 3).
@@ -371,7 +371,7 @@ def _numbers(where: str, cells: list[str], names: tuple[str, ...]) -> dict[str, 
 
 def _sensor(row: dict[str, float], index: int, where: str) -> Sensor:
     elevation = row["elevation_mean"]
-    # it may exceed a right angle by its rounding in a file of few digits
+    # it may exceed a right angle by rounding in a file of few digits
     if abs(elevation) > math.pi / 2 + COARSE_SLACK:
         raise DataError(f"elevation_mean is {elevation!r}", where=where, allowed="radians from -pi/2 to pi/2")
     elevation = min(max(elevation, -math.pi / 2), math.pi / 2)
@@ -419,7 +419,7 @@ def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
             elevation_sigma = math.hypot(sine * horizontal, cosine * vertical)
         cosine = math.cos(sensor.elevation_rad)
         if azimuth_sigma >= cosine * FULL_TURN:
-            # towards a pole the azimuth covers the whole turn, and no standard deviation beyond a turn says more
+            # towards a pole the azimuth covers the whole turn; larger standard deviations make no difference
             if azimuth_sigma > 0:
                 notes.append(f"{sensor.name} points at a pole: its azimuth spread was cut at a full turn")
             azimuth_sigma = FULL_TURN

@@ -4,24 +4,24 @@ Scanner, platform and survey files for HELIOS++: one scanner per sensor, one cha
 
 HELIOS++ fires along the y axis of a scanner and turns it by the channel's rotations about fixed axes: about x by the
 elevation, then about z by the azimuth less a quarter turn. Channels start at their own offset from the platform and
-have their own range limits, so any list of rays with any gates is held. A leg ends when the head has turned far enough:
-it turns by one degree in front of the only pulse, from -1 to 0, and the leg ends there.
+have their own range limits, so any list of rays with any gates can be written. A leg ends when the head has turned far
+enough: it turns by one degree before the only pulse, from -1 to 0, and the leg ends there.
 
-Version 2 focuses the beam where its gate starts: with a range R and a start R0, the power that is sent grows with
-(1 - R / R0) to the power of -2, so a start of 0 sends none. The wider the beam, the less that matters.
+Version 2 focuses the beam at the start of its gate: with a range R and a start R0, the emitted power grows with
+(1 - R / R0) to the power of -2, so a start of 0 emits none. The wider the beam, the smaller the effect.
 
-Scenes for Mitsuba 3 with mitransient: per sensor a film of gated histograms, its rays, and the light beside it.
+Scenes for Mitsuba 3 with mitransient: per sensor a film of gated histograms, its rays, and a light at its origin.
 
-One radiancemeter per ray, all of them in a batch, one pixel each: directions are held exactly, whatever the layout. The
-light is a point at the sensor, so light straight there and back has the optical path length of twice the range, and a
-film that listens from twice the gate's start in bins of c times their duration is the gate. Scenes hold no shapes.
+One radiancemeter per ray, all of them in a batch, one pixel each: directions are exact for any layout. The light is a
+point at the sensor, so direct light has an optical path length of twice the range, and a film from twice the gate's
+start in bins of c times their duration is the gate. Scenes hold no shapes.
 
 Ray patterns for Robotec GPU Lidar and its Gazebo plugin: a pattern file per sensor, and the model that uses them.
 
 A pattern is one row-major 3 x 4 float32 matrix per ray, its pose in the sensor's frame (x forward, y left, z up); the
 ray looks along the third axis of its pose. The plugin has one range for all rays of a sensor and fires them at once;
-the library's own calls take a range and a time per ray, which is what the `.range2f` files (pairs of float32, metres)
-and the `.time1f` files (float32, milliseconds) are.
+the library's own calls take a range and a time per ray, for which there are the `.range2f` files (pairs of float32,
+metres) and the `.time1f` files (float32, milliseconds).
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ from lidardesign.space import angles
 
 SCANNERS, PLATFORMS, SURVEY, SCENE = "scanners.xml", "platforms.xml", ".survey.xml", "scene.xml#scene"
 # HELIOS++ drops echoes whose rise begins before the gate does: a short pulse, in fine bins, loses little. Half a bin
-# more than ten: where a version counts one too few, no bin of the pulse lies behind the end of its waveform.
+# more than ten, because some versions count one too few: then no bin of the pulse lies behind the waveform's end.
 PULSE_NS, BIN_NS = 0.0105, 0.001
 # A pulse is t^2 exp(-7 t / pulse): its rise lasts that part of it.
 RISE = 2 / 7
-# Peaks are told apart over two bins.
+# Window of the peak search.
 WINDOW_NS = 2.5 * BIN_NS
-# A gate that starts at 0 gets no power.
+# HELIOS++ 2 emits no power through a gate from 0.
 LEAST_START_M = 0.001
 # The divergence is that of a common scanner, though beams have no width: at the default of 0.3 mrad a least start sends
 # 10,000 times less power. So much power finds a tenth of the light at 60 degrees from 100 m, in every version.
@@ -125,7 +125,7 @@ def write_helios(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> 
 
 
 def _add_scanner(root: Element, mount: Mount, rays: Rays, pulse_hz: int) -> None:
-    """One sensor, its rays as channels; their places are offsets from the first one's."""
+    """Append the scanner of one sensor, its rays as channels with origins relative to the first one's."""
     scanner = child(
         root, "scanner", id=mount.name, name=mount.sensor.name, optics="rotating",
         beamDivergence_rad=DIVERGENCE_RAD, averagePower_w=POWER_W, pulseFreqs_Hz=pulse_hz, pulseLength_ns=PULSE_NS,
@@ -179,7 +179,7 @@ def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
 
 
 def _gate_m(rays: Rays, place: Place) -> tuple[float, float]:
-    """The narrowest gate that holds those of all rays of a place: start and end."""
+    """Start and end of the narrowest gate that contains those of all rays of a place [m]."""
     gate = rays.gate_m[place.ray]
     return float(gate[:, 0].min()), float(gate[:, 1].max())
 
@@ -190,7 +190,7 @@ def _bins(rays: Rays, place: Place) -> int:
 
 
 def _scene(place: Place, rays: Rays) -> Element:
-    """Integrator, rays with their film, and light."""
+    """Scene of a place: integrator, rays with their film, and light."""
     root = element("scene", {"version": "3.0.0"})
     child(child(root, "integrator", type="transient_path"), "integer", name="max_depth", value=DEPTH)
     batch = child(root, "sensor", type="batch", id=place.name)
@@ -211,7 +211,7 @@ def _scene(place: Place, rays: Rays) -> Element:
 
 
 def _add_film(batch: Element, place: Place, rays: Rays) -> None:
-    """One pixel per ray, and the gate that they share as optical path lengths."""
+    """Append a film with a pixel per ray and their common gate as optical path lengths."""
     start, _ = _gate_m(rays, place)
     film = child(batch, "film", type="transient_hdr_film")
     for name, value in (
@@ -283,7 +283,7 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
 
 
 def _matrices(mount: Mount, rays: Rays) -> np.ndarray:
-    """Poses of rays in their sensor's frame, which stands where the first of them starts, shape (K, 3, 4)."""
+    """Poses of rays in their sensor's frame, with its origin at that of the first ray, shape (K, 3, 4)."""
     looking = rays.direction @ mount.sensor.frame.T
     azimuth, _ = angles(looking)
     across = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(rays))], axis=1)

@@ -13,7 +13,7 @@ from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 
-# A frame of a quarter of an hour, and one of a microsecond.
+# Frames of a quarter of an hour and of a microsecond.
 SLOWEST_HZ, FASTEST_HZ = 0.001, 1e6
 
 
@@ -22,13 +22,13 @@ class Exporter:
     """One export format.
 
     Arguments:
-        name: As `export --format` takes it.
-        suffix: Of the file that it writes, with the dot; of the folder where it writes several.
+        name: Name in `export --format`.
+        suffix: Suffix of the file or folder that it writes, with the dot.
         summary: One line for `export --list`.
-        module: The module of its function.
-        function: The name of the function that writes it, `(design, rays, path) -> list[str]`.
-        reader: The program that reads it.
-        checked: How the tests show that this program takes what is written.
+        module: Module of its function.
+        function: Name of the function that writes it, `(design, rays, path) -> list[str]`.
+        reader: Program that reads it.
+        checked: How the tests check that this program reads the file.
         folder: Whether it writes a folder of files.
         rated: Whether it holds the frame rate, so that `write` takes `rate_hz` too.
         robotic: Whether it can hold a robot's model with the sensors in it, so that `write` takes `robot` too.
@@ -59,11 +59,11 @@ class Exporter:
             design: The design.
             rays: Its rays.
             path: The file or folder.
-            rate_hz: Frames per second [Hz]; that of the read-out model by default.
-            robot: A model that the sensors are put into; None: they are written alone.
+            rate_hz: Frames per second [Hz]; by default that of `Bandwidth`.
+            robot: Robot model that receives the sensors; None: sensors alone.
 
         Raises:
-            ConfigError: A frame rate or a robot for a format that holds none, or a rate that no sensor has.
+            ConfigError: A frame rate or a robot for a format without one, or a rate out of range.
             DataError: The file cannot be written, or the format cannot hold such a design at all.
         """
         write = getattr(import_module(self.module), self.function)
@@ -82,10 +82,10 @@ class Exporter:
         return notes
 
     def check_rate(self, rate_hz: float | None) -> None:
-        """Refuse a frame rate [Hz] that no sensor has, or that the format cannot hold.
+        """Refuse a frame rate [Hz] that is out of range, or that the format cannot hold.
 
         Raises:
-            ConfigError: It is such a one.
+            ConfigError: Such a rate.
         """
         if rate_hz is not None and not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
             raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")

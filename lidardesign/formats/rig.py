@@ -1,9 +1,9 @@
-"""A rig as a file of another program describes it: the design that fires exactly its rays, and the constraints it sets.
+"""Rigs of other programs: the design that fires exactly the rays of a rig, and the constraints of designs like it.
 
-The rays are the pattern of the layout `fixed`; boresight, field of view and gate of a sensor are those that hold all of
-its rays. Designs that are to be like a rig have as many sensors at its places, none wider, and as many rays. What a
-user asks for goes before that: of two bounds on one number theirs is taken, and where they say anything of where
-sensors are, the rig says nothing of it. Where sensors look is left to the fit.
+The rays are the pattern of the layout `fixed`; boresight, field of view and gate of a sensor are those that contain all
+of its rays. Designs like a rig have as many sensors at the same positions, with fields of view and gates no wider, and
+as many rays. The user's own constraints take precedence: of two bounds on one number theirs is taken, and any bound on
+positions replaces those of the rig. Boresights are left to the fit.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ from lidardesign.space import DIMENSIONS, FARTHEST_M, FULL_TURN, DesignSpace, an
 
 # Rounds in which a boresight moves to the middle of its field: away from the poles it rests after two or three.
 CENTRING_ROUNDS = 8
-# Rays of a whole turn cancel: so short a mean of unit vectors says nothing of where a sensor looks.
+# Rays of a whole turn cancel: a shorter mean of unit vectors does not define a boresight.
 SHORTEST_MEAN = 1e-3
-# More sensors than any rig has; each takes a row in every table.
+# Upper limit of sensors; each takes a row in every table.
 MOST_SENSORS = 10_000
 # Rays of one direction, or of directions that differ by rounding, have no field of view that could be a bound; those of
 # a fan have one in their plane, and this one across it.
 SMALLEST_FIELD_DEG = 1e-3
-PLACES = ("fixed_m", "low_m", "high_m", "mounts_m")  # keys of constraints that say where sensors are
+PLACES = ("fixed_m", "low_m", "high_m", "mounts_m")  # keys of constraints on positions of sensors
 SHARED = tuple(SensorConstraints.model_fields)  # keys of constraints on all sensors
 MOST_NAMED = 4  # sensors in a message
 
 
 @dataclass(frozen=True)
 class Aim:
-    """Where a sensor looks and how wide, where its file says so.
+    """Boresight and field of view of a sensor.
 
     Arguments:
         azimuth_rad, elevation_rad, roll_rad: The boresight.
@@ -73,12 +73,12 @@ class RigSensor:
     """The rays of one sensor of a rig, in the world's frame.
 
     Arguments:
-        name: As the file has it; it need not be unique.
-        origin_m: Shape (N, 3).
-        azimuth_rad, elevation_rad: Shape (N,).
-        gate_m: Shape (N, 2); an end that the file does not say is infinite.
-        order: The places of the rays in the file, shape (N,); None: after those of the sensors before.
-        aim: What the file says of its field; None: what its rays fill.
+        name: Name in the file, which need not be unique.
+        origin_m: Origins, shape (N, 3).
+        azimuth_rad, elevation_rad: Angles, shape (N,).
+        gate_m: Gates, shape (N, 2); an end missing in the file is infinite.
+        order: Positions of the rays in the file, shape (N,); None: after those of the sensors before.
+        aim: Boresight and field of view in the file; None: those that contain its rays.
     """
 
     name: str
@@ -92,13 +92,13 @@ class RigSensor:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """What a file describes.
+    """A rig as read from a file.
 
     Arguments:
-        kind: What sort of file it is, for people.
-        sensors: Its sensors, each with a ray at least.
-        notes: What the file does not say, and what of it a design does not hold; one line each.
-        end_hint: How the file says how far a ray is heard.
+        kind: Kind of the file, for messages.
+        sensors: Its sensors, each with at least one ray.
+        notes: Missing values of the file, and parts of it that a design cannot hold; one line each.
+        end_hint: Hint on how to give the ends of gates in the file.
     """
 
     kind: str
@@ -108,15 +108,15 @@ class Rig:
 
 
 def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
-    """The design that fires the rays of a rig.
+    """The design that fires exactly the rays of a rig.
 
     Arguments:
-        rig: What the file describes.
+        rig: The rig.
         path: The file; the design takes its stem as its name.
-        reach_m: How far rays are heard whose file does not say so [m].
+        reach_m: End of gates without one in the file [m].
 
     Raises:
-        DataError: No ray, too many, numbers that rays cannot have, or a gate without an end where no reach is given.
+        DataError: No ray, too many, invalid numbers, or a gate without an end where no reach is given.
     """
     total = sum(len(one.azimuth_rad) for one in rig.sensors)
     if not (1 <= total <= MOST_RAYS and len(rig.sensors) <= MOST_SENSORS):
@@ -144,7 +144,7 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
         end = end if reach_m is None else np.where(np.isinf(end), np.maximum(reach_m, start), end)
         gated.append(replace(one, gate_m=np.stack([start, end], axis=1)))
         _check_numbers(gated[-1], path)
-    # sensors that share a name are numbered, and those whose name a design could not have
+    # repeated names are numbered, and names that a design cannot have are replaced
     usable = [one.name if is_name(one.name) else f"sensor_{index + 1}" for index, one in enumerate(gated)]
     often, taken, names = Counter(usable), set(usable), []
     for name in usable:
@@ -188,7 +188,7 @@ def _check_numbers(one: RigSensor, path: Path) -> None:
 
 
 def number_of(text: str) -> float | None:
-    """The number that a cell holds; None where it is none."""
+    """The number in a cell, or None."""
     try:
         return plain_number(text)
     except ValueError:
@@ -216,9 +216,9 @@ def _sensor(one: RigSensor, name: str, total: int) -> Sensor:
 
 
 def aim_of(directions: np.ndarray) -> Aim:
-    """The boresight in the middle of unit vectors, shape (N, 3), and the field of view that holds all of them.
+    """Boresight in the middle of unit vectors, shape (N, 3), and the field of view that contains all of them.
 
-    Where they go all around, the sensor looks along +x.
+    Where they cover a whole turn, the boresight is about +x.
     """
     mean = directions.mean(axis=0)
     if np.linalg.norm(mean) < SHORTEST_MEAN:
@@ -238,18 +238,18 @@ def aim_of(directions: np.ndarray) -> Aim:
 def rig_constraints(
     rig: DesignSpec, space: DesignSpace, asked: Constraints, *, rays: int | None, hint: str | None = None
 ) -> Constraints:
-    """The constraints of a rig below those that were asked for.
+    """Constraints of designs like a rig, completed by the user's own, which take precedence.
 
     Arguments:
-        rig: The design to be like.
+        rig: The rig's design.
         space: The design space; a coordinate that is a condition stays open, as sensors move along it.
-        asked: What the user wants.
-        rays: The number of rays that the user wants, where that is said elsewhere; else the rig's own is a bound.
-        hint: What to do where the rig's sensors stand outside the space.
+        asked: The user's constraints.
+        rays: The user's number of rays from elsewhere; None: the rig's own is a bound.
+        hint: Hint where the rig's sensors are outside the space.
 
     Raises:
         ConfigError: More sensors than a fit takes.
-        InfeasibleError: A sensor of the rig stands where those of the space may not, and the user asks for no place.
+        InfeasibleError: A sensor of the rig is outside the space, and the user constrains no position.
     """
     if len(rig.sensors) > MOST_FITTED:
         raise ConfigError(
@@ -267,7 +267,7 @@ def rig_constraints(
     }
     result = merged(document, {key: own[key] for key in own if key not in ("sensors", "each")})
     like = [_of_sensor(sensor, space) for sensor in rig.sensors]
-    # entries beyond the rig's sensors stay: there are then too many, which is found where all contradictions are
+    # entries beyond the rig's sensors are kept: the check of contradictions reports too many
     like += [{} for _ in each[len(like) :]]
     wanted = [merged(shared, entry) for entry in each]
     placed = [any(key in entry.get("origin", {}) for key in PLACES) for entry in wanted]
@@ -279,7 +279,7 @@ def rig_constraints(
 
 
 def _check_places(rig: DesignSpec, space: DesignSpace, placed: Sequence[bool], hint: str | None) -> None:
-    """Refuse a rig whose sensors stand where the design space has no place, of those that the user puts nowhere."""
+    """Refuse a rig with sensors outside the design space, unless the user constrains their positions."""
     boxes = {sensor.name: _box(sensor) for sensor, own in zip(rig.sensors, placed, strict=False) if not own}
     beyond = {name: axes for name, box in boxes.items() if (axes := axes_outside(*box, space))}
     if not beyond:
@@ -296,7 +296,7 @@ def _check_places(rig: DesignSpec, space: DesignSpace, placed: Sequence[bool], h
 
 
 def _of_sensor(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
-    """A sensor's place, a point or the box of its origins, open along conditions; its field of view and its gate."""
+    """Bounds of a sensor's position (a point or a box, open along conditions), field of view and gate."""
     low, high = _box(sensor)
     place = snap_place_to_space(sensor.origin_m, space)
     moving = [axis for axis in range(3) if DIMENSIONS[axis] in space.condition]
@@ -319,18 +319,18 @@ def _of_sensor(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
 
 
 def _box(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the box of a sensor's origins, (3,) each [m]."""
+    """Lower and upper corner of the box of a sensor's origins, (3,) each [m]."""
     half = interval_factor(DEFAULT_LEVEL) * np.sqrt(np.maximum(np.diag(sensor.covariance_m2), 0.0))
     return sensor.origin_m - half, sensor.origin_m + half
 
 
 def moved_notes(rig: DesignSpec, space: DesignSpace, constraints: Constraints) -> list[str]:
-    """Which sensors of a rig are taken to stand where the space fixes their place, as they stand next to it."""
+    """Note of the sensors of a rig that are moved slightly to a fixed position of the space."""
     moved = []
     for sensor, one in zip(rig.sensors, constraints.each, strict=False):
         place = snap_place_to_space(sensor.origin_m, space)
         off = float(np.abs(np.subtract(place, sensor.origin_m)).max())
-        # what is said of other places, or of conditions, is no move
+        # other constraints on positions, and conditions, are no move
         if off > SLACK and one.origin.fixed_m == place:
             moved.append((sensor.name, 1e3 * off))
     if not moved:
@@ -342,7 +342,7 @@ def moved_notes(rig: DesignSpec, space: DesignSpace, constraints: Constraints) -
 
 
 def rig_notes(rig: DesignSpec, constraints: Constraints, asked: Constraints) -> list[str]:
-    """What a rig's likeness says, one line each, for people."""
+    """Lines that describe the constraints of designs like a rig."""
     sensors, own = len(rig.sensors), asked.as_document()
     has_rays = constraints.budget.rays is not None and asked.budget.rays is None
     rays = f", {constraints.budget.rays} rays" if has_rays else ""

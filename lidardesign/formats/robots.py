@@ -2,11 +2,11 @@
 
 MuJoCo: a body per sensor, a site per ray whose +z looks along it, and a rangefinder on each.
 
-`sensordata` has the rays in their own order: the distance [m], negative where nothing is hit, the gate's end where what
-is hit lies beyond (`cutoff`). The start of the gate, the sensor's number and the firing time stand in the rangefinder's
-user data, which MuJoCo keeps (`model.sensor_user`) and does not use. The file is a model of its own and may be
-included in another one, or a copy of a robot's with the sensors on one of its bodies. Rangefinders see neither geoms of
-their own body, of which those of sensors have none, nor ones that are fully transparent.
+`sensordata` has the rays in their own order: the distance [m], negative without a hit, the gate's end for hits beyond
+it (`cutoff`). The start of the gate, the sensor's number and the firing time are in the rangefinder's user data, which
+MuJoCo keeps (`model.sensor_user`) and does not use. The file is a model of its own and may be included in another one,
+or a copy of a robot's with the sensors on one of its bodies. Rangefinders ignore geoms of their own body, of which
+those of sensors have none, and fully transparent ones.
 
 Gazebo and ROS: a gpu_lidar per sensor, in SDF 1.9, in a URDF, or in a xacro macro.
 
@@ -60,7 +60,7 @@ from lidardesign.sensors.bandwidth import Bandwidth
 from lidardesign.sensors.design import DesignSpec
 
 WORLD = "world"
-# Half of what a site of one ray is drawn as [m].
+# Drawn radius of a ray's site [m].
 SITE_SIZE_M = 0.002
 UNSEEN = "lidardesign_unseen"
 USER_VALUES = 4  # of a rangefinder: gate start and end, sensor, time
@@ -73,7 +73,7 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | No
         design: The design; with a robot its sensors are on the body that it is mounted on, else in the world.
         rays: Its rays.
         path: The file.
-        robot: A MuJoCo model, MJCF or URDF, of which the file is a copy with the sensors in it.
+        robot: A MuJoCo model, MJCF or URDF; the file is a copy of it with the sensors added.
 
     Raises:
         DataError: The robot's model cannot be read, or has no such body.
@@ -104,7 +104,7 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path, robot: RobotFile | No
 
 
 def _robot_with(mount: str | None, robot: RobotFile, path: Path) -> tuple[Element, Element, Element]:
-    """A robot's model as MuJoCo writes it, for a file at a path, its body that sensors go into, and its sensors."""
+    """A robot's model as MuJoCo writes it to a path, its body that receives the sensors, and its <sensor> element."""
     specifications: list[Any] = []
     model, _ = load_model(robot.path, folder=robot.folder, edit=specifications.append)
     seen = set(seen_geoms(model, robot.groups)[0].tolist())
@@ -140,7 +140,7 @@ def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:
     x, y, z = (rays.direction[mount.ray] @ frame.T).T
     across = np.hypot(x, y)
     half = np.arctan2(across, z) / 2
-    # straight down any axis across will do
+    # straight down any horizontal axis is right
     along = np.where(across > 0, across, 1.0)
     axis_x, axis_y = np.where(across > 0, -y / along, 1.0), x / along
     turns = np.stack([np.cos(half), np.sin(half) * axis_x, np.sin(half) * axis_y, np.zeros(len(x))], axis=1)
@@ -157,7 +157,7 @@ def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:
 def _rangefinder(site: str, rays: Rays, ray: int) -> Element:
     start, end = rays.gate_m[ray]
     user = numbers([start, end, rays.sensor[ray], rays.time_s[ray]])
-    # a cutoff of 0 would be none
+    # a cutoff of 0 means none
     return element("rangefinder", {"name": site, "site": site, "cutoff": number(max(end, SLACK)), "user": user})
 
 
@@ -199,7 +199,7 @@ def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list
 
 
 def sensor_element(mount: Mount, rate_hz: float, *, posed: bool, name: str | None = None) -> Element:
-    """The <sensor> of a mount: at its pose, or at that of the link that holds it."""
+    """<sensor> element of a mount, with its own pose or at that of its link."""
     grid = grid_of(mount)
     start, end = max(mount.gate_m[0], NEAREST_M), max(mount.gate_m[1], NEAREST_M)
     axes = [_axis("horizontal", grid.columns, grid.azimuth_rad), _axis("vertical", grid.rows, grid.elevation_rad)]
@@ -231,7 +231,7 @@ def _axis(name: str, samples: int, bounds_rad: tuple[float, float]) -> Element:
     )
 
 
-# No sensor's link is called so: those end in _link. Nor its joint, for none has the name of the world.
+# Unlike the name of any sensor's link, which ends in _link, or of its joint.
 BASE = "lidar_base"
 BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
 
@@ -254,7 +254,7 @@ def urdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> lis
 
 
 def _base() -> list[Element]:
-    """The base link, which has a mass, and what fixes it to the world."""
+    """World link, base link with a mass, and the joint between them."""
     moments = {
         name: numbers([BASE_INERTIA_KG_M2 * (name[1] == name[2])])
         for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -268,7 +268,7 @@ def _base() -> list[Element]:
 
 
 def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = "") -> list[Element]:
-    """The link of a sensor, the joint that fixes it to a parent, and what Gazebo simulates on it."""
+    """Link of a sensor, the joint that fixes it to a parent, and Gazebo's sensor on it."""
     name = f"{prefix}{mount.name}_link"
     joint = element(
         "joint",
@@ -280,7 +280,7 @@ def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = ""
         ],
     )
     sensor = sensor_element(mount, rate_hz, posed=False, name=f"{prefix}{mount.name}")
-    # what Gazebo publishes is then in the frame of the link, whose name ROS knows
+    # Gazebo then publishes in the frame of the link, whose name ROS knows
     sensor.append(element("gz_frame_id", text=name))
     return [element("link", {"name": name}), joint, element("gazebo", {"reference": name}, [sensor])]
 
@@ -289,7 +289,7 @@ MACRO = "xacro:macro"
 
 
 def write_xacro(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
-    """Write the macro, atomically; returns how to use it and notes of what the format cannot hold."""
+    """Write the macro, atomically; returns its usage and notes of what the format cannot hold."""
     design, rays, mounted = channel_mounts(design, rays)
     name = identifier(design.name)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent="${parent}", prefix="${prefix}")]

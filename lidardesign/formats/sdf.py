@@ -3,9 +3,9 @@
 A scan fires `samples` rays from `min_angle` to `max_angle`, both ends included, in every of its rows from the lowest
 up; sensors look along their own +x.
 
-Links stand where poses relative to frames, joints, links and nested models put them. A model is a scope of names.
-Within it a pose counts from the model's own frame unless `relative_to` names another; a joint's pose counts from its
-child link, and a frame's from what it is attached to.
+Poses of links may be relative to frames, joints, links and nested models. A model is a scope of names. Within it a pose
+is relative to the model's own frame unless `relative_to` names another; a joint's pose is relative to its child link,
+and a frame's to the element that it is attached to.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ MODEL_FRAME, WORLD_FRAME = "__model__", "world"
 SEPARATOR = "::"
 FORMATS = ("euler_rpy", "quat_xyzw")
 NAMED = ("link", "model", "frame", "joint")
-# Poses count from one another through a few frames; a file may not make of them more than the program can follow.
+# Longest chain of relative poses, which are resolved recursively.
 LONGEST_CHAIN = 100
 
 
 @dataclass(eq=False)
 class Scope:
-    """A model or a world: what its names stand for.
+    """A model or a world as a scope of names with poses.
 
     Arguments:
         element: Its element.
         path: The file.
-        parent: The scope that it stands in; None for the file's topmost.
-        found: Poses that are known already; None marks one that is being worked out.
-        waiting: Names whose poses are being worked out, in all scopes of the file.
+        parent: The enclosing scope; None for the file's topmost.
+        found: Resolved poses by name; None marks one that is being resolved.
+        waiting: Names whose poses are being resolved, in all scopes of the file.
     """
 
     element: ElementTree.Element
@@ -57,10 +57,10 @@ class Scope:
 
     @cached_property
     def _named(self) -> dict[tuple[str, str], ElementTree.Element]:
-        """What has a pose, by tag and name.
+        """Elements with a pose, by tag and name.
 
         Raises:
-            DataError: One has no name, or that of another.
+            DataError: A missing or repeated name.
         """
         named: dict[tuple[str, str], ElementTree.Element] = {}
         for one in self.element:
@@ -77,23 +77,23 @@ class Scope:
         return named
 
     def children(self, tag: str) -> list[ElementTree.Element]:
-        """Its links, models, frames or joints, which have names that differ."""
+        """Its links, models, frames or joints, with distinct names."""
         return [one for (its, _), one in self._named.items() if its == tag]
 
     def within(self, model: ElementTree.Element) -> Scope:
-        """The scope of a model that stands in this one, always the same."""
+        """Scope of a nested model, always the same object."""
         return self._nested.setdefault(id(model), Scope(model, self.path, self, waiting=self.waiting))
 
     def where(self, element: ElementTree.Element | None = None) -> str:
-        """The position of an element, as `file:line`."""
+        """Location of an element in the file, as `file:line`."""
         chosen = self.element if element is None else element
         return f"{self.path}:{chosen.line if isinstance(chosen, Element) else 1}"
 
     def pose_of(self, name: str, asking: ElementTree.Element) -> np.ndarray:
-        """The pose of what a name stands for in this scope's frame, shape (4, 4).
+        """Pose of a named element in this scope's frame, shape (4, 4).
 
         Raises:
-            DataError: Nothing has that name, or poses count from each other in a circle or in a long chain.
+            DataError: Nothing has that name, or poses are relative to each other in a circle or a long chain.
         """
         if name in ("", MODEL_FRAME) or (name == WORLD_FRAME and self.element.tag == WORLD_FRAME):
             return np.eye(4)
@@ -135,14 +135,14 @@ class Scope:
         return pose
 
     def placed(self, element: ElementTree.Element, usual: str) -> np.ndarray:
-        """The pose of an element in this scope's frame, counted from `usual` unless its <pose> names another."""
+        """Pose (4, 4) of an element in this scope's frame, relative to `usual` unless its <pose> names another."""
         pose = element.find("pose")
         if pose is None:
             return self.pose_of(usual, element)
         return self.pose_of(pose.get("relative_to") or usual, pose) @ pose_matrix(pose, self.where(pose))
 
     def in_world(self) -> np.ndarray:
-        """The pose of this scope's frame in the file's topmost one, shape (4, 4)."""
+        """Pose of this scope's frame in the file's topmost one, shape (4, 4)."""
         if self.element.tag == "world":
             return np.eye(4)
         if self.parent is None:
@@ -151,10 +151,10 @@ class Scope:
 
 
 def pose_matrix(pose: ElementTree.Element, where: str) -> np.ndarray:
-    """The rigid transform of a <pose>, shape (4, 4): x y z roll pitch yaw, or x y z and a quaternion x y z w.
+    """Rigid transform of a <pose>, shape (4, 4): x y z roll pitch yaw, or x y z and a quaternion x y z w.
 
     Raises:
-        DataError: It has other numbers, or a rotation that is none.
+        DataError: Wrong numbers, format or quaternion.
     """
     if not (pose.text or "").strip():
         return np.eye(4)
@@ -173,13 +173,13 @@ def pose_matrix(pose: ElementTree.Element, where: str) -> np.ndarray:
 
 
 TYPES = ("gpu_lidar", "lidar", "gpu_ray", "ray")
-# Most angles of a scan [rad]: a turn, a little more for rounding.
+# Widest scan [rad]: a turn and a little more for rounding.
 WIDEST = 1.001 * FULL_TURN
 INFINITE = ("inf", "infinity")
 
 
 def read_sdf(path: Path) -> Rig:
-    """The lidars of a file.
+    """Read the lidars of an SDF file.
 
     Raises:
         DataError: The file is no SDF, has no lidar, or an element of one cannot be used; with file and line.
@@ -187,7 +187,7 @@ def read_sdf(path: Path) -> Rig:
     root = read_xml(path, "an SDF file")
     version = [int(part) for part in root.get("version", "").split(".") if part.isdecimal()]
     if version and version < [1, 7]:
-        # poses of these versions count from what `frame` names, which is called `relative_to` since
+        # poses of these versions are relative to `frame`, renamed `relative_to` since
         for pose in root.iter("pose"):
             if "frame" in pose.attrib:
                 pose.attrib.setdefault("relative_to", pose.attrib["frame"])
@@ -241,7 +241,7 @@ def _lidars(root: ElementTree.Element, path: Path) -> Iterator[tuple[Scope, Elem
 
 
 def _sensor(scope: Scope, link: ElementTree.Element, element: ElementTree.Element, notes: dict[str, None]) -> RigSensor:
-    """One lidar; `notes` takes what a design does not hold of it."""
+    """One lidar as a sensor of a rig; notes of what a design cannot hold are added to `notes`."""
     where = scope.where(element)
     lidar = element.find("lidar") if element.find("lidar") is not None else element.find("ray")
     if lidar is None:
@@ -284,7 +284,7 @@ def _number(element: ElementTree.Element, tag: str, scope: Scope) -> float:
 
 
 def _axis(element: ElementTree.Element, scope: Scope, notes: dict[str, None], widest: float) -> np.ndarray:
-    """The angles of one axis of a scan, shape (samples,) [rad]; a single one is the first."""
+    """Angles of one axis of a scan, shape (samples,) [rad]; a single sample is at `min_angle`."""
     samples = _number(element, "samples", scope)
     if not (1 <= samples <= MOST_RAYS and samples % 1 == 0):
         raise DataError(f"samples is {samples:g}", where=scope.where(element), allowed=f"1 to {MOST_RAYS}")
@@ -308,7 +308,7 @@ def _axis(element: ElementTree.Element, scope: Scope, notes: dict[str, None], wi
 
 
 def _gate(element: ElementTree.Element, scope: Scope, notes: dict[str, None]) -> np.ndarray:
-    """Start and end of the gate, shape (2,) [m]; an end that is not said is infinite."""
+    """Start and end of the gate, shape (2,) [m]; an end missing in the file is infinite."""
     bounds = {"min": 0.0, "max": math.inf}
     for tag in bounds:
         child = element.find(tag)

@@ -5,27 +5,26 @@ CARLA: a sensor.lidar.ray_cast per sensor, with its blueprint's attributes and i
 `attributes` are the text that `blueprint.set_attribute` takes; `transform` is in CARLA's left-handed frame: x forward,
 y to the right, z up, in metres and degrees. With the world's fixed time step of `fixed_delta_seconds`, every frame has
 all rays once: azimuths are swept from minus half of `horizontal_fov` on, so the mount is turned by half a step. The
-next frame begins where a product of single-precision numbers ends: where it falls short of the field of view by its
-rounding, the first column looks to the other edge. Frequency and field are written so that it does not.
+sweep of a frame is a product of single-precision numbers: where rounding makes it smaller than the field of view, the
+first column of the next frame is at the other edge. Frequency and field are chosen so that it is exact.
 
 ASAM OSI: a SensorViewConfiguration with one LidarSensorViewConfiguration per sensor, as protobuf writes it in JSON.
 
-Every sensor stands at its mounting position (x forward, y to the left, z up; yaw, then pitch, then roll), and its rays
-are unit vectors in its own frame with the microsecond in which each fires. Rays of one sensor that start at several
-places become as many configurations.
+Every sensor has its mounting position (x forward, y to the left, z up; yaw, then pitch, then roll), and its rays are
+unit vectors in its own frame with firing times in microseconds. Rays of one sensor with several origins become as many
+configurations.
 
 Isaac Sim from version 5 on: an OmniLidar prim per sensor in USD, in its text form.
 
 A lidar has one emitter state: an emitter per ray at its azimuth (x forward, y at +90 degrees, z up) and elevation in
-degrees, its firing time in the frame, and the number of its range. Ranges are the different gates of the sensor, so
-gates of single rays are held. All emitters are one line: nothing says that rays lie in rows.
+degrees, its firing time in the frame, and the index of its range. Ranges are the different gates of the sensor, so
+gates of single rays are kept. All emitters are one line, as rays need not lie in rows.
 
 Attributes have the names and types of OmniSensorGenericLidarCoreAPI. `reportRateBaseHz` became `patternFiringRateHz` in
 version 6: both are written. Each prim is posed by translate and orient ops below one Xform, in metres, z up.
 
-NVIDIA's documentation wants a sensor's near range above its range offset and its least distance between echos, which
-are 0, so gates start at a millimetre or more. What a range resolution of 0 does is not documented: 0.1 mm is
-written.
+NVIDIA's documentation requires a sensor's near range above its range offset and its least distance between echos, which
+are 0, so gates start at a millimetre or more. A range resolution of 0 is not documented: 0.1 mm is written.
 """
 
 from __future__ import annotations
@@ -62,11 +61,11 @@ from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import angles
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
-# A sweep of one column is as narrow as its field of view is written.
+# Field of view of a sweep of one column [deg].
 NARROWEST_DEG = 0.001
-# Unreal's frames last from half a millisecond to 0.4 s; it makes others so.
+# Unreal limits frames to between half a millisecond and 0.4 s.
 SLOWEST_HZ, FASTEST_HZ = 2.5, 2000.0
-# How many single-precision numbers around the field of view and the frequency are tried, the nearest first.
+# Offsets, in units in the last place, of the fields of view and frequencies that are tried, the nearest first.
 TRIED_FIELDS, TRIED_RATES = (sorted(range(-most, most + 1), key=abs) for most in (4000, 3))
 
 
@@ -112,7 +111,7 @@ def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
         "upper_fov": repr(high_deg),
         "lower_fov": repr(low_deg),
         "horizontal_fov": repr(field_deg),
-        # a design says nothing of the noise: every ray that hits is reported, where it hits
+        # a design has no noise: every hit is reported, at its exact range
         "dropoff_general_rate": "0.0",
         "dropoff_zero_intensity": "0.0",
         "noise_stddev": "0.0",
@@ -131,7 +130,7 @@ def _blueprint(mount: Mount, rate_hz: float) -> dict[str, Any]:
 
 
 def _sweep(field_deg: float, rate_hz: float) -> tuple[float, float]:
-    """The rotation frequency [Hz] and the field of view [deg] of which CARLA sweeps just the whole in a frame."""
+    """Rotation frequency [Hz] and field of view [deg] with which CARLA sweeps exactly the field in a frame."""
     field, rate, step_s = (np.float32(value) for value in (field_deg, rate_hz, 1 / rate_hz))
     fields = (field.view(np.int32) + np.array(TRIED_FIELDS, dtype=np.int32)).view(np.float32)
     rates = (rate.view(np.int32) + np.array(TRIED_RATES, dtype=np.int32)).view(np.float32)
@@ -148,7 +147,7 @@ def _rotation(mount: Mount, grid: EvenGrid, field_deg: float) -> dict[str, float
     turned = np.array([[cos_t, -sin_t, 0.0], [sin_t, cos_t, 0.0], [0.0, 0.0, 1.0]])
     forward, side, up = (MIRROR @ mount.sensor.frame.T @ MIRROR @ turned).T
     flat = math.hypot(forward[0], forward[1])
-    # straight up or down, yaw and roll are one angle
+    # straight up or down, yaw and roll are the same angle
     level = flat > HALF_DIGITS
     yaw = math.atan2(forward[1], forward[0]) if level else math.atan2(-side[0], side[1])
     roll = math.atan2(-side[2], up[2]) if level else 0.0
@@ -170,7 +169,7 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
         DataError: The design has no rays, or the file cannot be written.
     """
     require_rays(design, rays, "a lidar's configuration")
-    # uint32 there: every frame rate that exports take has fewer microseconds in a frame; the last are not rounded into
+    # uint32 there: every allowed frame rate has fewer microseconds in a frame; the last are not rounded into
     # the next frame
     times_us = np.rint(fire_times_s(rays, rate_hz) * MICROSECONDS_PER_S)
     times_us = np.minimum(times_us, math.ceil(MICROSECONDS_PER_S / rate_hz) - 1)
@@ -198,7 +197,7 @@ def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
 
 
 def _configuration(number: int, place: Place, rays: Rays, times_us: np.ndarray) -> dict[str, Any]:
-    """The configuration of the rays of one place; its fields of view hold all of them."""
+    """Configuration of the rays of one origin, with fields of view that contain all of them."""
     looking = rays.direction[place.ray] @ place.mount.sensor.frame.T
     azimuth, elevation = angles(looking)
     roll, pitch, yaw = (math.remainder(angle, FULL_TURN) for angle in place.mount.roll_pitch_yaw_rad)
@@ -221,7 +220,7 @@ def _vector(values: np.ndarray) -> dict[str, float]:
     return dict(zip("xyz", values.tolist(), strict=True))
 
 
-# Isaac counts nanoseconds of a frame as signed 32-bit numbers, and frames per second as whole numbers.
+# Isaac has nanoseconds of a frame as signed 32-bit numbers, and frames per second as whole numbers.
 SLOWEST_ISAAC_HZ = 1
 LEAST_START_M, RESOLUTION_M = 0.001, 0.0001
 # Returns of less than a tenth are lost beyond this range, or beyond the last gate.
@@ -300,7 +299,7 @@ def _prim(mount: Mount, rays: Rays, rate_hz: int) -> list[str]:
 
 
 def _attributes(mount: Mount, rays: Rays, rate_hz: int) -> list[tuple[str, str, str]]:
-    """Type, name and value of what holds for all emitters of a sensor, then of the arrays of their state."""
+    """Type, name and value of the attributes of a sensor, then of its emitters' arrays."""
     count, (near, far) = len(mount.ray), np.maximum(mount.gate_m, LEAST_START_M).tolist()
     ranges, range_id = np.unique(np.maximum(rays.gate_m[mount.ray], LEAST_START_M), axis=0, return_inverse=True)
     fire_time_ns = np.floor(fire_times_s(rays, rate_hz)[mount.ray] * NANOSECONDS_PER_S).astype(np.int64)
@@ -321,7 +320,7 @@ def _attributes(mount: Mount, rays: Rays, rate_hz: int) -> list[tuple[str, str, 
         ("uint", "rangeCount", str(len(ranges))),
         ("float[]", "rangesMinM", _singles(ranges[:, 0])),
         ("float[]", "rangesMaxM", _singles(ranges[:, 1])),
-        # a design says nothing of errors: there are none
+        # a design has no errors
         *(("float", f"{axis}Error{what}", "0") for axis in ("azimuth", "elevation") for what in ("Mean", "Std")),
         ("float", "rangeAccuracyM", "0"),
         ("float", "rangeResolutionM", _single(RESOLUTION_M)),

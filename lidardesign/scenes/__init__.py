@@ -1,1 +1,1 @@
-"""Scenes, their bodies, and where rays meet them."""
+"""Scenes, their bodies, mesh files and ray casting."""

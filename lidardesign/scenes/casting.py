@@ -1,9 +1,9 @@
 """First hits and all crossings of rays with a scene: Embree for meshes, closed forms for primitives.
 
-Meshes at rest are one Embree scene; a mesh that moves has one in its own frame, built once, and rays are brought into
-that frame where they pass the mesh's ball. First hits are asked for twice where a ray may have slipped through a
-mesh (see `triangles`), and how often it had is counted. `trace` and `trace_each`, of which learning asks many more
-rays, cast once: vertices have no share of a density.
+Meshes at rest share one Embree scene; a moving mesh has one in its own frame, built once, and rays that pass its
+bounding ball are transformed into that frame. Rays that may have slipped through a mesh are cast twice (see
+`triangles`), and the hits found that way are counted. `trace` and `trace_each`, which learning calls with many more
+rays, cast once: rays exactly at vertices have probability 0 in a density.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from lidardesign.scenes.scene import Body, Mesh, Scene, inverse_rigid
 from lidardesign.scenes.surface import KINDS, SIZES, bounding_radius_m
 from lidardesign.scenes.triangles import FARTHEST_M, SecondCasts, Triangles, advances_m, mesh_caster
 
-# After a triangle the next one is looked for this share of the scene's reach further on.
+# Step behind a triangle before the next cast, as a share of the scene's reach.
 STEP_SHARE = COARSE_SLACK
 MAXIMUM_LAYERS = 16
-CROSSINGS_PER_RAY = 2  # of primitives, that there is room for at first
+CROSSINGS_PER_RAY = 2  # of primitives, allocated at first
 RAYS_AT_ONCE = 100_000  # over frames that are traced together
 
 Only = Literal["all", "targets", "occluders"]
@@ -36,7 +36,7 @@ class SceneCaster:
     Arguments:
         scene: The scene.
         frame: The time frame.
-        only: Which bodies rays can hit.
+        only: The bodies that rays can hit.
     """
 
     def __init__(self, scene: Scene, frame: int = 0, *, only: Only = "all") -> None:
@@ -52,13 +52,13 @@ class SceneCaster:
 
     @property
     def resting(self) -> _AtRest | None:
-        """Its meshes at rest, where it casts at nothing else."""
+        """The meshes at rest, or None if there are other shapes too."""
         return None if self.primitives or self.moving else self.at_rest
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
-        """The nearest hit of every ray, shapes (N, 3) and (N, 3); directions are normalised here.
+        """First hits of rays, origins and directions of shape (N, 3); directions are normalised here.
 
-        A ray that starts inside a solid hits its way out.
+        A ray that starts inside a solid hits its surface from inside.
 
         Raises:
             ConfigError: An origin or direction that is not finite, or a direction of zero length.
@@ -66,14 +66,14 @@ class SceneCaster:
         return next(first_hits([self], *checked_rays(origins, directions)))
 
     def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
-        """First hits of finite float64 rays of unit length, cast once; from its limit (N,) on, a hit is a miss."""
+        """First hits of finite float64 rays of unit length, cast once; hits at or beyond limits (N,) [m] are misses."""
         (hits,) = _traced([self], origins, directions, limit_m, None)
         return hits
 
     def crossings(
         self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
     ) -> Crossings:
-        """Every surface that rays as in `trace` pass from a start (N,) up to a limit (N,), hidden ones too.
+        """All surfaces that rays cross from starts (N,) up to limits (N,) [m], hidden ones too; rays as in `trace`.
 
         Up to `MAXIMUM_LAYERS` triangles per ray are found; triangles closer than the step between them count once.
         """
@@ -101,11 +101,11 @@ class SceneCaster:
 
 
 def first_hits(casters: Sequence[SceneCaster], origins: np.ndarray, directions: np.ndarray) -> Iterator[Hits]:
-    """The first hits of the same rays in each of several frames of a scene.
+    """First hits of the same rays in each of several frames of a scene.
 
     Arguments:
         casters: One per frame, with the same bodies.
-        origins, directions: As `checked_rays` returned them, shapes (N, 3).
+        origins, directions: Rays from `checked_rays`, shapes (N, 3).
     """
     at_once = max(RAYS_AT_ONCE // max(len(origins), 1), 1)
     for start in range(0, len(casters), at_once):
@@ -157,8 +157,8 @@ def trace_each(
 ) -> Hits:
     """First hits of many casters' rays at once: caster c traces the rays from starts[c] to starts[c + 1].
 
-    Rays are as those of `SceneCaster.trace`, and so are hits. Casters of meshes at rest, of which there are many in
-    learning, only share Embree's own calls out.
+    Rays and hits are as in `SceneCaster.trace`. Casters of meshes at rest alone, which are many in learning, run only
+    Embree's calls one by one.
     """
     resting = [caster.resting for caster in casters]
     if any(meshes is None for meshes in resting):
@@ -167,7 +167,7 @@ def trace_each(
             for caster, begin, end in zip(casters, starts[:-1], starts[1:], strict=True)
         ]
         return Hits.joined(parts)
-    # for meshes at rest everything but Embree's calls is done for all rays together
+    # for meshes at rest everything except Embree's calls is done for all rays together
     counts = np.diff(starts)
     local = origins - np.repeat([meshes.triangles.centre_m for meshes in resting], counts, axis=0)
     advance_m = advances_m(local, directions, np.repeat([meshes.radius_m for meshes in resting], counts))
@@ -202,7 +202,7 @@ _casters: WeakKeyDictionary[Scene, dict[tuple[int, ...], SceneCaster]] = WeakKey
 
 
 def shared_caster(scene: Scene, frame: int = 0, *, only: Only = "all") -> SceneCaster:
-    """The one caster of a scene's frame and bodies, built at first use and kept as long as the scene."""
+    """Shared caster of a scene's frame and bodies, built at first use and kept as long as the scene."""
     known = _casters.setdefault(scene, {})
     key = (frame, *(i for i, _ in _chosen(scene, only)))
     if key not in known:
@@ -230,10 +230,10 @@ def checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarra
 
 
 class Primitives:
-    """The primitives of a frame.
+    """Ray casting against the primitives of a frame.
 
     Arguments:
-        members: Their numbers among all bodies, and the bodies; at least one.
+        members: Indices among all bodies, and the bodies; at least one.
         frame: The time frame.
     """
 
@@ -251,7 +251,7 @@ class Primitives:
         )
 
     def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> None:
-        """Enter the hits that are nearer than what `hits` holds, with outward normals."""
+        """Replace the entries of `hits` by nearer hits on primitives, with outward normals."""
         from lidardesign.scenes import primitive_kernels
 
         primitive_kernels.keep_nearer(self._shapes, origins, directions, limit_m, hits.range_m, hits.body, hits.normal)
@@ -259,7 +259,7 @@ class Primitives:
     def crossings(
         self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
     ) -> Crossings:
-        """See `SceneCaster.crossings`."""
+        """Crossings with the primitives, as in `SceneCaster.crossings`."""
         from lidardesign.scenes import primitive_kernels
 
         room = CROSSINGS_PER_RAY * len(origins)
@@ -274,7 +274,7 @@ class Primitives:
 class _AtRest:
     def __init__(self, bodies: Sequence[tuple[int, Body]]) -> None:
         self.body_of_geometry = np.array([index for index, _ in bodies], dtype=np.int64)
-        self._meshes = [body.shape for _, body in bodies]  # as long as they live, nothing else has their identities
+        self._meshes = [body.shape for _, body in bodies]  # kept alive, so that their ids stay unique
         self.triangles = Triangles([body.shape.transformed(body.poses) for _, body in bodies])
         self.radius_m = self.triangles.radius_m
 
@@ -288,13 +288,13 @@ class _AtRest:
         return hits
 
 
-# By the first of its bodies and by geometry: what was built of them.
+# Cached Embree scenes, by the first of their bodies and by geometry.
 _at_rest: WeakKeyDictionary[Body, dict[Hashable, _AtRest]] = WeakKeyDictionary()
 _by_geometry: WeakValueDictionary[Hashable, _AtRest] = WeakValueDictionary()
 
 
 def _shared_at_rest(bodies: Sequence[tuple[int, Body]]) -> _AtRest:
-    """What does not move is built once for all frames of a scene, and for scenes of the same meshes in their places."""
+    """Embree scene of bodies at rest, shared by all frames and by scenes with the same meshes at the same poses."""
     geometry = tuple((index, id(body.shape), body.poses.tobytes()) for index, body in bodies)
     known = _at_rest.setdefault(bodies[0][1], {})
     if geometry not in known:
@@ -316,7 +316,7 @@ class _Moving:
     def passing(
         self, number: int, origins: np.ndarray, directions: np.ndarray, bound_m: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The rays that pass the ball of a mesh before a bound (N,), (K,), and these in its own frame, (K, 3) each."""
+        """Rows (K,) of rays that pass a mesh's ball before bounds (N,) [m], and the rays in its frame, (K, 3) each."""
         from lidardesign.scenes import primitive_kernels
 
         rows, local, toward = np.empty(len(origins), np.intp), np.empty(origins.shape), np.empty(origins.shape)
@@ -325,7 +325,7 @@ class _Moving:
         return rows[:found], local[:found], toward[:found]
 
     def enter(self, number: int, hits: Hits, rows: np.ndarray, range_m: np.ndarray, normal: np.ndarray) -> None:
-        """Enter what some rays (K,) hit of a mesh, with normals in its own frame."""
+        """Write the hits of rays (K,) on a mesh into `hits`, from normals in the mesh's frame."""
         hit = np.isfinite(range_m)
         won = rows[hit]
         hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
@@ -340,9 +340,9 @@ def _keep_nearer(
     limit_m: np.ndarray,
     twice: SecondCasts | None,
 ) -> None:
-    """Enter the hits of the same moving meshes in several frames that are nearer than what is found there so far.
+    """Replace hits in several frames by nearer ones on moving meshes, the same in all frames.
 
-    Each mesh is asked once for the rays of all frames: most of the time of few rays goes into the calls.
+    Each mesh is cast once with the rays of all frames: most of the time of few rays goes into the calls.
     """
     for number, caster in enumerate(moving[0].casters):
         bounds = [np.minimum(hits.range_m, limit_m) for hits in found]
@@ -357,11 +357,11 @@ def _keep_nearer(
 
 
 def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Rotated vectors (N, 3); unlike a matrix product, to the same bits in whatever batch."""
+    """Rotated vectors (N, 3); unlike a matrix product, bit-identical for any batch size."""
     x, y, z = (vectors[:, [axis]] * rotation[:, axis] for axis in range(3))
     return x + y + z
 
 
 def _facing(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Normals (N, 3) turned against the directions (N, 3) of the rays that hit there."""
+    """Normals (N, 3) flipped to face the origins of rays with directions (N, 3)."""
     return np.where((np.einsum("nk,nk->n", normals, directions) > 0)[:, None], -normals, normals)

@@ -1,8 +1,8 @@
-"""Distances from points to the nearest of many triangles, exact, by a tree of boxes that numba walks.
+"""Exact distances from points to the nearest of many triangles, by a bounding box tree in numba.
 
-Triangles are halved at the median of their longest side until few are left. Eight boxes, and eight triangles, are
-measured at once by the processor's vectors; a point visits the nearest boxes first and leaves out every box that is
-further than what was found (Ericson, Real-Time Collision Detection, 2005, chapters 5 and 6).
+Sets of triangles are halved at the median of their longest extent until few are left. Eight boxes, or eight triangles,
+are measured at once with SIMD; a point visits the nearest boxes first and skips every box that is further than the
+nearest triangle so far (Ericson, Real-Time Collision Detection, 2005, chapters 5 and 6).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from lidardesign.numerics import EPSILON, SQUARABLE
 
 HALVINGS = 3  # of the triangles of a box, to those of its children
 WIDTH = 2**HALVINGS  # children of a box, and triangles of a leaf
-FLAT = 8 * EPSILON  # of the longest side: what is left of a lower height is rounding, and may point anywhere
-DEEPEST = 128  # boxes that wait at once: seven more with each level, so a tree of 2^50 triangles would fit
+FLAT = 8 * EPSILON  # share of the longest side below which a triangle's height is rounding noise
+DEEPEST = 128  # boxes on the stack: seven more with each level, so a tree of 2^50 triangles would fit
 
 
 class TriangleTree:
-    """Triangles that points are measured from.
+    """Bounding box tree of triangles, for distances of points.
 
     Arguments:
         triangles: Corners [m], shape (T, 3, 3), at least one; those without an area count as segments or points.
@@ -40,15 +40,15 @@ class TriangleTree:
         self._frames = np.ascontiguousarray(frames[self._members].transpose(0, 2, 1))
 
     def distance_m(self, points: np.ndarray) -> np.ndarray:
-        """The distance of each point to the nearest triangle [m], (N, 3) to (N,)."""
+        """Distance of each point to the nearest triangle [m], (N, 3) to (N,)."""
         return self._nearest(points, math.inf)[0]
 
     def closest(self, points: np.ndarray, within_m: float = math.inf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The distance of each point to the nearest triangle [m], the triangle, and the nearest place on it [m].
+        """Distance of each point to the nearest triangle [m], the triangle's index, and the nearest point on it [m].
 
         Arguments:
-            points: Any number [m], shape (N, 3).
-            within_m: What is further away is not looked for: its distance is infinite, its triangle -1.
+            points: Points [m], shape (N, 3).
+            within_m: Search radius [m]; without a triangle inside it, the distance is infinite and the index -1.
 
         Returns:
             Shapes (N,), (N,) and (N, 3).
@@ -60,7 +60,7 @@ class TriangleTree:
         return distance, triangles, places
 
     def _nearest(self, points: np.ndarray, within_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Distances, and the leaves that hold the nearest triangles."""
+        """Distances [m], and the leaves that hold the nearest triangles, shapes (N,)."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         squared, leaves = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
         _nearest(points, self._frames, self._boxes, self._children, within_m * within_m, squared, leaves)
@@ -69,10 +69,10 @@ class TriangleTree:
 
 @njit(cache=True, nogil=True)
 def _build_boxes(triangles: np.ndarray, boxes: np.ndarray, children: np.ndarray, members: np.ndarray) -> int:
-    """Fills the boxes of each node's children, (K, 6, 8) lower and upper corners, and returns the number of leaves.
+    """Fill the boxes of each node's children, (K, 6, 8) lower and upper corners, and return the number of leaves.
 
-    A child is a node, or below 0 the complement of a leaf, (K, 8); boxes of children that there are not are infinitely
-    far. Leaves (K, 8) hold triangles, the last one several times where they are not full.
+    A child is a node, or below 0 the complement of a leaf, (K, 8); boxes of missing children are infinitely far. Leaves
+    (K, 8) hold triangles, the last one several times where they are not full.
     """
     middles = np.empty((len(triangles), 3))
     for t in range(len(triangles)):
@@ -126,7 +126,7 @@ def _nearest(
     squared: np.ndarray,
     leaves: np.ndarray,
 ) -> None:
-    """Fills the squared distance of each point to the nearest triangle, and its leaf: infinite, -1 from a limit on."""
+    """Fill the squared distance of each point to the nearest triangle, and its leaf; infinite and -1 beyond a limit."""
     waiting, away = np.empty(DEEPEST, dtype=np.int64), np.empty(DEEPEST)
     apart = np.empty(WIDTH)
     for n in range(len(points)):
@@ -160,10 +160,10 @@ def _nearest(
         squared[n], leaves[n] = least if leaf >= 0 else np.inf, leaf
 
 
-# Indices, and no slices, are passed to what follows: loops over `apart` are then what the compiler makes vectors of.
+# The following functions take indices, not slices, so that the compiler vectorises loops over `apart`.
 @njit(cache=True, nogil=True, inline="always")
 def _boxes_squared(x: float, y: float, z: float, boxes: np.ndarray, node: int, apart: np.ndarray) -> None:
-    """Fills the squared distance of a point to each of a node's boxes (8,)."""
+    """Fill the squared distance of a point to each of a node's boxes (8,)."""
     for index in range(boxes.shape[2]):
         beyond_x = max(boxes[node, 0, index] - x, x - boxes[node, 3, index], 0.0)
         beyond_y = max(boxes[node, 1, index] - y, y - boxes[node, 4, index], 0.0)
@@ -173,12 +173,12 @@ def _boxes_squared(x: float, y: float, z: float, boxes: np.ndarray, node: int, a
 
 @njit(cache=True, nogil=True)
 def _build_frames(triangles: np.ndarray, frames: np.ndarray) -> None:
-    """Fills frames (T, 17): each triangle in its own plane, the longest side from the origin along the first axis.
+    """Fill frames (T, 17): each triangle in its own plane, the longest side from the origin along the first axis.
 
     They hold the origin, three axes (the last one is the normal), the length of that side, the third corner, and the
-    inverse squares of the lengths of the two other sides. Made orthogonal twice, the axes are so to rounding whatever
-    the triangle: a normal from a cross product is off by the inverse of a needle's sharpest sine. A triangle without
-    area has any plane through it, and is as thin there.
+    inverse squares of the lengths of the two other sides. Orthogonalised twice, the axes are exact to rounding for any
+    triangle: a normal from a cross product is off by the inverse sine of a needle's sharpest angle. A triangle without
+    area gets any plane through it.
     """
     sides = np.empty((3, 3))
     for t in range(len(triangles)):
@@ -208,7 +208,7 @@ def _build_frames(triangles: np.ndarray, frames: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True, inline="always")
 def _triangles_squared(x: float, y: float, z: float, frames: np.ndarray, leaf: int, apart: np.ndarray) -> None:
-    """Fills the squared distance of a point to each of a leaf's triangles (8,), whose frames are (L, 17, 8).
+    """Fill the squared distance of a point to each of a leaf's triangles (8,), whose frames are (L, 17, 8).
 
     Over the inside it is the distance to the plane, elsewhere that to the nearest side.
     """
@@ -230,7 +230,7 @@ def _triangles_squared(x: float, y: float, z: float, frames: np.ndarray, leaf: i
 
 @njit(cache=True, nogil=True, inline="always")
 def _segment_squared(x: float, y: float, end_x: float, end_y: float, inverse: float) -> float:
-    """From a point of the plane to the segment from the origin to an end."""
+    """Squared distance of a point (x, y) to the segment from the origin to an end, given its inverse squared length."""
     share = min(max((x * end_x + y * end_y) * inverse, 0.0), 1.0)
     beyond_x, beyond_y = x - share * end_x, y - share * end_y
     return beyond_x * beyond_x + beyond_y * beyond_y
@@ -240,7 +240,7 @@ def _segment_squared(x: float, y: float, end_x: float, end_y: float, inverse: fl
 def _closest_on(
     points: np.ndarray, frames: np.ndarray, leaves: np.ndarray, members: np.ndarray, found: np.ndarray, on: np.ndarray
 ) -> None:
-    """Fills the nearest triangle of each point's leaf and the nearest place on it; nothing where a leaf is -1."""
+    """Fill the nearest triangle of each point's leaf and the nearest point on it; nothing where a leaf is -1."""
     apart = np.empty(WIDTH)
     for n in range(len(points)):
         leaf = leaves[n]

@@ -1,7 +1,7 @@
-"""Mesh files, read through trimesh and checked: refused or mended with a note, never silently wrong.
+"""Mesh files, read through trimesh and checked: refused, or repaired with a note.
 
-Whether faces run around a mesh the same way is found from edges alone. Weights that someone painted on a mesh are a
-number per vertex, or the brightness of vertex colours.
+Consistent orientation of faces is found from edges alone. Painted weights of a mesh are a number per vertex, or the
+brightness of vertex colours.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where each distinct row (N, K) stands first, in their order, and which of these each row is, (U,) and (N,).
+    """Indices of the first of each distinct row (N, K), sorted by row, and each row's index into them, (U,) and (N,).
 
     As `numpy.unique` along an axis, which takes minutes for the faces of a large scan.
     """
@@ -42,7 +42,7 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which edge each side of faces (F, 3) is and whether it runs upwards, (3 F,), and the faces per edge (E,)."""
+    """Index and ascending direction of each side of faces (F, 3), shapes (3 F,), and the faces per edge (E,)."""
     start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1).astype(np.int64)
     # one number per edge: pairs of int32 fit into an int64
     number = np.minimum(start, end) * (int(faces.max(initial=0)) + 1) + np.maximum(start, end)
@@ -51,7 +51,7 @@ def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def edge_defects(faces: np.ndarray) -> tuple[int, int]:
-    """How many edges are open, and how many join faces that run along them the same way.
+    """Number of open edges, and of edges between faces of opposite winding.
 
     An edge is open when an odd number of faces meets there. Where closed parts touch, four faces share an
     edge, two in each direction: that is no defect.
@@ -63,17 +63,17 @@ def edge_defects(faces: np.ndarray) -> tuple[int, int]:
 
 
 def turned_to_agree(faces: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, int]:
-    """Faces (F, 3) of which those that disagree with their neighbours are turned, and how many those are.
+    """Faces (F, 3) wound consistently with their neighbours, and the number of flipped ones.
 
-    Two faces that alone share an edge agree when they run along it in opposite directions. Within a part that such
-    edges hold together, the orientation of the larger area stays; a part that has none, as a Moebius strip, stays as
-    it is.
+    Two faces that alone share an edge agree when they run along it in opposite directions. Within a part connected by
+    such edges, the orientation of the larger area is kept; a part that cannot be oriented, as a Moebius strip, is left
+    unchanged.
 
     Arguments:
         faces: Vertex indices, shape (F, 3).
-        areas: Of the faces, in any unit, shape (F,).
+        areas: Areas of the faces, in any unit, shape (F,).
     """
-    # Pairs of faces that alone share an edge, and whether they run along it in opposite directions, (P,) each
+    # Pairs of faces that alone share an edge, shapes (P,)
     edge, upwards, count = _edges(faces)
     order = np.argsort(edge, kind="stable")
     starts = np.concatenate([[0], np.cumsum(count)[:-1]])[count == 2]
@@ -82,7 +82,7 @@ def turned_to_agree(faces: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, i
     if side is None:
         return faces, 0
     part, flipped = side
-    # the sheet of less area is turned
+    # the orientation of the smaller area is flipped
     share = np.bincount(part, weights=np.where(flipped, areas, -areas))
     turn = flipped ^ (share[part] > 0)
     return np.where(turn[:, None], faces[:, ::-1], faces), int(turn.sum())
@@ -91,10 +91,10 @@ def turned_to_agree(faces: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, i
 def _sides(
     count: int, first: np.ndarray, second: np.ndarray, agree: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The part of each face and whether it lies on the other side than the part's first face; None if none turns.
+    """Part of each face, and mask of the faces oriented against its first one; None if all agree.
 
-    Every face stands twice in a graph, once as it is and once turned (the orientation double cover): a part whose
-    two copies hang together cannot be oriented, and keeps its faces.
+    Every face is twice in a graph, once as it is and once flipped (the orientation double cover): a part whose two
+    copies are connected cannot be oriented, and keeps its faces.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -119,11 +119,11 @@ POSITIONS = ("x", "y", "z", "nx", "ny", "nz")
 
 @dataclass(frozen=True)
 class Painted:
-    """Where a file has its weights.
+    """Source of the painted weights in a mesh file.
 
     Arguments:
-        attribute: The name of a property of the vertices whose values are the weights, or `colours`.
-        contrast: How many times as much white counts as black; a brightness b between them counts contrast^b.
+        attribute: Name of the vertex property with the weights, or `colours`.
+        contrast: Weight of white over that of black; a brightness b between them has the weight contrast^b.
     """
 
     attribute: str
@@ -131,7 +131,7 @@ class Painted:
 
 
 def painted_weights(part: trimesh.Trimesh, painted: Painted, where: str) -> np.ndarray:
-    """The weight of each vertex of a mesh as it was loaded, unprocessed, shape (V,).
+    """Painted weight of each vertex of a mesh as loaded, shape (V,).
 
     Raises:
         DataError: It has no such property or no colours, or a weight is not a positive number.
@@ -168,7 +168,7 @@ def painted_weights(part: trimesh.Trimesh, painted: Painted, where: str) -> np.n
 
 
 def brightness(part: trimesh.Trimesh, where: str) -> np.ndarray:
-    """How bright the colour of each vertex is, 0 for black to 1 for white, shape (V,).
+    """Brightness of each vertex colour, 0 for black to 1 for white, shape (V,).
 
     Raises:
         DataError: The mesh has no vertex colours.
@@ -185,7 +185,7 @@ def brightness(part: trimesh.Trimesh, where: str) -> np.ndarray:
 
 
 def vertex_properties(part: trimesh.Trimesh) -> dict[str, np.ndarray]:
-    """The properties of a mesh's vertices by name, besides positions, normals and colours."""
+    """Properties of a mesh's vertices by name, besides positions, normals and colours."""
     found = {name: _alone(values) for name, values in part.vertex_attributes.items()}
     data = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     names = getattr(getattr(data, "dtype", None), "names", None) or (data if isinstance(data, dict) else ())
@@ -199,12 +199,12 @@ def _alone(values: np.ndarray) -> np.ndarray:
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 READERS = {".obj": read_obj, ".off": read_off, ".stl": read_stl}
-# a triangle whose double area is a smaller share of its longest edge squared has a normal of rounding noise
+# a triangle is degenerate if its double area is a smaller share of its longest edge squared
 FLATTEST_TRIANGLE = ROUNDING
 
 
 def list_mesh_files(folder: str | Path) -> list[Path]:
-    """The mesh files directly inside a folder, sorted by name.
+    """Paths of the mesh files directly inside a folder, sorted by name.
 
     Raises:
         DataError: No such folder, or no mesh file in it.
@@ -220,13 +220,13 @@ def list_mesh_files(folder: str | Path) -> list[Path]:
 
 
 def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, painted: Painted | None = None) -> Mesh:
-    """A checked mesh from a file; all geometry in it becomes one mesh.
+    """Load a checked mesh from a file; all geometry in it becomes one mesh.
 
     Arguments:
         path: A file of one of the formats `SUFFIXES`.
-        sign: How the inside is told from the outside, see `check_mesh`.
+        sign: Rule of the sign of distances, see `check_mesh`.
         scale: Factor from the file's unit to metres (0.001 for millimetres).
-        painted: Where the file has the importance of the surface; None: it counts 1 everywhere.
+        painted: Source of the importance in the file; None: importance 1 everywhere.
 
     Raises:
         DataError: The file is missing, unreadable, empty, or its mesh cannot be used, or it has no such importance; the
@@ -236,7 +236,7 @@ def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, pain
     if not (np.isfinite(scale) and scale > 0):
         raise DataError(f"the scale {scale} is not a factor to metres", where=str(path), allowed="a positive number")
     vertices, faces, importance = _read(path, painted)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is too large is refused below
+    with np.errstate(over="ignore", invalid="ignore"):  # too large values are refused below
         vertices = vertices * scale
     return check_mesh(vertices, faces, sign=sign, where=str(path), importance=importance)
 
@@ -244,19 +244,18 @@ def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, pain
 def check_mesh(
     vertices: Any, faces: Any, *, sign: Sign = "auto", where: str = "mesh", importance: np.ndarray | None = None
 ) -> Mesh:
-    """A mesh without degenerate, duplicate or dangling parts, with a sign rule that it can bear.
+    """Build a mesh without degenerate faces, duplicate faces or unused vertices, with a valid sign rule.
 
-    `auto` takes `solid` for a closed mesh, after turning faces that disagree with their neighbours, and `unsigned` for
+    `auto` takes `solid` for a closed mesh, after flipping faces that disagree with their neighbours, and `unsigned` for
     an open one or one that has no outside (a Klein bottle), each with a note. Only an explicit `solid` refuses. A mesh
-    that is inside out is turned, with a note.
+    that is inside out is flipped, with a note.
 
     Arguments:
         vertices: Positions [m], shape (V, 3).
         faces: Vertex indices, shape (F, 3).
-        sign: How the inside is told from the outside.
-        where: The file or object that messages name.
-        importance: How much the surface counts at each vertex, shape (V,). Where vertices become one, it is their
-            geometric mean.
+        sign: Rule of the sign of distances, see `Mesh`.
+        where: Name of the file or object in messages.
+        importance: Weight of the surface at each vertex, shape (V,). Merged vertices get the geometric mean.
 
     Raises:
         DataError: Nothing usable is left, values are not finite, indices are wrong, or `sign` does not fit.
@@ -319,7 +318,7 @@ def _refuse_unusable(vertices: np.ndarray, faces: np.ndarray, where: str) -> Non
 
 
 def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
-    """The faces that have an area and are no duplicate of another; what was dropped is added to `notes`."""
+    """Faces without degenerate and duplicate ones, each with a line in `notes` where any are dropped."""
     edges = np.roll(vertices[faces], -1, axis=1) - vertices[faces]
     longest = np.einsum("fek,fek->fe", edges, edges).max(axis=1)
     degenerate = _double_areas(vertices, faces) <= FLATTEST_TRIANGLE * longest
@@ -369,13 +368,13 @@ def _oriented(
 
 
 def signed_volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """The enclosed volume of a closed mesh [m^3]; negative when its normals point inwards."""
+    """Enclosed volume of a closed mesh, negative when its normals point inwards [m^3]."""
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
     return float(np.einsum("fk,fk->f", a, np.cross(b, c)).sum() / 6)
 
 
 def _read(path: Path, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices, faces and weights of everything in a file, with every way to fail turned into a `DataError`."""
+    """Vertices, faces and weights of a file; any failure to read it becomes a `DataError`."""
     where = str(path)
     if path.suffix.lower() not in SUFFIXES:
         raise DataError(f"has the suffix {path.suffix!r}", where=where, allowed=", ".join(SUFFIXES))
@@ -398,14 +397,14 @@ def _read(path: Path, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _reason(error: Exception) -> str:
-    """One line for people; trimesh asks an optional package about text that is not UTF-8."""
+    """Message of an error in one line; trimesh needs an optional package for text that is not UTF-8."""
     if isinstance(error, ModuleNotFoundError):
         return "it is not UTF-8 text" if error.name == "charset_normalizer" else f"needs {error.name}"
     return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
 
 
 def _geometry(path: Path, data: bytes, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """All triangles of a file as one mesh, each part at its place in the file's scene; weights where asked for."""
+    """All triangles of a file as one mesh, each part with its transform; weights if `painted` is given."""
     vertices, faces, weights, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0)], 0
     for part, transform in _parts(path, data):
         own = np.asarray(part.faces, dtype=np.int64)
@@ -427,7 +426,7 @@ def _geometry(path: Path, data: bytes, painted: Painted | None) -> tuple[np.ndar
 
 
 def _parts(path: Path, data: bytes) -> Iterator[tuple[trimesh.Trimesh, np.ndarray]]:
-    """The meshes of a file and where each stands, a transform of shape (4, 4)."""
+    """Meshes of a file, each with its transform (4, 4)."""
     import trimesh
 
     suffix = path.suffix.lower()
@@ -461,14 +460,14 @@ def _check_polygons(part: trimesh.Trimesh, where: str) -> None:
 
 
 class _SameFolder:
-    """Gives loaders the files beside a mesh file (the .bin buffers of a .gltf), nothing from elsewhere."""
+    """Resolver that gives loaders files of a mesh's own folder only (the .bin buffers of a .gltf)."""
 
     def __init__(self, path: Path) -> None:
         self._folder = path.resolve().parent
         self._bytes = 0
 
     def get(self, name: str) -> bytes:
-        """The content of a file of the same folder."""
+        """Content of a file of the same folder."""
         path = (self._folder / name).resolve()
         if path.parent != self._folder:
             raise DataError(f"refers to {name!r}, which is outside its folder", where=str(self._folder))
@@ -482,14 +481,14 @@ class _SameFolder:
 
 @contextmanager
 def _quiet_trimesh() -> Iterator[None]:
-    """Loaders speak through the errors raised here, not through log lines and warnings of their own."""
+    """Silence the log and the warnings of loaders, except one that means data loss, which becomes an error."""
     log = logging.getLogger("trimesh")
     level = log.level
     log.setLevel(logging.CRITICAL + 1)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            # what is no number ends the reading of numbers: the rest would be left out in silence
+            # numpy stops at text that is no number and would drop the rest silently
             warnings.filterwarnings("error", "string or file could not be read")
             yield
     finally:

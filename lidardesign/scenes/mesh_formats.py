@@ -1,9 +1,9 @@
-"""Mesh formats whose every index and count is checked: a file that names or promises what it lacks is refused.
+"""Readers and checks of mesh formats: files with indices or counts beyond their content are refused.
 
-OBJ, OFF and STL are read here, with the line of whatever is wrong in text: trimesh takes index 0 of an OBJ for its last
-vertex, leaves out OFF faces and STL solids that are cut short, and orders faces by their numbers of corners. Of PLY and
-glTF, which it reads, the counts and references in the header are checked before: it would make room for what they
-promise, and take a negative number for one from the end.
+OBJ, OFF and STL are read here, with the line of each error in text: trimesh takes index 0 of an OBJ for its last
+vertex, drops truncated OFF faces and STL solids, and orders faces by their numbers of corners. PLY and glTF are read by
+trimesh after a check of the counts and references in the header: it would allocate memory for any count, and take a
+negative index for one from the end.
 
 Readers return the vertices (V, 3), the faces as indices from 0 (F, 3), polygons in fans of triangles, and red, green
 and blue of every vertex from 0 to 1 (V, 3), None where it has none.
@@ -23,9 +23,9 @@ import numpy as np
 from lidardesign.errors import DataError
 from lidardesign.run.inputs import MESH, check_bytes, parse_json
 
-# Of all parts of a file together, as often as they are placed; checking so many takes 5 GB.
+# In all parts of a file together, each counted as often as it is placed; checking them takes 5 GB.
 MOST_TRIANGLES = 10_000_000
-# Lines of a text, each of which is taken apart by itself.
+# Lines of a text file, each of which is split by itself.
 MOST_ROWS = 5_000_000
 LONGEST_LINE = LONGEST_HEADER = 100_000
 BINARY_HINT = "export it as binary PLY or GLB"
@@ -35,9 +35,9 @@ Triangles = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
 
 def _rows(data: bytes, where: str, joining: bytes | None = None) -> Iterator[tuple[int, list[bytes]]]:
-    """The words of every line of a text that has any, with the line's number from 1; comments are left out.
+    """Number, from 1, and words of every line with words; comments are left out.
 
-    A line that ends in `joining` goes on in the next one.
+    A line that ends in `joining` continues in the next one.
     """
     data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if data.count(b"\n") > MOST_ROWS:
@@ -58,7 +58,7 @@ def _rows(data: bytes, where: str, joining: bytes | None = None) -> Iterator[tup
 
 
 def _point(words: list[bytes], where: str, line: int, most: float = math.inf) -> list[float]:
-    """The finite numbers of a vertex in a line: three, or more where that is allowed."""
+    """Finite numbers of a vertex in a line: three, or up to `most`."""
     if not 3 <= len(words) <= most:
         allowed = "3 or more" if most > 3 else "3"
         raise DataError(f"has {len(words)} values", where=f"{where}:{line}", allowed=allowed)
@@ -66,7 +66,7 @@ def _point(words: list[bytes], where: str, line: int, most: float = math.inf) ->
         values = [float(word) for word in words]
     except ValueError:
         values = [math.nan]
-    # Python's own numbers may have underscores
+    # Python accepts underscores in numbers
     if not all(map(math.isfinite, values)) or b"_" in b"".join(words):
         shown = b" ".join(words)[:60].decode(errors="replace")
         raise DataError(f"the vertex is {shown!r}", where=f"{where}:{line}", allowed="finite numbers")
@@ -83,16 +83,16 @@ def _add_fan(triangles: array[int], polygon: list[int]) -> None:
         triangles.extend((polygon[0], second, third))
 
 
-# Lists of an OBJ file in the order in which a corner of a face names their entries.
+# Lists of an OBJ file in the order of the indices in a face's corner.
 OBJ_LISTS = {b"v": "vertex", b"vt": "texture coordinate", b"vn": "normal"}
 OBJ_CORNER = re.compile(rb"[-+]?\d{1,18}(?:/(?:[-+]?\d{1,18})?){0,2}")
 
 
 def read_obj(data: bytes, where: str) -> Triangles:
-    """A Wavefront OBJ file: all its faces; groups, materials and lines are left out.
+    """Read all faces of a Wavefront OBJ file; groups, materials and lines are left out.
 
     Raises:
-        DataError: A number is none or a face names what is not there; with its line.
+        DataError: Invalid number, or a face with a missing vertex; with its line.
     """
     text = data.replace(b"\r", b"\n")
     totals = {word: len(re.findall(rb"(?mi)^[ \t]*%b[ \t]" % word, text)) for word in OBJ_LISTS}
@@ -118,7 +118,7 @@ def read_obj(data: bytes, where: str) -> Triangles:
 
 
 def _named_vertex(corner: bytes, totals: dict[bytes, int], before: dict[bytes, int], place: str) -> int:
-    """The vertex of a face's corner, from 0; all that it names is there."""
+    """Index of the vertex of a face's corner, from 0, with all of its indices checked."""
     if not OBJ_CORNER.fullmatch(corner):
         shown, allowed = corner[:40].decode(errors="replace"), "whole numbers, as 1, 1/2, 1//3 or 1/2/3"
         raise DataError(f"a corner of the face is {shown!r}", where=place, allowed=allowed)
@@ -137,10 +137,10 @@ WHOLE_NUMBER = re.compile(rb"[-+]?\d{1,18}")
 
 
 def read_off(data: bytes, where: str) -> Triangles:
-    """An OFF file, with colours or normals behind its vertices or without.
+    """Read an OFF file; colours and normals are left out.
 
     Raises:
-        DataError: It promises more than it has, a number is none, or a face names what is not there; with its line.
+        DataError: Truncated file, invalid number, or a face with a missing vertex; with its line.
     """
     rows = _rows(data, where)
     line, (word, *counts) = next(rows, (1, [b""]))
@@ -179,10 +179,10 @@ STL_HEADER, STL_FACET = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (
 
 
 def read_stl(data: bytes, where: str) -> Triangles:
-    """An STL file, binary or text; every triangle has corners of its own.
+    """Read an STL file, binary or text; every triangle has corners of its own.
 
     Raises:
-        DataError: It promises another number of triangles than it has, or a number is none.
+        DataError: Wrong number of triangles, or invalid number.
     """
     promised = int.from_bytes(data[80:STL_HEADER], "little") if len(data) >= STL_HEADER else 0
     if len(data) == STL_HEADER + promised * STL_FACET.itemsize:
@@ -216,10 +216,10 @@ PLY_BYTES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort":
 
 
 def check_ply(data: bytes, where: str) -> None:
-    """Refuse a PLY file whose header promises more than follows.
+    """Refuse a PLY file with more elements in its header than in its body.
 
     Raises:
-        DataError: So it does, or it has no header.
+        DataError: The file is truncated, too long, or has no valid header.
     """
     header, found, body = data.partition(b"end_header")
     if not data.startswith(b"ply") or not found:
@@ -242,14 +242,14 @@ def check_ply(data: bytes, where: str) -> None:
         raise DataError(f"promises {total} elements, and has {has} of them", where=where, hint="it may be cut short")
 
 
-# Lists of a glTF file by the keys that hold indices into them.
+# Lists of a glTF file by the keys of indices into them.
 LISTS = {
     "accessor": "accessors", "attributes": "accessors", "buffer": "buffers", "bufferView": "bufferViews",
     "camera": "cameras", "children": "nodes", "indices": "accessors", "material": "materials", "mesh": "meshes",
     "nodes": "nodes", "scene": "scenes", "skin": "skins", "targets": "accessors",
 }  # fmt: skip
 COUNTS = ("byteLength", "byteOffset", "byteStride", "count")
-# Anything may stand here.
+# Keys with arbitrary content.
 FREE = ("extras", "extensions", "asset")
 COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -259,10 +259,10 @@ MOST_NODES = 100_000
 
 
 def check_gltf(data: bytes, where: str) -> None:
-    """Refuse a GLB or glTF file with references to what is not there, or that grows beyond measure when it is read.
+    """Refuse a GLB or glTF file with invalid references, or that grows beyond the limits when it is read.
 
     Raises:
-        DataError: So it does, or it needs what is not read: packed or sparse geometry.
+        DataError: The file is invalid or too large, or uses unsupported packed or sparse geometry.
     """
     text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data.startswith(b"glTF") else data
     try:
@@ -280,7 +280,7 @@ def check_gltf(data: bytes, where: str) -> None:
 
 
 def _check_indices(value: Any, document: dict[str, Any], path: str, where: str) -> None:
-    """Every index below a value lies in its list, and every count is one."""
+    """Refuse indices outside their lists and invalid counts, anywhere below a value."""
     entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, item in entries:
         place = f"{path}.{key}".lstrip(".") if isinstance(value, dict) else f"{path}[{key}]"
@@ -320,7 +320,7 @@ def _check_accessors(document: dict[str, Any], where: str) -> None:
 
 
 def _check_nodes(document: dict[str, Any], where: str) -> None:
-    """Nodes form trees of a bounded depth, and place a bounded number of triangles."""
+    """Refuse nodes that are no trees of bounded depth, or that place too many triangles."""
     nodes, accessors = document.get("nodes") or [], document.get("accessors") or []
     meshes = [_size(mesh, accessors, f"meshes[{n}]", where) for n, mesh in enumerate(document.get("meshes") or [])]
     if len(nodes) > MOST_NODES:
@@ -342,7 +342,7 @@ def _check_nodes(document: dict[str, Any], where: str) -> None:
 
 
 def _size(mesh: Any, accessors: list[Any], place: str, where: str) -> int:
-    """Vertices or corners of a mesh, whichever are more, in triangles."""
+    """Size of a mesh in triangles, from its vertices or corners, whichever are more."""
     total = 0
     for number, primitive in enumerate(mesh.get("primitives", ()) if isinstance(mesh, dict) else ()):
         attributes = primitive.get("attributes") if isinstance(primitive, dict) else None
@@ -357,10 +357,10 @@ def _size(mesh: Any, accessors: list[Any], place: str, where: str) -> int:
 
 
 def check_triangles(count: int, where: str) -> None:
-    """Refuse more triangles than a scene can hold.
+    """Refuse more than `MOST_TRIANGLES` triangles.
 
     Raises:
-        DataError: They are more.
+        DataError: There are more.
     """
     if count > MOST_TRIANGLES:
         raise DataError(

@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 
 DIRECTORIES = ("meshdir", "texturedir", "assetdir")
 MAX_INCLUDES = MAX_DIRECTORIES = 100
-# What MuJoCo would make of a few words: elements, copies of them, pixels, places of terrain, room for keyframes.
-# Its time grows with the square of the elements, and faster with copies.
+# Limits of a model's size after reading: elements, copies of them, pixels, points of terrain, keyframes and user data.
+# MuJoCo's time grows with the square of the elements, and faster with copies.
 MOST_ELEMENTS, MOST_COPIES = 20_000, 2000
 MOST_PIXELS, MOST_PLACES = 1 << 27, 1 << 21
 MOST_NUMBERS = 10_000
 REPEATING = ("replicate", "composite", "flexcomp")
 PNG_BEGINNING = b"\x89PNG\r\n\x1a\n"
-MESH_ENDINGS = (".obj", ".stl", ".msh")  # what MuJoCo reads
-# What MuJoCo's viewer shows unless told otherwise; Menagerie keeps what is seen in group 2, what collides in group 3.
+MESH_ENDINGS = (".obj", ".stl", ".msh")  # mesh formats of MuJoCo
+# Groups that MuJoCo's viewer shows by default; Menagerie has visual geoms in group 2, collision geoms in group 3.
 SHOWN_GROUPS = (0, 1, 2)
 PRIMITIVES: dict[str, Callable[[float, float, float], Shape]] = {
     "sphere": lambda radius_m, *_: Sphere(radius_m),
@@ -54,7 +54,7 @@ FileState = tuple[str, int, int]
 
 @dataclass(frozen=True)
 class RobotFile:
-    """The file of a model, the folder that holds all its files (None: its own), and the groups of geoms to be seen."""
+    """File of a model, folder of all its files (None: the file's own), and visible geom groups (None: the default)."""
 
     path: Path
     folder: Path | None = None
@@ -63,15 +63,15 @@ class RobotFile:
 
 @dataclass(frozen=True, eq=False)
 class ModelGeom:
-    """One visible piece of a model: a geom, or all meshes without a name of one of its bodies.
+    """A visible piece of a model: a geom, or all unnamed meshes of a body.
 
     Arguments:
-        name: Of the body, with the geom's name or a number where the body has several pieces.
-        body_name: Of its MuJoCo body, `world` for what stands still.
-        geom_name: Of the geom, empty where it has none.
-        body: The number of its MuJoCo body.
-        shape: Its geometry; keep it between scenes, since what is cached about a mesh hangs on it.
-        pose: Of the shape in the body's frame, shape (4, 4).
+        name: Name of the body, with the geom's name or a number where the body has several pieces.
+        body_name: Name of its MuJoCo body, `world` for fixed geoms.
+        geom_name: Name of the geom, empty where it has none.
+        body: Index of its MuJoCo body.
+        shape: Its geometry; keep it between scenes, since caches are keyed by the mesh object.
+        pose: Pose of the shape in the body's frame, shape (4, 4).
     """
 
     name: str
@@ -89,7 +89,7 @@ class ModelGeom:
 
 @dataclass(frozen=True, eq=False)
 class ModelBody:
-    """A body of a scene, and which MuJoCo body and geom it is."""
+    """A body of a scene, with the names of its MuJoCo body and geom."""
 
     body: Body
     body_name: str
@@ -97,7 +97,7 @@ class ModelBody:
 
 
 def import_mujoco() -> Any:
-    """MuJoCo, the physics engine; raises ConfigError where it is missing."""
+    """Import MuJoCo; raises ConfigError where it is missing."""
     try:
         return import_module("mujoco")
     except ImportError as error:
@@ -108,7 +108,7 @@ def import_mujoco() -> Any:
 
 @contextmanager
 def mujoco_warnings() -> Iterator[list[str]]:
-    """Collects MuJoCo's warnings, which would otherwise be written to MUJOCO_LOG.TXT in the working folder."""
+    """Collect MuJoCo's warnings, which would otherwise be written to MUJOCO_LOG.TXT in the working folder."""
     mujoco = import_mujoco()
     before, collected = mujoco.get_mju_user_warning(), []
     mujoco.set_mju_user_warning(collected.append)
@@ -121,12 +121,12 @@ def mujoco_warnings() -> Iterator[list[str]]:
 def load_model(
     path: str | Path, *, folder: Path | None = None, edit: Callable[[mujoco.MjSpec], None] | None = None
 ) -> tuple[mujoco.MjModel, tuple[str, ...]]:
-    """The model of an MJCF or URDF file, and MuJoCo's warnings, one line each.
+    """Load the model of an MJCF or URDF file, with MuJoCo's warnings, one line each.
 
     Arguments:
         path: The file.
-        folder: All that it reads must lie here; None: in the file's own folder.
-        edit: What changes its specification before it is compiled.
+        folder: Folder that must contain all its files; None: the file's own folder.
+        edit: Function that changes its specification before it is compiled.
 
     Raises:
         DataError: A file is missing, unreadable, too large, outside the model's folder, or no model.
@@ -157,10 +157,10 @@ def load_model(
 
 
 def _check_places(model: mujoco.MjModel, path: Path) -> None:
-    """Refuse poses and sizes that are no numbers, or farther than anything is measured.
+    """Refuse poses and sizes that are not finite or too large, and height fields that are too large.
 
     Raises:
-        DataError: So is one, with the body or geom.
+        DataError: Such a value, with its body, geom or joint.
     """
     kinds = {"body": ("body_pos", "body_quat"), "geom": ("geom_pos", "geom_quat", "geom_size"), "jnt": ("jnt_pos",)}
     for kind, names in kinds.items():
@@ -185,9 +185,9 @@ def bodies_from_mujoco(
     Arguments:
         model: From `load_model` or from MuJoCo itself.
         qpos: Joint configurations, one per frame, shape (F, nq), or one for a scene at rest, shape (nq,).
-        groups: Of the geoms that are seen; None: 0, 1 and 2, as MuJoCo shows them, without shapes that collide where
-            their body has others that are only seen.
-        clip_m: Planes reach at most so far from their middle [m]; None: as far as their own size.
+        groups: Visible groups of geoms; None: 0, 1 and 2, as MuJoCo shows them, without collision shapes of bodies that
+            have visual ones in another group.
+        clip_m: Largest half size of planes [m]; None: their own size.
 
     Raises:
         DataError: No geom is visible, or `qpos` does not fit the model.
@@ -198,7 +198,7 @@ def bodies_from_mujoco(
 
 
 def body_poses(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """The poses of all bodies of a model, body to world, shape (F, nbody, 4, 4).
+    """Poses of all bodies of a model, body to world, shape (F, nbody, 4, 4).
 
     Arguments:
         model: The MuJoCo model.
@@ -223,10 +223,10 @@ def body_poses(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
 def visible_geoms(
     model: mujoco.MjModel, *, groups: Sequence[int] | None = None, clip_m: float | None = None
 ) -> tuple[tuple[ModelGeom, ...], tuple[str, ...]]:
-    """The visible pieces of a model, body by body, and notes on what was mended or left out.
+    """Visible pieces of a model, body by body, and notes on repaired and omitted geometry.
 
     Arguments:
-        model, groups, clip_m: As of `bodies_from_mujoco`.
+        model, groups, clip_m: As in `bodies_from_mujoco`.
 
     Raises:
         DataError: No geom is visible, or the mesh of one cannot be used.
@@ -252,22 +252,22 @@ def visible_geoms(
 
 
 def seen_geoms(model: mujoco.MjModel, groups: Sequence[int] | None = None) -> tuple[np.ndarray, list[str]]:
-    """The numbers of the visible geoms of a model, ascending, and notes on what was left out.
+    """Indices of the visible geoms of a model, ascending, and notes on omitted ones.
 
     Arguments:
-        model, groups: As of `bodies_from_mujoco`.
+        model, groups: As in `bodies_from_mujoco`.
 
     Raises:
         DataError: There are none.
     """
     shown = np.isin(model.geom_group, SHOWN_GROUPS if groups is None else list(groups))
-    # MuJoCo's rays pass through what is fully transparent, too
+    # MuJoCo's rays pass through fully transparent geoms, too
     alpha, coated = model.geom_rgba[:, 3].copy(), model.geom_matid >= 0
     alpha[coated] = model.mat_rgba[model.geom_matid[coated], 3]
     chosen = np.flatnonzero(shown & (alpha > 0))
     notes = []
     if groups is None:
-        # what collides is a coarse double where its body has shapes in another group that are only seen
+        # collision shapes are coarse doubles where their body has visual shapes in another group
         bodies = model.geom_bodyid[chosen]
         places = bodies * import_mujoco().mjNGROUP + model.geom_group[chosen]
         collides = (model.geom_contype[chosen] != 0) | (model.geom_conaffinity[chosen] != 0)
@@ -283,7 +283,7 @@ def seen_geoms(model: mujoco.MjModel, groups: Sequence[int] | None = None) -> tu
 
 
 def _kind(model: mujoco.MjModel, geom: int) -> str:
-    """The type of a geom, as "mesh" or "sphere"."""
+    """Type of a geom, as "mesh" or "sphere"."""
     return import_mujoco().mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
 
 
@@ -292,7 +292,7 @@ def _is_mesh(model: mujoco.MjModel, geom: int) -> bool:
 
 
 def _piece(model: mujoco.MjModel, name: str, geoms: list[int], clip_m: float | None) -> tuple[Shape, np.ndarray]:
-    """The shape of a geom, or of several meshes as one, and its pose in the body's frame."""
+    """Shape of a geom, or of several meshes as one, and its pose in the body's frame."""
     pose, kind, size = _geom_pose(model, geoms[0]), _kind(model, geoms[0]), model.geom_size[geoms[0]].tolist()
     if _is_mesh(model, geoms[0]):
         return _merged(model, name, geoms), np.eye(4)
@@ -300,7 +300,7 @@ def _piece(model: mujoco.MjModel, name: str, geoms: list[int], clip_m: float | N
         return PRIMITIVES[kind](*size), pose
     if kind == "hfield":
         return _height_field(model, name, int(model.geom_dataid[geoms[0]])), pose
-    # a plane, endless where its size is 0
+    # a plane, infinite where its size is 0
     x, y = (min(half or np.inf, clip_m or np.inf) for half in size[:2])
     if np.isinf(max(x, y)):
         return Plane(), pose
@@ -328,7 +328,7 @@ def _merged(model: mujoco.MjModel, name: str, geoms: list[int]) -> Mesh:
 
 
 def _height_field(model: mujoco.MjModel, name: str, number: int) -> Mesh:
-    """Terrain as a closed mesh in the geom's frame: the triangles that MuJoCo sees, sides and a flat bottom."""
+    """Terrain as a closed mesh in the geom's frame: MuJoCo's triangles, sides and a flat bottom."""
     rows, columns, start = (int(column[number]) for column in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
     x_m, y_m, highest_m, base_m = model.hfield_size[number].tolist()
     height = highest_m * model.hfield_data[start : start + rows * columns]
@@ -348,7 +348,7 @@ def _height_field(model: mujoco.MjModel, name: str, number: int) -> Mesh:
 
 
 def model_files(path: Path, folder: Path | None = None) -> tuple[FileState, ...]:
-    """Name, time of change [ns] and size of every file of an MJCF or URDF model, the XML files first.
+    """Name, modification time [ns] and size of every file of an MJCF or URDF model, the XML files first.
 
     Raises:
         DataError: A file is missing, unreadable, no model, or lies outside the model's folder.
@@ -357,14 +357,14 @@ def model_files(path: Path, folder: Path | None = None) -> tuple[FileState, ...]
 
 
 def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], ElementTree.Element]:
-    """The same, and the root of the first, a URDF's with its names settled."""
+    """States as in `model_files`, and the root element of the first file, for a URDF with resolved mesh names."""
     own, allowed_folder = path.resolve().parent, (folder or path.parent).resolve()
     documents, assets, directories, roots = [path.resolve()], [], {""}, []
     if folder is not None and not os.path.isdir(allowed_folder):
         raise DataError("is not a folder", where=str(folder), hint="name the folder that holds all files of the model")
 
     def inside(directory: str, name: str) -> Path:
-        """The file that the model names, links followed."""
+        """Resolved path of a file that the model names; raises DataError outside the allowed folder."""
         found = (own / directory / name).resolve()
         if not found.is_relative_to(allowed_folder):
             what = f"reads {(Path(directory) / name).as_posix()!r}, which is outside the model's folder"
@@ -399,10 +399,10 @@ def _documents(path: Path, folder: Path | None) -> tuple[tuple[FileState, ...], 
 
 
 def _check_growth(roots: Sequence[ElementTree.Element], files: Collection[Path], path: Path) -> None:
-    """Refuse a model that is small as text, and beyond measure once MuJoCo has read it.
+    """Refuse a model that is small as text, but exceeds the limits once MuJoCo has read it.
 
     Raises:
-        DataError: So it is, with what grows.
+        DataError: The quantity that is too large.
     """
     pixels = {file.name: _pixels(file) for file in files if file.suffix.lower() == ".png"}
     elements = [element for root in roots for element in root.iter()]
@@ -426,7 +426,7 @@ def _check_growth(roots: Sequence[ElementTree.Element], files: Collection[Path],
 
 
 def _expanded(element: ElementTree.Element) -> int:
-    """How many elements one becomes: itself and those inside, as often as it repeats them."""
+    """Number of elements that one expands to: itself and its descendants, times its repetitions."""
     times = 1
     for count in element.get("count", "1").split() if element.tag in REPEATING else ():
         times *= max(int(count), 1) if count.isdecimal() and len(count) < 12 else 1
@@ -439,14 +439,14 @@ def _whole(element: ElementTree.Element, name: str) -> int:
 
 
 def _pixels(path: Path) -> int:
-    """How many pixels a PNG file says that it has; 0 where it is none."""
+    """Number of pixels by a PNG file's header; 0 for other files."""
     head = read_head(path, ROBOT_FILES)
     width, height = (int.from_bytes(head[begin : begin + 4], "big") for begin in (16, 20))
     return width * height if head.startswith(PNG_BEGINNING) else 0
 
 
 def _settle_urdf(root: ElementTree.Element, own: Path, folder: Path) -> None:
-    """Keep the visual shapes and all links of a URDF, and name the meshes of its package from its own folder."""
+    """Keep the visual shapes and all links of a URDF, and resolve package:// meshes relative to its own folder."""
     extension = root.find("mujoco")
     extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
     compiler = extension.find("compiler")

@@ -1,7 +1,7 @@
-"""Compiled loops of rays against primitives in closed form, each in its own frame.
+"""Compiled loops that intersect rays with primitives in closed form, each in its own frame.
 
-Points, directions and sizes are tuples of three numbers: compiled loops keep them in registers, where arrays would cost
-as much as the arithmetic.
+Points, directions and sizes are tuples of three numbers, which compiled loops keep in registers; arrays would cost as
+much time as the arithmetic.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def turned_back(to_body, b, v):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True, inline="always")
 def _ball_roots(origin, direction, radius):  # noqa: ANN001, ANN202
-    """Both crossings of a line with a ball, NaN where it passes by; |direction| is 1."""
+    """Ranges at which a line enters and leaves a ball, NaN on a miss; |direction| is 1."""
     along = origin[0] * direction[0] + origin[1] * direction[1] + origin[2] * direction[2]
     x, y, z = origin[0] - along * direction[0], origin[1] - along * direction[1], origin[2] - along * direction[2]
     room = radius * radius - (x * x + y * y + z * z)
@@ -61,7 +61,7 @@ def _ball_roots(origin, direction, radius):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def box_roots(low, high, origin, direction):  # noqa: ANN001, ANN201
-    """Where a line enters and leaves a box between two corners; NaN where it passes."""
+    """Ranges at which a line enters and leaves a box between two corners, NaN on a miss."""
     near, far = -np.inf, np.inf
     for k in range(3):
         if direction[k] == 0.0:
@@ -77,9 +77,9 @@ def box_roots(low, high, origin, direction):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def _capsule_roots(size, origin, direction):  # noqa: ANN001, ANN202
-    """A line meets the side, or the cap on whose side it meets the endless cylinder.
+    """Ranges at which a line enters and leaves a capsule, NaN on a miss.
 
-    Choosing the cap that way leaves no seam between side and cap for a ray to slip through.
+    The crossing with the infinite cylinder selects side or cap, so that there is no seam for a ray to slip through.
     """
     radius, half_length = size[0], size[1]
     across = direction[0] * direction[0] + direction[1] * direction[1]
@@ -108,7 +108,7 @@ def _capsule_roots(size, origin, direction):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _cylinder_roots(size, origin, direction):  # noqa: ANN001, ANN202
-    """Where a line is both between the planes of the ends and in the endless cylinder."""
+    """Ranges at which a line enters and leaves a cylinder, NaN on a miss."""
     radius, half_length = size[0], size[1]
     near, far = -np.inf, np.inf
     across = direction[0] * direction[0] + direction[1] * direction[1]
@@ -130,7 +130,7 @@ def _cylinder_roots(size, origin, direction):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _ellipsoid_roots(axes, origin, direction):  # noqa: ANN001, ANN202
-    """Stretched along its axes it is a ball of radius 1."""
+    """Ranges at which a line enters and leaves an ellipsoid, scaled to the unit ball, NaN on a miss."""
     x, y, z = direction[0] / axes[0], direction[1] / axes[1], direction[2] / axes[2]
     length = math.sqrt(x * x + y * y + z * z)
     start = origin[0] / axes[0], origin[1] / axes[1], origin[2] / axes[2]
@@ -140,7 +140,7 @@ def _ellipsoid_roots(axes, origin, direction):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def primitive_roots(kind, size, origin, direction):  # noqa: ANN001, ANN201
-    """Where a line enters and leaves a primitive, NaN where it passes."""
+    """Ranges at which a line enters and leaves a primitive, NaN on a miss; a plane has one crossing."""
     if kind == SPHERE:
         return _ball_roots(origin, direction, size[0])
     if kind == BOX:
@@ -185,7 +185,7 @@ def primitive_normal(kind, size, point):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True, inline="always")
 def _passes(centre, radius, origin, direction, limit):  # noqa: ANN001, ANN202
-    """Whether a ray passes a ball before a limit."""
+    """True if a ray passes a ball before a limit."""
     x, y, z = centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2]
     along, squared = x * direction[0] + y * direction[1] + z * direction[2], x * x + y * y + z * z
     slack = BALL_SLACK * squared
@@ -195,7 +195,7 @@ def _passes(centre, radius, origin, direction, limit):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def normal_at_range(kind, size, to_body, body, origin, direction, distance):  # noqa: ANN001, ANN201
-    """Outward normal in the world where a ray meets a primitive at a range, and its cosine to the ray."""
+    """Outward normal, in the world, of a primitive at a ray's range, and its cosine with the ray."""
     q, along = placed(to_body, body, origin), turned(to_body, body, direction)
     met = q[0] + distance * along[0], q[1] + distance * along[1], q[2] + distance * along[2]
     own = primitive_normal(kind, size, met)
@@ -205,14 +205,14 @@ def normal_at_range(kind, size, to_body, body, origin, direction, distance):  # 
 
 @njit(cache=True, nogil=True)
 def keep_nearer(shapes, origins, directions, limits, ranges, bodies, normals):  # noqa: ANN001, ANN201
-    """Enter the hits of rays on primitives that are nearer than what is known.
+    """Replace known hits of rays by nearer ones on primitives.
 
     Arguments:
-        shapes: Kinds (B,), sizes (B, 3), world to body (B, 3, 4), centres (B, 3) and radii (B,) of balls around them,
-            and their numbers among all bodies (B,).
-        origins, directions: Of rays, directions of unit length, shape (N, 3).
-        limits: Where rays end, shape (N,) [m].
-        ranges, bodies, normals: Known hits, and out: shapes (N,), (N,) and (N, 3), normals outward in the world.
+        shapes: Kinds (B,), sizes (B, 3), world to body (B, 3, 4), centres (B, 3) and radii (B,) of bounding balls, and
+            indices among all bodies (B,).
+        origins, directions: Rays with directions of unit length, shape (N, 3).
+        limits: Ends of the rays, shape (N,) [m].
+        ranges, bodies, normals: Known hits, updated: shapes (N,), (N,) and (N, 3), normals outward in the world.
     """
     kinds, sizes, to_body, centres, radii, numbers = shapes
     for n in range(origins.shape[0]):
@@ -235,17 +235,17 @@ def keep_nearer(shapes, origins, directions, limits, ranges, bodies, normals):  
 
 @njit(cache=True, nogil=True)
 def passing(centre, radius, pose, origins, directions, bounds, rows, local, toward):  # noqa: ANN001, ANN201
-    """Enter the rays that pass a ball before their bounds, and these in the frame of the body that it is around.
+    """Find the rays that pass a body's bounding ball before their bounds, and transform them into its frame.
 
     Arguments:
-        centre, radius: Of the ball in the world, shape (3,), and [m].
-        pose: Of the body, shape (4, 4).
-        origins, directions: Of rays, directions of unit length, shape (N, 3).
-        bounds: Shape (N,) [m].
-        rows, local, toward: Out: which they are, where they start and where they look, shapes (N,), (N, 3) and (N, 3).
+        centre, radius: Ball in the world, shape (3,) [m] and [m].
+        pose: Pose of the body, shape (4, 4).
+        origins, directions: Rays with directions of unit length, shape (N, 3).
+        bounds: Ends of the rays, shape (N,) [m].
+        rows, local, toward: Output: indices, origins and directions of these rays, shapes (N,), (N, 3) and (N, 3).
 
     Returns:
-        How many they are.
+        The number of these rays.
     """
     found, ball = 0, (centre[0], centre[1], centre[2])
     for n in range(origins.shape[0]):
@@ -264,15 +264,15 @@ def passing(centre, radius, pose, origins, directions, bounds, rows, local, towa
 
 @njit(cache=True, nogil=True)
 def crossings(shapes, origins, directions, starts, limits, rows, ranges, cosines):  # noqa: ANN001, ANN201
-    """Every crossing of rays with primitives from a start up to a limit, by ray; as many as there is room for.
+    """Find the crossings of rays with primitives from starts up to limits, by ray, up to the size of the output.
 
     Arguments:
         shapes, origins, directions, limits: As in `keep_nearer`.
-        starts: Where rays begin, shape (N,) [m].
-        rows, ranges, cosines: Out: the ray, the range and the cosine between normal and ray, without its sign.
+        starts: Starts of the rays, shape (N,) [m].
+        rows, ranges, cosines: Output: index of the ray, range [m] and absolute cosine between normal and ray.
 
     Returns:
-        The number of crossings; where it is above the room, the call has to be repeated.
+        The number of crossings; if it exceeds the size of the output, the call must be repeated with more room.
     """
     kinds, sizes, to_body, centres, radii, _ = shapes
     met, room = 0, rows.shape[0]

@@ -1,6 +1,6 @@
-"""Rays that a design fires, what they meet, the returns that its receiver reports, and rotation matrices.
+"""Rays that a design fires, their hits and returns, and rotation matrices.
 
-A fixed receiver stands upright: its lateral axis is horizontal, wherever it looks. A field of view is the pyramid of
+A fixed receiver is upright: its lateral axis is horizontal in any direction. A field of view is the pyramid of
 the points whose two angles, about its upright and its lateral axis, are both within half of its extents, as behind the
 rectangular stop of a camera.
 
@@ -23,17 +23,17 @@ from lidardesign.numerics import COARSE_SLACK
 from lidardesign.scenes.scene import Receiver
 from lidardesign.space import angles, direction
 
-# Frames per second where nothing else is said.
+# Default frames per second.
 DEFAULT_RATE_HZ = 10.0
 
 
 def fire_times(count: int, rate_hz: float) -> np.ndarray:
-    """When each ray fires in its frame, i / (n * rate), shape (n,) [s]."""
+    """Firing time of each ray in its frame, i / (n * rate), shape (n,) [s]."""
     return np.arange(count) / (max(count, 1) * rate_hz)
 
 
 class Outcome(IntEnum):
-    """What became of one ray; a gate is closed at its start and open at its end."""
+    """Outcome of a ray; a gate is closed at its start and open at its end."""
 
     RETURN = 0
     OCCLUDED = 1
@@ -47,13 +47,13 @@ class Rays:
     """An explicit list of rays, in the order in which they fire.
 
     Arguments:
-        origin_m: Where rays start [m], shape (N, 3).
+        origin_m: Origins [m], shape (N, 3).
         direction: Unit vectors, shape (N, 3).
-        gate_m: Start and end of the interval each ray listens in [m], shape (N, 2).
-        sensor: The index of the sensor that fires it, shape (N,).
-        time_s: When it fires within the frame [s], shape (N,).
-        angles_rad: The azimuths and elevations that directions were made from, shape (N, 2); None where they follow
-            from the directions. Files hold angles: reading and writing them again changes no digit.
+        gate_m: Start and end of each ray's range gate [m], shape (N, 2).
+        sensor: Index of each ray's sensor, shape (N,).
+        time_s: Firing times within the frame [s], shape (N,).
+        angles_rad: Azimuths and elevations that directions were made from, shape (N, 2); None: computed from the
+            directions. Files hold angles: reading and writing them again changes no digit.
 
     Raises:
         ConfigError: Non-finite values, directions that are not unit vectors, reversed or negative gates.
@@ -107,29 +107,29 @@ class Rays:
         gate_m: np.ndarray,
         sensor: np.ndarray,
     ) -> Rays:
-        """Rays whose angles (N,) keep every digit, evenly over a frame at the default rate."""
+        """Rays from angles (N,), which are kept to the last digit, fired evenly over a frame at the default rate."""
         looking = direction(azimuth_rad, elevation_rad)
         times = fire_times(len(looking), DEFAULT_RATE_HZ)
         return cls(origin_m, looking, gate_m, sensor, times, np.stack([azimuth_rad, elevation_rad], axis=1))
 
     @classmethod
     def joined(cls, parts: Sequence[Rays]) -> Rays:
-        """Several lists as one, one after the other, with angles as they follow from directions."""
+        """Concatenated lists of rays, with angles computed from directions."""
         names = ("origin_m", "direction", "gate_m", "sensor", "time_s")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     @property
     def azimuth_rad(self) -> np.ndarray:
-        """Shape (N,)."""
+        """Azimuths [rad], shape (N,)."""
         return angles(self.direction)[0] if self.angles_rad is None else self.angles_rad[:, 0]
 
     @property
     def elevation_rad(self) -> np.ndarray:
-        """Shape (N,)."""
+        """Elevations [rad], shape (N,)."""
         return angles(self.direction)[1] if self.angles_rad is None else self.angles_rad[:, 1]
 
     def as_angles(self) -> Rays:
-        """These rays as a file holds them: directions are those of their own angles, and may differ by rounding."""
+        """These rays as read from a file: directions computed from their angles, which may differ by rounding."""
         return Rays.from_angles(self.origin_m, *angles(self.direction), self.gate_m, self.sensor)
 
     def __len__(self) -> int:
@@ -142,15 +142,15 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Returns:
-    """What the receiver reports, one entry per ray.
+    """Returns of rays, one entry per ray.
 
     Arguments:
-        rays: The rays that were fired.
+        rays: The fired rays.
         outcome: Values of `Outcome`, shape (N,).
         range_m: The measured one-way range [m], NaN without a return, shape (N,).
-        body: Index of the body that was hit inside the gate, shape (N,); -1 without a return, and where a detector took
-            noise for one. For scoring only.
-        frame: The scene's time frame that they were measured in.
+        body: Index of the body that was hit inside the gate, shape (N,); -1 without a return and for false alarms. For
+            scoring only.
+        frame: The time frame of the scene.
     """
 
     rays: Rays
@@ -171,7 +171,7 @@ class Returns:
         return self.rays.origin_m[hit] + self.range_m[hit, None] * self.rays.direction[hit]
 
     def counts(self) -> dict[str, int]:
-        """How many rays met each outcome, by lower-case name."""
+        """Number of rays of each outcome, by lower-case name."""
         return {outcome.name.lower(): int((self.outcome == outcome).sum()) for outcome in Outcome}
 
 
@@ -191,12 +191,12 @@ class Hits:
 
     @classmethod
     def none(cls, count: int) -> Hits:
-        """So many misses."""
+        """`count` misses."""
         return cls(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
 
     @classmethod
     def joined(cls, parts: Sequence[Hits]) -> Hits:
-        """Several lists as one, one after the other."""
+        """Concatenated lists of hits."""
         return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
     def subset(self, chosen: np.ndarray | slice) -> Hits:
@@ -205,7 +205,7 @@ class Hits:
 
 
 class Crossings(NamedTuple):
-    """All surfaces that rays pass, as flat lists: ray (K,), range (K,) [m], |cosine| with the normal (K,)."""
+    """All surfaces that rays cross, as flat lists: ray (K,), range (K,) [m], |cosine| with the normal (K,)."""
 
     row: np.ndarray
     range_m: np.ndarray
@@ -235,10 +235,10 @@ def receiver_axes(receiver: Receiver) -> np.ndarray:
 
 
 def angles_in_view(receiver: Receiver, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where a receiver sees points (..., 3) [m]: horizontal and vertical angle [rad] and distance [m], each (...).
+    """Horizontal and vertical angle [rad] and distance [m] of points (..., 3) [m] from a receiver, each (...).
 
     Angles are signed turns from the boresight about the upright axis (left is positive) and about the lateral axis
-    (up is positive), beyond a quarter turn for what lies behind.
+    (up is positive), beyond a quarter turn for points behind it.
     """
     offset = np.asarray(points, dtype=np.float64) - np.asarray(receiver.origin_m)
     ahead, left, up = np.moveaxis(offset @ receiver_axes(receiver).T, -1, 0)
@@ -246,14 +246,14 @@ def angles_in_view(receiver: Receiver, points: np.ndarray) -> tuple[np.ndarray, 
 
 
 def in_view(receiver: Receiver, points: np.ndarray) -> np.ndarray:
-    """Which points (..., 3) lie in a receiver's field of view and interval of ranges, ends included, shape (...)."""
+    """Mask of points (..., 3) in a receiver's field of view and interval of ranges, ends included, shape (...)."""
     horizontal, vertical, distance_m = angles_in_view(receiver, points)
     inside = (np.abs(horizontal) <= receiver.horizontal_rad / 2) & (np.abs(vertical) <= receiver.vertical_rad / 2)
     return inside & (distance_m >= receiver.range_m[0]) & (distance_m <= receiver.range_m[1])
 
 
 def path_of_range(rays: Rays, receiver: Receiver | None, range_m: np.ndarray) -> np.ndarray:
-    """Half the whole path of light that meets a surface at ranges (N,) along rays, shape (N,) [m]."""
+    """Half the path of light from the emitter by a surface at ranges (N,) to the receiver, shape (N,) [m]."""
     if receiver is None:
         return range_m
     points = rays.origin_m + range_m[:, None] * rays.direction
@@ -262,7 +262,7 @@ def path_of_range(rays: Rays, receiver: Receiver | None, range_m: np.ndarray) ->
 
 
 def range_of_path(rays: Rays, receiver: Receiver | None, path_m: np.ndarray) -> np.ndarray:
-    """Ranges along rays whose light took half paths (N,), shape (N,) [m]; the inverse of `path_of_range`.
+    """Ranges along rays from half paths (N,), shape (N,) [m]; the inverse of `path_of_range`.
 
     A path shorter than the way from the emitter to the receiver has no range: NaN.
     """
@@ -278,17 +278,17 @@ def range_of_path(rays: Rays, receiver: Receiver | None, path_m: np.ndarray) -> 
 
 
 def path_windows(rays: Rays, receiver: Receiver | None) -> np.ndarray:
-    """The gates of rays as intervals of half paths, shape (N, 2) [m]: a path grows with its range."""
+    """Gates of rays as intervals of half path, which grows with range, shape (N, 2) [m]."""
     return np.stack([path_of_range(rays, receiver, np.ascontiguousarray(end)) for end in rays.gate_m.T], axis=1)
 
 
 def _at_the_receiver(rays: Rays, receiver: Receiver) -> np.ndarray:
-    """Which rays start where the receiver is: there nothing needs to be solved."""
+    """Mask of rays that start at the receiver, shape (N,): half path and range are equal there."""
     return (rays.origin_m == np.asarray(receiver.origin_m)).all(axis=1)
 
 
 def rotation_of_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.ndarray:
-    """The rotation about the fixed axes x, then y, then z, as URDF, SDF and ROS mean it, shape (3, 3)."""
+    """Rotation about the fixed axes x, then y, then z, as in URDF, SDF and ROS, shape (3, 3)."""
     (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a), math.cos(a)) for a in (roll_rad, pitch_rad, yaw_rad))
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
     about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
@@ -296,7 +296,7 @@ def rotation_of_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.nda
 
 
 def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> np.ndarray:
-    """The rotation of a quaternion of any length above 0, shape (3, 3); columns are the axes.
+    """Rotation of a quaternion of any length above 0, shape (3, 3); columns are the axes.
 
     Raises:
         ValueError: It has no length.

@@ -23,14 +23,14 @@ Role = Literal["target", "occluder", "both"]
 Sign = Literal["auto", "solid", "winding", "unsigned"]
 ROLES = ("target", "occluder", "both")
 IDENTITY = np.eye(3)
-# How far the products of a pose's axes may be from those of a rotation: poses are often written with few digits.
+# Tolerated deviation of a pose's axes from orthonormality: poses are often written with few digits.
 RIGID_TOLERANCE = COARSE_SLACK + 10 * COARSE_SLACK * IDENTITY
 SPEED_OF_LIGHT_M_S = 299_792_458.0
-# Light that fades over a nanometre has entered a solid.
+# Largest extinction or backscatter of a medium: light fades within a nanometre.
 DENSEST = 1e9
-# A picometre is less than an atom; areas are squares of lengths and must stay numbers, as must what is divided by them.
+# A picometre; areas are squares of lengths and must stay normal numbers, as must quotients by them.
 SMALLEST_M = 1 / 1e12
-# A part of a surface that counts a million times as much as another is what a density ever sees of it.
+# Largest importance; beyond it a density would cover nothing else.
 LARGEST_WEIGHT = 1e6
 # Shares of light that were meant to add up to 1 may exceed it by rounding.
 SHARE_ROUNDING = SLACK
@@ -119,10 +119,10 @@ class Mesh:
     Arguments:
         vertices: Positions [m], shape (V, 3) float64.
         faces: Vertex indices, shape (F, 3) int32.
-        sign: How the inside is told from the outside: `solid` (closed and consistently wound), `winding`
+        sign: Rule of the sign of distances: `solid` (closed and consistently wound), `winding`
             (generalised winding number beyond +-1/2), `unsigned` (no inside: distances are never negative).
-        notes: What loading mended or found, one line each.
-        importance: How much the surface counts at each vertex, above 0, shape (V,); between vertices its logarithm is
+        notes: Repairs and findings of loading, one line each.
+        importance: Weight of the surface at each vertex, above 0, shape (V,); between vertices its logarithm is
             interpolated. None: 1 everywhere.
     """
 
@@ -157,7 +157,7 @@ class Mesh:
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 of vertices, faces and sign rule: the name of everything cached about this geometry."""
+        """SHA-256 of vertices, faces and sign rule: the key of everything cached about this geometry."""
         digest = hashlib.sha256(self.sign.encode())
         digest.update(self.vertices.tobytes())
         digest.update(self.faces.tobytes())
@@ -197,11 +197,11 @@ def _check_shares(what: str, **shares: float) -> None:
 
 @dataclass(frozen=True)
 class Medium:
-    """What fills the air: haze, fog, dust.
+    """Scattering medium: haze, fog, dust.
 
     Arguments:
-        extinction_per_m: How fast light fades, exp(-extinction * length) [1/m].
-        backscatter_per_m_sr: How much of it comes straight back per length and solid angle [1/(m sr)].
+        extinction_per_m: Extinction coefficient; light fades as exp(-extinction * length) [1/m].
+        backscatter_per_m_sr: Backscatter coefficient [1/(m sr)].
     """
 
     extinction_per_m: float
@@ -216,11 +216,11 @@ class Medium:
 
 @dataclass(frozen=True)
 class Ambient:
-    """Light that the emitter did not send.
+    """Ambient light.
 
     Arguments:
-        illuminance_lux: On the surfaces [lux]; full sunlight has about 100,000, a lit room 300.
-        source: Its spectrum: `sun`, or `indoor` (white LEDs, which hardly shine in the infrared).
+        illuminance_lux: Illuminance of the surfaces [lux]; full sunlight has about 100,000, a lit room 300.
+        source: Spectrum: `sun`, or `indoor` (white LEDs, which emit little infrared).
     """
 
     illuminance_lux: float
@@ -235,13 +235,13 @@ class Ambient:
 
 @dataclass(frozen=True)
 class Receiver:
-    """A fixed detector that listens for light from elsewhere; without one, every ray listens from its own origin.
+    """A fixed, bistatic receiver; without one, every ray is received at its own origin.
 
     Arguments:
-        origin_m: Where it is [m].
-        azimuth_rad, elevation_rad: Where it looks.
+        origin_m: Position [m].
+        azimuth_rad, elevation_rad: Direction of its boresight.
         horizontal_rad, vertical_rad: Its whole field of view, angles about its upright and its lateral axis.
-        range_m: The interval of distances from it that it can hear in [m].
+        range_m: Interval of distances from it that it receives [m].
     """
 
     origin_m: Vector
@@ -264,19 +264,19 @@ class Receiver:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One rigid thing in a scene.
+    """A rigid body in a scene.
 
     Arguments:
         shape: Its geometry in its own frame.
-        name: For people and messages.
-        role: `target` counts as surface worth observing, `occluder` blocks rays, `both` does both.
+        name: Name in messages and reports.
+        role: `target` is a surface to observe, `occluder` blocks rays, `both` does both.
         poses: Body to world, shape (4, 4) for a body at rest or (frames, 4, 4).
         reflectance: Lambertian albedo, 0 to 1.
-        specular: Share of the light that it mirrors, 0 to 1.
-        transmission: Share of the light that each of its surfaces lets through, straight on, 0 to 1.
-        velocity_m_s: How a body at rest in all frames moves within one [m/s]; bodies with a pose per frame move
+        specular: Share of the light that is mirrored, 0 to 1.
+        transmission: Share of the light that each of its surfaces transmits, without refraction, 0 to 1.
+        velocity_m_s: Velocity within a frame of a body with a single pose [m/s]; bodies with a pose per frame move
             from each to the next.
-        importance: How much its surface counts as a target, above 0; a factor on that of its mesh.
+        importance: Weight of its surface as a target, above 0; a factor on that of its mesh.
     """
 
     shape: Shape
@@ -332,33 +332,33 @@ class Body:
 
     @property
     def is_target(self) -> bool:
-        """Whether its surface is worth observing."""
+        """True if its surface is to be observed."""
         return self.role != "occluder"
 
     @property
     def is_occluder(self) -> bool:
-        """Whether it blocks rays in the density."""
+        """True if it blocks rays in the density."""
         return self.role != "target"
 
     def pose(self, frame: int = 0) -> np.ndarray:
-        """The 4x4 pose at a frame; a body at rest has the same one in all frames."""
+        """Pose (4, 4) at a frame; a body at rest has the same one in all frames."""
         return self.poses if self.poses.ndim == 2 else self.poses[frame]
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What the sensors look at: bodies, optionally moving over frames, and what the task knows of the truth.
+    """A scene: bodies, optionally moving over frames, and ground truth for the task's score.
 
     Arguments:
         bodies: At least one, and at least one target.
-        name: For people and messages.
-        truth: Arrays that the task's score needs (never read by designs, densities or estimates).
+        name: Name in messages and reports.
+        truth: Ground truth for the task's score (never read by designs, densities or estimates).
         frame_rate_hz: Frames per second where bodies move.
-        notes: What a user should know of how the scene was made, one line each.
-        medium: What fills the air; None: nothing.
-        ambient: Light that the emitter did not send; None: darkness.
-        receiver: A fixed detector that receives the light of all rays; None: every ray is received at its own origin.
-        group: What was drawn independently, such as the mesh that several scenes show; None: this scene alone.
+        notes: Notes to the user on how the scene was made, one line each.
+        medium: Scattering medium; None: clear air.
+        ambient: Ambient light; None: darkness.
+        receiver: A fixed receiver of the light of all rays; None: every ray is received at its own origin.
+        group: Name of the independent draw, such as a mesh that several scenes share; None: this scene alone.
 
     Example:
         >>> scene = run.scenes("test", seed=0)[0]
@@ -398,7 +398,7 @@ class Scene:
 
 
 def group_numbers(scenes: Sequence[Scene]) -> np.ndarray:
-    """The number of each scene's group, shape (S,): 0, 1, ... as they first appear."""
+    """Index of each scene's group, shape (S,): 0, 1, ... as they first appear."""
     numbers: dict[object, int] = {}
     keys = (number if scene.group is None else scene.group for number, scene in enumerate(scenes))
     return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)

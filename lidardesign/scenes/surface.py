@@ -1,4 +1,4 @@
-"""Points uniform in area on meshes and primitives, and what compiled loops know of shapes: kind, lengths, reach."""
+"""Area-uniform points on meshes and primitives, and the kinds and lengths of shapes for compiled loops."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lidardesign.numerics import ROUNDING
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Round, Scene, Shape, Sphere
 from lidardesign.space import RANGE, DesignSpace
 
-# Kinds of bodies, as compiled loops know them; a mesh is one of the grids of distance fields.
+# Kinds of bodies in compiled loops; a mesh is one of the grids of distance fields.
 SPHERE, BOX, CAPSULE, PLANE, GRID, CYLINDER, ELLIPSOID = range(7)
 KINDS: dict[type, int] = {
     Sphere: SPHERE, Box: BOX, Capsule: CAPSULE, Plane: PLANE, Mesh: GRID, Cylinder: CYLINDER, Ellipsoid: ELLIPSOID,
@@ -27,12 +27,12 @@ SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
     Plane: lambda shape: (0.0, 0.0, 0.0),
     Mesh: lambda shape: (0.0, 0.0, 0.0),
 }
-# Relative rounding of squared distances, doubled many times over: bounding balls are never missed.
+# Relative rounding of squared distances with a wide margin: bounding balls are never missed.
 BALL_SLACK = ROUNDING
 
 
 class Sampled(NamedTuple):
-    """Points (K, 3) [m] and the corners of the triangle of each (K, 3, 3); on primitives all three are it."""
+    """Points (K, 3) [m] and the corners of each one's triangle (K, 3, 3); on primitives all three are the point."""
 
     points: np.ndarray
     triangles: np.ndarray
@@ -41,7 +41,7 @@ class Sampled(NamedTuple):
 def sample_triangles(
     vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Area-uniform points (count, 3) and the index of the face of each, in ascending order.
+    """Area-uniform points (count, 3) and the indices of their faces, in ascending order.
 
     Places along the cumulated area are stratified, which halves the noise of means over the surface.
     A surface without area gives its vertices.
@@ -77,7 +77,7 @@ def sample_body(
 
 
 def surface_area_m2(body: Body, space: DesignSpace) -> float:
-    """The area of a body's surface [m^2]; of a plane, the square that the space can reach."""
+    """Area of a body's surface [m^2]; of a plane, the square within reach of the space."""
     match body.shape:
         case Sphere(radius_m=radius_m):
             return 4 * math.pi * radius_m**2
@@ -99,7 +99,7 @@ def surface_area_m2(body: Body, space: DesignSpace) -> float:
 
 
 def target_area_m2(scene: Scene, space: DesignSpace) -> float:
-    """The area of all targets of a scene [m^2]."""
+    """Area of all targets of a scene [m^2]."""
     return sum(surface_area_m2(body, space) for body in scene.bodies if body.is_target)
 
 
@@ -144,7 +144,7 @@ def _on_primitive(shape: Round | Box, count: int, generator: np.random.Generator
         return shape.radius_m * direction
     if isinstance(shape, Ellipsoid):
         axes = np.array(shape.semi_axes_m)
-        # a ball that is stretched to it grows by |direction / axes| there, at most by 1 / the smallest axis
+        # a ball stretched to it grows in area by |direction / axes| there, at most by 1 / the smallest axis
         growth = np.linalg.norm(direction / axes, axis=1) * axes.min()
         accepted = axes * direction[generator.random(count) < growth]
         rest = count - len(accepted)
@@ -166,7 +166,7 @@ def grid_faces(rows: int, columns: int) -> np.ndarray:
 
 
 def round_triangles(shape: Round, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) [m] and outward faces (F, 3) of a round shape with so many steps round its z axis."""
+    """Vertices (V, 3) [m] and outward faces (F, 3) of a round shape with `steps` steps round its z axis."""
     turn = np.linspace(0.0, 2 * np.pi, steps + 1)
     half = np.linspace(0.0, np.pi / 2, steps // 4 + 1)
     latitude = np.concatenate([half[::-1], -half])
@@ -182,7 +182,7 @@ def round_triangles(shape: Round, steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def half_extents_m(shape: Shape) -> tuple[float, float, float]:
-    """Half the sides of the box around a primitive in its own frame, infinite around a plane [m]."""
+    """Half extents of a primitive's bounding box in its own frame, infinite for a plane [m]."""
     match shape:
         case Sphere(radius_m=radius_m):
             return radius_m, radius_m, radius_m
@@ -196,7 +196,7 @@ def half_extents_m(shape: Shape) -> tuple[float, float, float]:
 
 
 def bounding_radius_m(shape: Shape) -> float:
-    """The radius of the ball around a primitive's origin that holds it, infinite for a plane [m]."""
+    """Radius of a primitive's bounding ball around its origin, infinite for a plane [m]."""
     half = half_extents_m(shape)
     match shape:
         case Box():

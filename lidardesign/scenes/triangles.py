@@ -1,11 +1,11 @@
-"""Rays at the triangles of meshes in one frame, by Embree; the one module that knows its interface.
+"""Ray casting against triangle meshes in one frame by Embree; the only module that calls it.
 
 Meshes are recentred in float64 before they become Embree's float32, and rays that start far away are advanced to their
 neighbourhood first, which keeps sub-micrometre accuracy far from the origin.
 
 Embree runs in its robust mode, without which a quarter of the rays aimed at vertices slip through. With it one in a
-hundred still does: to nowhere, or from outside to the back of a closed mesh. So rays that hit nothing, or a triangle's
-back, can be cast a second time from a place beside; what that finds nearer counts.
+hundred still does: it misses, or hits the back of a closed mesh from outside. So rays that miss or hit a triangle's
+back can be cast a second time from a shifted origin; a nearer hit of that cast replaces the first.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ import numpy as np
 from lidardesign.numerics import COARSE_SLACK, unit_vectors
 from lidardesign.scenes.scene import Mesh
 
-FARTHEST_M = 1e30  # what Embree takes for an unlimited ray
+FARTHEST_M = 1e30  # range of an unlimited ray in Embree
 # Rays that start further than this many radii from the meshes' ball are advanced to it in float64.
 FAR_RADII = 4.0
-# Rays are cast a second time from this share of the meshes' radius beside: some ten roundings of Embree's float32, and
-# no more than its ranges are off by anyway.
+# Lateral shift of the second cast as a share of the meshes' radius: some ten roundings of Embree's float32, and no
+# more than the error of its ranges.
 BESIDE_SHARE = COARSE_SLACK
-# The second hit counts where it is nearer by more than this share of the range or radius, and so is another surface.
+# A second hit is another surface if it is nearer by more than this share of the range or radius.
 NEARER_SHARE = 1e-4
-# From each of two axes across a ray unlike shares are taken: a mesh's planes of symmetry hold many of its vertices.
+# Unequal shares of the two lateral axes avoid a mesh's planes of symmetry, which hold many of its vertices.
 BESIDE_SLANT = 0.618
 
 
 @dataclass
 class SecondCasts:
-    """How often the triangles of meshes were asked twice.
+    """Counts of rays cast a second time.
 
     Arguments:
-        rays: Rays whose first hit was asked for.
-        cast: How often one was cast at meshes a second time.
-        found: How often it had slipped through a nearer surface the first time.
+        rays: Number of rays in all.
+        cast: Number of second casts at meshes.
+        found: Number of second casts with a nearer hit, whose ray slipped through the first time.
     """
 
     rays: int = 0
@@ -50,7 +50,7 @@ class SecondCasts:
 
 
 class Triangles:
-    """Meshes in one Embree scene, recentred; `centre_m` (3,) and `radius_m` are those of a ball around them."""
+    """Meshes in one Embree scene, recentred; `centre_m` (3,) and `radius_m` give their bounding ball."""
 
     def __init__(self, meshes: Sequence[Mesh]) -> None:
         from embreex.mesh_construction import TriangleMesh
@@ -69,8 +69,8 @@ class Triangles:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """First hits of finite float64 rays of unit length: rows (K,), ranges (K,), meshes (K,) and normals (K, 3).
 
-        From its limit (N,) on, a hit counts as a miss. Normals are wound as the faces are. Where hits are asked for
-        twice, what is cast again is counted there.
+        Hits at or beyond limits (N,) are misses. Normals follow the winding of the faces. With `twice`, doubtful rays
+        are cast again and counted there.
         """
         local = origins - self.centre_m
         advance_m = advances_m(local, directions, self.radius_m)
@@ -91,7 +91,7 @@ class Triangles:
         limit_m: np.ndarray,
         counted: SecondCasts,
     ) -> None:
-        """Enter what rays that hit nothing, or a triangle's back, meet before that from a place beside."""
+        """Cast rays that missed or hit a triangle's back again from a shifted origin, and keep nearer hits."""
         missed = found["primID"] < 0
         doubtful = np.flatnonzero(missed | (np.einsum("nk,nk->n", found["Ng"], directions) > 0))
         counted.cast += len(doubtful)
@@ -127,12 +127,12 @@ class Triangles:
         return range_m, normal
 
     def run(self, local: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> dict[str, np.ndarray]:
-        """Embree's own answer for float32 rays."""
+        """Embree's result for float32 rays."""
         return self._scene.run(local, directions, dists=limit_m, output=True)
 
 
 def advances_m(local: np.ndarray, directions: np.ndarray, radius_m: np.ndarray | float) -> np.ndarray:
-    """How far starts are moved towards meshes around 0 where float32 could not tell them apart, shape (N,)."""
+    """Distance to advance distant origins towards meshes around 0, where float32 is too coarse, shape (N,) [m]."""
     far = np.einsum("nk,nk->n", local, local) > (FAR_RADII * radius_m) ** 2
     if not far.any():
         return np.zeros(len(local))
@@ -145,7 +145,7 @@ _casters_by_content: WeakValueDictionary[str, Triangles] = WeakValueDictionary()
 
 
 def mesh_caster(mesh: Mesh) -> Triangles:
-    """The one caster of a mesh in its own frame, kept as long as the mesh; meshes of equal content share it."""
+    """Shared caster of a mesh in its own frame, kept as long as the mesh; meshes of equal content share it."""
     if mesh not in _mesh_casters:
         known = _casters_by_content.get(mesh.content_hash)
         if known is None:

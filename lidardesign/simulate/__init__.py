@@ -1,1 +1,1 @@
-"""The returns of a design: first hits, gates and outcomes of every ray."""
+"""Simulation of returns: first hits, gates, detectors and optional physical effects."""

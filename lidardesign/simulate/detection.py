@@ -1,4 +1,4 @@
-"""Detection: the strongest echo, or the return that it finds among the photons that it counts."""
+"""Detection: the strongest echo, or the return in a histogram of counted photons."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ from lidardesign.simulate.effects.photon_noise import draw_numbers, draw_places
 from lidardesign.simulate.effects.pile_up import survive_dead_time
 from lidardesign.simulate.effects.quantisation import round_to_bins
 
-# Rays that more photons than this are expected of are counted bin by bin, others photon by photon
+# Rays with more expected photons than this are counted bin by bin, others photon by photon
 PHOTONS_ONE_BY_ONE = 512.0
 # Draws of a ray whose bins are counted one by one, beyond those of its photons
 FIRST_BIN = 1 << 40
-# A range further than this many standard deviations (and half a bin) from every echo was found in noise
+# A range further than this many standard deviations (and half a bin) from every echo is a false alarm
 EXPLAINED_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """What a detector reports of N rays.
+    """Detected half paths and bodies of N rays.
 
     Arguments:
         path_m: Half the whole path, NaN without a return, shape (N,) [m].
-        body: The body whose echo it is, -1 where noise was taken for one and without a return, shape (N,).
+        body: Index of the echo's body, -1 for false alarms and without a return, shape (N,).
     """
 
     path_m: np.ndarray
@@ -61,13 +61,13 @@ class Detections:
 def detect(
     scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, background: Background, physics: Physics
 ) -> Detections:
-    """What a detector reports of all rays of a frame, which share the emitter's light.
+    """Detect the returns of all rays of a frame, which share the emitter's light.
 
     Arguments:
         scene, frame: They name the random streams.
-        windows_m: The half paths that each ray listens to, closed at the start and open at the end, shape (N, 2) [m].
+        windows_m: Each ray's gate in half paths, closed at the start and open at the end, shape (N, 2) [m].
         echoes: The light that comes back.
-        background: Counts that no surface sent back.
+        background: Counts from ambient light, dark counts and haze.
         physics: The detector and the effects that are on.
 
     Raises:
@@ -91,7 +91,7 @@ def detect(
 
 
 def _from_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physics) -> np.ndarray:
-    """The half paths that are read from a chunk's histograms, NaN without a return [m]."""
+    """Half paths of the returns in a chunk's histograms, NaN without a return, shape (N,) [m]."""
     detector, bins = physics.detector, light.bins
     counts = count_photons(scene, frame, light, physics)
     sigma_m = metres(detector.timing_sigma_s)
@@ -111,7 +111,7 @@ def _from_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physi
 
 
 def _known_level(light: ArrivingLight, physics: Physics) -> np.ndarray:
-    """Background counts per bin that a detector measures between its pulses, shape (N,): blind after each, or not.
+    """Background counts per bin that a detector measures between its pulses, thinned by dead time, shape (N,).
 
     With a correction, they are those of pulses that are all alive; at most one per pulse and bin.
     """
@@ -125,7 +125,7 @@ def _known_level(light: ArrivingLight, physics: Physics) -> np.ndarray:
 
 
 def _strongest(scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, physics: Physics) -> Detections:
-    """The strongest echo in each window; those that the detector cannot tell from it, as their mean by gain."""
+    """The strongest echo in each window, averaged by gain with the echoes within the detector's resolution."""
     count, detector = len(windows_m), physics.detector
     inside = (echoes.path_m >= windows_m[echoes.ray, 0]) & (echoes.path_m < windows_m[echoes.ray, 1])
     echoes = echoes.subset(inside & (echoes.gain > 0))
@@ -135,7 +135,7 @@ def _strongest(scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, 
     found = best >= 0
     path_m, body = np.full(count, np.nan), np.full(count, -1)
     path_m[found], body[found] = echoes.path_m[best[found]], echoes.body[best[found]]
-    # How far echoes near the strongest one (index `best`, -1: none) move each ray's range [m]
+    # Shift of each ray's range by echoes near the strongest one (index `best`, -1: none) [m]
     resolution = resolution_m(detector)
     away = echoes.path_m - path_m[echoes.ray]
     near = np.abs(away) <= resolution
@@ -155,16 +155,16 @@ def _strongest(scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, 
 
 @dataclass(frozen=True, eq=False)
 class ArrivingLight:
-    """The light that N neighbouring rays of a list get in a frame, E echoes.
+    """The light that N consecutive rays of a list receive in a frame, E echoes.
 
     Arguments:
-        bins: What it is sorted into.
-        first_ray: Index of the first of them in the list.
-        rays: How many rays the list has, which share the emitter's energy.
-        pulses: How many pulses each of them gets.
+        bins: Bins of the histograms.
+        first_ray: Index of the first ray in the list.
+        rays: Number of rays in the list, which share the emitter's energy.
+        pulses: Number of pulses per ray.
         echo_offset: Echoes of ray i are echo_offset[i] to echo_offset[i + 1], shape (N + 1,).
-        path_m: Their half paths, shape (E,) [m].
-        expected: Their expected counts in a frame, shape (E,).
+        path_m: Half paths of the echoes, shape (E,) [m].
+        expected: Expected counts of the echoes in a frame, shape (E,).
         per_metre: Ambient and dark counts per pulse and metre, shape (N,).
         edges_m, haze: Cells of haze, (N, C + 1) [m], and their counts per pulse, (N, C); None: clear air.
     """
@@ -209,7 +209,7 @@ class ArrivingLight:
         )
 
     def part(self, begin: int, end: int) -> ArrivingLight:
-        """That of rays begin to end."""
+        """The light of rays begin to end."""
         echoes = slice(self.echo_offset[begin], self.echo_offset[end])
         return ArrivingLight(
             self.bins.part(begin, end),
@@ -226,9 +226,9 @@ class ArrivingLight:
 
 
 def count_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physics) -> np.ndarray:
-    """Counts per bin of the rays that `light` is of, flat as its bins say."""
+    """Simulated counts per bin of the rays of `light`, flat with the offsets of its bins."""
     counts = np.zeros(light.bins.offset[-1], np.int64)
-    # ray by ray: in differences of running sums a blinding echo would drown those of other rays
+    # ray by ray: differences of running sums would lose other rays next to a very strong echo
     ray = np.repeat(np.arange(len(light.bins)), np.diff(light.echo_offset))
     total = np.bincount(ray, weights=light.expected, minlength=len(light.bins))
     few = np.flatnonzero((total <= PHOTONS_ONE_BY_ONE) & (total > 0))
@@ -312,7 +312,7 @@ def _add_bin_by_bin(
         sigma_m,
     )
     offset = np.concatenate([[0], np.cumsum(np.diff(bins.offset)[many])])
-    # where their number is chance, photons stray within the pulse; where only their timing is, from bin to bin
+    # with photon noise or jitter counts of bins are Poisson, drawn from the first one's stream
     chance = [name for name in ("photon_noise", "jitter") if name in effects]
     if chance:
         key = np.uint64(physics.stream(chance[0], scene, frame))
@@ -323,14 +323,14 @@ def _add_bin_by_bin(
 
 
 def coates(counts: np.ndarray, pulses: float) -> np.ndarray:
-    """Photons per pulse that arrived in each bin, from those that a detector counted which is blind after the first.
+    """Coates' correction: arrived photons per pulse and bin, from the counts of a detector blind after the first.
 
-    A bin's photons can only be counted in pulses that were not over: log((P - C_before) / (P - C_to_here)), with C the
-    running count (Coates 1968). In bins after the last pulse was used up nothing is known: NaN.
+    A bin's photons can only be counted in pulses without an earlier count: log((P - C_before) / (P - C_to_here)), with
+    C the running count (Coates 1968). NaN in bins after every pulse has a count.
 
     Arguments:
         counts: Photons counted per bin, from the time on at which the detector was armed, shape (..., B).
-        pulses: How many pulses there were.
+        pulses: Number of pulses.
 
     Raises:
         ConfigError: More photons were counted than there were pulses.

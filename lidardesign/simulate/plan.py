@@ -1,14 +1,13 @@
-"""The plan: which effects a scene calls for with a detector and lists of rays, and why.
+"""Choice of the effects to simulate for a scene, a detector and lists of rays, from bounds of each effect.
 
-Each effect's `bound` (`simulate.effects`) says what it could change at most. The smallest are skipped as long as all
-that is skipped stays within a tolerance together: errors of range add up in the worst case, and so do shares of
-returns. That is promised of what a detector reports, rounded and from the photons that chance brings, ray by ray with
-the same random numbers (`add_quantisation_bounds`; tests/soak/promise.py tries it). Where nothing calls for an effect,
-no ray is cast to see it.
+Each effect's `bound` (`simulate.effects`) is an upper bound of its change. The smallest are skipped while their sum
+stays within a tolerance: errors of range add up in the worst case, and so do shares of returns. The tolerance holds for
+reported returns, with rounding and photon noise, ray by ray with the same random numbers (`add_quantisation_bounds`;
+tests/soak/promise.py tests it). Effects that are absent from a scene are ruled out without casting a ray.
 
-What simulating an effect takes is predicted per ray and frame, as measured on one core (2.5 GHz) with a face of 20,000
-triangles, some hundred photons per ray and a gate of 1 m, each effect added to photon noise alone. Elsewhere the
-relation between effects holds roughly; full sunlight and wide gates take several times as much.
+The time of an effect is predicted per ray and frame, as measured on one core (2.5 GHz) with a face of 20,000 triangles,
+some hundred photons per ray and a gate of 1 m, each effect added to photon noise alone. Elsewhere the relation between
+effects holds roughly; full sunlight and wide gates take several times as much.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ from lidardesign.task import Metric
 
 # Per further sub-ray of a beam [s].
 SUB_RAY_SECONDS = 3e-7
-# Per ray, whatever detects [s]; detours are rendered by another program.
+# Per ray, with any detector [s]; multipath light is rendered by another program.
 LIGHT_SECONDS = {"motion": 4e-7, "specular": 1.8e-6, "shadowing": 1e-6, "multipath": 3e-3}
 # Per ray, where photons are counted [s].
 PHOTON_SECONDS = {"photon_noise": 2e-6, "jitter": 3e-7, "ambient": 4e-7, "pile_up": 5e-6, "atmosphere": 3.5e-6}
@@ -76,34 +75,34 @@ EFFECT_MODULES = {
     "pile_up": pile_up,
     "quantisation": quantisation,
 }
-# Effects by a word, or by name.
+# Words that choose effects, instead of names.
 CHOICES = ("auto", "all", "none")
 Choice = Literal["auto", "all", "none"] | frozenset[str]
-# Ranges may be off by this share of a bin, or by this where there are none [m].
+# Tolerated range error as a share of a bin, or without bins [m].
 TOLERATED_BIN_SHARE, TOLERATED_RANGE_M = 0.1, 0.001
 TOLERATED_RETURNS = 0.001  # a share of them
 # Units of metrics that are lengths [m].
 LENGTHS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
-# What `--effects` takes besides names; the audit is not a choice of effects.
+# Words that `--effects` accepts besides names; the audit is not a choice of effects.
 WORDS = (*CHOICES, "audit")
-# Scenes that move are looked at in so many frames, evenly spread: bounds are means over time.
+# Most frames of a moving scene that bounds are averaged over, evenly spread.
 MOST_FRAMES = 16
 # Where these are on, a ray may have several echoes.
 SEVERAL_ECHOES = frozenset({"footprint", "specular", "multipath"})
-# What these change depends on first hits alone, behind mirrors and glass too.
+# Effects whose bounds depend on first hits alone, behind mirrors and glass too.
 OF_FIRST_HITS = ("specular", "multipath", "shadowing")
-# Of a shift over the distance of an edge: how likely it is passed where other shifts are of unknown size.
+# Probability that a shift passes an edge, per shift over distance, with other shifts of unknown size.
 PASSED_SHARE = 0.2
-# An edge further than so many standard deviations of all shifts is not passed.
+# Edges further than this many standard deviations of all shifts are not passed.
 EDGE_REACH = 4.0
-# Whether a return is reported that has barely enough light is a matter of these.
+# Effects that decide whether a return near the detection threshold is reported.
 OF_BARE_LIGHT = {"photon_noise", "jitter", "quantisation"}
-# By these rays meet what their first hits are not.
+# Effects by which rays hit other surfaces than their first hits.
 ELSEWHERE = {"footprint", "motion"}
 
 
 def predicted_seconds(effect: str, detector: Detector, rays: int) -> float:
-    """Of an effect for so many rays over all frames [s]."""
+    """Predicted time of simulating an effect for this many rays over all frames [s]."""
     if effect == "footprint":
         return rays * (detector.footprint_rays - 1) * SUB_RAY_SECONDS
     known = LIGHT_SECONDS if detector.photons is None else LIGHT_SECONDS | PHOTON_SECONDS
@@ -112,11 +111,11 @@ def predicted_seconds(effect: str, detector: Detector, rays: int) -> float:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What all skipped effects together may change.
+    """Tolerated change by all skipped effects together.
 
     Arguments:
-        range_m: Of ranges as they are reported, rms over returns [m].
-        lost: Of returns, the share that is lost, invented or taken from somewhere else.
+        range_m: Rms error of reported ranges over returns [m].
+        lost: Share of returns that are lost, invented or taken from somewhere else.
 
     Raises:
         ConfigError: A value that is not above 0, or not finite.
@@ -132,18 +131,18 @@ class Tolerance:
 
     @classmethod
     def of(cls, detector: Detector) -> Tolerance:
-        """A tenth of a bin, or 1 mm without bins, and a thousandth of the returns."""
+        """Default tolerance of a detector: a tenth of a bin, or 1 mm without bins, and a thousandth of the returns."""
         return cls(TOLERATED_RANGE_M if detector.bin_m is None else TOLERATED_BIN_SHARE * detector.bin_m)
 
     def within(self, metric: Metric) -> Tolerance:
-        """At most what a metric tolerates, where it is a length: ranges that are off by more could move it by more."""
+        """This tolerance with the range error limited to the tolerance of a metric that is a length."""
         limit_m = metric.tolerance * LENGTHS_M.get(metric.unit, math.inf)
         return replace(self, range_m=min(self.range_m, limit_m)) if limit_m > 0 else self
 
 
 @dataclass(frozen=True)
 class Bound:
-    """What an effect could change in the list of rays where it changes most.
+    """Upper bound of an effect in the list of rays that it changes most.
 
     Arguments:
         range_m: Error of range, rms over returns [m].
@@ -156,7 +155,7 @@ class Bound:
     reason: str
 
     def relative(self, tolerance: Tolerance) -> float:
-        """In units of the tolerance, whichever of the two is more."""
+        """The bound in units of the tolerance, the larger of range error and lost share."""
         return max(self.range_m / tolerance.range_m, self.lost / tolerance.lost)
 
 
@@ -165,11 +164,11 @@ class Decision:
     """An effect in a plan.
 
     Arguments:
-        name: Of `EFFECTS`.
+        name: Name of the effect, out of `EFFECTS`.
         on: Whether it is simulated.
-        bound: What it could change.
-        seconds: What simulating it takes on a typical core [s].
-        missing: What its simulation needs and is not there; None: nothing.
+        bound: Upper bound of its effect.
+        seconds: Predicted time of simulating it on a typical core [s].
+        missing: Missing requirement of its simulation; None: nothing is missing.
     """
 
     name: str
@@ -181,11 +180,11 @@ class Decision:
 
 @dataclass(frozen=True)
 class EffectPlan:
-    """What is simulated of a scene, the same for all lists of rays.
+    """Effects to simulate in a scene, the same for all lists of rays.
 
     Arguments:
         decisions: One per effect, in the order in which light meets them.
-        tolerance: Of what is skipped.
+        tolerance: Tolerance of the skipped effects.
     """
 
     decisions: tuple[Decision, ...]
@@ -193,19 +192,19 @@ class EffectPlan:
 
     @property
     def effects(self) -> frozenset[str]:
-        """What is on."""
+        """Names of the effects to simulate."""
         return frozenset(decision.name for decision in self.decisions if decision.on)
 
 
 @dataclass(frozen=True)
 class Planner:
-    """How effects are chosen.
+    """Rule by which effects are chosen.
 
     Arguments:
-        detector: What measures.
-        choice: `auto` takes what a scene calls for, `all` whatever the detector and this machine have, `none` nothing;
-            names are taken as they are.
-        tolerance: Of what `auto` skips; None: `Tolerance.of` the detector.
+        detector: The detector.
+        choice: `auto` takes the effects above the tolerance, `all` those that the detector and this machine support,
+            `none` nothing; names are taken as they are.
+        tolerance: Tolerance of the effects that `auto` skips; None: `Tolerance.of` the detector.
 
     Raises:
         ConfigError: An unknown effect among names; all are listed.
@@ -221,12 +220,12 @@ class Planner:
 
     @property
     def tolerated(self) -> Tolerance:
-        """Of what `auto` skips."""
+        """Tolerance of the effects that `auto` skips."""
         return self.tolerance or Tolerance.of(self.detector)
 
     @phase("planning")
     def plan(self, scene: Scene, lists: Sequence[Rays], casters: Sequence[SceneCaster] | None = None) -> EffectPlan:
-        """Which effects are on for lists of rays in a scene.
+        """Choose the effects to simulate for lists of rays in a scene.
 
         Arguments:
             scene: The scene.
@@ -244,7 +243,7 @@ class Planner:
         return self._decided(found, {name: predicted_seconds(name, self.detector, rays) for name in EFFECTS})
 
     def chosen_from(self, plan: EffectPlan) -> EffectPlan:
-        """What this planner makes of the bounds in another's plan of the same rays, with the same detector."""
+        """Choose again from the bounds in another planner's plan of the same rays, with the same detector."""
         found = {decision.name: decision.bound for decision in plan.decisions}
         return self._decided(found, {decision.name: decision.seconds for decision in plan.decisions})
 
@@ -252,7 +251,7 @@ class Planner:
         if self.choice == "auto":
             wanted = _called_for(found, self.tolerated)
             if self.detector.photons is not None and wanted & SEVERAL_ECHOES and not wanted & COUNTED:
-                # echoes that are counted mix in another way than those that are not
+                # counted echoes mix in another way than uncounted ones
                 wanted.add(max(COUNTED, key=lambda name: (found[name].relative(self.tolerated), name)))
         elif self.choice == "all":
             wanted = available_effects(self.detector)
@@ -267,12 +266,12 @@ class Planner:
         return EffectPlan(tuple(decisions), self.tolerated)
 
     def physics(self, plan: EffectPlan, seed: int) -> Physics | None:
-        """What `simulate` takes for a plan; None where nothing is on."""
+        """`Physics` of a plan for `simulate`; None without effects."""
         return Physics(self.detector, plan.effects, seed) if plan.effects else None
 
 
 def parse_effects(text: str) -> Choice:
-    """`auto`, `all`, `none`, or names of effects between commas.
+    """Parse `auto`, `all`, `none`, or names of effects between commas.
 
     Raises:
         ConfigError: An unknown effect; all are listed.
@@ -299,12 +298,12 @@ def parse_effects(text: str) -> Choice:
 
 
 def available_effects(detector: Detector) -> frozenset[str]:
-    """The effects that a detector has at all."""
+    """Names of the effects that apply to a detector."""
     return frozenset(EFFECTS) - ({"motion"} if motion.is_instant(detector) else set())
 
 
 def _called_for(found: dict[str, Bound], tolerance: Tolerance) -> set[str]:
-    """What is left when effects are skipped, the smallest first, while all that is skipped is within the tolerance."""
+    """Names of the effects that remain after skipping the smallest while their sum is within the tolerance."""
     on = set()
     range_m = lost = 0.0
     for name in sorted(found, key=lambda name: found[name].relative(tolerance)):
@@ -319,7 +318,7 @@ def _called_for(found: dict[str, Bound], tolerance: Tolerance) -> set[str]:
 def _bounds(
     scene: Scene, lists: Sequence[Rays], detector: Detector, casters: Sequence[SceneCaster] | None
 ) -> dict[str, Bound]:
-    """The bound of every effect over frames evenly spread, for the list that it changes most."""
+    """Bound of every effect over evenly spread frames, for the list that it changes most."""
     absent = {name: EFFECT_MODULES[name].why_absent(detector, scene, lists) for name in EFFECTS}
     present = [name for name, reason in absent.items() if reason is None]
     found = {name: Bound(0.0, 0.0, reason) for name, reason in absent.items() if reason is not None}
@@ -340,9 +339,9 @@ def _bounds(
 
 
 def _frame_bounds(counts: Counts, present: Sequence[str]) -> dict[str, EffectBound]:
-    """What each effect could change: anything, where mirrors and glass lead light to what no first hit shows."""
+    """Bound of each effect in a frame; rays whose first hit is on mirrors or glass count as lost."""
     bounds = {name: EFFECT_MODULES[name].bound(counts.first_hits, counts) for name in present}
-    # of ranges, where an echo takes a longer or shorter way to a receiver that stands elsewhere
+    # errors of half path become errors of range with a bistatic receiver
     stretched = 1 / counts.first_hits.path_per_range**2
     bounds = {
         name: replace(bound, squared_m2=bound.squared_m2 * stretched)
@@ -361,7 +360,7 @@ def _frame_bounds(counts: Counts, present: Sequence[str]) -> dict[str, EffectBou
 
 
 class _BoundSum:
-    """An effect's bounds over frames, list by list."""
+    """Sums of an effect's bounds over frames, list by list."""
 
     def __init__(self, lists: int) -> None:
         self._squared_m2, self._lost, self._returns = np.zeros(lists), np.zeros(lists), np.zeros(lists)
@@ -382,7 +381,7 @@ class _BoundSum:
             self._largest, self._reason = float(squared.max() + lost.max()), bound.reason
 
     def bound(self) -> Bound:
-        # without a single return, every one that is invented is one too many, and may be of any ray
+        # without a single return, false returns of any ray count
         returns = np.maximum(self._returns, 1.0)
         squared_m2 = np.where(self._returns > 0, self._squared_m2 / returns, self._unseen_m2 / self._rays)
         lost = np.minimum(self._lost / returns, 1.0)
@@ -390,18 +389,18 @@ class _BoundSum:
 
 
 def add_quantisation_bounds(counts: Counts, bounds: dict[str, EffectBound]) -> dict[str, EffectBound]:
-    """What effects change of what a detector reports, by what they change of the light; names to bounds.
+    """Bounds of reported returns, with quantisation and photon noise, from bounds of the light; names to bounds.
 
-    Behind rounding, what moves a range by little moves it by a whole bin, or not at all. An edge that is nearer than
-    the shift s is passed; beyond, at the distance d, with P(shift > d), taken as normal. What else moves ranges moves
-    that edge too: with the scale t of all of it, unknown but at most as bounded, the density at the edge is at most
+    After rounding, a small shift moves a range by a whole bin, or not at all. An edge that is nearer than the shift s
+    is passed; beyond, at the distance d, with P(shift > d), taken as normal. Other effects shift ranges relative to
+    that edge too: with their scale t, unknown but at most as bounded, the density at the edge is at most
     max over t of phi(d / t) / t = 0.24 / d, and the mean shift 0.8 s, so that it is passed with at most 0.2 s / d. The
     matched filter averages: its edges are as wide as a pulse, its steps lower, and each of n photons passes edges by
     itself.
 
-    A photon that goes to another bin, which one of n does with at most n s / bin, may make another bin the highest, and
-    others the ones that a dead time hides: the range strays once more, as chance has it. Multipath is left out of this:
-    it takes a thousand times as long as other effects, and one chance is as good as another.
+    A photon that changes bins, which one of n does with at most n s / bin, may make another bin the highest and change
+    the photons that dead time hides: the range errs once more, at random. Multipath is left out of this: it takes a
+    thousand times as long as other effects, and gives another equally likely outcome.
     """
     detector = counts.first_hits.detector
     if not detector.bin_m and detector.photons is None:
@@ -419,14 +418,14 @@ def add_quantisation_bounds(counts: Counts, bounds: dict[str, EffectBound]) -> d
             squared_m2, lost = squared_m2 + share * chance.squared_m2, np.minimum(lost + share * chance.lost, 1.0)
         changed[name] = replace(bounds[name], squared_m2=squared_m2, lost=lost)
     if chance is not None:
-        # how much light comes of what a beam or a ray of another time meets is not known: it may be barely enough
+        # the light from surfaces that a wide beam or a later ray hits is not known: it may be at the threshold
         for name, other in itertools.product(OF_BARE_LIGHT & bounds.keys(), ELSEWHERE & bounds.keys()):
             changed[name] = replace(changed[name], lost=np.maximum(changed[name].lost, bounds[other].lost))
     return changed
 
 
 class _Chance:
-    """How far ranges of photons stray, squared (N,) [m^2], and how many of them are lost (N,), by chance alone."""
+    """Squared range error (N,) [m^2] and share of lost returns (N,) between two draws of photons."""
 
     def __init__(self, counts: Counts) -> None:
         detector, sigma_m, blind = counts.first_hits.detector, counts.first_hits.sigma_m(), Blindness.of(counts)
@@ -438,7 +437,7 @@ class _Chance:
 
 
 def _steps_m2(counts: Counts, shift_m: np.ndarray, others_m: np.ndarray) -> np.ndarray:
-    """Mean squared steps over edges of bins by a shift (N,) where others shift by up to so much (N,) [m], (N,)."""
+    """Mean squared step over edges of bins by a shift (N,) with other shifts up to (N,) [m], shape (N,) [m^2]."""
     first_hits, bin_m, alone_m2 = counts.first_hits, counts.bin_m, 0.0
     if first_hits.detector.photons is not None and first_hits.detector.estimator == "matched":
         others_m = others_m + first_hits.sigma_m()
@@ -448,7 +447,7 @@ def _steps_m2(counts: Counts, shift_m: np.ndarray, others_m: np.ndarray) -> np.n
 
 
 def _passed(shift_m: np.ndarray, others_m: np.ndarray, edge_m: np.ndarray) -> np.ndarray:
-    """How likely a shift (N,) passes an edge at a distance (N,) that others move by up to so much (N,) [m], (N,)."""
+    """Probability that a shift (N,) passes an edge at a distance (N,), with other shifts up to (N,) [m], shape (N,)."""
     from scipy.special import ndtr
 
     ratio = shift_m / edge_m

@@ -1,12 +1,12 @@
-"""Returns of a list of rays in a scene: exact first hits, or what a detector makes of them where effects are on.
+"""Returns of a list of rays in a scene: exact first hits, or detected returns where effects are simulated.
 
-Rays are traced from the sensor, not from the start of the gate, so whatever stands between the sensor and the
-gate hides what is behind it.
+Rays are traced from the sensor, not from the start of the gate, so a surface between the sensor and the gate hides
+everything behind it.
 
-With effects, light is followed in the order in which it travels: beams leave (`footprint`), meet what stands or moves
-there (`motion`), come back from it directly and by detours (`specular`, `multipath`), to a receiver that may stand
-elsewhere (`shadowing`), weakened by the air (`atmosphere`); then photons are counted and timed (`detection`). Each
-effect is one module of `simulate.effects`.
+With effects, light is followed in the order in which it travels: beams leave (`footprint`), hit static or moving bodies
+(`motion`), come back from them directly and by detours (`specular`, `multipath`), to a receiver that may be elsewhere
+(`shadowing`), attenuated by the air (`atmosphere`); then photons are counted and timed (`detection`). Each effect is
+one module of `simulate.effects`.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from lidardesign.simulate.effects.specular import detours
 def simulate(
     scene: Scene, rays: Rays, *, casters: Sequence[SceneCaster] | None = None, physics: Physics | None = None
 ) -> list[Returns]:
-    """The returns of rays in every time frame of a scene.
+    """Simulate the returns of rays in every time frame of a scene.
 
     Arguments:
-        scene: What the rays meet; targets and occluders both stop them.
+        scene: The scene; targets and occluders both stop rays.
         rays: The rays, fired anew in each frame, N of them.
         casters: One caster per frame, as `build_casters` makes them; None builds them here.
         physics: A detector and the effects that are on; None, or none on: geometry alone.
@@ -62,16 +62,16 @@ def simulate_many(
     physics: Physics | None = None,
     repeats: Sequence[int] | None = None,
 ) -> list[list[Returns]]:
-    """The returns of several lists of rays in every time frame of a scene, each as `simulate` gives them.
+    """Simulate the returns of several lists of rays in every time frame of a scene, each as in `simulate`.
 
     All lists are traced together: over many frames, most of the time of short lists goes into the calls.
 
     Arguments:
-        scene: What the rays meet; targets and occluders both stop them.
+        scene: The scene; targets and occluders both stop rays.
         lists: Lists of rays, each fired anew in each frame.
         casters: One caster per frame; None builds them here.
         physics: A detector and the effects that are on; each list shares the emitter's energy among its own rays.
-        repeats: For each list, the `Physics.repeat` that its random numbers are of; None: the same for all lists.
+        repeats: `Physics.repeat` of each list; None: the same for all lists.
 
     Returns:
         For each list, one `Returns` per frame.
@@ -114,13 +114,13 @@ def build_casters(scene: Scene) -> list[SceneCaster]:
 
 
 def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: Physics) -> Returns:
-    """What a detector reports of rays in a frame of a scene.
+    """Returns of rays in a frame of a scene, as a detector reports them.
 
     Arguments:
-        scene: What the rays meet.
+        scene: The scene.
         frame: The time frame.
         rays: The rays that share the emitter's energy, N of them.
-        caster: Of this frame.
+        caster: Caster of this frame.
         physics: The detector and at least one effect.
     """
     # it loads compiled loops, which geometry alone does without
@@ -140,7 +140,7 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
 
 
 class FollowedLight(NamedTuple):
-    """What arrives of rays' light, before anything is detected."""
+    """Light of rays that arrives at the receiver, before detection."""
 
     beams: Beams
     hits: Hits
@@ -150,7 +150,7 @@ class FollowedLight(NamedTuple):
 
 
 def followed_light(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: Physics) -> FollowedLight:
-    """The light of rays on its way out and back, as far as the effects that are on lead it; see `measure`."""
+    """Beams, first hits, echoes and background of rays under the simulated effects; arguments as in `measure`."""
     effects, detector = physics.effects, physics.detector
     tracer = moving_tracer(scene, frame) if "motion" in effects else still_tracer(caster)
     beams = Beams.of(rays)
@@ -175,15 +175,15 @@ def followed_light(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, ph
 
 @dataclass(frozen=True, eq=False)
 class PhotonHistograms:
-    """Counts over time of N rays.
+    """Photon histograms of N rays.
 
     Arguments:
-        start_m: Where each ray's first bin starts, as half the whole path, shape (N,) [m]. The first and the last bin
+        start_m: Start of each ray's first bin in half path, shape (N,) [m]. The first and the last bin
             hold only what lies within the ray's gate.
-        width_m: Of a bin, in half paths [m].
-        number: How many bins each ray has, shape (N,).
+        width_m: Width of a bin in half path [m].
+        number: Number of bins of each ray, shape (N,).
         counts: Photons counted per bin, zero beyond a ray's own bins, shape (N, most bins).
-        pulses: How many pulses each ray got.
+        pulses: Number of pulses per ray.
     """
 
     start_m: np.ndarray
@@ -194,14 +194,14 @@ class PhotonHistograms:
 
 
 def photon_histograms(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: Physics) -> PhotonHistograms:
-    """The histograms that `simulate` finds the returns of rays in, with the same random numbers.
+    """Photon histograms in which `simulate` detects the returns of rays, with the same random numbers.
 
     Arguments:
-        scene: What the rays meet.
+        scene: The scene.
         frame: The time frame.
         rays: The rays that share the emitter's energy, N of them.
-        caster: Of this frame.
-        physics: A detector that counts photons, and the effects that are on.
+        caster: Caster of this frame.
+        physics: A detector that counts photons, and the simulated effects.
 
     Raises:
         ConfigError: The detector counts no photons, or its histogram does not cover a gate.

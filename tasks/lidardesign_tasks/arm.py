@@ -1,4 +1,4 @@
-"""Tracking what a robot arm carries: sensors on the ceiling, pick-and-place below, the arm in the way.
+"""Tracking the ball that a robot arm carries: sensors on the ceiling, pick-and-place below, occlusion by the arm.
 
 World frame: the arm stands at the origin on the floor z = 0 and works on its +x side; the ceiling is z = 1 m.
 The task of Behari et al. 2026, experiment B: a KUKA LBR iiwa 14 whose end effector is tracked.
@@ -31,7 +31,7 @@ SMALL = {"train": 4, "test": 4, "frames": 12}
 
 
 class ArmConfig(MovingSurroundings):
-    """The arm, how many trajectories of how many frames, how much they differ, its surroundings, and the sensors'."""
+    """The arm, number, length and variation of its trajectories, the surroundings, and bounds of sensors."""
 
     size: Literal["full", "small"] = Field(
         "full", description="small: 4 trajectories of 12 frames in each split unless set otherwise, for trials"
@@ -85,7 +85,7 @@ class ArmTask:
         """Random pick-and-place cycles; each has a generator of its own, so counts do not change them.
 
         Raises:
-            DataError: The robot cannot be used, or cannot do what is drawn for it.
+            DataError: The robot cannot be used, or can perform none of the drawn motions.
             ConfigError: All cycles would be the same.
         """
         if config.jitter_m == 0:
@@ -114,15 +114,15 @@ class ArmTask:
         return Score(min(discrete_frechet_m(path, scene.truth["ball_m"]), self.metric.worst), details=details)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
-        """What returns on the ball tell about its place in their own and in neighbouring frames."""
+        """Information of returns on the ball about its position in their own and in neighbouring frames."""
         return path_information(returns, [np.array([_target(scene)])], scene.truth["ball_m"][None])
 
 
 def _tracked(scene: Scene, returns: Sequence[Returns]) -> tuple[np.ndarray, np.ndarray]:
-    """Frames in which the ball was seen, and its place in each [m], see `tracked_places`.
+    """Frames with returns of the ball, and its position in each [m], see `tracked_places`.
 
-    A robot knows where its own links are, so their returns are told apart; what a detector made of noise is not, and
-    counts as the ball.
+    The poses of the robot's own links are known, so their returns are discarded; false alarms are not, and count as the
+    ball.
     """
     target = _target(scene)
     taken = [(one.body == target) | (one.body < 0) for one in returns]
@@ -134,7 +134,7 @@ def _target(scene: Scene) -> int:
 
 
 def rejection_notes(motions: Sequence[Motion], split: str) -> tuple[str, ...]:
-    """One line on drawn motions that the arm cannot do, none where it can do all."""
+    """A note on drawn motions that the arm cannot perform; none where it can perform all."""
     rejected = sum((motion.rejected for motion in motions), Counter())
     if not rejected:
         return ()
@@ -154,5 +154,5 @@ def _scene(robot: Robot, motion: Motion, name: str, rate_hz: float, notes: tuple
 
 
 def _steady(poses: np.ndarray) -> np.ndarray:
-    """One pose (4, 4) where a body does not move, its poses (F, 4, 4) where it does."""
+    """A single pose (4, 4) of a body at rest, or all poses (F, 4, 4) of a moving one."""
     return poses[0] if (poses == poses[0]).all() else poses

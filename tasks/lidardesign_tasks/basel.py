@@ -2,7 +2,7 @@
 
 Layout: `shape/model/{mean (3V,), pcaBasis (3V, K), pcaVariance (K,)}`, `shape/representer/cells (3, T)`, with
 or without the `shape/` in front; in old files triangles are in `representer/reference-mesh/triangle-list`. In
-version 0.9 the basis is orthonormal, in 0.8 it is multiplied by the standard deviations: its norms tell.
+version 0.9 the basis is orthonormal, in 0.8 it is multiplied by the standard deviations, as its norms show.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from lidardesign.run.inputs import HEAD_MODEL, check_bytes, check_file
 Unit = Literal["auto", "mm", "cm", "m"]
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 LAYOUT = "the HDF5 layout of the Basel Face Model"
-# Squares of what is beyond would overflow; no head is as large in any unit.
+# Largest value of a file, larger than any head in any unit.
 LARGEST_VALUE = 1e12
 CELL_NAMES = ("representer/cells", "representer/reference-mesh/triangle-list")
-# norms of basis columns are 1, or the standard deviations, to single precision and file rounding
+# tolerance of the norms of basis columns, by single precision and file rounding
 NORM_TOLERANCE = 1e-2
-# plausible largest extents of a head or bust, by unit, where the file does not say
+# plausible extents of a head or bust, by unit, for files without a unit
 EXTENTS = {"m": (0.05, 1.5), "cm": (5.0, 60.0), "mm": (60.0, 1500.0)}
 
 
@@ -36,7 +36,7 @@ class MorphableModel:
         mean: Vertices of the mean shape [m], shape (V, 3).
         modes: Displacements per standard deviation [m], shape (K, V, 3).
         faces: Vertex indices, shape (T, 3).
-        notes: What reading found or assumed, one line each.
+        notes: Findings and assumptions of reading, one line each.
     """
 
     mean: np.ndarray
@@ -50,12 +50,12 @@ class MorphableModel:
 
 
 def load_model(path: str | Path, *, unit: Unit = "auto", modes: int | None = None) -> MorphableModel:
-    """A morphable model, checked.
+    """Load and check a morphable model.
 
     Arguments:
         path: An HDF5 file in the Basel layout.
         unit: The file's unit of length; `auto` reads it from the file or, failing that, from the head's size.
-        modes: Keep at most so many modes.
+        modes: Largest number of modes to keep.
 
     Raises:
         DataError: The file is missing, not HDF5, lacks a dataset, or one has wrong shapes or values.
@@ -133,7 +133,7 @@ def _read(file: _File, unit: Unit, modes: int | None) -> MorphableModel:
 
 
 def _per_deviation(file: _File, basis: np.ndarray, deviation: np.ndarray, notes: list[str]) -> np.ndarray:
-    """The basis multiplied by the standard deviations, unless the file's already is (version 0.8)."""
+    """The basis multiplied by the standard deviations, which it already is in files of version 0.8."""
     norms, used = np.linalg.norm(basis, axis=0), deviation > 0
     if np.abs(norms[used] - 1).max(initial=0) < NORM_TOLERANCE:
         return basis * deviation
@@ -159,7 +159,7 @@ def _faces(file: _File, vertices: int) -> np.ndarray:
 
 
 def _unit(file: _File, mean: np.ndarray, unit: Unit, notes: list[str]) -> str:
-    """The unit of length: as asked for, as the file says, or the one that makes the head a head's size."""
+    """Unit of length: as configured, as in the file, or inferred from the head's size."""
     if unit != "auto":
         return unit
     for place in (file.file, file.file.get("shape"), file.file.get(file.prefix + "representer")):

@@ -1,8 +1,8 @@
-"""Emitter design: a detector that is fixed in front of a face, as a smartphone's, and where its light should come from.
+"""Emitter design: emitters around a detector that is fixed in front of a face, as in a smartphone.
 
-World frame and heads are those of the task `face`. The detector stands at one place and hears every ray; what is
-designed are the emitters around it: their places, directions and ranges. Light goes from an emitter to the face and
-from there to the detector, so only what both of them see counts, and the range along a ray follows from the whole
+World frame and heads are those of the task `face`. The detector has a fixed position and receives every ray; the
+positions, directions and ranges of the emitters around it are designed. Light goes from an emitter to the face and
+from there to the detector, so only surface visible to both counts, and the range along a ray follows from the whole
 path of its light (`lidardesign.scenes.rays`). A flood emitter is a sensor whose rays are the dots of its pattern.
 """
 
@@ -28,7 +28,7 @@ FieldAngle = Annotated[float, Field(gt=0, lt=180)]
 
 
 class EmitterConfig(HeadConfig):
-    """Heads, the detector in front of them, and where emitters may be."""
+    """Heads, the detector in front of them, and bounds of emitters."""
 
     detector_m: Vector = Field((0.40, 0.0, 0.0), description="place of the detector [m]; the nose tip is at 0")
     detector_azimuth_deg: float = Field(180.0, ge=-360, le=360, description="where the detector looks [deg]")
@@ -86,7 +86,7 @@ class EmitterTask:
     defaults: ClassVar[Defaults] = Defaults(rays=(100, 196, 361, 576), level=0.99, density={"sigma_m": 0.005})
 
     def space(self, config: EmitterConfig) -> DesignSpace:
-        """Emitter places in a box around the detector, directions around where it looks."""
+        """Emitter origins in a box around the detector, directions around its boresight."""
         half = np.broadcast_to(np.asarray(config.emitter_box_m, dtype=np.float64), 3)
         centre, angle = np.array(config.detector_m), math.radians(config.half_angle_deg)
         azimuth, elevation = math.radians(config.detector_azimuth_deg), math.radians(config.detector_elevation_deg)
@@ -117,18 +117,18 @@ class EmitterTask:
         return scenes
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
-        """Chamfer distance [mm] between the reconstruction and the part of the face that could be heard."""
+        """Chamfer distance between the reconstruction and the visible part of the face [mm]."""
         return surface_score(self.metric, scene, returns)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
-        """What returns tell about points of the visible face, the more the nearer they are."""
+        """Information of returns about points of the visible face, larger for nearer points."""
         return surface_informs(scene, returns)
 
 
 def winding_number(mesh: Mesh, point: np.ndarray) -> float:
-    """How often a mesh winds round a point (3,) [m]: 1 inside of a closed one, 0 outside.
+    """Generalised winding number of a mesh around a point (3,) [m]: 1 inside of a closed one, 0 outside.
 
-    The solid angles of its triangles by van Oosterom and Strackee (1983), added up over 4 pi.
+    The sum of the solid angles of its triangles (van Oosterom and Strackee 1983) over 4 pi.
     """
     a, b, c = np.moveaxis((mesh.vertices - point)[mesh.faces], 1, 0)
     length_a, length_b, length_c = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))

@@ -1,4 +1,4 @@
-"""Flash-LiDAR face scanning: one place in front of a head, and which rays are worth firing from there.
+"""Flash-LiDAR face scanning: choice of rays from a single origin in front of a head.
 
 World frame: the nose of the mean head points along +x with its tip at the origin, z is up. The sensor is at
 (distance, 0, 0) and looks back at the face. Heads are random identities of a morphable model (the embedded
@@ -31,11 +31,11 @@ from lidardesign_tasks.surroundings import any_direction
 
 # columns: the world's x, y, z are the model's z (out of the face), x (to the head's left) and y (up)
 WORLD_AXES = [2, 0, 1]
-LARGEST_COEFFICIENT = 3.0  # identities further from the mean than this in any mode are cut: no faces are so
+LARGEST_COEFFICIENT = 3.0  # identity coefficients are clipped to this many standard deviations
 
 
 class HeadConfig(Importance):
-    """The model, how many heads, how they move, how finely they are judged, what counts, and what surrounds them."""
+    """The model, number, variation and motion of heads, points of their truth, importance, and surroundings."""
 
     model: Path | None = Field(None, description="HDF5 file of a morphable model; empty: the embedded head model")
     unit: Unit = Field("auto", description="unit of length of the model file")
@@ -53,7 +53,7 @@ class HeadConfig(Importance):
 
 
 class FaceConfig(HeadConfig):
-    """Heads, and where the sensor in front of them may be."""
+    """Heads, and bounds of the sensor in front of them."""
 
     distance_m: float = Field(0.40, ge=0.1, le=5, description="from the mean nose tip to the sensor [m]")
     origin_box_m: Metres | Vector = Field(0.0, description="half size of the box of sensor origins [m]; 0: fixed")
@@ -86,11 +86,11 @@ class FaceTask:
         return head_scenes(config, space or self.space(config), split, seed)
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
-        """Chamfer distance [mm] between the reconstruction and the part of the face that could be seen."""
+        """Chamfer distance between the reconstruction and the visible part of the face [mm]."""
         return surface_score(self.metric, scene, returns)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
-        """What returns tell about points of the visible face, the more the nearer they are."""
+        """Information of returns about points of the visible face, larger for nearer points."""
         return surface_informs(scene, returns)
 
 
@@ -100,11 +100,11 @@ def head_scenes(
     """Random heads; each has generators of its own, so counts do not change them.
 
     Arguments:
-        config: Which heads, and how many.
-        space: What the sensors may do; truths follow it.
+        config: Configuration of the heads.
+        space: The design space, for which truths are computed.
         split: Training or held-out heads.
-        seed: Of all of them.
-        receiver: A fixed detector that stands in every scene.
+        seed: Seed of all heads.
+        receiver: A fixed receiver in every scene.
 
     Raises:
         DataError: The model cannot be used, or no ray can reach a head.
@@ -125,7 +125,7 @@ def head_scenes(
 class HeadFamily:
     """The heads of a model in the world frame: cleaned faces, sign rule, and the nose tip as origin.
 
-    What counts is measured on the mean head, and holds for the same vertices of all heads.
+    Importance is computed on the mean head, and used for the same vertices of all heads.
     """
 
     def __init__(self, model: MorphableModel, sign: Sign, where: str) -> None:
@@ -152,7 +152,7 @@ class HeadFamily:
         return cls(_embedded_model(config.modes), config.sign, "the embedded head model")
 
     def weigh(self, importance: Importance, viewpoint_m: np.ndarray) -> None:
-        """Let all heads count as the mean one does by a configuration, seen from a place (3,) [m].
+        """Set the importance of all heads to that of the mean one, seen from a viewpoint (3,) [m].
 
         Raises:
             ConfigError: The region of interest is beside the head, or roughness cannot be measured.
@@ -175,7 +175,7 @@ class HeadFamily:
         index: int,
         receiver: Receiver | None = None,
     ) -> Scene:
-        """One head of a split with its pose and truth."""
+        """A random head of a split with its pose and truth."""
         drawn = random_generator(seed, "face", split, index, "identity").normal(size=len(self.model.modes))
         coefficients = config.identity_scale * np.clip(drawn, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
         pose = jittered_pose(

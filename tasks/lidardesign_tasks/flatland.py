@@ -25,17 +25,17 @@ from lidardesign.task import Defaults, Information, Metric, Score, Split, random
 from lidardesign_tasks.surroundings import Surroundings
 
 MILLIMETRES = 1000.0
-BUMP_VERTICES = np.array([-1.5, -0.9, -0.4, 0.0, 0.4, 0.9, 1.5])  # in widths: the curve bends only there
+BUMP_VERTICES = np.array([-1.5, -0.9, -0.4, 0.0, 0.4, 0.9, 1.5])  # bends of the curve, in widths of the bump
 LARGEST_GAP_M = 0.15  # neighbouring returns further apart than this belong to different curves
 TRUTH_STEP_M = 0.004  # a fifth of the density's sigma
-ITEMS = 200  # points of the curve that rays are chosen for
-TRUTH_ORIGINS = 17  # positions on the sensor line that the truth is looked at from
+ITEMS = 200  # points of the curve for choosing rays
+TRUTH_ORIGINS = 17  # positions on the sensor line from which visibility is tested
 # closed forms of primitives are exact to rounding; neighbouring truth points are 40 times further apart
 SAME_POINT_M = 1e-4
 
 
 class FlatlandConfig(Surroundings):
-    """What the scenes show, how many there are, and what surrounds them."""
+    """Type, number and variation of the scenes, and their surroundings."""
 
     scene: Literal["surface", "discs", "occluded"] = Field(
         "surface", description="a bumpy curve, two discs, or the curve behind an occluding disc"
@@ -84,7 +84,7 @@ class FlatlandTask:
         return Score(min(value, self.metric.worst), details={"returns": float(len(points))})
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
-        """What returns tell about points of the visible curve, the more the nearer they are."""
+        """Information of returns about points of the visible curve, larger for nearer points."""
         curve = in_space(scene.truth["curve_m"])
         points = curve[np.linspace(0, len(curve) - 1, min(ITEMS, len(curve))).astype(int)]
         is_target = [body.is_target for body in scene.bodies]
@@ -138,7 +138,7 @@ def discs(variation: float, generator: np.random.Generator) -> tuple[Body, ...]:
 
 
 def occluder(variation: float, generator: np.random.Generator) -> Body:
-    """A disc between the sensor line and the curve; it blocks rays and is no surface worth observing."""
+    """A disc between the sensor line and the curve, which blocks rays and is no target."""
     middle = np.array([0.62, 0.35]) + variation * generator.normal(0.0, 0.02, 2)
     return disc("occluder", middle, 0.07, "occluder")
 
@@ -176,7 +176,7 @@ def outline(body: Body) -> np.ndarray:
 
 
 def visible_outline(scene: Scene, space: DesignSpace) -> np.ndarray:
-    """The points of target outlines that some admissible ray sees first, shape (K, 2) [m]."""
+    """Points of target outlines that are the first hit of some admissible ray, shape (K, 2) [m]."""
     points = np.concatenate([outline(body) for body in scene.bodies if body.is_target])
     flat = in_space(points)
     origins = np.linspace(space.low[:3], space.high[:3], TRUTH_ORIGINS)

@@ -1,10 +1,10 @@
-"""How much the parts of a surface count: by how obliquely they are seen, how rough they are, and where they are.
+"""Importance of the parts of a surface: by area per solid angle, roughness, and a region of interest.
 
-A density of rays that count alike is even over angles: what is far away or seen obliquely gets few rays for its area.
-With the exponent e of the area a part counts as (r^2 / cos(incidence))^e, the area in a solid angle: 1 spreads returns
-evenly over the surface. Roughness is the rms distance of the surface from its own best plane within a ball, as
-CloudCompare and other tools for scans define it: what straight lines between returns miss there. With its exponent e a
-part counts as (roughness / mean roughness)^e.
+Without importance a density of rays is even over angles: distant or oblique parts get few rays for their area. With the
+exponent e of the area a part has the weight (r^2 / cos(incidence))^e, the area per solid angle: 1 spreads returns
+evenly over the surface. Roughness is the rms distance of the surface from its own best plane within a ball, as in
+CloudCompare and other tools for scans: the error of straight lines between returns there. With its exponent e a part
+has the weight (roughness / mean roughness)^e.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from lidardesign.space import DesignSpace
 from lidardesign.task import Vector, random_generator
 from lidardesign_tasks.surroundings import Surroundings
 
-# What is flatter than this share of the mean roughness counts as if it were so rough: no part counts nothing.
+# Lower limit of roughness as a share of its mean, so that no part has the weight 0.
 LEAST_ROUGHNESS = 0.1
-# At the rim of a surface the area in a solid angle has no bound; next to the sensor it vanishes.
+# Lower limits of cosine and distance: the area per solid angle is unbounded at a rim and 0 at the sensor.
 FLATTEST_COSINE, NEAREST_SHARE = 0.1, 0.01
-# A plane through so many points has an rms distance good to a tenth.
+# Points per ball, for an rms distance accurate to a tenth.
 POINTS_PER_BALL = 100
 LEAST_PER_BALL = 25
 LEAST_POINTS, MOST_POINTS = 2_000, 400_000
 VERTICES_AT_ONCE = 2048
-# Roundings of coordinates that a distance from a plane passes through.
+# Rounding errors of coordinates in a distance from a plane.
 ROUNDINGS = 64
 
 
 class Importance(Surroundings):
-    """What of a surface counts more than the rest, if anything."""
+    """Importance of parts of a surface, even by default."""
 
     area_exponent: float = Field(
         0.0,
@@ -74,7 +74,7 @@ class Importance(Surroundings):
         return self
 
     def weights(self, vertices: np.ndarray, faces: np.ndarray, viewpoint_m: np.ndarray) -> np.ndarray | None:
-        """How much a surface counts at its vertices (V, 3) [m], seen from a place (3,), shape (V,); None: evenly."""
+        """Importance at vertices (V, 3) [m], seen from a viewpoint (3,), shape (V,); None: even."""
         factors = []
         if self.area_exponent > 0:
             factors.append(relative_area(vertices, faces, viewpoint_m) ** self.area_exponent)
@@ -85,10 +85,10 @@ class Importance(Surroundings):
         return np.prod(factors, axis=0) if factors else None
 
     def refuse_empty_region(self, surfaces: Sequence[np.ndarray]) -> None:
-        """Refuse a region that no surface has a vertex in; vertices of each, shapes (V, 3) [m].
+        """Refuse a region without any vertex of the surfaces, given by vertices (V, 3) [m] each.
 
         Raises:
-            ConfigError: So it is.
+            ConfigError: The region is empty.
         """
         if self.region_centre_m is None or any(self.share_of_region(vertices).any() for vertices in surfaces):
             return
@@ -103,7 +103,7 @@ class Importance(Surroundings):
         )
 
     def share_of_region(self, points: np.ndarray) -> np.ndarray:
-        """1 in the region and 0 beyond its edge, linear between, at points (N, 3) [m], shape (N,)."""
+        """Share of the region at points (N, 3) [m]: 1 inside, 0 beyond its edge, linear between, shape (N,)."""
         offset = points - np.array(self.region_centre_m)
         if self.region_half_size_m is None:
             outside_m = np.linalg.norm(offset, axis=1) - self.region_radius_m
@@ -114,19 +114,19 @@ class Importance(Surroundings):
         return np.clip(1.0 - outside_m / self.region_edge_m, 0.0, 1.0)
 
 
-# Keys that say what counts more, and nothing about the scenes.
+# Keys of the importance, which do not change the scenes.
 WEIGHING_KEYS = tuple(key for key in Importance.model_fields if key not in Surroundings.model_fields)
 
 
 def middle_of_origins(space: DesignSpace) -> np.ndarray:
-    """The middle of a design space's origins, shape (3,) [m]."""
+    """Centre of a design space's origins, shape (3,) [m]."""
     return (np.array(space.low[:3]) + np.array(space.high[:3])) / 2
 
 
 def relative_area(vertices: np.ndarray, faces: np.ndarray, viewpoint_m: np.ndarray) -> np.ndarray:
-    """The area that a solid angle covers of a surface at its vertices (V, 3), over its median, shape (V,).
+    """Area per solid angle at the vertices (V, 3) of a surface over its median, shape (V,).
 
-    Surfaces count as seen no more flatly than `FLATTEST_COSINE`, from whichever side.
+    The cosine of incidence is at least `FLATTEST_COSINE`, from either side.
     """
     facing = _facing(vertices, faces)
     look = vertices - viewpoint_m
@@ -152,13 +152,13 @@ def relative_roughness(vertices: np.ndarray, faces: np.ndarray, radius_m: float)
 
 
 def vertex_roughness(vertices: np.ndarray, faces: np.ndarray, radius_m: float) -> np.ndarray:
-    """The rms distance of the surface within a ball around each vertex from its own best plane, shape (V,) [m].
+    """Rms distance of the surface within a ball around each vertex from its own best plane, shape (V,) [m].
 
-    Only what faces the same half space as the vertex is its surface: not the far side of a thin part, nor what lies
-    under the skin. The surface is that of `POINTS_PER_BALL` even points per ball, as far as `MOST_POINTS` go.
+    Only parts that face the same half space as the vertex are included: not the far side of a thin part, nor inner
+    layers. The surface is sampled by `POINTS_PER_BALL` even points per ball, at most `MOST_POINTS` in all.
 
     Raises:
-        ConfigError: They leave fewer than `LEAST_PER_BALL` in a ball.
+        ConfigError: These are fewer than `LEAST_PER_BALL` per ball.
     """
     from scipy.spatial import cKDTree
 
@@ -187,7 +187,7 @@ def vertex_roughness(vertices: np.ndarray, faces: np.ndarray, radius_m: float) -
 
 
 def _doubled_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Normals of faces as long as twice their areas, shape (F, 3) [m^2]."""
+    """Normals of faces with twice their areas as lengths, shape (F, 3) [m^2]."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return np.cross(b - a, c - a)
 
@@ -201,7 +201,7 @@ def _facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _off_plane(row: np.ndarray, offset: np.ndarray, count: int) -> np.ndarray:
-    """The rms distance of the points (P, 3) of each row from their best plane, 0 without points, shape (count,)."""
+    """Rms distance of the points (P, 3) of each row from their best plane, 0 without points, shape (count,) [m]."""
     total = np.maximum(np.bincount(row, minlength=count), 1)
     mean = np.stack([np.bincount(row, offset[:, i], minlength=count) / total for i in range(3)], axis=1)
     centred = offset - mean[row]

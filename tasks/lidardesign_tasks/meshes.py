@@ -1,10 +1,10 @@
 """Bring your own meshes: a folder of mesh files and a design space.
 
 Every file is one object of a class (or one scan). Files are split into training and held-out ones; each is
-shown in a few slightly different poses. With a single file the poses alone make the splits. The world's z
-axis is up, and unless told otherwise one sensor place is in front (+x) of the objects, at twice their extent,
-and looks at them. With a CSV of poses over time objects and occluders move, and every frame is judged. With
-clutter several objects lie in a bin or on a table, and the sensor looks down at them from the same side.
+shown in a few slightly different poses. With a single file the splits differ in poses alone. The world's z
+axis is up, and by default the sensor is in front (+x) of the objects, at twice their extent, and looks at
+them. With a CSV of poses over time objects and occluders move, and every frame is scored. With clutter
+several objects lie in a bin or on a table, and the sensor looks down at them from the same side.
 """
 
 from __future__ import annotations
@@ -43,22 +43,22 @@ from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 from lidardesign_tasks.view import space_around, space_around_box
 
 Axis = Literal["x", "y", "z"]
-# which of the file's axes become the world's x, y, z: turns the up axis to z without mirroring
+# the file's axes that become the world's x, y, z: a rotation of the up axis to z
 WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 RELATIVE_JITTER = 0.02  # of the largest extent, where no shift is given
 SENSOR_DISTANCE = 2.0  # extents
-ABOVE_DEG = 45.0  # how far above the middle of a pile the sensor stands
+ABOVE_DEG = 45.0  # elevation of the sensor seen from the middle of a pile
 TOLERATED_SHARE = 4e-4  # of the longest extent: 0.1 mm of a head of 0.25 m
-SPLIT_SEED = 0  # of which meshes are held out, whatever the seed of a run
+SPLIT_SEED = 0  # of the choice of held-out meshes, for all seeds of runs
 SAME_MESH = "training and held-out scenes show the same one in other poses, so scores say nothing of other objects"
 ROOM = 1.1  # around the bounding sphere, for the pose jitter
 MOST_NAMED = 6
-KNOWN = "known"  # what of a scene is removed before scoring
+KNOWN = "known"  # key of the background whose returns are removed before scoring
 ALONE = ("motion", "speed_m_s", "jitter_rotation_deg", "jitter_translation_m", "area_exponent")
 
 
 class MeshesConfig(FolderConfig, Importance):
-    """Where meshes are, how they are read, split and moved, what counts, what is around, and where the sensor is."""
+    """Folder, reading, split, motion and importance of meshes, their surroundings, and bounds of sensors."""
 
     folders: ClassVar[dict[str, tuple[str, ...]]] = {"folder": SUFFIXES, "occluders": SUFFIXES}
 
@@ -143,16 +143,16 @@ class MeshesTask:
     defaults: ClassVar[Defaults] = Defaults(rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005})
 
     def space(self, config: MeshesConfig) -> DesignSpace:
-        """A sensor in front of all meshes that sees every one of them whole."""
+        """Design space of a sensor in front of all meshes that covers every one of them."""
         meshes = load_folder(config)
         return derived_space(config, meshes, motion_of(config, meshes))
 
     def scenes(
         self, config: MeshesConfig, split: Split, seed: int, space: DesignSpace | None = None
     ) -> Sequence[Scene]:
-        """Each mesh of the split in `poses` poses, its group; the occluders stand in every scene.
+        """Each mesh of the split, a group, in `poses` poses; the occluders are in every scene.
 
-        In a pile it lies among others of its split, and the group of a scene is the set of the meshes in it.
+        In a pile it is among others of its split, and the group of a scene is the set of its meshes.
 
         Raises:
             DataError: The folder or a file in it cannot be used, no ray can reach a mesh, or piles do not come to rest.
@@ -198,9 +198,9 @@ class MeshesTask:
         return scenes
 
     def metric_of(self, config: MeshesConfig) -> Metric:
-        """At worst a scene is off by the longest extent of any of the meshes; a share of that does not matter.
+        """Metric with the longest extent of any mesh as the worst value, and a share of it as the tolerance.
 
-        A pile is at worst off by its own longest extent.
+        The worst value of a pile is its own longest extent.
         """
         meshes = load_folder(config)
         longest_mm = MILLIMETRES * max(extent_m([mesh]) for _, mesh in meshes)
@@ -209,7 +209,7 @@ class MeshesTask:
         return replace(self.metric, worst=worst_mm, tolerance=TOLERATED_SHARE * longest_mm)
 
     def notes(self, config: MeshesConfig, space: DesignSpace) -> list[str]:
-        """What was read, what is held out, where sensors stand; lengths that look like another unit."""
+        """Notes on the meshes, the split, the sensors' origins, and lengths that may be in another unit."""
         meshes = load_folder(config)
         extents_m = {name: extent_m([mesh]) for name, mesh in [*meshes, *load_occluders(config)]}
         motion = motion_of(config, meshes)
@@ -229,19 +229,19 @@ class MeshesTask:
         return score(scene.truth.get(METRIC, self.metric), scene, _without_known(scene, returns))
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
-        """What returns tell about points of the visible surface in each frame, the more the nearer they are."""
+        """Information of returns about points of the visible surface in each frame, larger for nearer points."""
         informs = moving_informs if SURFACES in scene.truth else surface_informs
         return informs(scene, _without_known(scene, returns))
 
 
 def _without_known(scene: Scene, returns: Sequence[Returns]) -> Sequence[Returns]:
-    """The returns without those on a background that is known and to be removed."""
+    """The returns without those on a known background that is to be removed."""
     background = scene.truth.get(KNOWN)
     return returns if background is None else [background.removed(frame) for frame in returns]
 
 
 def pile_of(config: MeshesConfig, meshes: Sequence[tuple[str, Mesh]]) -> Background | None:
-    """What objects are dropped into or onto; None where they stand alone."""
+    """The bin or table of a pile; None for single objects."""
     if not config.clutter:
         return None
     return background_of(config.background, [mesh for _, mesh in meshes], config.clutter)
@@ -254,7 +254,7 @@ def _pile(
     background: Background,
     generator: np.random.Generator,
 ) -> tuple[tuple[Body, ...], str]:
-    """A mesh among others of its split at rest, each as often as any other, and the names of all as a group."""
+    """A mesh in a pile with others of its split, drawn equally often, and the names of all as the group."""
     rounds = -(-background.objects // len(chosen))
     drawn = np.concatenate([generator.permutation(len(chosen)) for _ in range(rounds)])[: background.objects]
     first = [index for index, (other, _) in enumerate(chosen) if other == name]
@@ -268,7 +268,7 @@ def _pile(
 
 
 def _what_was_read(config: MeshesConfig, meshes: Sequence[tuple[str, Mesh]], space: DesignSpace) -> list[str]:
-    """How many meshes of which size were read, which of them are held out, and where sensors may stand."""
+    """Notes on number, size and split of the meshes, on the pile, and on the sensors' origins."""
     lengths_m = sorted(extent_m([mesh]) for _, mesh in meshes)
     sizes = " to ".join(dict.fromkeys(f"{length_m:.3g}" for length_m in (lengths_m[0], lengths_m[-1])))
     held_out = [name for name, _ in split_meshes(meshes, config, "test")]
@@ -291,7 +291,7 @@ def _what_was_read(config: MeshesConfig, meshes: Sequence[tuple[str, Mesh]], spa
 
 
 def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
-    """Name and mesh of every file, in metres, z up, centred if so configured."""
+    """Name and mesh of every file, in metres, z up, centred by default."""
     if config.folder is None:
         raise ConfigError("no folder of meshes is set", where="task.folder", hint="--set folder=PATH")
     painted = None if config.importance is None else Painted(config.importance, config.colour_contrast)
@@ -299,12 +299,12 @@ def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
 
 
 def load_occluders(config: MeshesConfig) -> list[tuple[str, Mesh]]:
-    """Name and mesh of every occluder, in metres, z up, where the files put them."""
+    """Name and mesh of every occluder, in metres, z up, in the files' coordinates."""
     return _load(str(config.occluders), config, "auto", False) if config.occluders is not None else []
 
 
 def motion_of(config: MeshesConfig, meshes: Sequence[tuple[str, Mesh]]) -> Motion | None:
-    """The motion of a configuration in frames; None where everything rests."""
+    """Motion of a configuration in frames; None without one."""
     if config.motion is None:
         return None
     others = [name for name, _ in load_occluders(config)]
@@ -312,13 +312,13 @@ def motion_of(config: MeshesConfig, meshes: Sequence[tuple[str, Mesh]]) -> Motio
 
 
 def _occluder(name: str, mesh: Mesh, motion: Motion | None) -> Body:
-    """An occluder where its file puts it, or along its own poses."""
+    """An occluder in its file's coordinates, or with its own poses."""
     path = None if motion is None else motion.of(name)
     return Body(mesh, name, "occluder") if path is None else Body(mesh, name, "occluder", path)
 
 
 def weighted(mesh: Mesh, config: MeshesConfig, space: DesignSpace) -> Mesh:
-    """A mesh with what the configuration says of its importance, besides what its file says."""
+    """A mesh with the importance of the configuration times that of its file."""
     weights = config.weights(mesh.vertices, mesh.faces, middle_of_origins(space))
     if weights is None:
         return mesh
@@ -341,7 +341,7 @@ def _load(
 def _load_file(
     path: Path, changed_ns: int, size: int, sign: Sign, scale: float, up: Axis, centre: bool, painted: Painted | None
 ) -> Mesh:
-    """One file; the same file unchanged is read once per process, as space and both splits need it."""
+    """Read a file, once per process while it is unchanged, as space and both splits need it."""
     mesh = load_mesh(path, sign=sign, scale=scale, painted=painted)
     vertices = mesh.vertices[:, WORLD_AXES[up]]
     if centre:
@@ -350,10 +350,10 @@ def _load_file(
 
 
 def split_meshes(meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split: Split) -> list[tuple[str, Mesh]]:
-    """The meshes of a split, each in exactly one; a single mesh is in both, told apart by its poses.
+    """Meshes of a split, each in exactly one; a single mesh is in both, in other poses.
 
-    The seed moves poses alone: what is held out stays held out where scenes of another seed are trained on. So it does
-    where files came or went since a run was learned: its own, also those that are gone, are what is split.
+    The seed changes poses alone: held-out meshes are the same for all seeds. They also stay the same where files were
+    added or removed since a run was learned, as the run's own files, also missing ones, are split.
 
     Raises:
         DataError: No mesh of the split is left.
@@ -372,7 +372,7 @@ def split_meshes(meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split
 
 
 def extent_m(meshes: Sequence[Mesh]) -> float:
-    """The longest side of the box around all meshes [m]."""
+    """Longest side of the bounding box of all meshes [m]."""
     low, high = _bounds([mesh.bounds_m for mesh in meshes])
     return float((high - low).max())
 
@@ -389,9 +389,9 @@ def _bounds(boxes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def derived_space(config: MeshesConfig, named: Sequence[tuple[str, Mesh]], motion: Motion | None = None) -> DesignSpace:
-    """The directions and ranges in which the sphere around all meshes lies wherever they move, from every origin.
+    """Design space with all directions and ranges to the sphere around all meshes in all poses, from every origin.
 
-    Where objects lie in a pile, it is the box around that.
+    For a pile it is the box around it instead of the sphere.
     """
     half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
     background = pile_of(config, named)

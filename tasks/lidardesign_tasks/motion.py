@@ -1,4 +1,4 @@
-"""Which meshes of a folder move along a CSV of poses, and where each is in every frame."""
+"""Motion of meshes of a folder from a CSV of poses, resampled to the frames of a scene."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lidardesign_tasks.poses_csv import BodyPath, read_poses, span_s
 
 EVERY = "*"
 MOST_FRAMES = 500
-# Of the names that a body may have, in a message.
+# Most allowed names of a body in a message.
 MOST_SHOWN = 12
-# A motion of whole frames ends in the last of them, whatever the product rounds to.
+# Tolerance in frames, so that rounding does not drop the last frame of a motion.
 ROUNDING_FRAMES = 1e-3
 
 
@@ -32,17 +32,17 @@ class Motion:
     poses: Mapping[str, np.ndarray]
 
     def of(self, name: str) -> np.ndarray | None:
-        """The poses of a mesh file (T, 4, 4): by its name with or without its ending, or those of every object."""
+        """Poses of a mesh file by its name with or without its suffix, shape (T, 4, 4), or None."""
         return next((self.poses[key] for key in (name, Path(name).stem) if key in self.poses), None)
 
     def of_object(self, name: str) -> np.ndarray | None:
-        """The poses of a target: its own, or those of every object."""
+        """Poses of a target: its own, or those of every object, shape (T, 4, 4), or None."""
         own = self.of(name)
         return self.poses.get(EVERY) if own is None else own
 
 
 def load_motion(path: Path, frame_rate_hz: float, objects: Iterable[str], others: Iterable[str]) -> Motion:
-    """The motion of a file in frames, from its first time to its last.
+    """Load the motion of a file in frames, from its first time to its last.
 
     Arguments:
         path: The CSV.
@@ -51,7 +51,7 @@ def load_motion(path: Path, frame_rate_hz: float, objects: Iterable[str], others
         others: Names of the mesh files that are occluders.
 
     Raises:
-        DataError: The file cannot be used, or names a body that no mesh is called.
+        DataError: The file cannot be used, or has a body without a mesh of that name.
         ConfigError: More frames than a scene takes.
     """
     try:
@@ -75,12 +75,12 @@ def load_motion(path: Path, frame_rate_hz: float, objects: Iterable[str], others
 
 @lru_cache(maxsize=8)
 def _read(path: Path, changed_ns: int, size: int) -> dict[str, BodyPath]:
-    """One file; space and both splits need it."""
+    """Read a file, cached as space and both splits need it."""
     return read_poses(path)
 
 
 def _check_bodies(paths: Mapping[str, BodyPath], path: Path, objects: list[str], others: list[str]) -> None:
-    """Every body of the file is one mesh file, or `*`, and none moves in two ways."""
+    """Refuse bodies of the file that are not exactly one mesh file or `*`, and meshes with two motions."""
     every = [*objects, *others]
     for name, one in paths.items():
         called = [mesh for mesh in every if name in (mesh, Path(mesh).stem)]
@@ -97,7 +97,7 @@ def _check_bodies(paths: Mapping[str, BodyPath], path: Path, objects: list[str],
 
 
 def moved_bounds_m(mesh: Mesh, poses: np.ndarray | None) -> np.ndarray:
-    """The corners of a box around a mesh in all of its poses (T, 4, 4), shape (2, 3) [m]."""
+    """Bounds of a mesh in all of its poses (T, 4, 4), shape (2, 3) [m]."""
     if poses is None:
         return mesh.bounds_m
     low, high = mesh.bounds_m

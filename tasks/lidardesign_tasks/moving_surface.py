@@ -1,7 +1,7 @@
-"""The truth and the score of surfaces that move: every frame is a surface of its own, and counts alike.
+"""The truth and the score of moving surfaces: every frame has a surface of its own and equal weight.
 
-A frame in which no admissible ray sees any of the targets has nothing to be judged by and is left out; a frame with too
-few returns has the metric's worst value, and a scene fails where all of its frames do.
+A frame in which no admissible ray sees any of the targets is left out; a frame with too few returns has the metric's
+worst value, and a scene fails if all of its frames do.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from lidardesign.task import Information, Metric, Score, random_generator
 from lidardesign_tasks.surface import ITEMS, LazyTruth, fewer_points, information_of, surface_score
 
 SURFACES = "surfaces"
-FEWEST_ITEMS = 25  # of a frame: so few tell its area to a tenth or two
+FEWEST_ITEMS = 25  # of a frame: they give its area to within 10 to 20 %
 
 
 class MovingTruth(LazyTruth):
-    """What some admissible ray sees of the targets: a SurfaceCloud or None per frame, under `surfaces`."""
+    """Part of the targets that is visible to some admissible ray: a SurfaceCloud or None per frame, as `surfaces`."""
 
     key = SURFACES
 
     def find(self) -> tuple[SurfaceCloud | None, ...]:
-        """The visible part of the targets in each frame."""
+        """Compute the visible part of the targets in each frame."""
         found = [self._surface(frame) for frame in range(self.scene.frames)]
         if all(surface is None for surface in found):
             raise DataError(
@@ -45,19 +45,19 @@ class MovingTruth(LazyTruth):
         try:
             return visible_surface(self.scene, self.space, self.points, generator, frame=frame)
         except DataError:
-            # nothing of it is in view
+            # no target is in view
             return None
 
 
 def with_moving_truth(
     scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator, **further: Any
 ) -> Scene:
-    """The scene with what some admissible ray can see in each frame as its truth: `surfaces`, and further keys."""
+    """The scene with its truth: `surfaces`, the visible part of the targets in each frame, and further keys."""
     return replace(scene, truth=MovingTruth(scene, space, points, int(generator.integers(2**62)), further))
 
 
 def moving_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
-    """The mean over frames of the Chamfer distance [mm] of each frame's returns to its visible surface.
+    """Mean over frames of the Chamfer distance of each frame's returns to its visible surface [mm].
 
     Details are means over frames; `failed_frames` counts those with too few returns.
     """
@@ -72,16 +72,16 @@ def moving_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Sc
 
 
 def moving_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
-    """What returns tell about points of the visible surface of their own frame, see `surface_information`.
+    """Information of returns about points of the visible surface of their own frame, see `surface_information`.
 
-    A frame in which nothing is to be seen has no points, and returns there are not judged.
+    A frame without a visible surface has no points, and its returns are ignored.
     """
     count = max(ITEMS // scene.frames, FEWEST_ITEMS)
     return information_of(fewer_points(scene.truth, count)[SURFACES], scene, returns)
 
 
 def _frames(scene: Scene, returns: Sequence[Returns]) -> list[tuple[Scene, list[Returns]]]:
-    """Every frame with something to see as a scene of its own, and its returns from all positions of a robot."""
+    """Each frame with a visible surface as a scene of its own, with its returns from all positions of a robot."""
     surfaces = scene.truth[SURFACES]
     return [
         (replace(scene, truth={"surface": surface}), [one for one in returns if one.frame == frame])

@@ -1,8 +1,8 @@
-"""Piles of objects as they come to rest in a bin or on a table: rigid bodies that MuJoCo drops.
+"""Piles of objects at rest in a bin or on a table, simulated as falling rigid bodies in MuJoCo.
 
 In contact an object is the convex hull of its mesh: hollows are filled, so nothing lies in a bowl or through a handle,
-and surfaces that hulls keep apart never cross. Lengths follow from the objects: what is simulated is scaled to objects
-of 0.1 m, so that toys and crates come to rest alike.
+and surfaces, kept apart by hulls, never cross. The simulation is scaled to objects of 0.1 m, so that objects of any
+size come to rest alike.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from lidardesign.scenes.rays import Outcome, Returns
 from lidardesign.scenes.scene import Body, Box, Mesh, rigid
 
 Kind = Literal["bin", "table"]
-# Everything that is simulated is scaled to objects of this size, dropped at this density, in steps of this length.
+# Size of objects in the scaled simulation, their density, and its time step.
 SIMULATED_M, DENSITY_KG_M3, STEP_S = 0.1, 500.0, 0.002
 # Sliding, twisting and rolling friction: dry plastic or wood, and balls that come to rest.
 FRICTION = (0.6, 0.003, 0.001)
-# MuJoCo's impedance: contacts that give way by a hundredth of a millimetre of what is simulated.
+# MuJoCo's impedance: contacts with a penetration of a hundredth of a millimetre in the simulation.
 STIFF = (0.95, 0.99, 1e-4, 0.5, 2.0)
-# Rest: no faster than this over so many steps on end.
+# Rest: speeds below these over so many successive steps.
 REST_M_S, REST_RAD_S, REST_STEPS, MOST_STEPS = 0.005, 0.1, 25, 3000
-# Hulls at rest overlap by no more than the smaller of a millimetre and a hundredth of an object.
+# Hulls at rest overlap by at most the smaller of a millimetre and a hundredth of an object.
 MOST_OVERLAP_M, OVERLAP_SHARE = 1e-3, 0.01
-# Returns this near to the known background, in objects, are taken for it.
+# Distance from the known background, in objects, within which returns are removed.
 REMOVED_SHARE = 0.01
 ATTEMPTS = 12
-# The box that objects are dropped into: its side is (1 + spread sqrt(objects)) objects long;
-# a table is wider, and a bin has walls so thick and high.
+# The square that objects are dropped into has a side of (1 + spread sqrt(objects)) objects;
+# further the margin of a table, and thickness and height of a bin's walls, in objects.
 SPREAD, TABLE_MARGIN, WALL_SHARE, WALL_HEIGHT = 0.5, 0.25, 0.05, 0.5
-# Hulls at rest fill at least this share of the space that they take; centres lie that much higher than alone, and more.
+# Least share of space that hulls at rest fill; a pile is higher than one object by at most HEAPED times that filling.
 PACKED_SHARE, HEAPED = 0.5, 0.75
 
 
@@ -46,9 +46,9 @@ class Background:
 
     Arguments:
         kind: `bin` has walls, `table` none.
-        object_m: How long the longest object is across, in any direction [m].
-        objects: How many are dropped.
-        highest_m: How high a pile may be [m].
+        object_m: Diameter of the largest object [m].
+        objects: Number of dropped objects.
+        highest_m: Largest height of a pile [m].
     """
 
     kind: Kind
@@ -58,7 +58,7 @@ class Background:
 
     @property
     def dropped_half_m(self) -> float:
-        """Half the side of the square that objects are dropped into [m]."""
+        """Half the side of the square into which objects are dropped [m]."""
         return _side_m(self.object_m, self.objects) / 2
 
     @property
@@ -68,17 +68,17 @@ class Background:
 
     @property
     def overlap_m(self) -> float:
-        """By how much hulls at rest may overlap [m]."""
+        """Largest overlap of hulls at rest [m]."""
         return min(MOST_OVERLAP_M, OVERLAP_SHARE * self.object_m)
 
     @property
     def bounds_m(self) -> np.ndarray:
-        """The box that objects at rest are in, shape (2, 3)."""
+        """Bounds of objects at rest, shape (2, 3) [m]."""
         half = self.half_m + (self.object_m / 2 if self.kind == "table" else 0.0)
         return np.array([[-half, -half, 0.0], [half, half, self.highest_m]])
 
     def boxes(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Half extents and centres of its parts [m]: the floor, and the walls."""
+        """Half extents and centres of the floor and the walls [m]."""
         half, thick, high = self.half_m, WALL_SHARE * self.object_m, WALL_HEIGHT * self.object_m / 2
         floor = (np.array([half + 2 * thick, half + 2 * thick, thick]), np.array([0.0, 0.0, -thick]))
         if self.kind == "table":
@@ -92,7 +92,7 @@ class Background:
         ]
 
     def bodies(self) -> tuple[Body, ...]:
-        """Its parts as they stand in scenes, where they block rays and are nothing to look at."""
+        """Floor and walls as occluders of a scene."""
         names = ["floor", "wall 1", "wall 2", "wall 3", "wall 4"] if self.kind == "bin" else ["top"]
         return tuple(
             Body(Box(tuple(half.tolist())), f"{self.kind} {name}", "occluder", rigid(translation_m=centre))
@@ -100,10 +100,10 @@ class Background:
         )
 
     def removed(self, returns: Returns) -> Returns:
-        """The returns without those on the background, which is where it is known to be.
+        """The returns without those on the background, whose pose is known.
 
-        As one does with a depth camera: what is measured within a hundredth of an object of it, or behind its faces,
-        is no object. Nothing but places and the background decides.
+        As with a depth camera, points within a hundredth of an object of its faces, or behind them, are removed,
+        decided by measured points alone.
         """
         points, hit = returns.points_m, np.flatnonzero(returns.returned)
         near = np.zeros(len(points), dtype=bool)
@@ -115,7 +115,7 @@ class Background:
 
 
 def background_of(kind: Kind, meshes: Sequence[Mesh], objects: int) -> Background:
-    """The bin or table for so many of these meshes, whichever of them are in it."""
+    """The bin or table for `objects` objects out of these meshes, any of them."""
     across_m = 2 * max(_hull(mesh).radius_m for mesh in meshes)
     filled_m = objects * max(_hull(mesh).volume_m3 for mesh in meshes) / PACKED_SHARE / _side_m(across_m, objects) ** 2
     return Background(kind, across_m, objects, across_m + HEAPED * filled_m)
@@ -127,12 +127,12 @@ def _side_m(object_m: float, objects: int) -> float:
 
 @lru_cache(maxsize=4096)
 def settled_poses(meshes: tuple[Mesh, ...], background: Background, seed: int) -> tuple[np.ndarray, ...]:
-    """The poses (4, 4) in which objects rest that were dropped into a bin any way, onto a table upright.
+    """Poses (4, 4) of objects at rest after a fall into a bin with any rotation, or onto a table upright.
 
     Arguments:
         meshes: One per object, each in its own frame.
-        background: What they are dropped into or onto.
-        seed: Of how they are dropped. What does not come to rest in its place is dropped anew.
+        background: The bin or table.
+        seed: Seed of the fall, which is repeated until all objects come to rest in place.
 
     Raises:
         DataError: They come to rest in no attempt, or a mesh is flat.
@@ -189,12 +189,12 @@ def _hull(mesh: Mesh) -> _Hull:
 
 @lru_cache(maxsize=64)
 def _simulation(meshes: tuple[Mesh, ...], background: Background) -> _Simulation:
-    """The simulation of some objects: to compile it takes as long as to drop them."""
+    """Cached simulation of objects: compiling takes as long as dropping them."""
     return _Simulation([_hull(mesh).corners for mesh in meshes], background)
 
 
 class _Simulation:
-    """Objects, a background, and guides above its walls that keep objects in until all have fallen."""
+    """Simulation of objects, a background, and planes that keep objects inside until all have fallen."""
 
     def __init__(self, hulls: Sequence[np.ndarray], background: Background) -> None:
         mujoco = import_mujoco()
@@ -225,7 +225,7 @@ class _Simulation:
         self.data = mujoco.MjData(self.model)
 
     def dropped(self, generator: np.random.Generator) -> np.ndarray | None:
-        """Scaled places and quaternions (N, 7) of the objects at rest; None where some are not."""
+        """Scaled positions and quaternions (N, 7) of the objects at rest; None if some do not come to rest."""
         from scipy.spatial.transform import Rotation
 
         mujoco, count = import_mujoco(), self.model.nbody - 1
@@ -251,7 +251,7 @@ class _Simulation:
         return placed if overlap <= self.scale * self.background.overlap_m else None
 
     def _come_to_rest(self) -> bool:
-        """Step until nothing has moved for a while; whether that came about in time."""
+        """Step until all objects are at rest; True if that happens within `MOST_STEPS`."""
         mujoco, still = import_mujoco(), 0
         for _ in range(MOST_STEPS):
             mujoco.mj_step(self.model, self.data)

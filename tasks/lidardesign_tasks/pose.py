@@ -6,7 +6,7 @@ import numpy as np
 
 from lidardesign.scenes.scene import rigid
 
-LARGEST_DEVIATIONS = 2.5  # jitter is normal, cut at this many standard deviations so that no scene is absurd
+LARGEST_DEVIATIONS = 2.5  # jitter is normal, clipped at this many standard deviations
 
 
 def rotation_matrix(rotation_rad: np.ndarray) -> np.ndarray:
@@ -25,10 +25,10 @@ def jittered_pose(
     """A 4x4 pose: a normal random rotation about a centre and a normal random shift, per axis.
 
     Arguments:
-        generator: Where the randomness comes from.
+        generator: The random generator.
         rotation_deg: Standard deviation of the rotation about each axis [degrees].
         translation_m: Standard deviation of the shift along each axis [m].
-        centre_m: The point that the rotation leaves in place [m], shape (3,).
+        centre_m: Centre of the rotation [m], shape (3,).
     """
     draws = np.clip(generator.normal(size=(2, 3)), -LARGEST_DEVIATIONS, LARGEST_DEVIATIONS)
     rotation = rotation_matrix(np.deg2rad(rotation_deg) * draws[0])

@@ -1,9 +1,9 @@
-"""Poses over time from a CSV: bodies that move without code.
+"""Poses of bodies over time from a CSV file.
 
 One row is the pose of one body at one time, under a header that names the columns: `time_s`, `body`, `x_m`, `y_m`,
 `z_m`, and for rotations either a quaternion `qw`, `qx`, `qy`, `qz` of any length, or `roll_deg`, `pitch_deg`, `yaw_deg`
-(or `_rad`) about the fixed axes x, y, z in this order. Between the rows of a body places are linear in time and
-rotations turn at an even speed the shorter way; before its first and after its last row a body rests.
+(or `_rad`) about the fixed axes x, y, z in this order. Between the rows of a body positions are linear in time and
+rotations have a constant rate the shorter way; before its first and after its last row a body is at rest.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class BodyPath:
     """The poses of one body at ascending times.
 
     Arguments:
-        time_s: Shape (K,), strictly ascending.
+        time_s: Strictly ascending times, shape (K,).
         poses: Body to world, shape (K, 4, 4).
-        line: Where its first row stands in the file.
+        line: Line of its first row in the file.
     """
 
     time_s: np.ndarray
@@ -52,7 +52,7 @@ class BodyPath:
     line: int
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
-        """The poses at times, shape (T,) to (T, 4, 4)."""
+        """Poses at times (T,) [s], shape (T, 4, 4)."""
         moments = np.clip(time_s, self.time_s[0], self.time_s[-1])
         return np.stack([self._at(float(moment)) for moment in moments])
 
@@ -66,14 +66,14 @@ class BodyPath:
 
 
 def interpolated(first: np.ndarray, last: np.ndarray, share: float) -> np.ndarray:
-    """The pose between two, shapes (4, 4): places are linear, the rotation turns by a share of the angle between."""
+    """Pose between two, shapes (4, 4), with linear position and a rotation by a share of the angle between."""
     turn = first[:3, :3].T @ last[:3, :3]
     place = (1 - share) * first[:3, 3] + share * last[:3, 3]
     return rigid(first[:3, :3] @ rotation_matrix(share * rotation_vector(turn)), place)
 
 
 def rotation_vector(rotation: np.ndarray) -> np.ndarray:
-    """The axis of a rotation (3, 3) by its angle, 0 to pi [rad], shape (3,)."""
+    """Rotation vector of a rotation (3, 3), the axis times the angle from 0 to pi [rad], shape (3,)."""
     axial = np.array([
         rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1],
     ]) / 2  # fmt: skip
@@ -81,7 +81,7 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
     angle = math.atan2(sine, cosine)
     if cosine > 0:
         return axial * (angle / sine) if sine > 0 else np.zeros(3)
-    # towards half a turn the axis is that column of R + R^T - (tr R - 1) I that is longest
+    # towards half a turn the axis is the longest column of R + R^T - (tr R - 1) I
     columns = rotation + rotation.T - (float(np.trace(rotation)) - 1) * np.eye(3)
     axis = columns[np.argmax(np.abs(columns).max(axis=1))]
     axis = axis / np.linalg.norm(axis)
@@ -89,7 +89,7 @@ def rotation_vector(rotation: np.ndarray) -> np.ndarray:
 
 
 def read_poses(path: Path) -> dict[str, BodyPath]:
-    """The poses of every body of a file by its name, in order of appearance.
+    """Read the poses of every body of a file by name, in order of appearance.
 
     Raises:
         DataError: The file cannot be read, or a cell cannot be used; with file, line and column.
@@ -109,7 +109,7 @@ def read_poses(path: Path) -> dict[str, BodyPath]:
 
 @dataclass(frozen=True)
 class _Row:
-    """One row of the file."""
+    """A row of the file."""
 
     path: Path
     line: int
@@ -150,7 +150,7 @@ class _Row:
 
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
-    """The line and the cells of every row that is not blank, the header first."""
+    """Line and cells of every row that is not blank, the header first."""
     rows = csv_rows(path, TABLE)
     if not rows or len(rows) > MOST_ROWS + 1:
         raise DataError(f"{max(len(rows) - 1, 0)} rows", where=str(path), allowed=f"a header and 1 to {MOST_ROWS} rows")
@@ -162,7 +162,7 @@ def _rows(path: Path) -> list[tuple[int, list[str]]]:
 
 
 def _checked_header(names: tuple[str, ...], where: str) -> tuple[str, ...]:
-    """The columns of the rotation; none where bodies only shift.
+    """Columns of the rotation; none where bodies only translate.
 
     Raises:
         DataError: A column is unknown, given twice or missing, or two kinds of rotation are mixed.
@@ -193,5 +193,5 @@ def _path(poses: Sequence[tuple[float, np.ndarray, int]], name: str, path: Path)
 
 
 def span_s(paths: Mapping[str, BodyPath]) -> tuple[float, float]:
-    """The first and the last time of any body [s]."""
+    """First and last time of any body [s]."""
     return min(float(one.time_s[0]) for one in paths.values()), max(float(one.time_s[-1]) for one in paths.values())

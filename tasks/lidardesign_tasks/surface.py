@@ -25,9 +25,9 @@ from lidardesign.task import Information, Metric, Score, random_generator
 
 MILLIMETRES = 1000.0
 RECONSTRUCTION_POINTS = 4000
-ITEMS = 200  # points of a surface that rays are chosen for
+ITEMS = 200  # points of a surface for choosing rays
 COVERED_M = 0.010
-# a return further than this from the surface is none of it, unless the surface is known by points further apart
+# returns further than this from the surface are outliers, unless the points of the surface are further apart
 OUTLIER_M = 0.010
 METRIC = "metric"
 STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps: with dense rays they made up half of the error
@@ -35,15 +35,15 @@ STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps: with dense rays the
 
 @dataclass(frozen=True, eq=False)
 class LazyTruth(Mapping[str, Any]):
-    """The truth of a scene under one key, found when it is first asked for: learning never asks.
+    """The truth of a scene under one key, computed at first use: learning does not use it.
 
     Arguments:
         scene: The scene without a truth.
-        space: What the sensors may do.
-        points: Points of a cloud.
-        seed: Of their random places.
-        further: What is known without looking, by key, as what scores mean under `metric`.
-        fewer: The same truth of other numbers of points, once these were asked for.
+        space: The design space.
+        points: Number of points of a cloud.
+        seed: Seed of their random positions.
+        further: Further entries by key, as the metric under `metric`.
+        fewer: Cached truths with other numbers of points.
     """
 
     key: ClassVar[str]
@@ -56,11 +56,11 @@ class LazyTruth(Mapping[str, Any]):
 
     @abstractmethod
     def find(self) -> Any:
-        """What stands under the key; raises DataError where no admissible ray sees any target."""
+        """Compute the value of the key; raises DataError where no admissible ray sees any target."""
 
     @cached_property
     def found(self) -> Any:
-        """What `find` found the first time."""
+        """Cached result of `find`."""
         return self.find()
 
     def __getitem__(self, key: str) -> Any:
@@ -79,32 +79,32 @@ class VisibleTruth(LazyTruth):
     key = "surface"
 
     def find(self) -> SurfaceCloud:
-        """The visible part of the targets."""
+        """Compute the visible part of the targets."""
         return visible_surface(self.scene, self.space, self.points, random_generator(self.seed, "truth"))
 
 
 def fewer_points(truth: Mapping[str, Any], count: int) -> Mapping[str, Any]:
-    """The same truth of so many points, which takes a tenth of the time to find; one that is known stays."""
+    """The same truth with `count` points, which are ten times faster to find; other mappings are returned unchanged."""
     return truth.fewer.setdefault(count, replace(truth, points=count)) if isinstance(truth, LazyTruth) else truth
 
 
 def with_visible_truth(
     scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator, **further: Any
 ) -> Scene:
-    """The scene with what some admissible ray can see as its truth: `surface`, a `SurfaceCloud`, and further keys."""
+    """The scene with its truth: `surface`, the visible part of the targets as a `SurfaceCloud`, and further keys."""
     truth = VisibleTruth(scene, space, points, int(generator.integers(2**62)), further)
     return replace(scene, truth=truth)
 
 
 def reconstruct(returns: Sequence[Returns], viewpoint_m: np.ndarray | None = None) -> SurfaceCloud | None:
-    """The surface through all returns, neighbours as seen from a viewpoint; `None` where they span none.
+    """Surface through all returns, triangulated as seen from a viewpoint; `None` where they span none.
 
-    Nothing but rays and returns goes in: a return from an occluder inside the gate is taken for surface, and where
-    several rays side by side saw nothing there is none.
+    It uses rays and returns only: a return from an occluder inside the gate is taken for surface, and there is no
+    surface where several neighbouring rays have no return.
 
     Arguments:
-        returns: Of all frames.
-        viewpoint_m: The place that sees all of them, shape (3,); None: the mean origin of the rays.
+        returns: Returns of all frames.
+        viewpoint_m: Common viewpoint, shape (3,); None: the mean origin of the rays.
     """
     origins = np.concatenate([frame.rays.origin_m for frame in returns])
     if not len(origins):
@@ -113,7 +113,7 @@ def reconstruct(returns: Sequence[Returns], viewpoint_m: np.ndarray | None = Non
     is_one_place = viewpoint_m is None and bool((origins == origins[0]).all())
     viewpoint_m = origins.mean(axis=0) if viewpoint_m is None else viewpoint_m
     if is_one_place:
-        # whatever they meet, rays are seen where they look
+        # from their own origin, rays are seen in their directions at any range
         spacing = [ray_spacing(frame.rays.direction)[frame.returned] for frame in returns]
     else:
         spacing = [_spacing(frame, viewpoint_m) for frame in returns]
@@ -124,9 +124,9 @@ def reconstruct(returns: Sequence[Returns], viewpoint_m: np.ndarray | None = Non
 
 
 def _spacing(frame: Returns, viewpoint_m: np.ndarray) -> np.ndarray:
-    """How far apart a frame's rays are, seen from a viewpoint, at each of its returns, shape (K,).
+    """Angular spacing of a frame's rays, seen from a viewpoint, at each of its returns, shape (K,) [rad].
 
-    A ray without a return counts where it would be at the returns' median range.
+    Rays without a return are placed at the returns' median range.
     """
     hit = frame.returned
     if not hit.any():
@@ -138,9 +138,9 @@ def _spacing(frame: Returns, viewpoint_m: np.ndarray) -> np.ndarray:
 
 
 def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
-    """Chamfer distance [mm] of the reconstruction to the visible surface, at most the metric's worst value.
+    """Chamfer distance of the reconstruction to the visible surface [mm], at most the metric's worst value.
 
-    Where a fixed receiver hears all rays, neighbours are those that it sees side by side.
+    With a fixed receiver, returns are triangulated as seen from there.
 
     Details: `returns`, `outliers_percent`, the returns further than 10 mm from the visible surface (than the gaps
     between its points, where those are wider), and `coverage`, the share of the visible surface with the
@@ -160,12 +160,12 @@ def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> S
 
 
 def surface_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
-    """What returns tell about points of the visible surface, see `surface_information`."""
+    """Information of returns about points of the visible surface, see `surface_information`."""
     return information_of([fewer_points(scene.truth, ITEMS)["surface"]] * scene.frames, scene, returns)
 
 
 def information_of(surfaces: Sequence[SurfaceCloud | None], scene: Scene, returns: Sequence[Returns]) -> Information:
-    """What returns tell about points of the visible surface of each frame, None where nothing is to be seen."""
+    """Information of returns about points of the visible surface of each frame, None where it has none."""
     points = [np.zeros((0, 3)) if surface is None else surface.points for surface in surfaces]
     counts = [importance_at(scene, places, frame) for frame, places in enumerate(points)]
     area_m2 = [scattered_area_m2(places) for places in points]
@@ -179,7 +179,7 @@ def information_of(surfaces: Sequence[SurfaceCloud | None], scene: Scene, return
 
 
 def importance_at(scene: Scene, points_m: np.ndarray, frame: int) -> np.ndarray:
-    """How much the targets' meshes count at points (K, 3) on them, as at the nearest vertex, (K,); others count 1."""
+    """Importance at points (K, 3) [m] on the targets' meshes, that of the nearest vertex, 1 by default, (K,)."""
     from scipy.spatial import cKDTree
 
     meshes = [body for body in scene.bodies if body.is_target and isinstance(body.shape, Mesh)]

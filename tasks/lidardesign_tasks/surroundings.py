@@ -1,7 +1,7 @@
-"""What a task's scenes are made of and what is around them: surfaces, light, air, speed.
+"""Surroundings of a task's scenes: reflectance of surfaces, ambient light, air and velocity.
 
-Detectors that count photons meet these; geometry alone does not, and no truth of a scene depends on them. By default
-matt grey surfaces rest in clear air and the light of a room.
+They affect only detectors that count photons, not geometry or the truth of a scene. By default surfaces are matt grey
+and at rest, in clear air and indoor light.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from lidardesign.scenes.scene import Ambient, Body, Medium, Scene
 from lidardesign.space import FARTHEST_M
 from lidardesign.task import TaskConfig
 
-# At the visibility one tells 2 % of a contrast: exp(-extinction * visibility) = 0.02 (Koschmieder 1924).
+# Contrast at the visibility, which defines it: exp(-extinction * visibility) = 0.02 (Koschmieder 1924).
 VISIBLE_CONTRAST = 0.02
 # Extinction over backscatter of water droplets in near infrared light (O'Connor, Illingworth, Hogan 2004).
 DROPLET_LIDAR_RATIO_SR = 18.8
-# What bodies reflect that no task gave a reflectance: then nothing needs to be said about them.
+# Default reflectance of bodies.
 MATT_GREY = 0.5
-# Poses of so many frames are made in a minute or two, and fill some hundred megabytes.
+# Poses of so many frames take a minute or two, and some hundred megabytes.
 MOST_FRAMES = 200_000
 
 
@@ -41,13 +41,13 @@ class Surroundings(TaskConfig):
     gloss: float = Field(0.0, ge=0, le=1, description="share of the light that surfaces mirror instead")
 
     def around(self, scene: Scene, velocity_m_s: Any = None) -> Scene:
-        """The scene in these surroundings; its truth stays.
+        """The scene in these surroundings, with the same truth.
 
         Arguments:
             scene: The scene.
-            velocity_m_s: At which all its bodies, which rest in all frames, move within one, (3,); None: as they do.
+            velocity_m_s: Velocity of all its bodies within a frame, (3,); None: unchanged.
         """
-        # what is mirrored is missing from what is matt
+        # the mirrored share is missing from the diffuse one
         changed: dict[str, Any] = {"reflectance": (1 - self.gloss) * self.reflectance, "specular": self.gloss}
         if velocity_m_s is not None:
             changed["velocity_m_s"] = tuple(map(float, velocity_m_s))
@@ -60,12 +60,12 @@ class Surroundings(TaskConfig):
 
 
 def _changed(body: Body, values: dict[str, Any]) -> Body:
-    """The body with these values; itself where it has them, as bodies check what they are made of."""
+    """The body with these values, or itself if unchanged, which saves the checks of a new one."""
     return body if all(getattr(body, name) == value for name, value in values.items()) else replace(body, **values)
 
 
 class MovingSurroundings(Surroundings):
-    """The same of scenes that have `frames`; those of a split are held in memory together."""
+    """Surroundings of scenes with `frames`, with a limit of the frames of a split, which are in memory together."""
 
     @model_validator(mode="after")
     def _frames_fit(self) -> MovingSurroundings:
@@ -77,12 +77,12 @@ class MovingSurroundings(Surroundings):
 
 
 def fog(visibility_m: float) -> Medium:
-    """Fog of droplets that are large against the wavelength, so that infrared light fades as visible light does."""
+    """Fog of droplets larger than the wavelength, so that extinction in the infrared is as in visible light."""
     extinction_per_m = -math.log(VISIBLE_CONTRAST) / visibility_m
     return Medium(extinction_per_m, extinction_per_m / DROPLET_LIDAR_RATIO_SR)
 
 
 def any_direction(generator: np.random.Generator) -> np.ndarray:
-    """A unit vector, even over all directions, shape (3,)."""
+    """A random unit vector, uniform over all directions, shape (3,)."""
     vector = generator.normal(size=3)
     return vector / np.linalg.norm(vector)

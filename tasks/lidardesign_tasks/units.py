@@ -1,4 +1,4 @@
-"""Lengths that look as if they were in another unit than metres."""
+"""Notes on lengths and times that are probably in another unit than metres and seconds."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 
 from lidardesign.space import RANGE, DesignSpace
 
-# An object that large is more likely in another unit, and so is a way of that length, in extents of what goes it.
+# Larger objects are probably in another unit, and so are longer paths, in extents of the moving object.
 DOUBTFUL_EXTENT_M, DOUBTFUL_WAY = 20.0, 50.0
-# Robots are recorded many times per second; of few moments, which people write, one may say nothing.
+# Robots are recorded many times per second; short recordings, which may be handwritten, are not judged.
 DOUBTFUL_STEP_S, FEW_MOMENTS = 1.0, 10
 
 
 def doubtful_meshes(extents_m: Mapping[str, float], scale: float) -> list[str]:
-    """One line on meshes that are larger than a building while no unit was given.
+    """A note on very large meshes while no scale is set.
 
     Arguments:
-        extents_m: How long each mesh is, by its file's name [m].
-        scale: The factor to metres that was set.
+        extents_m: Largest extent of each mesh, by its file's name [m].
+        scale: Configured factor to metres.
     """
     large = {name: extent for name, extent in extents_m.items() if extent >= DOUBTFUL_EXTENT_M}
     if scale != 1.0 or not large:
@@ -34,12 +34,12 @@ def doubtful_meshes(extents_m: Mapping[str, float], scale: float) -> list[str]:
 
 
 def doubtful_motion(bounds_m: Mapping[str, np.ndarray], extent_m: float, space: DesignSpace) -> list[str]:
-    """One line on ways that are much longer than what goes them, or that no sensor reaches.
+    """A note on paths that are much longer than the moving objects, or out of reach of all sensors.
 
     Arguments:
-        bounds_m: The corners of a box around the whole way of each body, shape (2, 3) [m].
-        extent_m: How long the largest of them is [m].
-        space: Where sensors may be, and how far they reach.
+        bounds_m: Bounding box of the whole path of each body, shape (2, 3) [m].
+        extent_m: Extent of the largest object [m].
+        space: Design space with the origins and ranges of sensors.
     """
     far_m = {name: _gap_m(bounds, space) for name, bounds in bounds_m.items()}
     name = max(far_m, key=lambda name: far_m[name], default=None)
@@ -59,10 +59,10 @@ def doubtful_motion(bounds_m: Mapping[str, np.ndarray], extent_m: float, space: 
 
 
 def doubtful_times(time_s: Mapping[str, np.ndarray]) -> list[str]:
-    """One line on recordings whose moments lie so far apart that their times may be in another unit.
+    """A note on recordings whose time steps are so long that times may be in another unit.
 
     Arguments:
-        time_s: The moments of each recording, by its name, ascending [s].
+        time_s: Ascending times of each recording, by its name [s].
     """
     steps_s = {name: float(np.median(np.diff(times))) for name, times in time_s.items() if len(times) > FEW_MOMENTS}
     name = max(steps_s, key=lambda name: steps_s[name], default=None)

@@ -1,4 +1,4 @@
-"""Where sensors have to look so that they see all of what may move in a sphere."""
+"""Design spaces that contain all rays from a box of origins to a sphere or box."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from lidardesign.space import DesignSpace, aim
 
 
 def space_around(centre: np.ndarray, radius: float, origin: np.ndarray, half: np.ndarray) -> DesignSpace:
-    """The directions and ranges in which a sphere lies, seen from every origin of a box.
+    """Design space with all directions and ranges to a sphere from every origin of a box.
 
-    An origin inside that sphere looks everywhere.
+    If an origin is inside the sphere, all directions are included.
 
     Arguments:
-        centre: Of the sphere [m], shape (3,).
-        radius: Of the sphere [m].
-        origin: The middle of the box of sensor origins [m], shape (3,).
-        half: Half of its sides [m], shape (3,); 0 where it is fixed.
+        centre: Centre of the sphere [m], shape (3,).
+        radius: Radius of the sphere [m].
+        origin: Centre of the box of sensor origins [m], shape (3,).
+        half: Half extents of that box [m], shape (3,); 0 for a fixed origin.
     """
     corners = origin + half * np.array([(0, 0, 0), *itertools.product((-1, 1), repeat=3)])
     seen = aim(corners, centre)
@@ -48,11 +48,11 @@ def space_around(centre: np.ndarray, radius: float, origin: np.ndarray, half: np
 
 
 def space_around_box(bounds_m: np.ndarray, origin_m: np.ndarray, half_m: np.ndarray) -> DesignSpace:
-    """The directions and ranges in which a box (2, 3) [m] lies from every origin: as wide as corners of both make them.
+    """Design space with all directions and ranges to a box (2, 3) [m] from every origin, from the corners of both.
 
-    An origin above or below the box looks all around.
+    If an origin is above or below the box, all azimuths are included.
     """
-    # from an origin to a place in the box: a box again
+    # offsets from an origin to a point of the box: a box again
     low, high = bounds_m[0] - origin_m - half_m, bounds_m[1] - origin_m + half_m
     nearest, farthest = np.clip(0.0, low, high), np.maximum(np.abs(low), np.abs(high))
     across = np.hypot(nearest[0], nearest[1]), np.hypot(farthest[0], farthest[1])

@@ -1,8 +1,8 @@
-"""Scanning shelves from a robot that drives past them: which elevations are worth a ray, and where along the aisle.
+"""Scanning shelves from a robot that drives past them, with elevations of rays that depend on its position.
 
 World frame: the robot drives along x with its sensor at y = z = 0 and looks towards -y, up to straight up. The
 shelf stands along the aisle with four levels of boxes; see `warehouse_shelf` for its shape. A design gives the
-rays for any robot position x; it is judged by the boxes that it misses there.
+rays for any robot position x; its score is the share of boxes that it misses there.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ AISLE_M = (-0.5, 4.0)
 PAPER_POSITIONS_M = (0.0, 1.2, 2.4, 3.6)
 # The density is conditioned on x; rays in one vertical plane need the others fixed.
 FIXED_DIMENSIONS = ("y_m", "z_m", "azimuth_rad")
-MAXIMUM_DRAWS = 100  # a shelf whose boxes are all hidden at all positions is drawn anew so often
+MAXIMUM_DRAWS = 100  # attempts to draw a shelf with a visible box
 
 Size = Literal["full", "small"]
 SIZES: dict[str, dict[str, int]] = {
@@ -37,7 +37,7 @@ SIZES: dict[str, dict[str, int]] = {
 
 
 class WarehouseConfig(Surroundings):
-    """How many shelves, how they differ, where they are looked at from, and what surrounds them."""
+    """Number and variation of shelves, robot positions, and the surroundings."""
 
     size: Size = Field("full", description="small: 6 training and 4 held-out shelves of 2 bays, for quick checks")
     train: int | None = Field(None, ge=1, le=10_000, description="training shelves; default 100, small 6")
@@ -65,13 +65,13 @@ class WarehouseConfig(Surroundings):
         return self
 
     def count(self, name: Literal["train", "test", "positions", "bays"]) -> int:
-        """A number of things: what was set, else that of the size."""
+        """The configured number of things, or the default of the size."""
         value = getattr(self, name)
         return SIZES[self.size][name] if value is None else value
 
     @property
     def plan(self) -> ShelfPlan:
-        """What shelves are drawn from."""
+        """Distribution of random shelves."""
         return ShelfPlan(
             aisle_m=AISLE_M,
             bays=self.count("bays"),
@@ -111,7 +111,7 @@ class WarehouseTask:
         )
 
     def conditions(self, config: WarehouseConfig) -> list[dict[str, float]]:
-        """The paper's four robot positions, then `positions` more, even over the aisle."""
+        """The paper's four robot positions, then `positions` more, evenly over the aisle."""
         count = config.count("positions")
         more = AISLE_M[0] + (np.arange(count) + 0.5) / max(count, 1) * (AISLE_M[1] - AISLE_M[0])
         return [{"x_m": float(x)} for x in (*PAPER_POSITIONS_M, *more)]
@@ -131,20 +131,20 @@ class WarehouseTask:
             _visible_shelf(config.plan, space, np.array(origins), split, seed, index)
             for index in range(config.count(split))
         ]
-        # the shelf stands still, and comes towards a robot that drives past
+        # the shelf moves relative to the driving robot
         return [config.around(shelf, (-config.speed_m_s, 0.0, 0.0)) for shelf in shelves]
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
-        """The share [%] of boxes in the sensor's plane that no ray returned on; one `Returns` per position."""
+        """Share of visible boxes in the sensor's plane without a return [%]; one `Returns` per position."""
         return miss_score(self.metric, scene, returns)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
-        """Which returns lie on which boxes that could be seen from their position."""
+        """Information of returns on boxes that are visible from their position."""
         return box_information(scene, returns)
 
 
 def _check_space(space: DesignSpace) -> None:
-    """Refuse spaces in which nobody can say which boxes a position should see."""
+    """Refuse spaces without a single vertical plane per robot position."""
     for name in FIXED_DIMENSIONS:
         if DIMENSIONS.index(name) in space.free:
             raise ConfigError(
@@ -168,7 +168,7 @@ def _check_space(space: DesignSpace) -> None:
 def _visible_shelf(
     plan: ShelfPlan, space: DesignSpace, origins_m: np.ndarray, split: Split, seed: int, index: int
 ) -> Scene:
-    """One shelf with its truth, drawn anew while no box can be seen from anywhere."""
+    """A random shelf with its truth, drawn again while no box is visible from any position."""
     for draw in range(MAXIMUM_DRAWS):
         generator = random_generator(seed, "warehouse", split, index, draw)
         scene = Scene(build_shelf(plan, generator), f"{split} shelf {index}")

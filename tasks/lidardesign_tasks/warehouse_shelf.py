@@ -1,9 +1,9 @@
 """Random shelves: four boards along the aisle on upright poles, with boxes standing close to the front edge.
 
 The shelf's own frame has u along the aisle, depth into the shelf and z up; its front edge is depth = 0. All bodies
-are boxes with a vertical axis. Boards and poles only occlude; boxes are what is looked for and occlude as well.
-Poles stand just before the front edge, so they hide what is behind them; a board hides the foot of a box that
-stands back from the edge, the more the higher the level; a box hides the second row behind it.
+are boxes with a vertical axis. Boards and poles only occlude; boxes are targets and occlude as well. Poles are
+just before the front edge, so they hide boxes behind them; a board hides the foot of a box that is set back
+from the edge, the more the higher the level; a box hides the second row behind it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LEVELS = 4
 BOARD_THICKNESS_M = 0.06  # the board with the beam that carries it
 SHELF_DEPTH_M = 0.6
 POLE_M = 0.05  # width and depth of an upright
-FLOOR_M = -0.2  # where the uprights stand: the robot carries its sensor 0.2 m above the floor
+FLOOR_M = -0.2  # height of the floor: the robot's sensor is 0.2 m above it
 BAY_STRETCH = (0.9, 1.15)  # bays of one shelf are the same, those of another this much shorter or longer
 BOX_DEPTH_M = (0.2, 0.4)
 NARROW_GAP_M = (0.005, 0.03)
@@ -31,14 +31,14 @@ FURTHEST_BACK_M = 0.05  # with the deepest box, the widest gap and the shallowes
 WIDEST_BOX_M = 1.0
 NEAREST_FRONT_M, FURTHEST_FRONT_M = 0.3, 4.0
 STEEPEST_AISLE = 0.2  # metres of distance per metre of aisle
-# The shelf goes on beyond both ends of the aisle: a box that does not fit at its end is left away, and the places
-# that the robot looks at are as full there as elsewhere.
+# The shelf extends beyond both ends of the aisle: a box that does not fit at its end is left out, and the positions
+# that the robot sees are as full there as elsewhere.
 BEYOND_AISLE_M = 0.65
 
 
 @dataclass(frozen=True)
 class ShelfPlan:
-    """What shelves are drawn from, uniformly within every interval; see `WarehouseConfig` for the meaning."""
+    """Distribution of random shelves, uniform within every interval; see `WarehouseConfig` for the fields."""
 
     aisle_m: Interval
     bays: int
@@ -53,7 +53,7 @@ class ShelfPlan:
     second_row_share: float
 
     def check(self) -> None:
-        """Refuse what cannot stand.
+        """Refuse a plan that cannot be built.
 
         Raises:
             ValueError: An interval that is reversed or not positive, boxes that do not fit between or on boards, a
@@ -105,7 +105,7 @@ class _Block:
     height: Interval
 
     def body(self, name: str, role: Role, pose: np.ndarray) -> Body:
-        """The body in the world, for a pose of the shelf whose -y is depth."""
+        """The block as a body in the world, for a pose of the shelf whose -y is depth."""
         low = np.array([self.along[0], -self.depth[1], self.height[0]])
         high = np.array([self.along[1], -self.depth[0], self.height[1]])
         half = (high - low) / 2
@@ -113,7 +113,7 @@ class _Block:
 
 
 def build_shelf(plan: ShelfPlan, generator: np.random.Generator) -> tuple[Body, ...]:
-    """Boards, poles and boxes of one random shelf; boxes are named by level and number."""
+    """Boards, poles and boxes of a random shelf; boxes are named by level and number."""
     pose = _shelf_pose(plan, generator)
     middle = sum(plan.aisle_m) / 2
     ends = (plan.aisle_m[0] - BEYOND_AISLE_M - middle, plan.aisle_m[1] + BEYOND_AISLE_M - middle)
@@ -132,7 +132,7 @@ def build_shelf(plan: ShelfPlan, generator: np.random.Generator) -> tuple[Body, 
 
 
 def _shelf_pose(plan: ShelfPlan, generator: np.random.Generator) -> np.ndarray:
-    """The shelf's frame in the world: its front edge runs through both ends' jittered distances."""
+    """Pose of the shelf in the world, with its front edge through both ends' jittered distances."""
     start, end = np.array(plan.front_m) + generator.uniform(-plan.front_jitter_m, plan.front_jitter_m, 2)
     turn = -math.atan2(end - start, plan.aisle_m[1] - plan.aisle_m[0])
     cosine, sine = math.cos(turn), math.sin(turn)
@@ -151,7 +151,7 @@ def _poles(plan: ShelfPlan, ends: Interval, top: float, generator: np.random.Gen
 def _boxes_of_a_level(plan: ShelfPlan, ends: Interval, height: float, generator: np.random.Generator) -> list[_Block]:
     """Boxes beside each other from one end to the other, some with an empty place after them or one behind."""
     blocks: list[_Block] = []
-    # the first box may stick out and is then left away: the pattern has no phase at the shelf's end
+    # the first box may extend beyond the end and is then left out: the pattern has a random phase
     cursor = ends[0] - generator.uniform(0.0, plan.box_width_m[1])
     while True:
         along = (cursor, cursor + generator.uniform(*plan.box_width_m))

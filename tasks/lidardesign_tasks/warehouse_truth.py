@@ -1,8 +1,8 @@
-"""Which boxes a robot could see from a position, and which of them its returns lie on.
+"""Ground truth of visible boxes from a robot's position, and assignment of its returns to boxes.
 
 All bodies are boxes with a vertical axis, so the sensor's vertical plane cuts each in a rectangle. Between
-neighbouring elevations of rectangles' corners a ray's first hit stays the same rectangle: one ray per such step finds
-everything that any ray could see, exactly.
+neighbouring elevations of rectangles' corners a ray's first hit is on the same rectangle: one ray per such step finds
+all visible boxes exactly.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 from lidardesign.task import Information, Metric, Score
 
 PERCENT = 100.0
-# No step between neighbouring elevations is wider: the ends of the design space's range cut faces to this angle.
+# Largest step between neighbouring elevations, to which the ends of the design space's range cut faces.
 LARGEST_STEP_RAD = math.radians(0.5)
-# Less of a box than this in all, 0.2 mm at 2 m, counts as hidden: rounding decides about slivers.
+# Smallest angle of a visible box in all, 0.2 mm at 2 m: smaller slivers depend on rounding.
 SMALLEST_VISIBLE_RAD = 1e-4
-# A return lies on the nearest surface in its plane, unless even that is further away: several times the range
+# A return is on the nearest surface in its plane, unless that is further away than this: several times the range
 # error of a single-photon detector (50 ps, 7.5 mm), less than half of the lowest box.
 ON_FACE_M = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneCut:
-    """What the sensor's vertical plane cuts out of a scene, in its coordinates (distance, height above the sensor).
+    """Cut of a scene by the sensor's vertical plane, in coordinates (distance, height above the sensor).
 
     Arguments:
         body: Indices of the cut bodies, shape (B,).
         low: Nearest distance and lowest height of each [m], shape (B, 2).
         high: Furthest distance and largest height [m], shape (B, 2).
-        is_box: Which are boxes to be seen, shape (B,).
+        is_box: Mask of target boxes, shape (B,).
     """
 
     body: np.ndarray
@@ -47,7 +47,7 @@ class PlaneCut:
     is_box: np.ndarray
 
     def first_hits(self, elevation_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The nearest rectangle of rays from the sensor: its row (-1 on a miss) and range [m], both (N,)."""
+        """First hits of rays from the sensor: rows of rectangles (-1 on a miss) and ranges [m], both (N,)."""
         if not len(self.body):
             return np.full(len(elevation_rad), -1), np.full(len(elevation_rad), np.inf)
         ray = np.stack([np.cos(elevation_rad), np.sin(elevation_rad)], axis=-1)[:, None]
@@ -68,7 +68,7 @@ class PlaneCut:
 
 
 def cut_scene(scene: Scene, origin_m: np.ndarray, azimuth_rad: float) -> PlaneCut:
-    """What the half plane from an origin (3,) towards an azimuth cuts out of a scene of upright boxes."""
+    """Cut of a scene of upright boxes by the half plane from an origin (3,) [m] towards an azimuth [rad]."""
     poses = np.array([body.pose() for body in scene.bodies]).reshape(-1, 4, 4)
     half = np.array([body.shape.half_extents_m for body in scene.bodies]).reshape(-1, 3)
     near, far = _crossed(poses, half[:, :2], origin_m, np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0]))
@@ -81,9 +81,9 @@ def cut_scene(scene: Scene, origin_m: np.ndarray, azimuth_rad: float) -> PlaneCu
 def _crossed(
     poses: np.ndarray, half_m: np.ndarray, origin_m: np.ndarray, forward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where a horizontal line from the origin enters and leaves the footprints of boxes, (B,) each [m].
+    """Ranges at which a horizontal line from the origin enters and leaves the footprints of boxes, (B,) each [m].
 
-    It leaves before it enters where it passes one by.
+    On a miss it leaves before it enters.
     """
     start = np.einsum("bji,bj->bi", poses[:, :3, :2], origin_m - poses[:, :3, 3])
     along = np.einsum("bji,j->bi", poses[:, :3, :2], forward)
@@ -96,9 +96,9 @@ def _crossed(
 
 
 def visible_boxes(cut: PlaneCut, space: DesignSpace) -> np.ndarray:
-    """The bodies of the boxes that some admissible ray of the plane sees, ascending, shape (V,).
+    """Ascending body indices of the boxes that are visible to some admissible ray of the plane, shape (V,).
 
-    One ray stands for each step of elevations with the same first hit.
+    One ray is cast for each step of elevations with the same first hit.
     """
     low, high = space.low[ELEVATION], space.high[ELEVATION]
     corners = [np.arctan2(z, s) for s in (cut.low[:, 0], cut.high[:, 0]) for z in (cut.low[:, 1], cut.high[:, 1])]
@@ -113,14 +113,14 @@ def visible_boxes(cut: PlaneCut, space: DesignSpace) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class BoxTruth(Mapping[str, list[np.ndarray]]):
-    """The boxes that could be seen (`visible`) and that stand in the plane at all (`standing`), per position.
+    """Visible boxes (`visible`) and all boxes in the plane (`standing`) per robot position.
 
-    Each is a list of body indices per robot position, found when first asked for: learning never asks.
+    Each is a list of body indices per position, computed at first use: learning does not use it.
 
     Arguments:
         scene: The scene without a truth.
-        space: What the sensor may do; its azimuth is fixed.
-        origins_m: Where the sensor is at the evaluated positions, shape (P, 3).
+        space: The design space, with a fixed azimuth.
+        origins_m: Origins of the sensor at the evaluated positions, shape (P, 3).
     """
 
     scene: Scene
@@ -129,21 +129,21 @@ class BoxTruth(Mapping[str, list[np.ndarray]]):
 
     @cached_property
     def cuts(self) -> list[PlaneCut]:
-        """The scene's cut at every position."""
+        """Cut of the scene at every position."""
         return [self._cut(origin) for origin in self.origins_m]
 
     @cached_property
     def visible(self) -> list[np.ndarray]:
-        """The bodies of the boxes that an admissible ray sees, per position."""
+        """Body indices of the boxes that are visible to an admissible ray, per position."""
         return [visible_boxes(cut, self.space) for cut in self.cuts]
 
     @cached_property
     def standing(self) -> list[np.ndarray]:
-        """The bodies of all boxes in the plane, per position."""
+        """Body indices of all boxes in the plane, per position."""
         return [cut.body[cut.is_box] for cut in self.cuts]
 
     def any_visible(self) -> bool:
-        """Whether a box can be seen from anywhere; looks no further than the first one."""
+        """True if a box is visible from any position; stops at the first one."""
         return any(len(visible_boxes(self._cut(origin), self.space)) for origin in self.origins_m)
 
     def _cut(self, origin_m: np.ndarray) -> PlaneCut:
@@ -162,7 +162,7 @@ class BoxTruth(Mapping[str, list[np.ndarray]]):
 
 
 def seen_boxes(cut: PlaneCut, points_m: np.ndarray, origin_m: np.ndarray, azimuth_rad: float) -> np.ndarray:
-    """The bodies of the boxes that measured points (N, 3) [m] lie on, ascending.
+    """Ascending body indices of the boxes that measured points (N, 3) [m] are on.
 
     See `boxes_of`.
     """
@@ -171,10 +171,10 @@ def seen_boxes(cut: PlaneCut, points_m: np.ndarray, origin_m: np.ndarray, azimut
 
 
 def boxes_of(cut: PlaneCut, points_m: np.ndarray, origin_m: np.ndarray, azimuth_rad: float) -> np.ndarray:
-    """The body of the box that each measured point (N, 3) [m] lies on, -1 for none, shape (N,).
+    """Body index of the box that each measured point (N, 3) [m] is on, -1 for none, shape (N,).
 
-    A point belongs to the nearest outline in the plane, box or not, and to none beyond `ON_FACE_M`; one that is
-    further than that from the plane itself belongs to none.
+    A point is on the nearest outline in the plane, box or not, if it is within `ON_FACE_M` of the outline and of the
+    plane.
     """
     if not len(cut.body):
         return np.full(len(points_m), -1)
@@ -188,10 +188,10 @@ def boxes_of(cut: PlaneCut, points_m: np.ndarray, origin_m: np.ndarray, azimuth_
 
 
 def miss_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
-    """The share [%] of (box, position) pairs without a return on the box, of those that some ray could have seen.
+    """Share of visible (box, position) pairs without a return on the box [%].
 
-    A design without a single return fails. Details: `returns`, `boxes` (pairs that could be seen), `boxes_seen`, and
-    `hidden_percent`, the share of boxes in the plane that no admissible ray could see.
+    A design without a single return fails. Details: `returns`, `boxes` (visible pairs), `boxes_seen`, and
+    `hidden_percent`, the share of boxes in the plane that are visible to no admissible ray.
 
     Raises:
         ConfigError: The number of returns is not the number of evaluated positions.
@@ -212,7 +212,7 @@ def miss_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Scor
 
 
 def missed_boxes(scene: Scene, returns: Sequence[Returns]) -> list[np.ndarray]:
-    """The bodies of the boxes that could be seen and that no return lies on, per position.
+    """Body indices of the visible boxes without a return, per position.
 
     Raises:
         ConfigError: The number of returns is not the number of evaluated positions.
@@ -227,7 +227,7 @@ def missed_boxes(scene: Scene, returns: Sequence[Returns]) -> list[np.ndarray]:
 
 
 def _require_positions(scene: Scene, returns: Sequence[Returns]) -> None:
-    """Refuse another number of returns than there are evaluated positions."""
+    """Refuse a number of returns that is not that of the evaluated positions."""
     positions = len(scene.truth.origins_m)
     if len(returns) != positions:
         raise ConfigError(
@@ -236,7 +236,7 @@ def _require_positions(scene: Scene, returns: Sequence[Returns]) -> None:
 
 
 def box_information(scene: Scene, returns: Sequence[Returns]) -> Information:
-    """Which returns lie on which boxes that could be seen: a single one tells all about a box and a position.
+    """Information of returns on visible boxes: a single one gives full information of a box at a position.
 
     Raises:
         ConfigError: The number of returns is not the number of evaluated positions.
@@ -245,7 +245,7 @@ def box_information(scene: Scene, returns: Sequence[Returns]) -> Information:
     _require_positions(scene, returns)
     rays, items, frames, known = [], [], [], 0
     for one, cut, origin, visible in zip(returns, truth.cuts, truth.origins_m, truth.visible, strict=True):
-        item = np.full(len(scene.bodies) + 1, -1)  # the last is that of no box
+        item = np.full(len(scene.bodies) + 1, -1)  # the last is for no box
         item[visible] = known + np.arange(len(visible))
         of_ray = item[boxes_of(cut, one.points_m, origin, truth.space.low[AZIMUTH])]
         rays.append(np.flatnonzero(one.returned)[of_ray >= 0])

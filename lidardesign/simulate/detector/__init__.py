@@ -1,1 +1,1 @@
-"""A receiver and its laser."""
+"""Models of detectors: receiver, laser and histogram."""

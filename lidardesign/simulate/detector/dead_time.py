@@ -1,6 +1,6 @@
-"""Compiled loops of detectors that are blind after a count: what they count, and the return that is found in it.
+"""Compiled loops of detectors with dead time: counted photons, and returns corrected for dead time.
 
-The return is found in what such a detector counts: a pulse can only be counted in while it is alive. With the counts
+The return is located in the counted photons: a photon is counted only while its pulse is alive. With the counts
 so far, the share a_b of pulses that are alive in bin b is known, and the counts expected there are a_b (b + s g) per
 alive pulse (Coates 1968, for any dead time). So a level of background is a level per alive share, and the log-matched
 filter becomes
@@ -8,7 +8,7 @@ filter becomes
     L(k) = sum_j h_{k+j} log(1 + s g_j / b) - s sum_j a_{k+j} g_j,
 
 with h the photons that arrived in alive pulses, of which only one per pulse and bin was counted.
-What pile-up has taken away is not brought back: a pulse in a bin with few alive pulses has few counts.
+The correction does not restore lost photons: a pulse in a bin with few alive pulses has few counts.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from lidardesign.simulate.detector.kernels import (
 )
 from lidardesign.simulate.detector.streams import normal, uniform
 
-# More photons in one bin than this are counted together, by mean and variance of how many pulses they fall into
+# More photons in one bin than this are counted together, by mean and variance of the number of pulses that they hit
 ONE_BY_ONE = 32
 # Expected hits of alive pulses below which a rounded normal would be wrong on average
 FEW_PULSES = 8.0
-# More photons per pulse in one bin than this are no more: they leave a pulse without any with the probability exp(-32)
+# Upper limit of photons per pulse in a bin: at it, a pulse is without any with the probability exp(-32)
 MOST_PER_PULSE = 32
 # A ray with more photons than this, where dead times reach across pulses, is followed in a share of its pulses only
 MOST_PHOTONS = 1 << 21
@@ -43,7 +43,7 @@ FIRST_BIN = 1 << 62
 
 @njit(cache=True, nogil=True)
 def count_alive(counts, offset, pulses, dead, period, key, first_ray):  # noqa: ANN001, ANN201
-    """The photons that are counted among those that arrive, flat; dead time and time between pulses in bins."""
+    """Counted photons per bin among those that arrive, flat; dead time and time between pulses in bins."""
     found = np.zeros_like(counts)
     for i in range(len(offset) - 1):
         arrived, mine = counts[offset[i] : offset[i + 1]], found[offset[i] : offset[i + 1]]
@@ -56,7 +56,7 @@ def count_alive(counts, offset, pulses, dead, period, key, first_ray):  # noqa: 
 
 @njit(cache=True, nogil=True)
 def _within_pulses(arrived, mine, pulses, dead, key, ray):  # noqa: ANN001, ANN202
-    """Bin after bin: a photon finds its pulse alive with the share of pulses without a count in the dead time."""
+    """Count photons bin by bin: each is counted with the share of pulses without a count within the dead time."""
     blind, oldest = 0, 0
     for b in range(len(arrived)):
         while oldest < b and b - oldest >= dead:
@@ -76,9 +76,9 @@ def _within_pulses(arrived, mine, pulses, dead, key, ray):  # noqa: ANN001, ANN2
 
 @njit(cache=True, nogil=True)
 def _hit_pulses(number, alive, pulses, z):  # noqa: ANN001, ANN202
-    """How many of the alive pulses get at least one of so many photons: a rounded normal of its mean and variance.
+    """Number of alive pulses hit by at least one of `number` photons: a rounded normal of its mean and variance.
 
-    Where it is few, the binomial quantile of the normal number z, as if pulses got photons independently.
+    Where it is small, the binomial quantile of the normal number z, as if pulses got photons independently.
     """
     empty = math.exp(number * math.log1p(-1.0 / pulses)) if pulses > 1 else 0.0
     two_empty = math.exp(number * math.log1p(-2.0 / pulses)) if pulses > 2 else 0.0
@@ -91,7 +91,7 @@ def _hit_pulses(number, alive, pulses, z):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _binomial_quantile(trials, failure, share):  # noqa: ANN001, ANN202
-    """The least number of successes whose distribution function reaches a share."""
+    """The least number of successes whose binomial distribution function reaches a share."""
     count = 0
     probability = math.exp(trials * math.log(failure))
     total = probability
@@ -104,7 +104,7 @@ def _binomial_quantile(trials, failure, share):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _share_of_counts(arrived, shares):  # noqa: ANN001, ANN202
-    """One of so many equal shares of photons, evenly over time."""
+    """One of `shares` equal parts of photons, evenly over time."""
     total, before = 0, 0
     found = np.empty_like(arrived)
     for b in range(len(arrived)):
@@ -116,7 +116,7 @@ def _share_of_counts(arrived, shares):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _across_pulses(arrived, mine, pulses, dead, period, key, ray):  # noqa: ANN001, ANN202
-    """Photon after photon in the order of time, where a count may blind the pulses after its own."""
+    """Count photons one by one in order of time, with dead time that may reach into later pulses."""
     arrived = np.minimum(arrived, MOST_PER_PULSE * pulses)
     total = arrived.sum()
     if total > MOST_PHOTONS and pulses > 1:
@@ -144,7 +144,7 @@ def _across_pulses(arrived, mine, pulses, dead, period, key, ray):  # noqa: ANN0
 
 @njit(cache=True, nogil=True)
 def _by_pulse(times, size, pulses):  # noqa: ANN001, ANN202
-    """Times pulse * size + bin that are in the order of bins, in the order of pulses and then bins (counting sort)."""
+    """Sort times pulse * size + bin, given in order of bins, by pulse and then bin (counting sort)."""
     place = np.zeros(pulses + 1, np.int64)
     for time in times:
         place[time // size + 1] += 1
@@ -157,7 +157,7 @@ def _by_pulse(times, size, pulses):  # noqa: ANN001, ANN202
     return ordered
 
 
-# How often the place of the pulse is used to tell it from the background that it is then found in
+# Iterations of locating the pulse and estimating the background outside of it
 PASSES = 3
 
 
@@ -174,7 +174,7 @@ def alive_shares(counts, pulses, dead, period):  # noqa: ANN001, ANN201
     alive = np.empty(size)
     for b in range(size):
         blind = running[b] - running[min(max(math.floor(b - dead) + 1, 0), b)]
-        # pulses back so far that any count of theirs still blinds, then those of which only the late ones do
+        # earlier pulses whose counts all reach here by dead time, then those of which only the late ones do
         back = max(math.ceil((dead - b) / period) - 1, 0)
         blind += back * running[size]
         since = b + (back + 1) * period - dead
@@ -188,7 +188,7 @@ def alive_shares(counts, pulses, dead, period):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def arrived_photons(counted, pulses):  # noqa: ANN001, ANN201
-    """How many photons fell into so many alive pulses of which `counted` had at least one, as far as that tells."""
+    """Estimated number of photons in alive pulses of which `counted` have at least one."""
     return -pulses * math.log1p(-min(counted / pulses, 1.0 - 1.0 / (pulses + 1.0)))
 
 
@@ -202,13 +202,13 @@ def _running(values):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _around(sums, middle, half):  # noqa: ANN001, ANN202
-    """The sum of bins middle - half to middle + half, as far as there are any."""
+    """Sum of the bins middle - half to middle + half from running sums, cut to the histogram."""
     return sums[min(middle + half + 1, len(sums) - 1)] - sums[max(middle - half, 0)]
 
 
 @njit(cache=True, nogil=True)
 def _stands_out(counted, room, level, half):  # noqa: ANN001, ANN202
-    """The middle of the bins that hold the most beyond their level, by running sums."""
+    """Middle of the bins with the most counts above their background level, from running sums."""
     best, most = 0, -np.inf
     for b in range(len(counted) - 1):
         excess = _around(counted, b, half) - level * _around(room, b, half)
@@ -219,7 +219,7 @@ def _stands_out(counted, room, level, half):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _alive_part(alive, shape, middle):  # noqa: ANN001, ANN202
-    """The share of a pulse in a bin's middle that falls into alive pulses."""
+    """Share of an echo centred in a bin that falls into alive pulses."""
     reach, total = len(shape) // 2, 0.0
     for b in range(max(middle - reach, 0), min(middle + reach, len(alive) - 1) + 1):
         total += alive[b] * shape[b - middle + reach]
@@ -230,7 +230,7 @@ def _alive_part(alive, shape, middle):  # noqa: ANN001, ANN202
 def _corrected_matched(counts, alive, shape, signal, level, score):  # noqa: ANN001, ANN202
     """The bin of the largest log-likelihood, and by how much of a bin its vertex lies off the bin's middle.
 
-    Only bins that a photon speaks for are considered.
+    Only bins within reach of a photon are considered.
     """
     size, reach = len(counts), len(shape) // 2
     weight = np.log1p(signal / level * shape)
@@ -263,7 +263,7 @@ def find_corrected(  # noqa: ANN201
     dead,  # noqa: ANN001
     period,  # noqa: ANN001
 ):
-    """As `find_returns`, with the pulses of a frame, and dead time and time between pulses in bins."""
+    """Find returns as `find_returns`, corrected for dead time, given pulses, dead time and pulse period in bins."""
     found = np.full(len(offset) - 1, np.nan)
     longest = 0
     for i in range(len(offset) - 1):

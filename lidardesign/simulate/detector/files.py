@@ -1,7 +1,7 @@
 """Detector files: YAML with units in its keys, checked value by value.
 
 A quantity may be given in any of its units (`bin_ps` or `bin_ns`), once. The keys of the light budget come together
-or not at all: without them every light is enough, and no photon is counted.
+or not at all: without them any amount of light is detected, and no photon is counted.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class Quantity:
     """A number with a unit.
 
     Arguments:
-        units: SI units per unit, by the suffix of its key; without a unit the key has no suffix.
-        low, high: What is allowed, in SI units.
-        above: Whether `low` itself is not allowed.
-        whole: Whether it counts something.
-        default: Its value where the file says nothing, in SI units; None: none.
+        units: SI units per unit, by the suffix of its key; a dimensionless key has no suffix.
+        low, high: Allowed interval, in SI units.
+        above: Whether `low` itself is excluded.
+        whole: Whether it is a whole number.
+        default: Default value in SI units; None: none.
     """
 
     units: Mapping[str, float]
@@ -46,7 +46,7 @@ class Quantity:
     default: float | None = None
 
     def keys(self, name: str) -> list[str]:
-        """How files may spell it."""
+        """Keys of a quantity in files, one per unit."""
         return [f"{name}_{unit}" if unit else name for unit in self.units]
 
 
@@ -83,7 +83,7 @@ QUANTITIES = {**TIMING, **LIGHT}
 
 
 def detector_names() -> list[str]:
-    """The names of the detectors that are shipped."""
+    """Names of the shipped detectors."""
     return sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 
@@ -170,7 +170,7 @@ def _unknown(key: str, where: str, allowed: list[str]) -> ConfigError:
 
 
 def _number(document: Document, values: Mapping[str, Any], name: str, quantity: Quantity) -> float | None:
-    """A quantity in SI units; its default where the file says nothing."""
+    """A quantity in SI units, or its default."""
     for key, scale in zip(quantity.keys(name), quantity.units.values(), strict=True):
         if key in values:
             return _checked(values[key], document.locate((key,)), key, quantity, scale)
@@ -201,7 +201,7 @@ def _choice(document: Document, values: Mapping[str, Any], name: str, options: t
 
 
 def _photons(document: Document, found: Mapping[str, float | None], emission: Any) -> Photons | None:
-    """The light budget; None where the file gives none of it."""
+    """The light budget; None if the file has none of its keys."""
     missing = [LIGHT[name].keys(name)[0] for name in LIGHT if found[name] is None]
     missing += [] if emission else ["emission"]
     if len(missing) == len(LIGHT) + 1:
@@ -228,7 +228,7 @@ def _photons(document: Document, found: Mapping[str, float | None], emission: An
 
 
 def _check_together(document: Document, detector: Detector) -> None:
-    """What single values cannot show."""
+    """Check the values that depend on each other."""
     if detector.footprint_rays > 1 and detector.divergence_rad == 0:
         raise ConfigError(
             f"footprint_rays: {detector.footprint_rays} rays in a beam of divergence 0 are all the same ray",

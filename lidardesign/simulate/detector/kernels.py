@@ -1,15 +1,15 @@
-"""Compiled loops that sort arriving photons into bins, find the return in a histogram, and say whether it is one.
+"""Compiled loops that sort arriving photons into bins, and locate and accept returns in histograms.
 
 Bins of ray i are offset[i] to offset[i + 1] of a flat array; they start at first[i], are `width` wide, and count only
-what lies in the ray's window, closed at its start and open at its end.
+photons in the ray's window, closed at its start and open at its end.
 
 The range is the middle of the highest bin, or the maximum of the log-matched filter: the likelihood of a pulse of the
 known shape g at a bin k in an even background b,
 
     L(k) = sum_j h_{k+j} log(1 + s g_j / b) - s sum_j g_j,
 
-over the bins k + j in the window, with as many signal photons s as stand out (Rapp and Goyal 2017; the second term
-only tells pulses that the window cuts off), refined by a parabola through its neighbours.
+over the bins k + j in the window, with s the signal photons above background (Rapp and Goyal 2017; the second term
+matters only for pulses that the window cuts off), refined by a parabola through its neighbours.
 
 It is reported if the photons within one full width at half maximum around it are more than the background alone
 brings anywhere in the window with the allowed probability: bins * P(Poisson(b m) >= n) <= false_alarm, m bins wide.
@@ -36,7 +36,7 @@ DRAWN_ONE_BY_ONE = 64.0
 
 @njit(cache=True, nogil=True)
 def echo_of(ray, share, echo_offset, expected):  # noqa: ANN001, ANN201
-    """For photons of rays (K,) at shares (K,) of their light: the echo they are of, and the share within it."""
+    """Index of the echo of each photon, by rays (K,) and shares (K,) of their light, and the share within the echo."""
     echo = np.empty(len(ray), np.int64)
     rest = np.empty(len(ray))
     for k in range(len(ray)):
@@ -87,7 +87,7 @@ def expected_in_bins(chosen, offset, first, width, windows, echo_offset, path, e
 
 @njit(cache=True, nogil=True)
 def _share_between(left, right, sigma):  # noqa: ANN001, ANN202
-    """Share of a normal distribution around 0 between two places; without width, all of it is in [left, right)."""
+    """Share of a normal distribution around 0 between two places; with sigma 0, all or none by [left, right)."""
     if sigma == 0:
         return 1.0 if left <= 0 < right else 0.0
     scale = 1 / (math.sqrt(2.0) * sigma)
@@ -112,7 +112,7 @@ def even_counts(expected, offset):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def poisson_of_rays(expected, rays, key):  # noqa: ANN001, ANN201
-    """Poisson counts of expected ones of rays (R,)."""
+    """Poisson counts of rays (R,) with these expected counts."""
     found = np.empty(len(expected), np.int64)
     for i in range(len(expected)):
         found[i] = poisson_quantile(expected[i], uniform(key, rays[i], 0))
@@ -121,7 +121,7 @@ def poisson_of_rays(expected, rays, key):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def poisson_of_bins(expected, offset, rays, key, first_draw):  # noqa: ANN001, ANN201
-    """Poisson counts of expected ones in the bins of rays (R,), whose bins are offset[i] to offset[i + 1]."""
+    """Poisson counts of the bins offset[i] to offset[i + 1] of rays (R,) with these expected counts."""
     found = np.zeros(len(expected), np.int64)
     for i in range(len(rays)):
         for k in range(offset[i], offset[i + 1]):
@@ -169,9 +169,9 @@ def add_even_light(counts, offset, first, width, windows, edges, expected, key, 
 
 # Outside of this many standard deviations around a pulse, photons are background
 PULSE_REACH = 4.0
-# With fewer photons outside of the pulse than this, the level that is known beforehand is the better one
+# With fewer photons outside of the pulse than this, the level is at least the known one
 FEW_BACKGROUND_PHOTONS = 10
-# A level that is measured in less than this many bins is none
+# Fewest bins from which a background level is measured
 LEAST_BINS = 0.5
 # Above this mean, Poisson's tail is taken as a normal one
 NORMAL_MEAN = 1e5
@@ -199,7 +199,7 @@ def at_least(number, mean):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def pulse_shape(width, sigma, longest):  # noqa: ANN001, ANN201
-    """The share of a pulse in each bin around the one that it is centred in, as far as bins can lie apart."""
+    """Share of a pulse in each bin around its central one, at most as wide as the longest histogram."""
     reach = min(math.ceil(PULSE_REACH * sigma / width), max(longest - 1, 0))
     shape = np.ones(2 * reach + 1)
     if sigma > 0:
@@ -211,7 +211,7 @@ def pulse_shape(width, sigma, longest):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def _fullest(counts, half):  # noqa: ANN001, ANN202
-    """The middle of the bins b - half to b + half that hold the most, the first of equals."""
+    """Middle b of the bins b - half to b + half with the most counts, the first of equals."""
     size = len(counts)
     total = 0
     for b in range(min(half, size)):
@@ -237,7 +237,7 @@ def _sum_around(counts, middle, half):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def vertex(score, best):  # noqa: ANN001, ANN201
-    """By how much of a bin the vertex of the parabola through a maximum and its neighbours lies off it."""
+    """Offset of the vertex of the parabola through a maximum and its neighbours, in bins."""
     if best == 0 or best == len(score) - 1:
         return 0.0
     left, middle, right = score[best - 1], score[best], score[best + 1]
@@ -249,7 +249,7 @@ def vertex(score, best):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def _matched(counts, shape, below, signal, level, score):  # noqa: ANN001, ANN202
-    """The bin of the largest log-likelihood, and by how much of a bin its vertex lies off the bin's middle.
+    """The bin of the largest log-likelihood, and the vertex's offset from the bin's middle in bins.
 
     `below` are the running sums of the pulse's shape, from 0 on.
     """
@@ -273,7 +273,7 @@ def _matched(counts, shape, below, signal, level, score):  # noqa: ANN001, ANN20
 
 @njit(cache=True, nogil=True)
 def _listened_bins(first, last, size, ends):  # noqa: ANN001, ANN202
-    """How many bins are listened to between two, both included, where the outermost ones are listened to in part."""
+    """Number of bins between two, both included, with the first and last bin counted by their shares in the window."""
     count = last - first + 1.0
     if first == 0:
         count -= 1.0 - ends[0]
@@ -284,12 +284,12 @@ def _listened_bins(first, last, size, ends):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def find_returns(counts, offset, ends, width, sigma, half, known_level, false_alarm, matched):  # noqa: ANN001, ANN201
-    """Where each ray's return is, in bins from its first bin's start, NaN without one, shape (N,).
+    """Position of each ray's return in bins from its first bin's start, NaN without one, shape (N,).
 
     Arguments are the flat counts and where rays begin in them, the shares of a ray's first and last bin that lie in its
-    window (N, 2), a bin's width and a photon's timing error in the same unit, bins on either side of a bin that belong
-    to its pulse, the background per bin that is known beforehand (N,), the allowed probability of a false alarm, and
-    whether to take the matched filter's maximum or the highest bin.
+    window (N, 2), a bin's width and a photon's timing error in the same unit, the half width of a pulse in bins, the
+    known background per bin (N,), the allowed probability of a false alarm, and whether to take the matched filter's
+    maximum or the highest bin.
     """
     found = np.full(len(offset) - 1, np.nan)
     longest = 0
@@ -314,7 +314,7 @@ def find_returns(counts, offset, ends, width, sigma, half, known_level, false_al
         within = 0.0
         if matched:
             signal = max(pulse - level * own, 1.0)
-            # less than one photon in the whole window cannot be told from none
+            # the lowest background is one photon in the whole window
             best, within = _matched(mine, shape, below, signal, max(level, 1.0 / size), score)
         else:
             best = mine.argmax()

@@ -1,6 +1,6 @@
-"""Light on its way out and back: beams that leave an emitter, echoes that come home, and light of the surroundings.
+"""Beams that leave an emitter, echoes that return to the receiver, and background light.
 
-Beams and echoes are flat lists that name the ray of a design that each entry belongs to, so that a ray may have many.
+Beams and echoes are flat lists with the index of each entry's ray, so that a ray may have many.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class Beams(Columns):
     """Thin beams of light, B of them.
 
     Arguments:
-        ray: The ray that each is part of, shape (B,), ascending.
-        origin_m: Where each starts [m], shape (B, 3).
+        ray: Index of each beam's ray, ascending, shape (B,).
+        origin_m: Origins [m], shape (B, 3).
         direction: Unit vectors, shape (B, 3).
-        time_s: When each is sent within the frame [s], shape (B,).
-        share: Its share of the ray's light; the shares of a ray add up to 1, shape (B,).
+        time_s: Firing times within the frame [s], shape (B,).
+        share: Shares of the ray's light, which add up to 1 for each ray, shape (B,).
     """
 
     ray: np.ndarray
@@ -67,12 +67,11 @@ class Echoes(Columns):
     """Light that comes back, E echoes.
 
     Arguments:
-        ray: The ray that each belongs to, shape (E,).
-        path_m: Half of the whole way from the emitter to the receiver: the range, where both are at one place [m],
-            shape (E,).
+        ray: Index of each echo's ray, shape (E,).
+        path_m: Half of the path from emitter to receiver, the range where both are at one place [m], shape (E,).
         gain: Share of the ray's light that reaches 1 m^2 of aperture: share * reflectance * cosine / (pi * distance^2)
-            and what else weakens it, shape (E,) [1/m^2].
-        body: What sent it back, shape (E,).
+            times further attenuation, shape (E,) [1/m^2].
+        body: Index of the body that reflected it, shape (E,).
     """
 
     ray: np.ndarray
@@ -83,11 +82,11 @@ class Echoes(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """Counts that no surface sent back, per pulse, of N rays.
+    """Background counts per pulse of N rays: ambient light, dark counts and haze.
 
     Arguments:
-        per_metre: Ambient light and dark counts per metre of range, the same over the whole gate, shape (N,).
-        edges_m: Cells of range within which the air sends light back, shape (N, C + 1) [m]; None: clear air.
+        per_metre: Ambient light and dark counts per metre of range, uniform over the gate, shape (N,).
+        edges_m: Edges of cells of haze in half path, shape (N, C + 1) [m]; None: clear air.
         counts: Counts per pulse in each of those cells, shape (N, C); None: clear air.
     """
 
@@ -97,13 +96,13 @@ class Background:
 
 
 def direct_echoes(scene: Scene, beams: Beams, hits: Hits) -> Echoes:
-    """The echo of every beam's first hit, wherever it is received: share * reflectance * cosine / (pi * distance^2)."""
+    """Echoes of first hits at the receiver, visible or not: share * reflectance * cosine / (pi * distance^2)."""
     seen = np.flatnonzero(hits.body >= 0)
     points = beams.origin_m[seen] + hits.range_m[seen, None] * beams.direction[seen]
     origins = beams.origin_m[seen]
     home = origins if scene.receiver is None else np.broadcast_to(np.asarray(scene.receiver.origin_m), origins.shape)
     back = home - points
-    # what starts at the receiver comes back by the way that it took, to the last bit
+    # a beam that starts at the receiver returns along the same path, to the last bit
     back_m = np.where((origins == home).all(axis=1), hits.range_m[seen], np.linalg.norm(back, axis=1))
     reflectance = np.array([body.reflectance for body in scene.bodies])[hits.body[seen]]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -311,11 +310,11 @@ BAND_POINTS = 33
 
 
 def spectral_irradiance(ambient: Ambient, wavelength_m: float, filter_m: float) -> float:
-    """What a filter lets through of ambient light on a surface, per width of the filter [W / (m^2 m)].
+    """Mean spectral irradiance of ambient light in a filter's band [W / (m^2 m)].
 
     Arguments:
         ambient: Its illuminance and source.
-        wavelength_m: The middle of the filter [m].
+        wavelength_m: Centre of the filter [m].
         filter_m: Its width [m].
     """
     band_nm = 1e9 * (wavelength_m + filter_m * ((np.arange(BAND_POINTS) + 0.5) / BAND_POINTS - 0.5))
@@ -329,5 +328,5 @@ def spectral_irradiance(ambient: Ambient, wavelength_m: float, filter_m: float) 
 
 
 def _table(values: np.ndarray, wavelength_nm: np.ndarray) -> np.ndarray:
-    """Linear between the middles of the cells; beyond the table its first or last value."""
+    """Linear interpolation between the middles of a table's cells, constant beyond its ends."""
     return np.interp(wavelength_nm, FIRST_NM + STEP_NM * np.arange(len(values)), values)

@@ -1,12 +1,10 @@
-"""Detectors: what a receiver and its laser do to light, and the bins that they sort it into.
+"""Detectors: laser, receiver, timing and histogram bins, and the names of the optional effects.
 
-A detector without photons (`ideal`) reports exact first hits. One with photons says how much light is sent, how much
-of it is caught, and how its arrival is timed. Emitted energy is shared among the rays of a frame: a scanned emitter
-gives each ray its share of the pulses, a flood gives each its share of every pulse.
+A detector without photons (`ideal`) reports exact first hits. One with photons has a light budget: emitted energy,
+collected share and timing. Emitted energy is shared among the rays of a frame: a scanned emitter gives each ray its
+share of the pulses, a flood gives each its share of every pulse.
 
 Histograms of photons over time are one per ray, as long as its window, side by side in one flat array.
-
-Which optional effects there are, and the settings that a detector measures with.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from lidardesign.scenes.scene import SPEED_OF_LIGHT_M_S, Scene
 from lidardesign.simulate.detector.light import Echoes
 
 PLANCK_J_S = 6.62607015e-34
-# More counts than this are as good as any number of them, and still exact in float64.
+# Upper limit of counts, still exact in float64.
 MOST_COUNTS = 2.0**40
 # Full width at half maximum over standard deviation of a Gaussian.
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
@@ -39,17 +37,17 @@ class Photons:
     """The light budget of a detector that counts photons.
 
     Arguments:
-        wavelength_m: Of the laser [m].
-        pulse_energy_j: One pulse of the emitter, all rays that share it together [J].
-        pulses_per_frame: Pulses in a frame, all rays together.
+        wavelength_m: Wavelength of the laser [m].
+        pulse_energy_j: Energy of one pulse of the emitter, over all rays that share it [J].
+        pulses_per_frame: Pulses in a frame, over all rays.
         emission: Whether rays share the pulses in time (`scanned`) or each pulse in energy (`flood`).
-        repetition_hz: Pulses per second, which says how long a dead time blinds it [Hz].
+        repetition_hz: Pulse repetition rate [Hz].
         aperture_m2: Area of the receiving aperture [m^2].
         field_of_view_sr: Solid angle that one ray's pixel sees ambient light from [sr].
         efficiency: Share of photons at the aperture that are counted: optics, fill factor and detection together.
         filter_m: Width of the optical filter [m].
         dark_hz: Counts per second in darkness [Hz].
-        dead_s: How long it is blind after a count [s].
+        dead_s: Dead time after a count [s].
     """
 
     wavelength_m: float
@@ -66,35 +64,35 @@ class Photons:
 
     @property
     def photon_energy_j(self) -> float:
-        """h c / wavelength [J]."""
+        """Energy of a photon, h c / wavelength [J]."""
         return PLANCK_J_S * SPEED_OF_LIGHT_M_S / self.wavelength_m
 
     def pulses(self, rays: int) -> float:
-        """Pulses that each of so many rays gets in a frame."""
+        """Pulses per ray and frame, shared by this many rays."""
         return self.pulses_per_frame / (max(rays, 1) if self.emission == "scanned" else 1)
 
     def emitted(self, rays: int) -> float:
-        """Photons of one pulse that each of so many rays sends."""
+        """Emitted photons per ray and pulse, shared by this many rays."""
         return (self.pulse_energy_j / (max(rays, 1) if self.emission == "flood" else 1)) / self.photon_energy_j
 
 
 @dataclass(frozen=True)
 class Detector:
-    """How returns are measured.
+    """Parameters of a detector.
 
     Arguments:
-        name: For people.
+        name: Name in reports.
         pulse_sigma_s: Standard deviation of the laser pulse, taken as Gaussian [s].
-        jitter_sigma_s: Standard deviation of the timing of one photon, besides [s].
+        jitter_sigma_s: Standard deviation of the timing of one photon besides the pulse [s].
         bin_s: Width of a histogram's bins; None: times are not rounded [s].
         divergence_rad: Full angle of a ray's beam, in which its light is spread evenly [rad]; 0: a line.
         footprint_rays: Sub-rays that a beam is split into.
-        photons: The light budget; None: any light at all is enough, and none is mistaken for it.
+        photons: The light budget; None: any amount of light is detected, without false alarms.
         estimator: The range from the histogram: its highest bin, or the log-matched filter with the pulse.
         false_alarm: Probability that a gate full of background light alone is taken for a return.
-        bins: How many bins a histogram has; None: as many as a gate needs.
-        histogram_start: Where its first bin starts: with the gate, or with the pulse, at range 0.
-        correction: Whether it reckons with its own dead time where it judges a histogram (`coates`).
+        bins: Number of bins of a histogram; None: as many as a gate needs.
+        histogram_start: Start of its first bin: with the gate, or with the pulse, at range 0.
+        correction: Correction for dead time where returns are detected (`coates`).
     """
 
     name: str
@@ -112,7 +110,7 @@ class Detector:
 
     @property
     def timing_sigma_s(self) -> float:
-        """Standard deviation of when one photon is counted: pulse and jitter together [s]."""
+        """Standard deviation of a photon's time by pulse and jitter together [s]."""
         return math.hypot(self.pulse_sigma_s, self.jitter_sigma_s)
 
     @property
@@ -125,16 +123,16 @@ IDEAL = Detector("ideal")
 
 
 def metres(seconds: float) -> float:
-    """The one-way range that light travels forth and back in a time: c t / 2."""
+    """One-way range of a round-trip time, c t / 2 [m]."""
     return SPEED_OF_LIGHT_M_S * seconds / 2
 
 
-# Where a detector has no bins, or times are not rounded, they are this share of a photon's timing error wide: too
-# fine to be seen, as their own error, a bin / sqrt(12), is 7 % of one photon's
+# Bins per timing error of a photon where a detector has no bins or times are not rounded: their own error,
+# a bin / sqrt(12), is 7 % of one photon's
 BINS_PER_SIGMA = 4
-# and never narrower than this, which is no error to anyone [m]
+# and at least this wide [m]
 FINEST_BIN_M = 1e-5
-# A histogram of more bins is a mistake: 1 km in millimetres
+# A histogram of more bins is refused: 1 km in millimetres
 MOST_BINS = 1_000_000
 # Bins that are filled at once: 32 MB of counts, whatever the number of rays
 BINS_AT_ONCE = 1 << 22
@@ -145,12 +143,12 @@ _NARROWER = "narrower gates, or a detector file with a longer histogram and a lo
 
 @dataclass(frozen=True, eq=False)
 class Bins:
-    """Where the bins of N rays lie.
+    """Histogram bins of N rays.
 
     Arguments:
-        windows_m: The half paths that each ray listens to, shape (N, 2) [m]; its first and last bin end there.
-        first_m: Where its first bin would start if it were whole, at most its window's start, shape (N,) [m].
-        width_m: Of a bin, as a one-way range [m].
+        windows_m: Each ray's gate in half paths, shape (N, 2) [m]; its first and last bin end there.
+        first_m: Start of its first bin, if that were whole, at most its window's start, shape (N,) [m].
+        width_m: Width of a bin, as a one-way range [m].
         offset: Bins of ray i are offset[i] to offset[i + 1] of a flat array, shape (N + 1,).
     """
 
@@ -183,7 +181,7 @@ class Bins:
 
     @property
     def end_shares(self) -> np.ndarray:
-        """The shares of each ray's first and last bin that lie in its window, shape (N, 2)."""
+        """Shares of each ray's first and last bin in its window, shape (N, 2)."""
         before, after = ((self.windows_m[:, end] - self.first_m) / self.width_m for end in (0, 1))
         return np.clip(np.stack([1 - before, after - np.diff(self.offset) + 1], axis=1), 0.0, 1.0)
 
@@ -193,7 +191,7 @@ class Bins:
         return Bins(self.windows_m[begin:end], self.first_m[begin:end], self.width_m, offset)
 
     def chunks(self) -> Iterator[tuple[int, int]]:
-        """Rays that are counted together, as begin and end, so that their bins fit into memory."""
+        """Begin and end of chunks of rays whose bins fit into memory."""
         begin = 0
         while begin < len(self):
             end = int(np.searchsorted(self.offset, self.offset[begin] + BINS_AT_ONCE, side="right")) - 1
@@ -267,29 +265,29 @@ def check_windows(windows_m: np.ndarray, detector: Detector) -> None:
 
 
 def bin_width_m(detector: Detector) -> float:
-    """A detector's bins, or where it has none the finer ones that its photons are sorted into [m]."""
+    """Width of a detector's bins, or of the finer ones that are used where it has none [m]."""
     return detector.bin_m or max(metres(detector.timing_sigma_s) / BINS_PER_SIGMA, FINEST_BIN_M)
 
 
 def resolution_m(detector: Detector) -> float:
-    """How far apart two echoes must be to be told apart: a bin, or the pulse's full width at half maximum [m]."""
+    """Smallest separation of two resolved echoes: a bin, or the pulse's full width at half maximum if larger [m]."""
     return max(detector.bin_m or 0.0, metres(FWHM_PER_SIGMA * detector.pulse_sigma_s))
 
 
 def bins_start(windows_m: np.ndarray, detector: Detector) -> np.ndarray:
-    """Where the bin that a window (N, 2) [m] starts in starts, shape (N,) [m]."""
+    """Start of the bin that contains the start of each window (N, 2) [m], shape (N,) [m]."""
     starts = windows_m[:, 0]
     return starts if detector.histogram_start == "gate" else np.floor(starts / detector.bin_m) * detector.bin_m
 
 
 def ends_of_bins(path_m: np.ndarray, windows_m: np.ndarray, detector: Detector) -> tuple[np.ndarray, np.ndarray]:
-    """Where the parts start and end that lie in windows (N, 2) of the bins of half paths (N,) [m], shapes (N,)."""
+    """Start and end of the bins of half paths (N,), cut to windows (N, 2) [m], shapes (N,) [m]."""
     first = bins_start(windows_m, detector)
     low = first + np.floor((path_m - first) / detector.bin_m) * detector.bin_m
     return np.maximum(low, windows_m[:, 0]), np.minimum(low + detector.bin_m, windows_m[:, 1])
 
 
-# In the order in which light meets them; each is a module of `simulate.effects`, with what it could change (`bound`).
+# In the order in which light meets them; each is a module of `simulate.effects`.
 EFFECTS = {
     "footprint": "beams have a width: mixed pixels, several returns",
     "motion": "things move within a frame",
@@ -303,7 +301,7 @@ EFFECTS = {
     "pile_up": "a detector is blind after a count",
     "quantisation": "times are rounded to bins",
 }
-# Where one of these is on, photons are counted; without them a detector reports the strongest echo.
+# Effects that require counting photons; without them a detector reports the strongest echo.
 COUNTED = frozenset({"photon_noise", "jitter", "ambient", "pile_up", "quantisation", "atmosphere"})
 
 
@@ -312,10 +310,10 @@ class Physics:
     """A detector and the effects that are simulated.
 
     Arguments:
-        detector: How returns are measured.
+        detector: The detector.
         effects: Names out of `EFFECTS`.
         seed: Seed of the random numbers of every effect.
-        repeat: Which time the scene is measured: rays that are fired again from elsewhere meet other chance.
+        repeat: Index of the measurement: repeated measurements have independent random numbers.
 
     Raises:
         ConfigError: An unknown effect; all are listed.
@@ -330,7 +328,7 @@ class Physics:
         check_effects(self.effects)
 
     def stream(self, effect: str, scene: Scene, frame: int) -> int:
-        """The key of an effect's random numbers in a frame of a scene; no other effect changes them."""
+        """Key of an effect's random numbers in a frame of a scene, independent of other effects."""
         again = (str(self.repeat),) if self.repeat else ()
         label = "\0".join((str(self.seed), effect, scene.name, str(frame), *again))
         return int.from_bytes(hashlib.sha256(label.encode()).digest()[:8], "little")

@@ -1,7 +1,7 @@
-"""Random numbers that depend on nothing but what they are for: functions of (key, row, draw).
+"""Counter-based random numbers: pure functions of (key, row, draw).
 
-A number is a hash of an effect's key, the index of a ray and the index of a draw, so that it is the same in whatever
-order, in whatever chunks and beside whatever other effects it is drawn. The hash is three rounds of the finaliser of
+A number is a hash of an effect's key, the index of a ray and the index of a draw, so that it does not depend on the
+order, the chunks or the other effects of a simulation. The hash is three rounds of the finaliser of
 splitmix64 (Steele, Lea and Flood 2014), one per word, each added to the hash of the words before it.
 """
 
@@ -152,7 +152,7 @@ def poisson_quantile(mean, share):  # noqa: ANN001, ANN201
     count = 0
     probability = math.exp(-mean)
     total = probability
-    # ends: the probabilities fall below the rounding of their sum, whatever the share
+    # terminates for any share: the probabilities fall below the rounding of their sum
     while total < share and probability > total * STEP:
         count += 1
         probability *= mean / count

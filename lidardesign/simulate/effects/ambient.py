@@ -1,22 +1,22 @@
-"""Light of the surroundings and dark counts.
+"""Ambient light and dark counts.
 
 A surface under the spectral irradiance E of the ambient light has the radiance reflectance * E / pi, in all directions.
 A pixel sees it through the aperture A, the filter's width W and its solid angle Omega:
 
     rate = E reflectance / pi * W * A * Omega * efficiency / (photon energy) + dark counts      [1/s]
 
-A metre of range lasts 2 / c. Rays that meet nothing see no light: a scene without a background has none.
+A metre of range lasts 2 / c. Rays without a hit receive no ambient light: a scene has no background.
 
-What it could change (`bound`), by false peaks, hidden echoes, and returns where there is none: with mean counts b per
+Bound of its effect (`bound`), by false peaks, hidden echoes, and returns where there is none: with mean counts b per
 bin, B bins and s counts in the echo's bin, another bin wins with at most (B - 1) exp(-(sqrt(s + b) - sqrt(b))^2): the
-union over bins of Chernoff's bound. A threshold that lets background pass with the probability `false_alarm` hides
-echoes below it, and a ray that has no return invents one as often as that. Counts under the echo make its range stray:
-in much background, b per metre, n photons of a Gaussian are placed with the variance (sigma^2 / n) (4 sqrt(pi) sigma b
-/ n) (Cramer and Rao's bound), which is added to that without; the highest bin strays (1 + b / s)^(1/4) times as far. By
-the level of background the matched filter's place between bins moves too, half a step at most (`FirstHits.step_m`).
+union over bins of Chernoff's bound. A detection threshold with the probability `false_alarm` hides echoes below it, and
+rays without a return have false alarms with this probability. Counts under the echo add to its range error: in strong
+background, b per metre, n photons of a Gaussian have the additional variance (sigma^2 / n) (4 sqrt(pi) sigma b / n)
+(Cramer and Rao's bound); the error of the highest bin grows by the factor (1 + b / s)^(1/4). The level of background
+also shifts the matched filter between bins, by at most half a step (`FirstHits.step_m`).
 
-No false peak can be where no count arrives: it is at most 1 - exp(-B b). Where a detector is blind after a count, light
-before an echo leaves less of it (see `Blindness`), and is uneven, so that more of it is taken for returns.
+A false peak needs a count: its probability is at most 1 - exp(-B b). With dead time, light before an echo reduces its
+counts (see `Blindness`), and the background is uneven, so that more of it is taken for returns.
 """
 
 from __future__ import annotations
@@ -42,22 +42,22 @@ from lidardesign.simulate.effects.expected_counts import (
 )
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 
-# Brighter light is no brighter: every pulse of any detector counts it at once
+# Upper limit of the background rate: above it any detector counts in every pulse at once [1/m]
 MOST_PER_METRE = 1e12
 
 
 def add_ambient(
     scene: Scene, rays: Rays, beams: Beams, hits: Hits, detector: Detector, background: Background
 ) -> Background:
-    """The background with ambient light and dark counts.
+    """The background with ambient light and dark counts added.
 
     Arguments:
         scene: Its light and its bodies' reflectances.
         rays: N rays.
-        beams: The thin beams that they consist of.
-        hits: What those meet first.
-        detector: One that does not count photons sees no background.
-        background: What is counted besides.
+        beams: The thin beams of the rays.
+        hits: First hits of the beams.
+        detector: The detector; one that does not count photons has no background.
+        background: The background so far.
     """
     photons = detector.photons
     if photons is None:
@@ -76,7 +76,7 @@ def add_ambient(
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
-    """Why nothing but the emitter's light is counted, if so."""
+    """Reason why there are neither ambient nor dark counts, or None."""
     if detector.photons is None:
         return "the detector does not count photons"
     dark = scene.ambient is None or scene.ambient.illuminance_lux == 0
@@ -84,7 +84,7 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """Of counts that no echo brought."""
+    """Bound of the effect of ambient light and dark counts."""
     sigma_m = first_hits.sigma_m()
     blind, in_the_dark = Blindness.of(counts), Blindness.of(counts, ambient=False)
     signal, per_bin = blind.left, counts.per_bin
@@ -102,7 +102,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
 
 
 def _strayed(counts: Counts, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
-    """How far counts under the echo make its range stray, shape (N,) [m]."""
+    """Range error caused by background counts under the echo, shape (N,) [m]."""
     error, per_bin = counts.error_m(signal, sigma_m), counts.per_bin
     if counts.first_hits.detector.estimator == "matched":
         per_metre = per_bin / counts.bin_m

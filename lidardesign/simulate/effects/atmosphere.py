@@ -1,20 +1,20 @@
-"""The air weakens light and sends some of it back.
+"""Atmosphere: extinction of light and backscatter from haze.
 
 Light fades as exp(-alpha * length) over its whole way, twice the half path (Beer, Lambert). Haze at a range r of a ray
 sends back, per metre, beta times the solid angle of the aperture there times exp(-alpha (r + b)), with b the way from
 there to the receiver: b = r at the emitter's own place (the lidar equation; Measures 1984, chapter 7).
 
-There a pixel looks along the ray, sharp at the range f of what the ray meets, or far away. Haze at r is blurred on it
+There a pixel looks along the ray, focused at the range f of the ray's hit, or at infinity. Haze at r is blurred on it
 to the solid angle A (1 / r - 1 / f)^2, as an aperture A seen from r is wider than from f; a pixel of a smaller solid
-angle catches its share of that (the overlap of an ideal lens). So haze right before the sensor counts no more than a
-pixel's solid angle, and not 1 / r^2. A fixed receiver elsewhere receives all haze in its view.
+angle receives its share of that (the overlap of an ideal lens). So haze right before the sensor is limited by the
+pixel's solid angle, instead of 1 / r^2. A fixed receiver elsewhere receives all haze in its view.
 
-What it could change (`bound`): over a range R the air leaves exp(-2 alpha R) of an echo's photons: the range strays
-more and returns are lost, as from fewer photons. Haze sends h counts into a bin, most at the gate's start; it is taken
-for the echo with at most (B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and raises the level that an echo
-has to stand out from. A ray without a return may take it for one where any of it is counted: 1 - exp(-all of its
-counts), as one count is enough in the dark. Where a detector is blind after a count, haze before an echo leaves less of
-it (see `Blindness`), and times the first photon of a pulse, which comes later where there are fewer.
+Bound of its effect (`bound`): over a range R the air leaves exp(-2 alpha R) of an echo's photons: range errors grow
+and returns are lost, as from fewer photons. Haze sends h counts into a bin, most at the gate's start; it is taken
+for the echo with at most (B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and raises the detection
+threshold. A ray without a return may take any count of it for one: 1 - exp(-all of its counts), as one count is enough
+in the dark. With dead time, haze before an echo reduces its counts (see `Blindness`), and the detector times the first
+photon of a pulse, which comes later where there are fewer.
 """
 
 from __future__ import annotations
@@ -53,17 +53,17 @@ def through_air(
     detector: Detector,
     background: Background,
 ) -> tuple[Echoes, Background]:
-    """Echoes as the air leaves them, and the background with what haze sends back before a beam meets anything.
+    """Echoes attenuated by the air, and the background with the backscatter of haze up to each beam's first hit.
 
     Arguments:
         scene: Its medium; without one, nothing changes.
         rays: The rays that share the emitter's energy, N of them.
-        beams: The thin beams that they consist of.
-        hits: What those meet first.
+        beams: The thin beams of the rays.
+        hits: First hits of the beams.
         windows_m: The rays' gates as half paths, shape (N, 2) [m].
-        echoes: What surfaces send back.
-        detector: Haze is counted where it counts photons.
-        background: What is counted besides.
+        echoes: Echoes of surfaces.
+        detector: Backscatter is counted only by a detector that counts photons.
+        background: The background so far.
     """
     medium, photons = scene.medium, detector.photons
     if medium is None:
@@ -81,7 +81,7 @@ def through_air(
 
 
 def _stops(rays: Rays, beams: Beams, hits: Hits, receiver: Receiver | None) -> np.ndarray:
-    """Half paths at which beams end, infinite where they meet nothing, shape (B,) [m]."""
+    """Half paths at which beams end, infinite without a hit, shape (B,) [m]."""
     if receiver is None:
         return hits.range_m
     hit = np.isfinite(hits.range_m)
@@ -91,7 +91,7 @@ def _stops(rays: Rays, beams: Beams, hits: Hits, receiver: Receiver | None) -> n
 
 
 def _lit_shares(beams: Beams, stops_m: np.ndarray, edges_m: np.ndarray) -> np.ndarray:
-    """The share of each ray's light that passes through its cells, part of the cells that beams end in, (N, C)."""
+    """Share of each ray's light in its cells, averaged over the length of cells that beams end in, shape (N, C)."""
     rays, cells = edges_m.shape[0], edges_m.shape[1] - 1
     passed = np.zeros((rays, cells))
     for cell in range(cells):
@@ -102,7 +102,7 @@ def _lit_shares(beams: Beams, stops_m: np.ndarray, edges_m: np.ndarray) -> np.nd
 
 
 def _cells(starts: np.ndarray, ends: np.ndarray, aperture_m2: float) -> np.ndarray:
-    """Edges of cells between half paths (N,) and (N,), shape (N, CELLS + 1), in even steps of their logarithm.
+    """Edges of cells between half paths (N,) and (N,), evenly spaced in their logarithm, shape (N, CELLS + 1) [m].
 
     Within the aperture's own radius the profile is flat: paths are counted from that far behind.
     """
@@ -115,11 +115,11 @@ def _cells(starts: np.ndarray, ends: np.ndarray, aperture_m2: float) -> np.ndarr
 
 @dataclass(frozen=True, eq=False)
 class _Haze:
-    """What haze along rays sends back.
+    """Backscatter of haze along rays.
 
     Arguments:
-        rays, receiver, medium, photons: Who sends, who receives, what is between, and with which aperture and pixel.
-        focus_m: Ranges that the rays' pixels are sharp at, infinite for far away, shape (N,) [m].
+        rays, receiver, medium, photons: Rays, receiver, medium, and the detector's aperture and pixel.
+        focus_m: Focus distance of each ray's pixel, shape (N,) [m].
     """
 
     rays: Rays
@@ -129,7 +129,7 @@ class _Haze:
     focus_m: np.ndarray
 
     def gain(self, edges_m: np.ndarray) -> np.ndarray:
-        """The share of each ray's light that haze in cells of half paths (N, C + 1) sends into the aperture, (N, C)."""
+        """Share of each ray's light that haze in cells of half paths (N, C + 1) scatters into its pixel, (N, C)."""
         nodes, weights = np.polynomial.legendre.leggauss(NODES)
         ranges = np.stack([range_of_path(self.rays, self.receiver, column) for column in edges_m.T], axis=1)
         # paths shorter than the way from emitter to receiver come from no range
@@ -137,9 +137,9 @@ class _Haze:
         middle, half = (ranges[:, 1:] + ranges[:, :-1]) / 2, (ranges[:, 1:] - ranges[:, :-1]) / 2
         gain = np.zeros_like(middle)
         for node, weight in zip(nodes, weights, strict=True):
-            # What haze at ranges (N, C) sends into the aperture and the pixel per metre [1/m]
+            # Share of the light that haze at ranges (N, C) scatters into the aperture and the pixel per metre [1/m]
             range_m = middle + node * half
-            # The share of the light in the aperture that falls on the pixel which looks along the ray, (N, C)
+            # Share of the light in the aperture that falls on the ray's pixel, (N, C)
             blurred = 1 - safe_divide(range_m, np.broadcast_to(self.focus_m[:, None], range_m.shape), 1.0)
             sharp = self.photons.field_of_view_sr * range_m**2
             overlap = np.minimum(safe_divide(sharp, self.photons.aperture_m2 * blurred**2, 1.0), 1.0)
@@ -160,19 +160,19 @@ class _Haze:
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
-    """Why the air does not matter, if so."""
+    """Reason why the air changes nothing, or None."""
     if scene.medium is None or scene.medium.extinction_per_m == scene.medium.backscatter_per_m_sr == 0:
         return "the air is clear"
     return None if detector.photons is not None else "the detector registers any echo, however weak"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """Of air that weakens and scatters."""
+    """Bound of the effect of extinction and backscatter."""
     sigma_m = first_hits.sigma_m()
     blind, without = Blindness.of(counts), Blindness.of(counts, haze=False)
     clear, left = counts.signal, blind.left
     haze, fullest = (counts.pulses * part for part in counts.haze_per_pulse)
-    # haze raises the level of background that a return has to stand out from
+    # haze raises the detection threshold
     fewer = counts.more_missed(Echo(clear, sigma_m), Echo(left, sigma_m, haze / counts.bins))
     any_count = -np.expm1(-haze)
     own = counts.per_bin * blind.under

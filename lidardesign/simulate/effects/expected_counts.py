@@ -1,18 +1,18 @@
-"""Expected counts of signal and background, and how likely a detector misses the one or mistakes the other for it.
+"""Expected counts of signal and background, and the probabilities of missed and false returns.
 
-Counts are Poisson. A return is the highest of B bins, or where a pulse fits best, reported if the m bins of one pulse's
+Counts are Poisson. A return is the highest of B bins, or the best fit of a pulse, reported if the m bins of one pulse's
 width around it hold at least k counts, the fewest that background alone brings to any of B such places with at most the
 detector's probability of a false alarm.
 
-A detector that is blind after each count leaves a part of echoes and of background (`Blindness`). Per pulse s counts of
-the echo, m counts before it and w in the whole gate are expected. Of the echo the first photon counts, with the
-probability exp(-m) (1 - exp(-s)); every count also blinds the c pulses that its dead time reaches into, which leaves
+A detector with dead time counts a part of echoes and of background (`Blindness`). Per pulse s counts of the echo, m
+counts before it and w in the whole gate are expected. Of the echo the first photon counts, with the probability
+exp(-m) (1 - exp(-s)); every count also blinds the c pulses that its dead time reaches into, which leaves
 the share 1 / (1 + c (1 - exp(-w))) of them. Of K photons, normal with sigma, the first is early by at most sigma
 min(sqrt(2 ln K), (K - 1) / sqrt(pi)), in the mean over K >= 1 as well (both bounds are concave in K or linear; Jensen),
 with E K = s / (1 - exp(-s)).
 
-Background is thinned alike: from all of it at the gate's start to exp(-m) under the echo. Its mean level, which returns
-are judged by, lies below its start, so that the start itself may be taken for a return.
+Background is thinned alike: from all of it at the gate's start to exp(-m) under the echo. The detection threshold
+follows its mean level, which lies below that at the start, so that the start itself may be taken for a return.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ NEAREST_SHARE = COARSE_SLACK
 def ambient_per_metre(first_hits: FirstHits) -> np.ndarray:
     """Ambient and dark counts per pulse and metre of range, shape (N,).
 
-    What a ray meets has the radiance reflectance E / pi, seen through the aperture and the pixel's field of view, and
-    what meets nothing sees no light; a metre of range takes 2 / c.
+    A hit surface has the radiance reflectance E / pi, seen through the aperture and the pixel's field of view; rays
+    without a hit receive no ambient light; a metre of range takes 2 / c.
     """
     photons, ambient = first_hits.detector.photons, first_hits.scene.ambient
     rate_hz = np.full(len(first_hits), photons.dark_hz)
@@ -51,12 +51,12 @@ def ambient_per_metre(first_hits: FirstHits) -> np.ndarray:
 
 
 def haze_per_pulse(first_hits: FirstHits, emitted: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Counts per pulse that the air sends back, at most: in the window up to the return, and in one bin, shapes (N,).
+    """Upper bounds of backscattered counts per pulse, in the window up to the return and in one bin, shapes (N,).
 
     From r to r + dr it sends beta Omega(r) exp(-2 alpha r) dr into an aperture, a disc of radius a seen under the solid
-    angle Omega = 2 pi (1 - r / sqrt(r^2 + a^2)), with the integral 2 pi (r - sqrt(r^2 + a^2)); what fades within the
-    window is not taken off. Before the range 1 / (1 / f + sqrt(pixel / A)), f that of what the ray meets, haze is
-    blurred beyond the pixel, which catches pixel / (1 - r / f)^2 instead. Of a fixed receiver see `_beside`.
+    angle Omega = 2 pi (1 - r / sqrt(r^2 + a^2)), with the integral 2 pi (r - sqrt(r^2 + a^2)); extinction within the
+    window is ignored. Before the range 1 / (1 / f + sqrt(pixel / A)), f the range of the first hit, haze is blurred
+    beyond the pixel, which catches pixel / (1 - r / f)^2 instead. For a fixed receiver see `_haze_beside_rays`.
     """
     photons, medium = first_hits.detector.photons, first_hits.scene.medium
     if medium is None:
@@ -80,7 +80,7 @@ def haze_per_pulse(first_hits: FirstHits, emitted: np.ndarray, bin_m: float) -> 
 
 
 def _haze_beside_rays(first_hits: FirstHits, end_m: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Solid angle times length of the haze that a fixed receiver gets, up to half paths (N,), and in one bin, (N,).
+    """Solid angle times length of the haze seen by a fixed receiver, up to half paths (N,) and in one bin, shapes (N,).
 
     It sees all of a ray that passes it at the distance h, c from the ray's start: at most the integral of
     A / (h^2 + (r - c)^2), A / h times the difference of arctan((r - c) / h), and no more than half of all around. Half
@@ -103,21 +103,21 @@ def _haze_beside_rays(first_hits: FirstHits, end_m: np.ndarray, bin_m: float) ->
     return whole, np.minimum(np.minimum(aperture_m2 / nearest**2, 2 * math.pi) * in_bin, whole)
 
 
-# Steps of the logarithm, 1 % each, in which levels of background are told apart.
+# Steps per unit of the logarithm, 1 % each, to which levels of background are rounded.
 LEVELS_PER_UNIT = 100
 # Counts from here on are shown as whole numbers.
 MANY = 100
-# The highest of a histogram's bins strays by this many of (sigma^5 / (n b))^(1/4), see `peak_error_m`.
+# Error of the highest bin in units of (sigma^5 / (n b))^(1/4), see `estimate_error_m`.
 PEAK_STRAY = 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class Echo:
-    """What arrives of the echoes of N rays.
+    """Expected echoes of N rays.
 
     Arguments:
         signal: Counts, shape (N,).
-        sigma_m: How far one photon strays, shape (N,) [m].
+        sigma_m: Standard deviation of one photon's half path, shape (N,) [m].
         level: Counts per bin besides ambient and dark ones, shape (N,).
     """
 
@@ -128,10 +128,10 @@ class Echo:
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Counts per frame of every ray of a first_hits, for a detector that counts photons.
+    """Expected counts per frame of every ray, for a detector that counts photons.
 
     Arguments:
-        first_hits: What the rays meet.
+        first_hits: First hits of the rays.
     """
 
     first_hits: FirstHits
@@ -143,7 +143,7 @@ class Counts:
 
     @cached_property
     def signal_per_pulse(self) -> np.ndarray:
-        """Counts of a return in clear air, 0 where there is none, shape (N,)."""
+        """Counts of a return per pulse in clear air, 0 without one, shape (N,)."""
         return np.where(self.first_hits.returned, self._of_first_hit, 0.0)
 
     @cached_property
@@ -154,9 +154,9 @@ class Counts:
         return np.minimum(self.first_hits.gain, MOST_COUNTS / (per_gain * self.pulses)) * per_gain
 
     def leaked(self, sigma_m: np.ndarray, nearer_m: np.ndarray | float = 0.0) -> np.ndarray:
-        """Counts that the pulse of a hit outside the gate spills into it in a frame, in clear air, shape (N,).
+        """Counts per frame that a hit outside the gate spills into it in clear air, shape (N,).
 
-        The part of a Gaussian inside the window, at most its part beyond the nearer end, where that is so much nearer.
+        At most the part of a Gaussian beyond the nearer end of the window, which is `nearer_m` nearer [m].
         """
         from scipy.special import ndtr
 
@@ -164,7 +164,7 @@ class Counts:
         return np.where(self.first_hits.returned, 0.0, self._of_first_hit * self.pulses * share)
 
     def spilled(self, moved_m: np.ndarray) -> np.ndarray:
-        """Probability that a pulse spills into a gate because its hit has moved so far (N,) [m], shape (N,)."""
+        """Probability that a pulse spills into a gate because its hit moves by (N,) [m], shape (N,)."""
         if self.first_hits.detector.photons is None:
             return np.zeros(len(self.first_hits))
         sigma_m = self.first_hits.sigma_m()
@@ -172,18 +172,18 @@ class Counts:
 
     @cached_property
     def signal(self) -> np.ndarray:
-        """Counts of the first hit in a frame, in clear air, shape (N,)."""
+        """Counts of a return per frame in clear air, 0 without one, shape (N,)."""
         return self.signal_per_pulse * self.pulses
 
     @property
     def typical(self) -> str:
-        """The median of `in_air` over returns, for people."""
+        """Median of `in_air` over returns, as text."""
         returned = self.in_air[self.first_hits.returned]
         return count_text(float(np.median(returned))) if len(returned) else "no"
 
     @cached_property
     def in_air(self) -> np.ndarray:
-        """`signal` weakened by the air, shape (N,)."""
+        """Counts of a return per frame after extinction by the air, shape (N,)."""
         medium = self.first_hits.scene.medium
         if medium is None:
             return self.signal
@@ -197,7 +197,7 @@ class Counts:
 
     @cached_property
     def haze_per_pulse(self) -> tuple[np.ndarray, np.ndarray]:
-        """Counts that the air sends back: in the whole window, and in its fullest bin, shapes (N,)."""
+        """Upper bounds of backscattered counts per pulse, in the window up to the return and in one bin, (N,)."""
         return haze_per_pulse(self.first_hits, self._by_sharing("emitted"), self.bin_m)
 
     @cached_property
@@ -207,33 +207,33 @@ class Counts:
 
     @cached_property
     def bins(self) -> np.ndarray:
-        """How many of them a window has, shape (N,)."""
+        """Number of bins in each window, shape (N,)."""
         return np.maximum(np.ceil(self.first_hits.width_m / self.bin_m), 1.0)
 
     @cached_property
     def per_bin(self) -> np.ndarray:
-        """Ambient and dark counts per bin in a frame, or in the part of it that is listened to, shape (N,)."""
+        """Ambient and dark counts per frame in a bin, or in the window if narrower, shape (N,)."""
         return self.background_per_metre * np.minimum(self.bin_m, self.first_hits.width_m) * self.pulses
 
     @cached_property
     def pulse_bins(self) -> int:
-        """How many bins a pulse is wide, at half of its height: 2 half + 1."""
+        """Full width at half maximum of a pulse in bins, an odd number."""
         return 2 * int(FWHM_PER_SIGMA * metres(self.first_hits.detector.timing_sigma_s) / (2 * self.bin_m)) + 1
 
     def needed(self, per_bin: np.ndarray) -> np.ndarray:
-        """The fewest counts in a pulse's width that are reported in so much background per bin (N,), shape (N,).
+        """Detection threshold: fewest counts in a pulse's width that are reported, by background per bin, shapes (N,).
 
-        Levels and numbers of bins are rounded up to one of `LEVELS_PER_UNIT` per factor e: few are worked out.
+        Levels and numbers of bins are rounded up to one of `LEVELS_PER_UNIT` per factor e, so that few are computed.
         """
         with np.errstate(divide="ignore"):
             steps = [np.ceil(LEVELS_PER_UNIT * np.log(values)) for values in (per_bin * self.pulse_bins, self.bins)]
         level, bins = (np.exp(step / LEVELS_PER_UNIT) for step in steps)
-        # pairs as complex numbers: those are told apart fastest
+        # pairs as complex numbers: the fastest for `unique`
         pairs, place = np.unique(level + 1j * bins, return_inverse=True)
         return needed_counts(pairs.real, pairs.imag, self.first_hits.detector.false_alarm)[place]
 
     def share_in_bins(self, count: int, sigma_m: np.ndarray) -> np.ndarray:
-        """Share of an echo's photons in an odd number of bins, and no more than its gate does not cut off, (N,)."""
+        """Share of an echo's photons in an odd number of bins, at most the share inside its gate, shape (N,)."""
         from scipy.special import ndtr
 
         away = (self.first_hits.window_m - self.first_hits.path_m[:, None]).T / np.maximum(sigma_m, SQUARABLE)
@@ -241,12 +241,12 @@ class Counts:
         return np.minimum(share_in_bins(count, self.bin_m, sigma_m), inside)
 
     def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_m: np.ndarray) -> np.ndarray:
-        """Probability that the echo's bins hold fewer counts than it takes to be reported, shape (N,).
+        """Probability that the echo's bins hold fewer counts than the detection threshold, shape (N,).
 
         Arguments:
             signal: Counts of the echo, shape (N,).
             per_bin: Background counts in each bin, shape (N,).
-            sigma_m: How far one photon strays, shape (N,) [m].
+            sigma_m: Standard deviation of one photon's half path, shape (N,) [m].
         """
         from scipy.special import pdtr
 
@@ -255,7 +255,7 @@ class Counts:
         return pdtr(self.needed(per_bin) - 1, expected)
 
     def more_missed(self, before: Echo, after: Echo) -> np.ndarray:
-        """How much more often an echo is missed, in the light of the surroundings or in the dark, shape (N,)."""
+        """Increase of the probability that an echo is missed, with or without ambient light, the larger, (N,)."""
         changes = [
             self.missed(after.signal, level + after.level, after.sigma_m)
             - self.missed(before.signal, level + before.level, before.sigma_m)
@@ -264,7 +264,7 @@ class Counts:
         return np.maximum(np.maximum(*changes), 0.0)
 
     def mistaken(self, signal: np.ndarray, other: np.ndarray, per_bin: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
-        """Bound of the probability that another bin beats the echo's, shape (N,).
+        """Upper bound of the probability that another bin holds more counts than the echo's, shape (N,).
 
         The union over all bins of P(X >= Y) <= exp(-(sqrt(E Y) - sqrt(E X))^2), Chernoff's bound for a difference of
         Poisson counts X of the fullest other bin (`other`) and Y of the echo's. The matched filter compares places as
@@ -276,7 +276,7 @@ class Counts:
         return np.minimum((self.bins - 1) * np.exp(-(lead**2)), 1.0)
 
     def missed_on_edges(self, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
-        """How much more often an echo is missed on the edge of a bin than in its middle, shape (N,)."""
+        """Increase of the probability that an echo is missed on the edge of a bin over its middle, shape (N,)."""
         from scipy.special import erf
 
         middle = erf(self.pulse_bins * self.bin_m / (2 * math.sqrt(2) * np.maximum(sigma_m, SQUARABLE)))
@@ -284,12 +284,12 @@ class Counts:
         return self.more_missed(Echo(signal * share, sigma_m), Echo(signal, sigma_m))
 
     def sunk(self) -> np.ndarray:
-        """How much more often echoes are missed because slanted beams spread them, shape (N,)."""
+        """Increase of the probability that an echo is missed because a slanted beam spreads it, shape (N,)."""
         timed_m = np.full(len(self.first_hits), metres(self.first_hits.detector.timing_sigma_s))
         return self.more_missed(Echo(self.in_air, timed_m), Echo(self.in_air, self.first_hits.sigma_m()))
 
     def by_chance(self, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:
-        """Probability that a return is of background, taken for the echo, or of haze too where there is none, (N,)."""
+        """Probability that background is taken for the echo, or background or haze for a missing one, shape (N,)."""
         any_haze = -np.expm1(-self.pulses * self.haze_per_pulse[0])
         any_count = -np.expm1(-self.per_bin * self.bins)
         wrong = self.mistaken(blind.left, self.per_bin, self.per_bin * blind.under, sigma_m)
@@ -299,12 +299,12 @@ class Counts:
 
     @cached_property
     def level_m2(self) -> np.ndarray:
-        """How far another level of background moves what the matched filter finds between bins, squared, (N,) [m^2]."""
+        """Squared range shift of the matched filter between bins by another background level, shape (N,) [m^2]."""
         matched = self.first_hits.detector.estimator == "matched" and self.first_hits.detector.bin_m is not None
         return (self.first_hits.step_m / 2) ** 2 * matched
 
     def error_m(self, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
-        """How far the range from so many photons strays, rms, shape (N,) [m]."""
+        """Rms range error with (N,) photons, shape (N,) [m]."""
         return estimate_error_m(self.first_hits.detector, signal, sigma_m)
 
     def _by_sharing(self, name: str) -> np.ndarray:
@@ -313,12 +313,12 @@ class Counts:
 
 
 def count_text(number: float) -> str:
-    """An expected count for people."""
+    """An expected count as text."""
     return f"{number:,.0f}" if number >= MANY else f"{number:.2g}"
 
 
 def share_in_bins(count: int, bin_m: float, sigma_m: np.ndarray) -> np.ndarray:
-    """Share of an echo's photons in an odd number of bins, in the worst case: it lies on an edge of the middle one."""
+    """Share of an echo's photons in an odd number of bins in the worst case, on an edge of the middle one, (N,)."""
     from scipy.special import erf
 
     spread_m = math.sqrt(2) * np.maximum(sigma_m, SQUARABLE)
@@ -326,7 +326,7 @@ def share_in_bins(count: int, bin_m: float, sigma_m: np.ndarray) -> np.ndarray:
 
 
 def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> np.ndarray:
-    """Fewest counts k >= 1 that B bins of Poisson background reach with a probability of at most that, shape (N,).
+    """Fewest counts k >= 1 that B bins of Poisson background reach with at most the false-alarm probability, (N,).
 
     The union over bins: B P(X >= k) <= false_alarm.
     """
@@ -337,15 +337,15 @@ def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> 
     quiet = -np.expm1(-least) <= allowed
     with np.errstate(invalid="ignore"):
         needed = np.ceil(np.nan_to_num(pdtrik(1 - allowed, least))) + 1
-    # the inverse is of a smooth curve through the steps: one step more where it fell short
+    # the inverse is of a smooth curve through the steps: one step more where it falls short
     needed += 1 - pdtr(needed - 1, least) > allowed
     return np.where(quiet, 1.0, np.maximum(needed, 1.0))
 
 
 def estimate_error_m(detector: Detector, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
-    """How far the range from n photons (N,) that stray by sigma (N,) [m] strays, rms, shape (N,) [m].
+    """Rms range error from n photons (N,) with standard deviation sigma (N,) [m], shape (N,) [m].
 
-    The matched filter averages: sigma / sqrt(n). The highest bin is a mode: it strays to where the expected counts
+    The matched filter averages: sigma / sqrt(n). The highest bin is a mode: it lies up to where the expected counts
     n b f fall short of the peak's by about their own noise; with f a Gaussian, e^4 = (8 sqrt(2 pi)) sigma^5 / (n b) up
     to a factor (Chernoff 1964: a mode converges slower than a mean), and no further than the earliest photon, which the
     highest bin may hold where most bins hold one: sigma sqrt(1 + ln n).
@@ -359,21 +359,21 @@ def estimate_error_m(detector: Detector, signal: np.ndarray, sigma_m: np.ndarray
 
 
 def changed_share(signal: np.ndarray, fewer: np.ndarray) -> np.ndarray:
-    """Share of an echo's photons that are not there any more, shape (N,)."""
+    """Share of an echo's photons that are lost, shape (N,)."""
     return np.clip(1 - safe_divide(fewer, signal, 1.0), 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Blindness:
-    """What is counted of the light of N rays.
+    """Expected counts of N rays under dead time.
 
     Arguments:
-        left: Counts of the echo, shape (N,).
-        awake: The share of the background at the gate's start that is counted, shape (N,).
-        under: That of the background under the echo, shape (N,).
-        level: That of all background, shape (N,).
-        early: How early the first of an echo's photons is, in standard deviations, at most, shape (N,).
-        per_pulse: Counts per pulse that arrive, shape (N,).
+        left: Counted photons of the echo, shape (N,).
+        awake: Counted share of the background at the gate's start, shape (N,).
+        under: Counted share of the background under the echo, shape (N,).
+        level: Counted share of all background, shape (N,).
+        early: Upper bound of the lead of an echo's first photon, in standard deviations, shape (N,).
+        per_pulse: Photons per pulse that arrive, shape (N,).
     """
 
     left: np.ndarray
@@ -385,9 +385,9 @@ class Blindness:
 
     @classmethod
     def of(cls, counts: Counts, *, ambient: bool = True, haze: bool = True, air: bool = True) -> Blindness:
-        """With ambient light and dark counts, with what the air sends back and what it takes, or without any of it."""
+        """Dead time with or without ambient light and dark counts, backscatter (`haze`) and extinction (`air`)."""
         first_hits, photons = counts.first_hits, counts.first_hits.detector.photons
-        # what spills into a gate from outside it is an echo there
+        # photons that spill into a gate from outside count as an echo
         arriving = (counts.in_air if air else counts.signal) + counts.leaked(first_hits.sigma_m())
         echo = safe_divide(arriving, counts.pulses)
         from_air = counts.haze_per_pulse[0] * haze
@@ -407,7 +407,7 @@ class Blindness:
 
 
 def missed_behind(counts: Counts, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:
-    """Probability that what is left of an echo falls below what its gate's mean background asks for, shape (N,)."""
+    """Probability that the counted echo is below the threshold of its gate's mean background, shape (N,)."""
     from scipy.special import pdtr
 
     width = counts.pulse_bins
@@ -416,9 +416,9 @@ def missed_behind(counts: Counts, blind: Blindness, sigma_m: np.ndarray) -> np.n
 
 
 def unevenness(counts: Counts, blind: Blindness) -> np.ndarray:
-    """How much more often background is taken for a return because there is more of it where gates start, (N,).
+    """Increase of the false-alarm probability by the higher background at the gate's start, shape (N,).
 
-    The union over all bins of what the start's level makes, less what the mean level does.
+    The union over all bins at the start's level, less that at the mean level.
     """
     from scipy.special import pdtrc
 
@@ -428,7 +428,7 @@ def unevenness(counts: Counts, blind: Blindness) -> np.ndarray:
 
 
 def variance_of_missing(counts: Counts, before: np.ndarray, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
-    """Variance by what is not there: all of the error where many photons are gone, its share where few are, (N,)."""
+    """Variance of range by lost photons: the estimate's own if many are lost, a share of it if few are, (N,)."""
     gone = changed_share(before, left)
     error = counts.error_m(left, sigma_m) ** 2
     if counts.first_hits.detector.estimator == "matched":

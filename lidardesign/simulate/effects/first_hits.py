@@ -1,4 +1,4 @@
-"""First hits of all rays of a scene's frame, and what an effect could change of them: bounds start from here."""
+"""First hits of all rays in a frame of a scene, from which the bounds of effects are computed."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from lidardesign.scenes.scene import Scene
 from lidardesign.simulate.detector.light import Beams, direct_echoes
 from lidardesign.simulate.detector.physics import Detector, bins_start, ends_of_bins, metres, resolution_m
 
-# A surface that is grazed more flatly than this counts as met at it: ranges then change by up to 50 times a step aside.
+# Lower limit of the cosine of incidence: ranges then change by up to 50 times a lateral step.
 FLATTEST_COSINE = 0.02
-# Rays whose ends a step aside is compared with.
+# Neighbouring rays that each ray is compared with.
 NEIGHBOURS = 4
-# The matched filter takes photons up to so many standard deviations from its pulse's centre into account.
+# Half width of the matched filter in standard deviations of the pulse.
 PULSE_REACH = 4.0
 # Of a pulse r bins wide, the matched filter leaves the share exp(-3.2 r) + 0.05 / r^2 of a step between bins, at most
 FILTER_SOFTENS, FILTER_LEAVES = 3.2, 0.05
@@ -27,7 +27,7 @@ FILTER_SOFTENS, FILTER_LEAVES = 3.2, 0.05
 
 @dataclass(frozen=True, eq=False)
 class EffectBound:
-    """What an effect could change, ray by ray.
+    """Upper bound of an effect, ray by ray.
 
     Arguments:
         squared_m2: Mean squared error of half the path of a return, (N,) [m^2].
@@ -45,14 +45,14 @@ class FirstHits:
     """First hits of all rays in a frame.
 
     Arguments:
-        scene: What they meet.
+        scene: The scene.
         frame: The time frame.
-        detector: What receives their light.
-        rays: Those of all lists, N.
-        row: The list of each, ascending, shape (N,).
-        sharing: How many rays share its emitter's energy, shape (N,).
-        hits: What they meet first.
-        caster: Of the frame, for the few further rays that a bound may need.
+        detector: The detector.
+        rays: The rays of all lists, N of them.
+        row: Index of each ray's list, ascending, shape (N,).
+        sharing: Number of rays that share each ray's emitter energy, shape (N,).
+        hits: The first hits.
+        caster: Caster of the frame, for the few further rays that a bound may need.
     """
 
     scene: Scene
@@ -66,7 +66,7 @@ class FirstHits:
 
     @classmethod
     def of(cls, scene: Scene, frame: int, detector: Detector, lists: Sequence[Rays], caster: SceneCaster) -> FirstHits:
-        """What lists of rays meet in a frame."""
+        """First hits of lists of rays in a frame."""
         names = ("origin_m", "direction", "gate_m", "sensor", "time_s")
         rays = Rays(*(np.concatenate([getattr(one, name) for one in lists]) for name in names))
         sizes = np.array([len(one) for one in lists])
@@ -78,7 +78,7 @@ class FirstHits:
         return len(self.rays)
 
     def nothing(self, reason: str) -> EffectBound:
-        """No error, and nothing lost."""
+        """Bound of an effect that changes nothing."""
         return EffectBound(np.zeros(len(self)), np.zeros(len(self)), reason)
 
     @cached_property
@@ -96,7 +96,7 @@ class FirstHits:
 
     @cached_property
     def returned(self) -> np.ndarray:
-        """Which rays have a return by geometry alone, shape (N,)."""
+        """Mask of rays with a return by geometry alone, shape (N,)."""
         return gate_outcomes(self.hits.range_m, self.rays.gate_m) == Outcome.RETURN
 
     @cached_property
@@ -106,13 +106,13 @@ class FirstHits:
 
     @cached_property
     def cosine(self) -> np.ndarray:
-        """Of incidence at the first hit, at least `FLATTEST_COSINE`; 1 on a miss, shape (N,)."""
+        """Cosine of incidence at the first hit, at least `FLATTEST_COSINE`; 1 on a miss, shape (N,)."""
         along = np.abs(np.einsum("nk,nk->n", self.hits.normal, self.rays.direction))
         return np.where(self.hits.body >= 0, np.maximum(along, FLATTEST_COSINE), 1.0)
 
     @cached_property
     def tangent(self) -> np.ndarray:
-        """Of incidence: how much the range changes by a step aside, shape (N,)."""
+        """Tangent of incidence, the change of range per lateral step, shape (N,)."""
         return np.sqrt(np.maximum(1 / self.cosine**2 - 1, 0.0))
 
     @cached_property
@@ -122,7 +122,7 @@ class FirstHits:
 
     @cached_property
     def width_m(self) -> np.ndarray:
-        """How much of half a path each ray listens to: no return is further off than that, shape (N,) [m]."""
+        """Length of each ray's gate in half path, an upper bound of any range error, shape (N,) [m]."""
         return self.window_m[:, 1] - self.window_m[:, 0]
 
     @cached_property
@@ -132,7 +132,7 @@ class FirstHits:
 
     @cached_property
     def path_per_range(self) -> np.ndarray:
-        """How much half a path grows by a longer range, at least `FLATTEST_COSINE`: 1 without a receiver, (N,)."""
+        """Derivative of half path by range, at least `FLATTEST_COSINE`; 1 without a receiver, shape (N,)."""
         if self.scene.receiver is None:
             return np.ones(len(self))
         back = (
@@ -142,7 +142,7 @@ class FirstHits:
         return np.maximum((1 + safe_divide(along, np.linalg.norm(back, axis=1), 1.0)) / 2, FLATTEST_COSINE)
 
     def half_path_m(self, range_m: np.ndarray, aside_m: np.ndarray) -> np.ndarray:
-        """How much half a path changes at most where a hit lies further by (N,) and aside by (N,) [m], shape (N,)."""
+        """Largest change of half path where a hit moves by (N,) in range and by (N,) laterally [m], shape (N,) [m]."""
         if self.scene.receiver is None:
             return range_m
         together = (self.rays.origin_m == np.asarray(self.scene.receiver.origin_m)).all(axis=1)
@@ -150,12 +150,12 @@ class FirstHits:
 
     @cached_property
     def before_m(self) -> np.ndarray:
-        """How much of its window lies before a ray's return; the whole window without one, shape (N,) [m]."""
+        """Length of each ray's window before its return; the whole window without one, shape (N,) [m]."""
         return np.where(self.returned, np.clip(self.path_m - self.window_m[:, 0], 0.0, self.width_m), self.width_m)
 
     @cached_property
     def gate_edge_m(self) -> np.ndarray:
-        """How far a first hit lies from the nearer end of its window, infinite on a miss, shape (N,) [m]."""
+        """Distance of each first hit from the nearer end of its window, infinite on a miss, shape (N,) [m]."""
         return np.where(self.hits.body >= 0, np.abs(self.path_m[:, None] - self.window_m).min(axis=1), np.inf)
 
     @cached_property
@@ -172,16 +172,16 @@ class FirstHits:
         return (self.detector.divergence_rad / 2 if self.detector.footprint_rays > 1 else 0.0) * self.range_m
 
     def sigma_m(self, *, jitter: bool = True) -> np.ndarray:
-        """How far one photon of an echo strays: the pulse, timing errors, and a slanted beam's spread, (N,) [m].
+        """Standard deviation of one photon's half path by pulse, timing and a slanted beam's spread, shape (N,) [m].
 
-        A beam that is even over a disc of radius a strays by a / 2 along any axis, times the tangent of incidence.
+        A uniform disc of radius a has the standard deviation a / 2 along any axis, here times the tangent of incidence.
         """
         timed = self.detector.timing_sigma_s if jitter else self.detector.pulse_sigma_s
         return np.hypot(metres(timed), self.beam_m * self.tangent / 2)
 
     @cached_property
     def resolution_m(self) -> float:
-        """Echoes closer than this are one: a bin or the width of the pulse, whichever is more [m].
+        """Half path within which echoes merge: a bin or the width of the pulse, whichever is larger [m].
 
         The matched filter averages over all of a pulse, far into its tails.
         """
@@ -190,7 +190,7 @@ class FirstHits:
 
     @cached_property
     def rounding_m(self) -> np.ndarray:
-        """How far each first hit lies from where its bin is reported, (N,) [m]."""
+        """Rounding error of each first hit, the distance to its bin's reported half path, shape (N,) [m]."""
         low, high = ends_of_bins(self.path_m, self.window_m, self.detector)
         if self.detector.photons is None:
             return np.abs(self.path_m - (low + high) / 2)
@@ -201,16 +201,16 @@ class FirstHits:
 
     @cached_property
     def bin_edge_m(self) -> np.ndarray:
-        """How far each first hit lies from the nearer end of its bin, or of the part that is listened to, (N,) [m]."""
+        """Distance of each first hit from the nearer end of its bin, cut to the window, shape (N,) [m]."""
         low, high = ends_of_bins(self.path_m, self.window_m, self.detector)
         return np.minimum(self.path_m - low, high - self.path_m)
 
     @cached_property
     def step_m(self) -> np.ndarray:
-        """How far a range jumps at most where an echo goes from one of the detector's bins to the next, (N,) [m].
+        """Largest step of the range where an echo moves from one of the detector's bins to the next, shape (N,) [m].
 
-        By a bin, but the matched filter finds its place between bins: what is left there of rounding was computed for
-        a Gaussian of the standard deviation r bins in all its places, levels of background and widths of the filter.
+        One bin, but less for the matched filter, which interpolates: its residual rounding was computed for a Gaussian
+        of the standard deviation r bins at all positions, levels of background and widths of the filter.
         """
         bin_m = self.detector.bin_m or 0.0
         if bin_m == 0 or self.detector.photons is None or self.detector.estimator == "peak":
@@ -219,21 +219,21 @@ class FirstHits:
         return np.minimum(np.exp(-FILTER_SOFTENS * spread) + FILTER_LEAVES / np.maximum(spread, 1.0) ** 2, 1.0) * bin_m
 
 
-# A step in range counts as an edge where it exceeds the slope of both surfaces this many times over.
+# A step in range counts as an edge if it exceeds the slope of both surfaces by this factor.
 STEEPER = 2.0
 
 
 def edge_probability(first_hits: FirstHits, aside_m: np.ndarray) -> np.ndarray:
-    """Probability that an edge lies within a distance aside of where a ray ends, shape (N,).
+    """Probability that an edge lies within a lateral distance of each first hit, shape (N,).
 
     Two neighbouring rays, a distance d apart, that end on different bodies, or further apart in range than the slope
     of either explains, have an edge somewhere between them: within a <= d of one with the probability a / d, wherever
-    it is. The nearest few of each list are asked. An estimate: edges between rays that both end on one
-    surface are not seen, in expectation over where rays fall they weigh as much as those that are.
+    it is. Only the nearest few rays of each list are compared. An estimate: edges between rays that both end on one
+    surface are missed; in expectation over ray positions they weigh as much as the detected ones.
 
     Arguments:
-        first_hits: What rays meet.
-        aside_m: How far aside, shape (N,) [m].
+        first_hits: First hits of the rays.
+        aside_m: Lateral distance, shape (N,) [m].
     """
     if not aside_m.any():
         return np.zeros(len(first_hits))
@@ -243,7 +243,7 @@ def edge_probability(first_hits: FirstHits, aside_m: np.ndarray) -> np.ndarray:
     chance = np.zeros(len(first_hits))
     for other in first_hits.neighbours.T:
         reach_m = np.minimum(first_hits.hits.range_m, first_hits.hits.range_m[other])
-        # how far rays are from their neighbours at the shorter range of the two, along both [m]
+        # distance of rays from their neighbours at the shorter range of the two [m]
         reach_m = np.where(np.isfinite(reach_m), reach_m, 0.0)
         apart_m = np.linalg.norm(origin - origin[other] + reach_m[:, None] * (along - along[other]), axis=1)
         sloped_m = STEEPER * apart_m * (1 + tangent + tangent[other])

@@ -1,16 +1,16 @@
-"""Beams have a width: each is split into thin ones that share its light, so that one ray may meet several surfaces.
+"""Beam footprint: each beam is split into thin ones that share its light, so that one ray may hit several surfaces.
 
-What a detector makes of several echoes of one ray is its own matter (`simulate.detection`): near ones merge into one
-mixed return, of distant ones it reports one.
+The detector combines several echoes of one ray (`simulate.detection`): near ones merge into one mixed return, of
+distant ones it reports one.
 
-What it could change (`bound`), as slanted surfaces spread an echo and beams on a depth edge meet two surfaces: a beam
-of half angle h is R h wide at the range R; on a plane met at the angle theta its rim lies up to R cos(theta) /
-cos(theta + h) away, so a return is off by at most what that exceeds R by, and may leave or enter a gate that ends
-within it, or spill into it, or sink below what is reported. A receiver elsewhere is further from the rim, too. An edge
-within R h of the ray's end mixes both surfaces: the return may be of either and counts as lost, or between them, as far
-apart as the detector does not tell them apart; see `edge_probability` (an estimate). What lies between rays is met by a
-beam but by none of them: one place on the rim of each beam is looked at too. Photons from all over the spread are as
-good as noise for the time of one: the spread is counted in full, not its rms of a half.
+Bound of its effect (`bound`), as slanted surfaces spread an echo and beams on a depth edge hit two surfaces: a beam of
+half angle h has the radius R h at the range R; on a plane met at the angle theta its rim lies up to R cos(theta) /
+cos(theta + h) away, so a return is off by at most the excess over R, and may leave or enter a gate that ends within
+it, or spill into it, or sink below the detection threshold. A bistatic receiver is further from the rim, too. An edge
+within R h of the ray's end mixes both surfaces: the return may be of either and counts as lost, or between them, within
+the detector's resolution; see `edge_probability` (an estimate). Surfaces between rays are hit by a beam but by none of
+the rays: one point on the rim of each beam is cast too. Photons from all over the spread act as timing noise: the
+spread is counted in full, not its rms of a half.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import FLATTEST_COSINE, STEEPER, EffectBound, FirstHits, edge_probability
 from lidardesign.simulate.light_transport.detours import GOLDEN_ANGLE_RAD
 
-# Pairs of opposite points are turned by the golden share of a half turn from one to the next: the most even spiral
-# with two arms (Vogel 1979 has one arm and a full turn, whose centre of mass lies off the axis).
+# Successive pairs of opposite points are turned by the golden share of a half turn: the most even spiral with two
+# arms (Vogel 1979 has one arm and a full turn, whose centre of mass lies off the axis).
 GOLDEN_SHARE = (math.sqrt(5) - 1) / 2
 
 
 def even_disc(count: int) -> np.ndarray:
-    """Points of equal share of the unit disc, shape (count, 2), that are unchanged by a half turn.
+    """Evenly spread points of the unit disc, symmetric under a half turn, shape (count, 2).
 
     So their mean is the centre exactly, and their mean square radius is a half, that of the disc (for an odd count,
-    which has a point in the centre, it differs by less than 1 / count^2). One point lies in the centre.
+    which has a point in the centre, it differs by less than 1 / count^2).
     """
     pairs = np.arange(count // 2)
     radius = np.sqrt((2 * pairs + 1 + count % 2) / count)
@@ -47,9 +47,9 @@ def even_disc(count: int) -> np.ndarray:
 
 
 def split_beams(beams: Beams, detector: Detector) -> Beams:
-    """Each beam as `detector.footprint_rays` thin ones of equal share, even over the solid angle of its cone.
+    """Split each beam into `detector.footprint_rays` thin ones of equal share, even over the solid angle of its cone.
 
-    The pattern is upright: it turns with the azimuth of a beam. Beams of no width stay as they are.
+    The pattern is upright: it turns with the azimuth of a beam. Beams without divergence are returned unchanged.
 
     Arguments:
         beams: B thin beams.
@@ -77,25 +77,25 @@ def split_beams(beams: Beams, detector: Detector) -> Beams:
 
 
 def _across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors across directions (B, 3): a level one to the left, and upwards; at a pole, those of azimuth 0."""
+    """Unit vectors perpendicular to directions (B, 3), horizontally to the left and upwards; of azimuth 0 at a pole."""
     azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     lateral = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(len(azimuth))], axis=1)
     return lateral, np.cross(direction, lateral)
 
 
-# Ranges of meshes are exact to float32; no step of less than this share of a range is an edge.
+# Smallest share of a range that counts as an edge: ranges of meshes are exact only to float32.
 MESH_ROUNDING = 1e-5
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
-    """Why beams are lines, if so."""
+    """Reason why beams are lines, or None."""
     if detector.divergence_rad == 0:
         return "beams are thin lines"
     return None if detector.footprint_rays > 1 else "each beam has a single sub-ray"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """Of beams with a width."""
+    """Bound of the effect of the beam footprint."""
     radius_m, wide_rad = first_hits.beam_m, first_hits.detector.divergence_rad
     # of a plane, at its far end: R (cos theta / cos(theta + h) - 1)
     steepness = math.cos(wide_rad / 2) - first_hits.tangent * math.sin(wide_rad / 2)
@@ -114,9 +114,9 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
 
 
 def stray_rims(first_hits: FirstHits) -> np.ndarray:
-    """Which beams meet, at one place on their rim, a surface that is not the one in their middle, (N,).
+    """Mask of beams whose rim, at one sampled point, hits another surface than their axis, shape (N,).
 
-    Surfaces that meet, as those of joined bodies, are one.
+    Adjoining surfaces, as those of joined bodies, count as one.
     """
     rays, hits, half_rad = first_hits.rays, first_hits.hits, first_hits.detector.divergence_rad / 2
     level = np.cross(np.eye(3)[np.abs(rays.direction).argmin(axis=1)], rays.direction)

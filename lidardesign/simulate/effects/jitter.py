@@ -1,13 +1,13 @@
-"""The timing of a photon strays: by diode and converter, as a normal error that every photon has anew.
+"""Timing jitter of diode and converter: an independent normal error of every photon.
 
-What it could change (`bound`): without photons each return has one normal error, (c / 2) sigma_j rms. With n photons
-the matched filter averages them: (c / 2) sigma_j / sqrt(n), where bins are as fine; each photon also goes to another
-bin by itself, which adds a bin times (c / 2) sigma_j to the variance of one, and a wider pulse is found elsewhere
-between bins. The highest bin does not average; with timing errors it strays as `estimate_error_m` says of pulse and
-timing together, and without them it strayed by itself, so that the two differ by at most sqrt(e(sigma_p, sigma_j)^2 +
-e(sigma_p)^2). A wider echo is also lower: returns are lost where it now falls below what is reported, or below
+Bound of its effect (`bound`): without photons each return has one normal error, (c / 2) sigma_j rms. With n photons
+the matched filter averages them: (c / 2) sigma_j / sqrt(n), where bins are as fine; each photon may also change bins
+by itself, which adds a bin times (c / 2) sigma_j to the variance of one, and a wider pulse is located elsewhere
+between bins. The highest bin does not average; with timing errors its error is `estimate_error_m` of pulse and timing
+together, and without them that of the pulse alone, so that the two differ by at most sqrt(e(sigma_p, sigma_j)^2 +
+e(sigma_p)^2). A wider echo is also lower: returns are lost where it falls below the detection threshold, or below
 background as photons leave their bins, and surfaces outside a gate spill more photons into it. Of several photons in a
-pulse a detector that is blind after a count times the first, which is the earlier the more they stray.
+pulse a detector with dead time times the first, which is the earlier the larger the timing errors.
 
 The pulse is taken as Gaussian and n as its expectation: an estimate where n is small.
 """
@@ -28,22 +28,22 @@ from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 def add_timing_errors(
     path_m: np.ndarray, ray: np.ndarray, order: np.ndarray, detector: Detector, key: int
 ) -> np.ndarray:
-    """Half paths as they are timed [m], shape (K,): of photons by ray and order in it, or of whole returns."""
+    """Half paths with timing errors, of photons by ray and order or of whole returns, shape (K,) [m]."""
     if detector.jitter_sigma_s == 0:
         return path_m
-    # compiled, which bounds do without
+    # compiled on import, which bounds do not need
     from lidardesign.simulate.detector.streams import normals
 
     return path_m + metres(detector.jitter_sigma_s) * normals(key, ray, order)
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
-    """Why photons are timed exactly, if so."""
+    """Reason why jitter changes nothing, or None."""
     return None if detector.jitter_sigma_s > 0 else "the detector times without error"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """Of a timing error per return, or per photon."""
+    """Bound of the effect of a timing error per return, or per photon."""
     detector = first_hits.detector
     sigma_s, timed = detector.jitter_sigma_s, f"timed to {1e12 * detector.jitter_sigma_s:.3g} ps"
     if detector.photons is None:
@@ -52,9 +52,9 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     blind = Blindness.of(counts)
     signal, pulse_m, both_m = blind.left, first_hits.sigma_m(jitter=False), first_hits.sigma_m()
     if detector.estimator == "matched":
-        # between bins a wider pulse is found elsewhere, too
+        # a wider pulse is located elsewhere between bins
         moved_m = np.minimum(2 * (both_m - pulse_m), first_hits.step_m)
-        # and every photon that strays may go to another bin by itself
+        # and every photon with an error may change bins by itself
         strayed_m2 = metres(sigma_s) * (metres(sigma_s) + (detector.bin_m or 0.0))
         squared = estimate_error_m(detector, signal, np.sqrt(strayed_m2)) ** 2 + moved_m**2
     else:

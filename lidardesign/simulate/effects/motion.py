@@ -1,17 +1,17 @@
-"""Things move within a frame: every ray meets them where they are at its own time.
+"""Motion within a frame: every ray is cast at the poses of bodies at its own firing time.
 
 A body with a pose per frame goes from each pose T_0 to the next T_1 on the one screw that joins them,
 T(s) = exp(s log(T_1 T_0^{-1})) T_0 with s = time * frame rate: with a constant turn about a fixed axis and a constant
 travel along it, which is how the links of a robot move when one joint turns (Murray, Li, Sastry 1994, chapter 2).
-Rays that are sent later than a frame lasts meet it on its way to the pose after that. After its last pose a body goes
-on as it came. A body at rest in all frames goes on with its velocity.
+Rays that are fired later than a frame lasts hit it on its way to the pose after that. After its last pose a body
+continues its last motion. A body with a single pose for all frames moves with its velocity.
 
-What it could change (`bound`): a ray fired at the time t meets a body that has moved by v t, v the velocity of the
-point it meets: its range changes by at most |v| t / cos(theta) on a plane met at the angle theta, which may lead it
-into or out of its gate, and at the body's edges it meets something else, with the probability that an edge lies within
-|v| t; see `edge_probability` (an estimate). What a body moves into that it was not in front of is met by moving the ray
-back by v t, v where the ray passes the body, and casting it (exact for bodies that do not turn, and for one that moves
-alone). A detector without any error or width, `ideal`, takes the whole frame at one instant.
+Bound of its effect (`bound`): a ray fired at the time t hits a body that has moved by v t, v the velocity of the hit
+point: its range changes by at most |v| t / cos(theta) on a plane met at the angle theta, which may lead it into or out
+of its gate, and at the body's edges it hits something else, with the probability that an edge lies within |v| t; see
+`edge_probability` (an estimate). Bodies that move into a ray are found by moving the ray back by v t, v where the ray
+passes the body, and casting it (exact for bodies that do not turn, and for a single moving body). A detector without
+any error or width, `ideal`, takes the whole frame at one instant.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ LocalTracer = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, n
 
 @dataclass(frozen=True, eq=False)
 class Screw:
-    """A pose that turns and travels evenly in time.
+    """Screw motion: a pose with constant angular velocity and translation.
 
     Arguments:
         pose: Body to world at time 0, shape (4, 4).
         turn_rad_s: Axis times angular speed, in the world [rad/s], shape (3,).
-        drift_m_s: Velocity of the point that passes the world's origin [m/s], shape (3,).
+        drift_m_s: Velocity of the body's point at the world's origin [m/s], shape (3,).
     """
 
     pose: np.ndarray
@@ -74,7 +74,7 @@ class Screw:
         return turned @ self.pose[:3, :3], turned @ self.pose[:3, 3] + moved
 
     def speed_m_s(self, point: np.ndarray) -> float:
-        """How fast a point of the body (3,), in its own frame, moves: on a screw, the same at all times."""
+        """Speed of a point (3,) in the body's frame, constant on a screw [m/s]."""
         place = self.pose[:3, :3] @ point + self.pose[:3, 3]
         return float(np.linalg.norm(np.cross(self.turn_rad_s, place) + self.drift_m_s))
 
@@ -96,7 +96,7 @@ def _translations(turn: np.ndarray, time: np.ndarray) -> np.ndarray:
 
 
 def path_of(body: Body, frame: int, rate_hz: float) -> Screw:
-    """How a body moves during a frame."""
+    """Screw motion of a body during a frame."""
     if body.poses.ndim == 2:
         return Screw(body.poses, np.zeros(3), np.asarray(body.velocity_m_s))
     if len(body.poses) == 1:
@@ -113,7 +113,7 @@ class _MovingBody:
         self._trace, self._centre, self._radius_m = _local_tracer(self._body.shape)
 
     def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray) -> None:
-        """Enter the hits that are nearer than what `hits` holds."""
+        """Replace the entries of `hits` by nearer hits of this body."""
         for path, piece, elapsed_s in self._pieces(time_s):
             near = self._near(path, origins[piece], directions[piece], elapsed_s, hits.range_m[piece])
             if not len(near):
@@ -129,7 +129,7 @@ class _MovingBody:
             hits.range_m[won], hits.body[won], hits.normal[won] = range_m[hit], self._index, turned
 
     def _pieces(self, time_s: np.ndarray) -> Iterator[tuple[Screw, np.ndarray, np.ndarray]]:
-        """Parts of its way, with the rows of the rays that meet it there and their times since that part began."""
+        """Screws of the body's path, each with the rows of its rays and their times since its start [s]."""
         if self._body.poses.ndim == 2:
             yield path_of(self._body, self._frame, self._rate_hz), np.arange(len(time_s)), time_s
             return
@@ -143,7 +143,7 @@ class _MovingBody:
     def _near(
         self, path: Screw, origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray, limit_m: np.ndarray
     ) -> np.ndarray:
-        """Rows of rays that pass, before their limit, the ball that holds the body at all their times."""
+        """Rows of rays that pass, before their limit, a ball around the body at all of their times."""
         if not np.isfinite(self._radius_m) or not len(origins):
             return np.arange(len(origins))
         earliest, latest = time_s.min(), time_s.max()
@@ -159,7 +159,7 @@ class _MovingBody:
 
 
 def _local_tracer(shape: Shape) -> tuple[LocalTracer, np.ndarray, float]:
-    """How rays are traced at a shape in its own frame, with the centre (3,) and radius [m] of a ball around it."""
+    """Tracer of a shape in its own frame, and the centre (3,) and radius of a ball around it [m]."""
     if isinstance(shape, Mesh):
         caster, counted = mesh_caster(shape), SecondCasts()
         return partial(caster.first_hits, twice=counted), caster.centre_m, caster.radius_m
@@ -178,7 +178,7 @@ _still_scenes: WeakKeyDictionary[Scene, tuple[Scene, np.ndarray]] = WeakKeyDicti
 
 
 def _still(scene: Scene) -> tuple[SceneCaster | None, np.ndarray]:
-    """A caster of the bodies that move in no frame, and their indices in the scene."""
+    """A caster of the bodies that never move, and their indices in the scene."""
     if scene not in _still_scenes:
         chosen = [i for i, body in enumerate(scene.bodies) if body.poses.ndim == 2 and not any(body.velocity_m_s)]
         if not chosen:
@@ -190,12 +190,12 @@ def _still(scene: Scene) -> tuple[SceneCaster | None, np.ndarray]:
 
 
 def still_tracer(caster: SceneCaster) -> Tracer:
-    """First hits of rays in a scene that stands still within a frame."""
+    """Tracer of a scene that is static within a frame."""
     return lambda origins, directions, time_s: caster.first_hit(origins, directions)
 
 
 def moving_tracer(scene: Scene, frame: int) -> Tracer:
-    """First hits of rays (N, 3), (N, 3) of unit length that are sent at times (N,) [s] within a frame."""
+    """Tracer of unit rays (N, 3), (N, 3) that are sent at times (N,) [s] within a frame, with bodies in motion."""
     caster, indices = _still(scene)
     rest = set(indices.tolist())
     moving = [_MovingBody(scene, index, frame) for index in range(len(scene.bodies)) if index not in rest]
@@ -214,7 +214,7 @@ def moving_tracer(scene: Scene, frame: int) -> Tracer:
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
-    """Why all rays of a frame see one moment, if so."""
+    """Reason why motion changes nothing, or None."""
     if is_instant(detector):
         return "the detector takes a frame at one instant"
     if not any(_moves(body) for body in scene.bodies):
@@ -223,12 +223,12 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
 
 
 def is_instant(detector: Detector) -> bool:
-    """Whether a detector is `ideal` but for its name: its rays take no time."""
+    """True if a detector equals `ideal` except for its name: it takes a frame at one instant."""
     return replace(detector, name=IDEAL.name) == IDEAL
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """Of moving bodies."""
+    """Bound of the effect of moving bodies."""
     step_m = np.linalg.norm(point_velocities(first_hits), axis=1) * first_hits.rays.time_s
     moved_m = step_m / first_hits.cosine
     edge = edge_probability(first_hits, step_m)
@@ -243,7 +243,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
 
 
 def entered_rays(first_hits: FirstHits) -> np.ndarray:
-    """Which rays meet, at their own time, a moving body that they do not meet when the frame begins, shape (N,)."""
+    """Mask of rays that hit, at their own time, a moving body that they do not hit at the frame's start, shape (N,)."""
     entered = np.zeros(len(first_hits), dtype=bool)
     rays, range_m = first_hits.rays, first_hits.hits.range_m
     for index, body in enumerate(first_hits.scene.bodies):
@@ -265,7 +265,7 @@ def entered_rays(first_hits: FirstHits) -> np.ndarray:
 
 
 def _ball(body: Body, frame: int) -> tuple[np.ndarray, float]:
-    """The middle (3,) and radius of a ball that holds a body at the start of a frame [m]."""
+    """Centre (3,) and radius of a ball around a body at the start of a frame [m]."""
     shape, pose = body.shape, body.pose(frame)
     if isinstance(shape, Mesh):
         low, high = shape.bounds_m
@@ -274,7 +274,7 @@ def _ball(body: Body, frame: int) -> tuple[np.ndarray, float]:
 
 
 def point_velocities(first_hits: FirstHits) -> np.ndarray:
-    """How the points that rays meet move with their bodies, shape (N, 3) [m/s]; 0 on a miss."""
+    """Velocities of the bodies at first hits, 0 on a miss, shape (N, 3) [m/s]."""
     points = first_hits.rays.origin_m + first_hits.range_m[:, None] * first_hits.rays.direction
     velocity = np.zeros((len(first_hits), 3))
     for index, body in enumerate(first_hits.scene.bodies):
@@ -285,7 +285,7 @@ def point_velocities(first_hits: FirstHits) -> np.ndarray:
 
 
 def _velocity(scene: Scene, body: Body, frame: int, points: np.ndarray) -> np.ndarray:
-    """Of points fixed to a body that goes on to its next pose, or, in the last frame, on from the one before."""
+    """Mean velocities of points (N, 3) fixed to a body until its next pose, or before its last, (N, 3) [m/s]."""
     if body.poses.ndim == 2:
         return np.broadcast_to(np.asarray(body.velocity_m_s), points.shape)
     start = min(frame, len(body.poses) - 2)

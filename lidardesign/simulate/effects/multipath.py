@@ -1,43 +1,42 @@
-"""Light that comes back by way of other surfaces, rendered by the light-transport simulator.
+"""Multipath: echoes by way of other surfaces, rendered by the light-transport simulator.
 
-Which detours a receiver gets depends on what is lit and what is looked at while a ray is listened to:
+The indirect light that a receiver gets depends on the emission and on what its pixels see:
 
 - A *flood* lights all rays' spots at once, and each pixel sees its own: light goes from the emitter to Q, to P and
   back, and pixel n sees its spot P, which all other spots Q light too. The spots are the lights, matt points with the
-  power of what they reflect (Keller 1997, Instant radiosity), so that light goes where the design's rays go and nowhere
-  else. Where pixels overlap, each receives the part that is its own ray's, of detours as of direct light.
+  power that they reflect (Keller 1997, Instant radiosity), so that only the design's rays emit light. Where pixels
+  overlap, each receives its own ray's part of indirect light, as of direct light.
 - A *scanned* beam lights one spot P, and its pixel sees a cone around the beam: light comes back by P, Q, P and, where
-  Q lies in that cone, by P, Q. The beam's own spot is the only light, looked at along rays spread in the cone. A pixel
-  without a solid angle receives no detours.
-- A *fixed receiver* gets a scanned beam's detours P, Q from all Q that lie in its field of view. By reciprocity light
-  is sent from the receiver instead, and what is seen along the beam is its gain.
+  Q lies in that cone, by P, Q. The beam's own spot is the only light, viewed along rays spread in the cone. A pixel
+  without a solid angle receives no indirect light.
+- A *fixed receiver* gets a scanned beam's paths P, Q from all Q in its field of view. By reciprocity light is sent from
+  the receiver instead, and the radiance along the beam is its gain.
 
-A detector that resolves everything and counts nothing (`ideal`) takes no late light for an echo, not even where no
-direct one arrives.
+A detector with perfect resolution that counts no photons (`ideal`) takes no late light for an echo, even without a
+direct one.
 
 Paths have up to `MOST_SURFACES` surfaces. A spot has a size, within which its light grows no stronger: without it, the
-few paths that end next to a spot in a crease would be worth any amount; light within a spot's own size is not told from
-its direct echo. Beams are thin, and nothing moves within a frame. Mirrors and glass are left to `specular`: here they
-swallow what they do not scatter, so that no light is received twice. What arrives earlier than a ray's direct echo by
-more than the emitters are apart (from nearer surfaces at the edge of its pixel) is left out. Estimates are unbiased up
-to that; their noise falls with the root of `PATHS`, which all rays share.
+few paths that end next to a spot in a crease would have unbounded weights; light within a spot's own size is part of
+its direct echo. Beams are thin, and bodies are static within a frame. Mirrors and glass are left to `specular`: here
+they absorb all light that they do not scatter, so that none is received twice. Light that is earlier than a ray's
+direct echo by more than the distance between emitters (from nearer surfaces at the edge of its pixel) is left out.
+Estimates are unbiased up to that; their noise falls with the root of `PATHS`, which all rays share.
 
 Echoes are the simulator's bins of half path, a quarter of the detector's resolution where no more than `MOST_CELLS` of
 them reach to the gates' ends. They name the body of the ray's first hit, whose echo they disturb.
 
-What it could change (`bound`): from points that rays meet, other surfaces are looked for, and what they send there is
-bounded (`multipath_bound`): of a flood or for one receiver that receives all, what they get of the light; where one
-spot at a time is lit and seen, what falls on it again. What is late by less than a detector tells apart moves the echo
-by its delay times its share; what is late by more makes its own peak, taken for the echo at most where all of it
-outweighs that. Where a receiver that stands elsewhere does not receive the echo at all, whatever comes by detours may
-be taken for it.
+Bound of its effect (`bound`): rays cast from hit points find other surfaces, and the light that these send back is
+bounded (`light_transport.detours`): for a flood or a fixed receiver, the light that reaches them; for a scanned pixel,
+the light that falls on its own spot again. Light late by less than the detector's resolution moves the echo by its
+delay times its share; later light makes a peak of its own, which is taken for the echo at most where all of it
+outweighs the echo. Where a bistatic receiver does not receive the echo at all, any indirect light may be taken for it.
 
 Where a flood lights all spots at once, other rays' spots send light to a ray's own. All rays have the same power. Ray j
 lights a spot Q at the distance R_j, which sends rho_Q of it on; a spot P of the area A, seen by pixel i, gets rho_Q cos
 cos A / (pi d^2) of what its own ray gives it, late by (R_j + d - R_i) / 2 of half path. Further bounces bring at most 1
-/ (1 - rho) times as much in all, rho the largest reflectance (energy is kept; a geometric series). Whether anything
-stands between the spots is not asked, and beams are taken to end on them: where only part of a wide beam does, its own
-light is weaker than is said here.
+/ (1 - rho) times as much in all, rho the largest reflectance (energy is kept; a geometric series). Occlusion between
+spots is ignored, and beams are taken to end on them: where only part of a wide beam does, its own light is weaker than
+assumed here.
 """
 
 from __future__ import annotations
@@ -67,14 +66,14 @@ CELLS_PER_RESOLUTION = 4
 MOST_CELLS = 512
 # Widths are rounded up to one of these steps per decade: the simulator compiles kernels per width.
 WIDTHS_PER_DECADE = 6
-# How densely a flood's rays lie is told from so many neighbours: right for grids and for random ones, within 5 %.
+# Neighbours from which the density of a flood's rays is estimated: within 5 % for grids and for random rays.
 NEIGHBOURS = 6
-# Rays whose detours together are fainter than this share of the direct light receive none: no detector counts so far.
+# Rays whose indirect light is below this share of the direct light receive none: no detector has that dynamic range.
 FAINTEST_SHARE = 1e-8
 
 
 def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> Echoes:
-    """Echoes of light that met 2 to `MOST_SURFACES` surfaces, in cells of half path.
+    """Echoes of light reflected by 2 to `MOST_SURFACES` surfaces, in bins of half path.
 
     Arguments:
         scene: Its bodies' shares of light, and its receiver.
@@ -105,15 +104,15 @@ def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Rays that could receive detours: their first hit lies before the end of their gate.
+    """Rays that may receive multipath light: their first hit lies before the end of their gate.
 
     Arguments:
-        number: Their places in the whole list, shape (K,).
-        rays, hits, direct: They, what they meet and its echo.
-        start_m: Whole paths that their bins start at, shape (K,).
-        pixel_sr: Solid angle that each one's pixel sees.
-        samples: Light paths for each.
-        seed: Of the simulator.
+        number: Indices of the rays in the whole list, shape (K,).
+        rays, hits, direct: The rays, their first hits and the direct echoes of these.
+        start_m: Whole path length at which each ray's bins start, shape (K,) [m].
+        pixel_sr: Solid angle of each ray's pixel [sr].
+        samples: Light paths per ray.
+        seed: Seed of the simulator.
     """
 
     scene: Scene
@@ -145,7 +144,7 @@ class _View:
         width_m = 10 ** (math.ceil(math.log10(finest_m) * WIDTHS_PER_DECADE) / WIDTHS_PER_DECADE)
         count = math.ceil(2 * reach_m / width_m) + 1
         bins = PathBins(width_m, 1 << (count - 1).bit_length())
-        # a pixel without a solid angle of its own sees that of its beam
+        # a pixel without a solid angle of its own has that of its beam
         photons, beam_sr = physics.detector.photons, math.pi * (physics.detector.divergence_rad / 2) ** 2
         pixel_sr = beam_sr if photons is None else photons.field_of_view_sr
         return cls(
@@ -165,20 +164,20 @@ class _View:
         )
 
     def of_a_flood(self) -> Transients:
-        """Radiance of spots that all other spots light."""
+        """Radiance of each ray's spot, lit by all other spots."""
         return self._rendered(self._spots(), bounces=MOST_SURFACES - 1)
 
     def of_a_pixel(self) -> Transients:
-        """Radiance of what lies in each ray's pixel, lit by its own spot."""
+        """Radiance in each ray's pixel, lit by the ray's own spot."""
         cone_sr = np.full(len(self.rays), self.pixel_sr)
         return self._rendered(self._spots(), bounces=MOST_SURFACES - 1, own_light=True, cone_sr=cone_sr)
 
     def of_a_receiver(self) -> Transients:
-        """Radiance of spots in the light of the receiver, less what comes from there directly."""
+        """Indirect radiance of each ray's spot, lit from the receiver (by reciprocity)."""
         return self._rendered(Lights.receiver(self.scene.receiver), bounces=MOST_SURFACES, direct=False)
 
     def solid_angles(self) -> np.ndarray:
-        """The solid angle that each pixel of a flood sees, or that its ray's part of the flood fills if less, (K,)."""
+        """Solid angle of each flood pixel, at most that of its ray's part of the flood, shape (K,) [sr]."""
         from scipy.spatial import cKDTree
 
         count = min(NEIGHBOURS, len(self.rays) - 1)
@@ -212,7 +211,7 @@ class _View:
         )
 
     def _looks(self) -> Rays:
-        """The lines along which detours are looked for: from where light is received, or along the beams themselves."""
+        """Rays along which indirect light is rendered: from the receiver of a flood, otherwise the beams themselves."""
         photons = self.detector.photons
         receiver = self.scene.receiver
         if receiver is None or photons is None or photons.emission != "flood":
@@ -224,12 +223,12 @@ class _View:
 
 
 MOST_POINTS, AT_ONCE = 64, 8
-# Bounces between white walls all around never end; a share this close to 1 stands for theirs.
+# Upper limit of the share that a bounce keeps: between white walls all around the series would not converge.
 WHITEST = 0.999
 
 
 def moved_by_spots_m(first_hits: FirstHits) -> np.ndarray:
-    """How far light from the spots of the same list moves ranges, for some rays of each list, shape (K,) [m]."""
+    """Range shift by light from other spots of the same list, for a sample of rays of each list, shape (K,) [m]."""
     found = [np.zeros(1)]
     for row in np.unique(first_hits.row[first_hits.returned]):
         rays = np.flatnonzero((first_hits.row == row) & (first_hits.hits.body >= 0))
@@ -241,7 +240,7 @@ def moved_by_spots_m(first_hits: FirstHits) -> np.ndarray:
 
 
 def _moved_m(first_hits: FirstHits, own: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Of spots `own` by those of `rays`, all of one list, shape (len(own),) [m]."""
+    """Range shift of rays `own` by light from the spots of `rays`, all of one list, shape (len(own),) [m]."""
     place = first_hits.rays.origin_m + first_hits.range_m[:, None] * first_hits.rays.direction
     reflectance = np.array([body.reflectance for body in first_hits.scene.bodies])[first_hits.hits.body[rays]]
     photons, half_rad = first_hits.detector.photons, first_hits.detector.divergence_rad / 2
@@ -258,14 +257,14 @@ def _moved_m(first_hits: FirstHits, own: np.ndarray, rays: np.ndarray) -> np.nda
     return np.minimum((share * late_m * near).sum(axis=1) / (1 - whitest), first_hits.resolution_m)
 
 
-# What lies in the way by less than this share of it is the surface itself: rays are traced to float32.
+# A hit nearer than the surface by less than this share is the surface itself: rays are traced to float32.
 CLEARANCE_SHARE = 1e-4
-# Shares of late light below this are not told apart [%].
+# Smallest share of late light that is reported [%].
 TINY_PERCENT = 0.01
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
-    """Why no light can go from one surface to another, if so."""
+    """Reason why multipath light changes nothing, or None."""
     if len(scene.bodies) == 1 and _convex_from(scene.bodies[0], lists):
         return "one convex body lights nothing else"
     if not detector.bin_s and not detector.pulse_sigma_s:
@@ -274,7 +273,7 @@ def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str |
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """Of light that is late, the same for all rays: as its rms over points."""
+    """Bound of the effect of multipath light, the same for all rays: its rms over a sample of points."""
     rows = np.flatnonzero(first_hits.returned)
     if not len(rows):
         return first_hits.nothing("no ray returns")
@@ -296,7 +295,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
 
 
 def _hidden(first_hits: FirstHits, rows: np.ndarray) -> np.ndarray:
-    """Whether the light of some rays that hit something does not come straight to a receiver elsewhere, (K,) bool."""
+    """Mask of hits that a bistatic receiver does not see directly, shape (K,)."""
     receiver = first_hits.scene.receiver
     if receiver is None:
         return np.zeros(len(rows), dtype=bool)
@@ -311,7 +310,7 @@ def _hidden(first_hits: FirstHits, rows: np.ndarray) -> np.ndarray:
 
 
 def _is_flood(first_hits: FirstHits) -> bool:
-    """Whether all rays are lit at once, and each is received where it starts."""
+    """True for flood emission with each ray received at its origin."""
     photons = first_hits.detector.photons
     return first_hits.scene.receiver is None and photons is not None and photons.emission == "flood"
 
@@ -324,7 +323,7 @@ def _detours(first_hits: FirstHits, rows: np.ndarray) -> Detours:
         beam_sr = math.pi * (first_hits.detector.divergence_rad / 2) ** 2
         pixel_sr = beam_sr if photons is None else max(photons.field_of_view_sr, beam_sr)
         return pixel_bound(first_hits.scene, rays, hits, first_hits.caster, pixel_sr, first_hits.resolution_m)
-    # a flood's pixels look at spots that its emitters light; a receiver alone gets what is sent anywhere in its view
+    # a flood's pixels see spots lit by its emitters; a fixed receiver gets light from anywhere in its view
     lamp_m = None if flood or receiver is None else np.asarray(receiver.origin_m)
     return lamp_bound(first_hits.scene, rays, hits, first_hits.caster, lamp_m, first_hits.resolution_m)
 
@@ -337,7 +336,7 @@ def _convex_from(body: Body, lists: Sequence[Rays]) -> bool:
 
 
 def _inside(body: Body, points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Which points (N, 3) lie in a primitive, shape (N,); both sides of a plane are flat."""
+    """Mask of points (N, 3) inside a primitive, shape (N,); a plane has no inside."""
     shape, local = body.shape, (points - pose[:3, 3]) @ pose[:3, :3]
     if isinstance(shape, Box):
         return (np.abs(local) < np.asarray(shape.half_extents_m)).all(axis=1)

@@ -1,14 +1,14 @@
-"""A detector is blind after a count: within a pulse the first photon hides later ones, and those of further pulses.
+"""Pile-up: dead time after a count hides later photons of the same pulse and of further pulses.
 
 Every photon falls into one of a ray's P pulses, each as likely as the others. A pulse in which nothing was counted
 within the dead time before is alive; in it, the photon is counted. Light that is not synchronous with the pulses, and
 counts before the window opens, blind nobody: the detector is armed at the window's start.
 
-What it could change (`bound`), as echoes are shifted towards their start, thinned, or hidden by what came before: what
-is left of the echo (see `Blindness`) strays, and is missed or mistaken, as fewer photons do: bounds grow by the
-difference. Nothing of this can be where no pulse has two counts: lost is at most the expected number of counts that are
-not there. Echoes are those that the air leaves, and haze is part of what they are mistaken for. Without an echo,
-background that is uneven is taken for one more often than is allowed, and haze less often than without.
+Bound of its effect (`bound`), as echoes are shifted towards their start, thinned, or hidden by earlier counts: the
+rest of the echo (see `Blindness`) is missed or mistaken, and its range errs, as with fewer photons; the bound is the
+difference. Only pulses with two counts lose any: the lost share is at most the expected number of missing counts.
+Echoes are attenuated by the air, and may be mistaken for haze. Without an echo, uneven background is taken for one more
+often than the false-alarm rate, and haze less often than without dead time.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 def survive_dead_time(
     counts: np.ndarray, bins: Bins, photons: Photons, rays: int, key: int, first_ray: int
 ) -> np.ndarray:
-    """The photons that are counted among those that arrive, flat as `bins` says.
+    """Counted photons per bin among those that arrive, flat with the offsets of `bins`.
 
     Arguments:
         counts: Arriving photons per bin, over all pulses of a frame.
-        bins: Of N rays.
-        photons: Its dead time and its pulses.
-        rays: How many rays share the pulses.
-        key: Of this effect's random numbers.
+        bins: Bins of N rays.
+        photons: The detector's dead time and pulses.
+        rays: Number of rays that share the pulses.
+        key: Key of this effect's random numbers.
         first_ray: Index of the first of the N rays.
     """
     if photons.dead_s == 0:
@@ -49,24 +49,24 @@ def survive_dead_time(
     pulses = max(round(photons.pulses(rays)), 1)
     dead_bins = metres(photons.dead_s) / bins.width_m
     period_bins = metres(1 / photons.repetition_hz) / bins.width_m
-    # compiled loops, which bounds do without
+    # compiled on import, which bounds do not need
     from lidardesign.simulate.detector.dead_time import count_alive
 
     return count_alive(counts, bins.offset, pulses, dead_bins, period_bins, np.uint64(key), first_ray)
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
-    """Why it is never blind, if so."""
+    """Reason why pile-up changes nothing, or None."""
     if detector.photons is None:
         return "the detector does not count photons"
     return None if detector.photons.dead_s > 0 else "the detector has no dead time"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """Of counts that blind it."""
+    """Bound of the effect of dead time."""
     sigma_m, blind = first_hits.sigma_m(), Blindness.of(counts)
     squared = (sigma_m * blind.early) ** 2 + variance_of_missing(counts, counts.in_air, blind.left, sigma_m)
-    # How much more often what is left of an echo is missed or mistaken
+    # Increase of the probability that the rest of an echo is missed or mistaken
     per_bin, haze = counts.per_bin, [counts.pulses * part for part in counts.haze_per_pulse]
     gone = counts.in_air - blind.left + counts.pulse_bins * per_bin * (1 - blind.under)
     squared += np.clip(gone, 0.0, 1.0) * counts.level_m2
@@ -86,7 +86,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
 
 
 def _invented(counts: Counts, blind: Blindness) -> np.ndarray:
-    """How much more or less often background is taken for a return; not at all where none of it is gone, (N,)."""
+    """Bound of the change of the probability that background is taken for a return, shape (N,)."""
     stray = counts.pulses * counts.haze_per_pulse[0] + counts.leaked(counts.first_hits.sigma_m())
     gone = (counts.per_bin * counts.bins + stray) * (1 - blind.level)
     return np.minimum(unevenness(counts, blind) - np.expm1(-stray), np.minimum(gone, 1.0))

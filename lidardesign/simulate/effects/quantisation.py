@@ -1,8 +1,8 @@
-"""Times are rounded to bins, which start with the gate or with the pulse: an error spread evenly over a bin.
+"""Quantisation: times are rounded to bins that start with the gate or with the pulse, a uniform error over a bin.
 
-What it could change (`bound`): its rms is bin / sqrt(12), as ranges lie anywhere in a bin, or what rounding does to the
-ranges of first hits where that is more: where all of them lie at one place of their bin it may be half a bin. The
-highest bin of other bins is another one, and background makes other peaks in them, or none.
+Bound of its effect (`bound`): its rms is bin / sqrt(12), as ranges lie anywhere in a bin, or the rounding error of the
+first hits where that is larger: half a bin where all of them lie at the same place in their bins. Other bins also
+change which bin is the highest and which peaks background makes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 
 
 def round_to_bins(path_m: np.ndarray, windows_m: np.ndarray, detector: Detector) -> np.ndarray:
-    """Half paths (N,) at the centre of the part of their bin that lies in their window (N, 2) [m], NaN kept."""
+    """Half paths (N,) rounded to the centre of the part of their bin in their window (N, 2) [m]; NaN is kept."""
     if detector.bin_m is None:
         return path_m
     low, high = ends_of_bins(path_m, windows_m, detector)
@@ -28,12 +28,12 @@ def round_to_bins(path_m: np.ndarray, windows_m: np.ndarray, detector: Detector)
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
-    """Why nothing is rounded, if so."""
+    """Reason why nothing is rounded, or None."""
     return None if detector.bin_m else "the detector has no bins"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """bin^2 / 12 for every ray, or what rounding does to the first hits of its list."""
+    """Bound of the effect of rounding: bin^2 / 12, or the mean over first hits of the ray's list if larger."""
     bin_m, row = first_hits.detector.bin_m, first_hits.row
     rounded_m2 = np.bincount(row, first_hits.rounding_m**2 * first_hits.returned)
     squared = np.maximum(bin_m**2 / 12, safe_divide(rounded_m2, np.bincount(row, first_hits.returned)))[row]

@@ -1,10 +1,10 @@
-"""A receiver that stands elsewhere may not see what the emitter lights.
+"""Occlusion between lit points and a bistatic receiver.
 
-It sees lit points in its view with nothing in between, or nothing but glass.
+The receiver sees lit points in its field of view along an unobstructed line of sight, or one obstructed only by glass.
 
-What it could change (`bound`): what the receiver sees of each point is not known without casting a ray there, so every
-return may be lost. Where a ray starts at the receiver the two see the same, and only what lies outside of the
-receiver's own view is lost, exactly.
+Bound of its effect (`bound`): occlusion of a point is not known without casting a ray from the receiver, so every
+return may be lost. A ray that starts at the receiver has the same line of sight both ways: it loses exactly the points
+outside the receiver's field of view.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from lidardesign.simulate.detector.physics import Detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 
-# Closed forms round at 1e-15 of a distance or so; this clears a surface and is far below the thickness of any pane.
+# Closed forms round at about 1e-15 of a distance; this clears a surface and is far below the thickness of any pane.
 CLEARANCE_SHARE = 1e-5
-# Hits on meshes are exact to float32, up to 1e-6 of their radius from as far away as Embree is asked: twice that.
+# Hits on meshes are exact to float32, up to 1e-6 of the mesh radius; this is twice that.
 MESH_CLEARANCE_SHARE = 2 * COARSE_SLACK
 # A line of sight through more surfaces than this counts as blocked.
 MAXIMUM_SURFACES = 8
@@ -35,11 +35,11 @@ _mesh_radii_m: WeakKeyDictionary[Scene, float] = WeakKeyDictionary()
 
 
 def clearance_m(scene: Scene, distance_m: np.ndarray) -> np.ndarray:
-    """How far off a surface a ray starts or ends, so that rounding does not let it meet that surface again.
+    """Distance from a surface at which rays start or end, so that rounding causes no second hit, shape (N,) [m].
 
     Arguments:
-        scene: Its meshes are as coarse as they are large.
-        distance_m: How far the ray has gone so far, shape (N,) [m].
+        scene: Its largest mesh sets the rounding error of hits.
+        distance_m: Length of the ray so far, shape (N,) [m].
     """
     if scene not in _mesh_radii_m:
         # Half the diagonal around what is traced as one: each moving mesh, or all that rest [m]
@@ -60,10 +60,10 @@ def clearance_m(scene: Scene, distance_m: np.ndarray) -> np.ndarray:
 def sight_shares(
     scene: Scene, points: np.ndarray, normal: np.ndarray, time_s: np.ndarray, tracer: Tracer
 ) -> np.ndarray:
-    """The share of the light of surface points (N, 3) that comes straight to the receiver, shape (N,).
+    """Transmittance of the line of sight from surface points (N, 3) to the receiver, shape (N,).
 
-    0 outside its field of view or range, and behind anything; a transparent surface in between lets its transmission
-    through. Sight ends a clearance above the surface, so that surfaces that touch the lit one do not hide it.
+    0 outside its field of view or range and behind opaque surfaces; transparent ones multiply it by their transmission.
+    The line ends a clearance above the surface, so that surfaces that touch the lit one do not hide it.
 
     Arguments:
         scene: Its receiver and its bodies' transmissions.
@@ -96,13 +96,13 @@ def sight_shares(
 
 
 def visible_echoes(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, tracer: Tracer) -> Echoes:
-    """The direct echoes that reach the scene's receiver, those behind glass fainter; all of them without a receiver.
+    """The direct echoes that reach the scene's receiver, attenuated by glass; all of them without a receiver.
 
     Arguments:
         scene: Its receiver and its bodies' transmissions.
         beams: Beams of light, B of them.
-        hits: What they meet first.
-        echoes: One for each of those hits, in their order.
+        hits: First hits of the beams.
+        echoes: One echo for each of these hits, in their order.
         tracer: First hits of any rays at any time within the frame.
     """
     if scene.receiver is None:
@@ -110,7 +110,7 @@ def visible_echoes(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, trace
     seen = np.flatnonzero(hits.body >= 0)
     points = beams.origin_m[seen] + hits.range_m[seen, None] * beams.direction[seen]
     share = in_view(scene.receiver, points).astype(np.float64)
-    # what starts at the receiver finds its way back open: nothing was in its way out
+    # a ray that starts at the receiver returns along its own unobstructed path
     apart = (beams.origin_m[seen] != np.asarray(scene.receiver.origin_m)).any(axis=1)
     rows = seen[apart]
     share[apart] = sight_shares(scene, points[apart], hits.normal[rows], beams.time_s[rows], tracer)
@@ -118,12 +118,12 @@ def visible_echoes(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, trace
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
-    """Why all that is lit is seen, if so."""
+    """Reason why the receiver sees all lit points, or None."""
     return None if scene.receiver is not None else "every ray is received where it starts"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """Of points that the receiver does not see."""
+    """Bound of the effect of occlusion between lit points and the receiver."""
     receiver, rays = first_hits.scene.receiver, first_hits.rays
     together = (rays.origin_m == np.asarray(receiver.origin_m)).all(axis=1)
     points = rays.origin_m + first_hits.range_m[:, None] * rays.direction

@@ -1,18 +1,17 @@
-"""Mirrors and glass lead light elsewhere: what it meets there comes back later, and fainter.
+"""Mirrors and glass: echoes by way of specular reflection and transmission, later and fainter than direct ones.
 
 At every surface a beam goes on twice, mirrored with the share `specular` and straight on with the share `transmission`;
-nothing is drawn at random. What it meets sends light back. A ray that is received at its own origin is received through
-the pixel that it was sent from, so its light comes back the way it went and meets every mirror and pane twice: an
-emitter behind a mirror is its image there, and an echo is that of the image, times the square of the share that went
-out. A fixed receiver elsewhere receives a lit surface straight, through glass but by no mirror; rays that start where
-it stands are received as without one. Mirrors are flat over the width of a beam: curved ones neither gather nor spread
-it. Panes do not bend light. A mirror that a beam meets squarely enough to shine back into the receiver is not taken for
-an echo.
+nothing is drawn at random. Surfaces that it hits send light back. A ray that is received at its own origin is received
+through the pixel that it was sent from, so its light returns along the same path and meets every mirror and pane twice:
+an emitter behind a mirror is its image there, and an echo is that of the image, times the square of the share that
+arrives. A fixed receiver elsewhere sees a lit surface directly, through glass but by no mirror; rays that start at the
+receiver are received as without one. Mirrors are flat over the width of a beam: curved ones neither focus nor spread
+it. Panes do not refract light. A specular reflection straight back into the receiver makes no echo.
 
-What it could change (`bound`): what they lead elsewhere may meet anything, so every ray that they meet may be wrong.
-Lost is the share of rays whose first hit is on a body that mirrors or lets through, and what else comes back of them
-may move their echoes by as much as the detector does not tell apart; the others are as they were. It bounds strictly:
-where that light goes is not known without following it, and how much it weighs is not asked.
+Bound of its effect (`bound`): redirected light may hit anything, so every ray that hits such a body may be wrong. Lost
+is the share of rays whose first hit is on a body that mirrors or transmits, and redirected light may move their echoes
+by the detector's resolution; other rays are unchanged. The bound is strict: the redirected light is neither followed
+nor weighed.
 """
 
 from __future__ import annotations
@@ -31,25 +30,25 @@ from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.effects.shadowing import clearance_m, sight_shares
 
-# Beams that have met more surfaces than this are given up: four panes, in and out.
+# Beams end after this many surfaces: four panes, in and out.
 MAXIMUM_TURNS = 8
-# Beams of less than this share of their light are given up: both ways, a millionth of it comes back.
+# Beams end below this share of their light: both ways, a millionth of it comes back.
 FAINTEST_SHARE = 1e-3
-# Beams that are followed at once: each may become 2^8, at 200 bytes and more.
+# Beams that are followed together: each may become 2^8, at 200 bytes and more.
 BEAMS_AT_ONCE = 1 << 14
-# Where a beam grazes a surface, it is followed from at most this many clearances further on.
+# Largest step along a grazing beam off its surface, in clearances.
 GRAZING_STEPS = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Front:
-    """Beams on their way, unfolded: each starts at the image of its emitter and runs straight to where it is now.
+    """Unfolded beams: each starts at the image of its emitter and runs straight to its present hit.
 
     Arguments:
-        beams: Images of the emitter and directions from there, any order of rays; shares are of what is left.
-        number: Which of the beams that left the emitter each comes from, shape (B,).
-        passed: What is left of a beam's light, between 0 and 1, shape (B,).
-        hits: What they meet, ranges from the image on.
+        beams: Origins at the images of the emitter, directions and remaining shares of light, in any order of rays.
+        number: Index of the emitted beam that each comes from, shape (B,).
+        passed: Remaining share of a beam's light, between 0 and 1, shape (B,).
+        hits: Hits, with ranges from the images.
     """
 
     beams: Beams
@@ -63,7 +62,7 @@ class _Front:
 
 
 def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
-    """Echoes of all that beams meet after mirrors and glass, up to `MAXIMUM_TURNS` of them.
+    """Echoes of surfaces that beams hit after up to `MAXIMUM_TURNS` mirrors and panes.
 
     Arguments:
         scene: Its bodies' shares of light, and its receiver.
@@ -75,7 +74,7 @@ def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
 
 
 def _groups(beams: Beams) -> Iterator[slice]:
-    """The beams of so many whole rays that what they split into fits into memory."""
+    """Slices of beams of whole rays, small enough that the beams that they split into fit into memory."""
     rays = beams.ray[-1] + 1 if len(beams) else 0
     step = max(BEAMS_AT_ONCE * rays // max(len(beams), 1), 1)
     edges = np.searchsorted(beams.ray, np.arange(0, rays + step, step))
@@ -88,7 +87,7 @@ def _detours_of(scene: Scene, beams: Beams, hits: Hits, rows: slice, tracer: Tra
     front = _Front(beams, np.arange(len(beams)), np.ones(len(beams)), hits).subset(rows)
     echoes = [_no_echoes()]
     for _ in range(MAXIMUM_TURNS):
-        # after a mirror, v - 2 (v.n) n; anything where nothing was hit
+        # mirrored direction v - 2 (v.n) n; arbitrary on a miss
         direction, normal = front.beams.direction, front.hits.normal
         back = direction - 2 * np.einsum("nk,nk->n", direction, normal)[:, None] * normal
         turned = _followed(scene, front, mirrored, back, tracer)
@@ -106,7 +105,7 @@ def _detours_of(scene: Scene, beams: Beams, hits: Hits, rows: slice, tracer: Tra
 
 
 def _followed(scene: Scene, front: _Front, shares: np.ndarray, direction: np.ndarray, tracer: Tracer) -> _Front:
-    """What beams that go on from their hits with a body's share (bodies,), in directions (B, 3), meet next."""
+    """Continue beams from their hits in directions (B, 3), with the bodies' shares (bodies,), to their next hits."""
     passed = np.where(front.hits.body >= 0, shares[front.hits.body] * front.passed, 0.0)
     rows = np.flatnonzero(passed >= FAINTEST_SHARE)
     old, direction = front.subset(rows), direction[rows]
@@ -142,7 +141,7 @@ def _received_back(scene: Scene, front: _Front) -> Echoes:
 
 
 def _received_elsewhere(scene: Scene, front: _Front, tracer: Tracer) -> Echoes:
-    """Straight from what is lit, by a fixed receiver."""
+    """Echoes that a fixed receiver gets directly from lit surfaces."""
     echoes = direct_echoes(scene, front.beams, front.hits)
     point = front.beams.origin_m + front.hits.range_m[:, None] * front.beams.direction
     share = sight_shares(scene, point, front.hits.normal, front.beams.time_s, tracer)
@@ -154,12 +153,12 @@ def _no_echoes() -> Echoes:
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
-    """Why light is led nowhere else, if so."""
+    """Reason why mirrors and glass change nothing, or None."""
     return None if any(_leads(body) for body in scene.bodies) else "nothing mirrors or lets light through"
 
 
 def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
-    """Of light that goes on."""
+    """Bound of the effect of mirrors and glass."""
     leading = np.array([_leads(body) for body in first_hits.scene.bodies])
     met = np.where(first_hits.hits.body >= 0, leading[first_hits.hits.body], False)
     names = ", ".join(dict.fromkeys(body.name for body in first_hits.scene.bodies if _leads(body)))

@@ -1,1 +1,1 @@
-"""Light that comes back by way of other surfaces, rendered in a process of its own."""
+"""Multipath light: an upper bound, and a light-transport simulator in a process of its own."""

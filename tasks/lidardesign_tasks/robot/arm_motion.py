@@ -1,4 +1,4 @@
-"""Pick-and-place motion: way-points, minimum-jerk timing, inverse kinematics, and what is rejected."""
+"""Pick-and-place motion: way-points, minimum-jerk timing, inverse kinematics, and rejection of infeasible motions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lidardesign_tasks.robot.motion import minimum_jerk
 HOVER_M = np.array([0.5, 0.0, 0.35])
 PICK_M = np.array([0.45, -0.35, 0.15])
 PLACE_M = np.array([0.45, 0.35, 0.15])
-LIFT_M = (0.12, 0.20)  # the ball is carried so far above the points where it is picked and placed
+LIFT_M = (0.12, 0.20)  # height at which the ball is carried above the pick and place points
 FINAL_DESCENT_M = 0.05
 LOWEST_M = BALL_RADIUS_M + 0.01
 CLEARANCE_M = 0.07  # between the highest point of the arm and the ceiling
@@ -29,18 +29,18 @@ STEPS_PER_WAYPOINT = 3
 FIRST_STEPS = 60  # the first way-point is reached from the home posture
 POSITION_RESIDUAL_M = 1e-3
 TILT_RESIDUAL_RAD = math.radians(0.5)
-POSTURE_COST = 1e-2  # settles elbow and yaw, far below the costs of 1 per m and per rad of the ball's pose
+POSTURE_COST = 1e-2  # determines elbow and yaw, far below the costs of 1 per m and per rad of the ball's pose
 LARGEST_TURN_RAD_S = math.radians(135)  # of the fastest joint in the arm's data sheet
 PENETRATION_M = 5e-3
 TRIES = 50
 
 
 class RejectedError(Exception):
-    """A drawn motion that the arm cannot do; the message is the reason that is counted."""
+    """A drawn motion that the arm cannot perform; reasons are counted by message."""
 
 
 def import_mink() -> Any:
-    """mink, inverse kinematics for MuJoCo; raises ConfigError where it is missing."""
+    """Import mink, inverse kinematics for MuJoCo; raises ConfigError where it is missing."""
     try:
         return import_module("mink")
     except ImportError as error:
@@ -56,11 +56,11 @@ class Motion:
     """One pick-and-place cycle.
 
     Arguments:
-        time_s: Of each frame, shape (F,).
+        time_s: Times of the frames, shape (F,).
         joints_rad: Joint angles, shape (F, 7).
         ball_m: The ball's centre by forward kinematics [m], shape (F, 3).
         links: Poses of the bodies of the robot's links, shape (L, F, 4, 4).
-        rejected: How many drawn motions were rejected before this one, by reason.
+        rejected: Number of drawn motions that were rejected before this one, by reason.
     """
 
     time_s: np.ndarray
@@ -90,7 +90,7 @@ def phase_shares(waypoints: np.ndarray) -> np.ndarray:
 
 
 def ball_path(waypoints: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Where the ball should be at shares of the time, (N,) to (N, 3) [m]."""
+    """Positions of the ball at shares of the time, (N,) to (N, 3) [m]."""
     ends = phase_shares(waypoints)
     phase = np.clip(np.searchsorted(ends, share, side="right") - 1, 0, len(ends) - 2)
     along = minimum_jerk((share - ends[phase]) / (ends[phase + 1] - ends[phase]))
@@ -98,7 +98,7 @@ def ball_path(waypoints: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 class Arm:
-    """The arm that moves: a robot with the state that inverse kinematics needs."""
+    """A robot arm with the state for inverse kinematics."""
 
     def __init__(self, robot: Robot, ceiling_m: float) -> None:
         self.robot, self.mink, self.mujoco = robot, import_mink(), import_mujoco()
@@ -113,10 +113,10 @@ class Arm:
         self.bodies = np.array([link.body for link in robot.links])
 
     def draw(self, jitter_m: float, frames: int, rate_hz: float, generator: np.random.Generator, name: str) -> Motion:
-        """A motion that the arm can do; drawn again until it can.
+        """Draw motions until the arm can perform one.
 
         Raises:
-            DataError: None of `TRIES` motions can be done.
+            DataError: The arm can perform none of `TRIES` motions.
         """
         rejected: Counter[str] = Counter()
         for _ in range(TRIES):
@@ -141,7 +141,7 @@ class Arm:
         return Motion(time_s, joints, ball, links, rejected)
 
     def _solve(self, waypoints: np.ndarray, frames: int) -> np.ndarray:
-        """Joint angles of all frames, shape (F, 7), by way of places at most `MAX_STEP_M` apart."""
+        """Joint angles of all frames, shape (F, 7), solved at positions at most `MAX_STEP_M` apart."""
         share = np.linspace(0.0, 1.0, frames)
         places = ball_path(waypoints, share)
         self.configuration.update(self.robot.home_rad)
@@ -220,7 +220,7 @@ class Arm:
 
 
 def _pointing_down(rotation: np.ndarray) -> np.ndarray:
-    """The rotation with the third axis straight down whose first axis is nearest to the one given."""
+    """Rotation with the third axis straight down and the first axis nearest to the given one's, shape (3, 3)."""
     first = np.array([rotation[0, 0], rotation[1, 0], 0.0])
     if not first.any():
         first = np.array([1.0, 0.0, 0.0])
@@ -230,8 +230,7 @@ def _pointing_down(rotation: np.ndarray) -> np.ndarray:
 
 
 def highest_m(shape: Shape, poses: np.ndarray) -> float:
-    """At least the height of a shape's highest point over its poses (F, 4, 4); by a box around it, if it is no ball or
-    capsule [m]."""
+    """Upper bound of the height of a shape over its poses (F, 4, 4), exact for balls and capsules [m]."""
     middle, up = poses[:, 2, 3], poses[:, 2, :3]
     if isinstance(shape, Sphere | Capsule):
         along_m = shape.half_length_m if isinstance(shape, Capsule) else 0.0

@@ -18,7 +18,7 @@ from lidardesign_tasks.robot.targets import without_notes
 if TYPE_CHECKING:
     import mujoco
 
-VISUAL_GROUP = 2  # MuJoCo Menagerie's convention: what is seen is in group 2, what collides in group 3
+VISUAL_GROUP = 2  # MuJoCo Menagerie's convention: visual geoms in group 2, collision geoms in group 3
 GROUPS = 6  # of MuJoCo
 BALL, TOOL = "lidardesign_ball", "lidardesign_tool"
 JOINTS = 7
@@ -37,9 +37,9 @@ class Robot:
 
     Arguments:
         model: The MuJoCo model, with the tool, the ball and a site `BALL` at the ball's centre.
-        links: What is seen of it, the tool last.
+        links: Its visible pieces without the ball, the tool last.
         home_rad: A comfortable posture, shape (7,).
-        notes: What reading it left out or mended, one line each.
+        notes: Repairs and omissions of reading, one line each.
     """
 
     model: mujoco.MjModel
@@ -49,11 +49,11 @@ class Robot:
 
 
 def load_robot(path: Path | None, tool_m: float) -> Robot:
-    """The arm of an MJCF file, or the embedded one, read once per process while its files stay the same.
+    """Read the arm of an MJCF file, or the embedded one, once per process while its files stay the same.
 
     Arguments:
         path: The file; None takes the embedded arm of primitive links.
-        tool_m: From the flange to the ball's centre [m].
+        tool_m: Distance from the flange to the ball's centre [m].
 
     Raises:
         DataError: The file cannot be used: missing, no MJCF, files outside its folder, no chain of 7 hinges.
@@ -67,7 +67,7 @@ def load_robot(path: Path | None, tool_m: float) -> Robot:
 
 @lru_cache(maxsize=4)
 def _read_once(path: Path, states: tuple[FileState, ...], tool_m: float) -> Robot:
-    """`states`, of all files of the model, only tells a changed model from the one in memory."""
+    """Read an arm; `states` of its files are part of the cache key, so that a changed model is read again."""
     model, warnings = load_model(path, edit=lambda spec: _add_tool(_flange(spec, path), tool_m))
     _check_chain(model, path)
     links, notes = seen_links(model, path)
@@ -75,9 +75,9 @@ def _read_once(path: Path, states: tuple[FileState, ...], tool_m: float) -> Robo
 
 
 def seen_links(model: mujoco.MjModel, path: Path) -> tuple[tuple[ModelGeom, ...], tuple[str, ...]]:
-    """What is seen of an arm without its ball, the tool last, and notes on what was mended or left out.
+    """Visible pieces of an arm without its ball, the tool last, and notes on repairs and omissions.
 
-    That is the visual group, or all geoms where only tool and ball are in it.
+    They are the geoms of the visual group, or all geoms where only tool and ball are in it.
 
     Raises:
         DataError: The arm has no visible shapes.

@@ -1,7 +1,7 @@
-"""What returns are worth to a robot's user: where targets are, their visible surface, or whether they are seen at all.
+"""Scores and information of the task `mujoco`: position, visible surface, or detection of targets.
 
-Returns on known bodies are told apart, as a robot knows where its own links are. What is neither known nor a target,
-and noise, is taken for the nearest target.
+Returns on known bodies are discarded, as the poses of a robot's own links are known. Returns on other bodies that are
+no targets, and false alarms, are taken for the nearest target.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ TRUTH_POINTS = 2000
 
 def with_truth(scene: Scene, model: Model, poses: np.ndarray, measure: Measure, metric: Metric, space: DesignSpace,
                generator: np.random.Generator) -> Scene:  # fmt: skip
-    """The scene with all that it is judged by."""
+    """The scene with its ground truth."""
     target_of = np.full(len(model.pieces) + 1, -1)  # of the body -1, too
     for number, target in enumerate(model.targets):
         target_of[target.pieces] = number
@@ -53,7 +53,7 @@ def score(scene: Scene, returns: Sequence[Returns]) -> Score:
 
 
 def informs(scene: Scene, returns: Sequence[Returns]) -> Information:
-    """What returns tell of a scene by its own measure."""
+    """Information of returns by the scene's own measure."""
     return _INFORMS[scene.truth["measure"]](scene, [_told_apart(scene, one) for one in returns])
 
 
@@ -65,7 +65,7 @@ def _told_apart(scene: Scene, one: Returns) -> Returns:
 
 
 def _taken_for(scene: Scene, one: Returns) -> tuple[np.ndarray, np.ndarray]:
-    """The target that each ray's return is taken for, -1 without one, (N,), and how far it is if mistaken [m], (N,)."""
+    """Target that each ray's return is taken for, -1 without one, and its distance if mistaken [m], shapes (N,)."""
     target, off_m = np.where(one.returned, scene.truth["target_of"][one.body], -1), np.zeros(len(one.rays))
     mistaken = one.returned & (target < 0)
     points = one.points_m[mistaken[one.returned]]
@@ -75,7 +75,7 @@ def _taken_for(scene: Scene, one: Returns) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _position_score(scene: Scene, returns: Sequence[Returns]) -> Score:
-    """The mean, over targets and frames, of how far the mean of a target's returns is from its middle [m]."""
+    """Mean position error over targets and frames, of the mean of a target's returns from its centre [m]."""
     metric, places_m = scene.truth["metric"], scene.truth["places_m"]
     taken = [_taken_for(scene, one)[0] for one in returns]
     errors_m, seen = np.full(places_m.shape[:2], metric.worst), []
@@ -98,7 +98,7 @@ def _position_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
 
 
 def _seen(scene: Scene, returns: Sequence[Returns]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """By frame, the rays with a return on a target, and its number."""
+    """Rays with a return on a target, and the target's index, for each frame."""
     found = [(one.returned & (scene.truth["target_of"][one.body] >= 0), one.body) for one in returns]
     return [(np.flatnonzero(hit), scene.truth["target_of"][body[hit]]) for hit, body in found]
 
@@ -110,7 +110,7 @@ def _seen_score(scene: Scene, returns: Sequence[Returns]) -> Score:
 
 
 def _seen_informs(scene: Scene, returns: Sequence[Returns]) -> Information:
-    """Every return on a target tells all about its own frame."""
+    """Full information of every return on a target about its own frame."""
     targets, hits = len(scene.truth["places_m"]), _seen(scene, returns)
     ray = np.concatenate([ray for ray, _ in hits])
     item = np.concatenate([frame * targets + target for frame, (_, target) in enumerate(hits)])
@@ -123,15 +123,15 @@ def _bodies(scene: Scene) -> list[np.ndarray]:
 
 
 def _is_hidden(scene: Scene) -> bool:
-    """Whether no sensor can see a target in any frame, as behind the robot."""
+    """True if no sensor can see a target in any frame, as behind the robot."""
     try:
         return scene.truth[SURFACES] is None
-    except DataError:  # so the truth says it
+    except DataError:  # raised by the truth
         return True
 
 
 def _surface_score(scene: Scene, returns: Sequence[Returns]) -> Score:
-    """As of any moving surface; the worst value where it is hidden."""
+    """Score of a moving surface; the worst value where it is hidden."""
     metric = scene.truth["metric"]
     return Score(metric.worst, failed=True) if _is_hidden(scene) else moving_score(metric, scene, returns)
 

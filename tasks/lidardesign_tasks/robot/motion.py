@@ -1,4 +1,4 @@
-"""How a robot moves in each scene: windows of recordings, ways through keyframes, or random ways free of collisions."""
+"""Motion of a robot in each scene: windows of recordings, paths through keyframes, or random collision-free paths."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from lidardesign_tasks.robot.recordings import Recording
 if TYPE_CHECKING:
     import mujoco
 
-SPLIT_SEED = 0  # of which recordings are held out, whatever the seed of a run
+SPLIT_SEED = 0  # of the choice of held-out recordings, for all seeds of runs
 MOVE_S = 1.0  # from one configuration to the next
-FINEST_HZ = 100.0  # of the way through keyframes
-TRIES, NEARER = 40, 0.85  # a configuration that collides is drawn again, each time nearer to the one at rest
-DEPTH_M = 1e-3  # bodies that are less in each other touch
+FINEST_HZ = 100.0  # of the path through keyframes
+TRIES, NEARER = 40, 0.85  # a configuration that collides is drawn again, each time nearer to rest
+DEPTH_M = 1e-3  # smaller penetrations are contacts, no collisions
 LIFTS, CHECKS = 4, 8
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """One scene's motion.
+    """Motion of a scene.
 
     Arguments:
-        name: Of the scene.
-        group: What was drawn independently: the recording, or the part of one.
+        name: Name of the scene.
+        group: Name of the independent draw: the recording, or the part of one.
         qpos: Joint configurations, shape (F, nq).
     """
 
@@ -41,7 +41,7 @@ class Trajectory:
 
 
 def minimum_jerk(share: np.ndarray) -> np.ndarray:
-    """The share of the way [0, 1] at a share of the time: rest to rest with the least integrated squared jerk.
+    """Share of the path [0, 1] at shares of the time: from rest to rest with the least integrated squared jerk.
 
     Flash and Hogan, The coordination of arm movements, Journal of Neuroscience 5 (1985).
     """
@@ -50,7 +50,7 @@ def minimum_jerk(share: np.ndarray) -> np.ndarray:
 
 
 def joined(model: mujoco.MjModel, start: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """The smooth way between two configurations (nq,) at shares (F,) of its time, shape (F, nq)."""
+    """Minimum-jerk path between two configurations (nq,) at shares (F,) of its time, shape (F, nq)."""
     mujoco, way = import_mujoco(), np.zeros(model.nv)
     mujoco.mj_differentiatePos(model, way, 1.0, start, end)
     found = np.tile(start, (len(share), 1))
@@ -60,7 +60,7 @@ def joined(model: mujoco.MjModel, start: np.ndarray, end: np.ndarray, share: np.
 
 
 def keyframes(model: mujoco.MjModel, where: str) -> Recording:
-    """A way through all keyframes of a model, in their order and back to the first.
+    """Path through all keyframes of a model, in their order and back to the first.
 
     Raises:
         DataError: It has less than two.
@@ -77,7 +77,7 @@ def keyframes(model: mujoco.MjModel, where: str) -> Recording:
 
 
 def spans(recordings: Sequence[Recording], split: Split) -> list[tuple[Recording, float, float]]:
-    """The recordings of a split with the first and last moment that it may show [s].
+    """Recordings of a split with the first and last time of their part in it [s].
 
     Half of several recordings is held out; of one, its second half.
     """
@@ -91,7 +91,7 @@ def spans(recordings: Sequence[Recording], split: Split) -> list[tuple[Recording
 
 
 def window_frames(recordings: Sequence[Recording], frames: int, rate_hz: float) -> int:
-    """How many frames a window has: those asked for, or what fits into the shortest part that a split shows."""
+    """Number of frames in a window: at most `frames`, and at most those of the shortest part of a split."""
     shortest_s = min(last - first for split in ("train", "test") for _, first, last in spans(recordings, split))
     return min(frames, int(shortest_s * rate_hz) + 1)
 
@@ -100,9 +100,9 @@ def windows(
     model: mujoco.MjModel, recordings: Sequence[Recording], split: Split, count: int, frames: int, rate_hz: float,
     seed: int,
 ) -> list[Trajectory]:  # fmt: skip
-    """So many windows of a split's recordings, in turn, that begin at random moments; see `spans`."""
+    """`count` windows of a split's recordings, in turn, that begin at random times; see `spans`."""
     frames, shown = window_frames(recordings, frames, rate_hz), spans(recordings, split)
-    # few windows of many recordings are of others with every seed
+    # a few windows of many recordings show others with every seed
     order = random_generator(seed, "mujoco", split, "order").permutation(len(shown))
     length_s, found = (frames - 1) / rate_hz, []
     for index in range(count):
@@ -117,9 +117,9 @@ def windows(
 
 
 class Wanderer:
-    """Random ways of a model that do not collide; contacts that it has at rest are no collisions.
+    """Random collision-free paths of a model; contacts that it has at rest are no collisions.
 
-    What stands free is raised out of the ground.
+    Free bodies are raised out of the ground.
     """
 
     def __init__(self, model: mujoco.MjModel, where: str) -> None:
@@ -139,10 +139,10 @@ class Wanderer:
         self.allowed = self._contacts(rest)
 
     def draw(self, frames: int, rate_hz: float, generator: np.random.Generator) -> np.ndarray:
-        """A way of so many frames from rest to rest, a configuration per `MOVE_S`, shape (F, nq).
+        """Draw a path of `frames` frames through a random configuration per `MOVE_S`, shape (F, nq).
 
         Raises:
-            DataError: No way without collisions was found.
+            DataError: No path without collisions was found.
         """
         time_s = np.arange(frames) / rate_hz
         moves = max(1, math.ceil(time_s[-1] / MOVE_S))
@@ -156,7 +156,7 @@ class Wanderer:
         return found
 
     def _next(self, here: np.ndarray, share: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        """A way to a random configuration that is free at all shares of its time, and so is the one from rest to it."""
+        """Path to a random configuration without collisions at shares of its time, reachable from rest without any."""
         for attempt in range(TRIES):
             there = self._configuration(NEARER**attempt, generator)
             way = self._way(here, there, share)
@@ -168,7 +168,7 @@ class Wanderer:
         )  # fmt: skip
 
     def _configuration(self, reach: float, generator: np.random.Generator) -> np.ndarray:
-        """Joints anywhere within a share of their limits around rest; what is free, or slides without end, rests."""
+        """Random joints within a share of their limits around rest; free bodies and unlimited slides rest."""
         model, qpos = self.model, self.rest.copy()
         low, high = model.jnt_range[self.limited].T
         places, turning = model.jnt_qposadr[self.limited], model.jnt_qposadr[self.turning]
@@ -190,7 +190,7 @@ class Wanderer:
         return all(self._contacts(qpos) <= self.allowed for qpos in way)
 
     def _lifted(self, qpos: np.ndarray) -> np.ndarray:
-        """The configuration with free bodies raised out of what stands in the world."""
+        """The configuration with free bodies raised out of fixed geometry."""
         model = self.model
         for _ in range(LIFTS if len(self.free) else 0):
             pairs, depth_m = self._inside(qpos)
@@ -203,11 +203,11 @@ class Wanderer:
         return qpos
 
     def _contacts(self, qpos: np.ndarray) -> set[tuple[int, int]]:
-        """Pairs of geoms that are in each other."""
+        """Pairs of geoms that penetrate each other."""
         return set(map(tuple, self._inside(qpos)[0].tolist()))
 
     def _inside(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of geoms that are in each other, (C, 2), and how deep, (C,) [m]."""
+        """Pairs of geoms that penetrate each other, (C, 2), and the depths, (C,) [m]."""
         self.data.qpos[:] = qpos
         with mujoco_warnings():
             self.mujoco.mj_fwdPosition(self.model, self.data)
@@ -219,7 +219,7 @@ class Wanderer:
 def wandering(
     model: mujoco.MjModel, split: str, count: int, frames: int, rate_hz: float, seed: int, where: str
 ) -> list[Trajectory]:
-    """So many random ways, each with a generator of its own."""
+    """`count` random paths, each with a generator of its own."""
     wanderer, found = Wanderer(model, where), []
     for index in range(count):
         qpos = wanderer.draw(frames, rate_hz, random_generator(seed, "mujoco", split, index))

@@ -1,4 +1,4 @@
-"""Joint positions over time: the columns of a model, and files that hold them."""
+"""Recorded joint positions over time, from CSV and NPZ files with the columns of a model."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TIME, ALL = "time_s", "qpos"
 PLACE, TURN = (".x", ".y", ".z"), (".qw", ".qx", ".qy", ".qz")
 ENDINGS = (".csv", ".npz")
 MOST_SHOWN = 12
-# How far recorded joints may be beyond their limits, as a share of what is between them: MuJoCo's own limits are soft.
+# Tolerated excess of recorded joints over their limits, as a share of the range: MuJoCo's own limits are soft.
 BEYOND_LIMIT = 0.05
 
 
@@ -35,9 +35,9 @@ class Recording:
     """Joint positions over time.
 
     Arguments:
-        name: Of the file, for people and for groups.
-        time_s: Ascending, shape (T,).
-        qpos: Joint configurations as MuJoCo orders them, shape (T, nq).
+        name: Name of the file, for messages and groups.
+        time_s: Ascending times, shape (T,).
+        qpos: Joint configurations in MuJoCo's order, shape (T, nq).
     """
 
     name: str
@@ -46,11 +46,11 @@ class Recording:
 
     @property
     def seconds(self) -> float:
-        """From its first to its last moment [s]."""
+        """Duration [s]."""
         return float(self.time_s[-1] - self.time_s[0])
 
     def at(self, model: mujoco.MjModel, time_s: np.ndarray) -> np.ndarray:
-        """Configurations (F, nq) at times (F,), linear in between; quaternions are made unit ones."""
+        """Configurations (F, nq) at times (F,), linearly interpolated; quaternions are normalised."""
         qpos = np.stack([np.interp(time_s, self.time_s, column) for column in self.qpos.T], axis=1)
         for start in turns(model):
             qpos[:, start : start + 4] /= np.linalg.norm(qpos[:, start : start + 4], axis=1, keepdims=True)
@@ -58,7 +58,7 @@ class Recording:
 
 
 def columns(model: mujoco.MjModel) -> list[str]:
-    """What each entry of `qpos` is called: a joint's name, of free ones with .x, .y, .z, and .qw to .qz of balls."""
+    """Names of the entries of `qpos`: joint names, with .x to .z and .qw to .qz if free, and .qw to .qz for balls."""
     kinds, names = import_mujoco().mjtJoint, []
     for joint in range(model.njnt):
         name = model.joint(joint).name or f"joint{joint}"
@@ -69,7 +69,7 @@ def columns(model: mujoco.MjModel) -> list[str]:
 
 
 def turns(model: mujoco.MjModel) -> list[int]:
-    """Where the quaternions of free joints and balls begin in `qpos`."""
+    """Indices in `qpos` at which quaternions of free joints and balls begin."""
     kinds = import_mujoco().mjtJoint
     shift = {int(kinds.mjJNT_FREE): 3, int(kinds.mjJNT_BALL): 0}
     pairs = zip(model.jnt_type.tolist(), model.jnt_qposadr.tolist(), strict=True)
@@ -77,10 +77,10 @@ def turns(model: mujoco.MjModel) -> list[int]:
 
 
 def read_recordings(model: mujoco.MjModel, path: Path, config: FolderConfig | None = None) -> list[Recording]:
-    """The recordings of a file, or of all files of a folder by name; of a configuration that keeps them, these.
+    """Read the recordings of a file, or of all files of a folder by name, or those that the configuration records.
 
     Raises:
-        DataError: There is none, one is gone, or one cannot be used: with file, column and what is allowed.
+        DataError: There is none, one is missing, or one cannot be used: with file, column and allowed values.
     """
     allowed = f"a file {' or '.join(ENDINGS)} or a folder of them"
     files = [path]
@@ -136,7 +136,7 @@ def _checked(model: mujoco.MjModel, path: Path) -> Recording:
 
 
 def _check_limits(model: mujoco.MjModel, qpos: np.ndarray, time_s: np.ndarray, path: Path) -> None:
-    """Hinges and slides stay within their limits; raises DataError for the first that does not."""
+    """Refuse hinges and slides beyond their limits; raises DataError for the first."""
     names = columns(model)
     for joint, place in enumerate(model.jnt_qposadr.tolist()):
         if not model.jnt_limited[joint] or names[place] not in (model.joint(joint).name, f"joint{joint}"):
@@ -154,7 +154,7 @@ def _check_limits(model: mujoco.MjModel, qpos: np.ndarray, time_s: np.ndarray, p
 
 
 def _continuous(quaternions: np.ndarray, name: str, path: Path) -> np.ndarray:
-    """Unit quaternions (T, 4) of which each has the sign that is nearer to the one before."""
+    """Unit quaternions (T, 4), each with the sign nearer to the one before."""
     largest = np.abs(quaternions).max(axis=1, keepdims=True)
     if not largest.all():
         raise DataError(f"a quaternion of {name.rpartition('.')[0]!r} is 0", where=str(path), allowed="other lengths")
@@ -165,7 +165,7 @@ def _continuous(quaternions: np.ndarray, name: str, path: Path) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _read(path: Path, changed_ns: int, size: int) -> Mapping[str, np.ndarray]:
-    """The columns of one file by name; space and both splits need it."""
+    """Read the columns of a file by name, cached as space and both splits need it."""
     if path.suffix.lower() == ".npz":
         return read_npz(path)
     (_, header), *rows = csv_rows(path, TABLE) or [(1, [])]
@@ -187,5 +187,5 @@ def _number(path: Path, name: str, line: int, cell: str) -> float:
 
 
 def listed(names: Sequence[str]) -> str:
-    """The first of many names."""
+    """The first of many names, as text."""
     return ", ".join(names[:MOST_SHOWN]) + (", ..." if len(names) > MOST_SHOWN else "")

@@ -1,4 +1,4 @@
-"""What of a model sensors are to find, what hides it, and where all of it is in the frames of a motion."""
+"""Targets, occluders and sensor mount of a MuJoCo model, and their poses in the frames of a motion."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ if TYPE_CHECKING:
     import mujoco
 
 OUTLINE_POINTS = 1000
-# How far a plane would count; no plane is a target.
+# Space that would limit planes; no plane is a target.
 NEAR = DesignSpace((0.0,) * 6, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
 Names = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A body of the model that sensors are to find.
+    """A target body of the model.
 
     Arguments:
-        name: Of the body.
-        body: Its number in the model.
-        pieces: Which of the model's pieces it is, shape (K,).
-        box_m: Corners of a box around it, in the body's frame, shape (8, 3).
-        depth_m: How far behind its returns its middle is expected, see `mean_depth_m`.
+        name: Name of the body.
+        body: Index of the body in the model.
+        pieces: Indices of its pieces in the model, shape (K,).
+        box_m: Corners of its bounding box in the body's frame, shape (8, 3).
+        depth_m: Expected distance of its centre behind its returns, see `mean_depth_m`.
     """
 
     name: str
@@ -53,15 +53,15 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A robot with all that stands around it, and what sensors are to find.
+    """A robot model with its surroundings, targets and sensor mount.
 
     Arguments:
         model: The MuJoCo model.
         pieces: Its visible pieces without the ignored ones.
-        targets: What sensors are to find.
-        known: Which pieces' returns are told apart, as those of a robot's own links, shape (pieces,).
-        mount: The number of the body that sensors are on; None: they stand in the world.
-        notes: What reading it mended or left out, one line each.
+        targets: The targets.
+        known: Mask of pieces whose returns are recognised, as those of a robot's own links, shape (pieces,).
+        mount: Index of the body that carries the sensors; None: sensors in the world.
+        notes: Repairs and omissions of reading, one line each.
     """
 
     model: mujoco.MjModel
@@ -72,7 +72,7 @@ class Model:
     notes: Names
 
     def poses(self, qpos: np.ndarray) -> np.ndarray:
-        """The poses (F, nbody, 4, 4) of all bodies in the frame of the mount, or in the world."""
+        """Poses of all bodies in the frame of the mount, or in the world, shape (F, nbody, 4, 4)."""
         poses = body_poses(self.model, qpos)
         if self.mount is not None:
             poses = inverse_rigid(poses[:, self.mount])[:, None] @ poses
@@ -89,15 +89,15 @@ class Model:
         )
 
     def places_m(self, poses: np.ndarray) -> np.ndarray:
-        """Where the middle of each target is, shape (targets, F, 3) [m]."""
+        """Centres of the targets' boxes, shape (targets, F, 3) [m]."""
         return self.corners_m(poses).mean(axis=2)
 
     def corners_m(self, poses: np.ndarray) -> np.ndarray:
-        """The corners of the box around each target, shape (targets, F, 8, 3) [m]."""
+        """Corners of the box around each target, shape (targets, F, 8, 3) [m]."""
         return np.stack([_moved(target.box_m, poses[:, target.body]) for target in self.targets])
 
     def mount_top_m(self) -> np.ndarray:
-        """The middle of the top of the mount's geometry in its own frame, shape (3,); its origin if it has none."""
+        """Middle of the top of the mount's bounding box in its own frame, (3,) [m]; its origin without geometry."""
         own = [outline_m(piece) for piece in self.pieces if piece.body == self.mount]
         low, high = (pick(np.concatenate(own), axis=0) for pick in (np.min, np.max)) if own else np.zeros((2, 3))
         return np.array([*(low + high)[:2] / 2, high[2]])
@@ -105,18 +105,18 @@ class Model:
 
 def read_model(path: Path, folder: Path | None, targets: Names, ignored: Names, known: Names,
                groups: tuple[int, ...] | None, mount: str | None) -> Model:  # fmt: skip
-    """A model, read once per process while its files stay the same.
+    """Read a model, once per process while its files stay the same.
 
     Arguments:
         path: The MJCF or URDF file.
-        folder: All that it reads must lie here; None: in the file's own folder.
+        folder: Folder that must contain all its files; None: the file's own folder.
         targets, ignored, known: Patterns of the names of bodies and geoms, as `hand*`.
-        groups: Of geoms that are seen; None: as MuJoCo shows them.
-        mount: The body that sensors are on; None: the world.
+        groups: Visible groups of geoms; None: as MuJoCo shows them.
+        mount: Name of the body that carries the sensors; None: the world.
 
     Raises:
         DataError: The file cannot be used.
-        ConfigError: A name or pattern is that of nothing visible; with the nearest.
+        ConfigError: A name or pattern matches nothing visible; with the nearest name.
     """
     return _read(path, folder, model_files(path, folder), targets, ignored, known, groups, mount)
 
@@ -124,7 +124,7 @@ def read_model(path: Path, folder: Path | None, targets: Names, ignored: Names, 
 @lru_cache(maxsize=4)
 def _read(path: Path, folder: Path | None, states: tuple[FileState, ...], targets: Names, ignored: Names,
           known: Names, groups: tuple[int, ...] | None, mount: str | None) -> Model:  # fmt: skip
-    """`states`, of all files of the model, only tells a changed model from the one in memory."""
+    """Read a model; `states` of its files are part of the cache key, so that a changed model is read again."""
     model, said = load_model(path, folder=folder)
     pieces, notes = visible_geoms(model, groups=groups)
     gone = _named(pieces, ignored, "ignored")
@@ -151,7 +151,7 @@ def _read(path: Path, folder: Path | None, states: tuple[FileState, ...], target
 
 
 def _named(pieces: Sequence[ModelGeom], patterns: Names, key: str) -> np.ndarray:
-    """Which pieces a pattern names by their body or geom, shape (pieces,)."""
+    """Mask of pieces whose body or geom matches a pattern, shape (pieces,)."""
     found, names = np.zeros(len(pieces), dtype=bool), [(piece.body_name, piece.geom_name) for piece in pieces]
     for pattern in patterns:
         fits = np.array([fnmatchcase(body, pattern) or fnmatchcase(geom, pattern) for body, geom in names], dtype=bool)
@@ -173,12 +173,12 @@ def _target(pieces: Sequence[ModelGeom], chosen: np.ndarray) -> Target:
 
 
 def without_notes(piece: ModelGeom) -> ModelGeom:
-    """The piece whose mesh has handed over its notes."""
+    """The piece without the notes of its mesh."""
     return replace(piece, shape=replace(piece.shape, notes=())) if isinstance(piece.shape, Mesh) else piece
 
 
 def outline_m(piece: ModelGeom) -> np.ndarray:
-    """Points of a piece's surface in its body's frame, none beyond it, shape (K, 3) [m]."""
+    """Points on a piece's surface in its body's frame, shape (K, 3) [m]."""
     if isinstance(piece.shape, Mesh):
         points = piece.shape.vertices[np.unique(piece.shape.faces)]
     else:
@@ -188,7 +188,7 @@ def outline_m(piece: ModelGeom) -> np.ndarray:
 
 
 def mean_depth_m(points_m: np.ndarray) -> float:
-    """Half the mean chord 4 V / S of the convex hull of points (K, 3): how far its middle is behind its returns [m].
+    """Half the mean chord 4 V / S of the convex hull of points (K, 3), the mean depth of its centre behind returns [m].
 
     Cauchy's mean chord; of a ball 2/3 of its radius, in the mean over its disc.
     """
@@ -204,9 +204,9 @@ def _moved(points_m: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 
 def refuse_sensors_inside(model: Model, poses: np.ndarray, origins_m: np.ndarray) -> None:
-    """Raises ConfigError where in most frames all of the places (K, 3) that sensors may be at are inside a piece.
+    """Refuse sensor origins (K, 3) [m] that are all inside a piece in most frames; raises ConfigError.
 
-    What moves at random, as a hand, may pass through a sensor, which sees nothing else then.
+    In a few frames a randomly moving piece, as a hand, may pass through a sensor and hide everything else.
     """
     direction = np.array([0.36, 0.48, 0.8])  # parallel to nothing that models are built of
     for piece in model.pieces:

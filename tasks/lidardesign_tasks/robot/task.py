@@ -1,7 +1,7 @@
 """Your robot: any model that MuJoCo loads, its motion, and sensors in the world or on one of its bodies.
 
 The frame is the model's world, z up, or that of the body that sensors are mounted on: then everything moves around the
-sensors. Without a motion of yours the robot wanders at random, free of collisions.
+sensors. Without a given motion the robot moves at random, free of collisions.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ Patterns = Annotated[tuple[str, ...], BeforeValidator(lambda given: [given] if i
 SENSOR_DISTANCE = 2.0  # extents
 ROOM = 1.1  # around the sphere that holds the targets wherever they move
 ABOVE_MOUNT_M = 0.01
-# Of random motions, so many tell the space in which targets move; of recordings, so many moments.
+# Random motions, or times of each recording, that define the space in which targets move.
 SPACE_MOTIONS, SPACE_MOMENTS = 12, 200
-TOUCHING_M = 1e-3  # what moves less, rests
+TOUCHING_M = 1e-3  # targets that move less are at rest
 
 
 class MujocoConfig(FolderConfig, MovingSurroundings):
-    """The model and its motion, what is to be found of it, where sensors are, and the surroundings."""
+    """The model, its motion and targets, bounds of sensors, and the surroundings."""
 
     folders: ClassVar[dict[str, tuple[str, ...]]] = {"motion": ENDINGS}
 
@@ -104,7 +104,7 @@ class MujocoTask:
     defaults: ClassVar[Defaults] = Defaults(density={"sigma_m": 0.02})
 
     def space(self, config: MujocoConfig) -> DesignSpace:
-        """All directions and ranges in which targets may be, from where sensors may be."""
+        """All directions and ranges of possible targets from the possible sensor origins."""
         model = model_of(config)
         low, high = _bounds(_corners_m(config, model))
         ahead = [max(SENSOR_DISTANCE * float((high - low).max()), 2 * _radius_m(low, high)), 0.0, 0.0]
@@ -125,7 +125,7 @@ class MujocoTask:
 
         Raises:
             DataError: A file cannot be used, or the robot cannot move as it should.
-            ConfigError: Names that are none, or sensors inside geometry.
+            ConfigError: Unknown names, or sensors inside geometry.
         """
         model, metric, space = model_of(config), self.metric_of(config), space or self.space(config)
         origins_m = np.array(list(itertools.product(*zip(space.low[:3], space.high[:3], strict=True))))
@@ -140,7 +140,7 @@ class MujocoTask:
         return found
 
     def metric_of(self, config: MujocoConfig) -> Metric:
-        """At worst a target is lost by the extent in which targets move, a surface by its own."""
+        """Metric with the worst value: the extent in which targets move, or of the largest target for surfaces."""
         metric, model = METRICS[config.metric], model_of(config)
         if config.metric == "seen":
             return metric
@@ -151,11 +151,11 @@ class MujocoTask:
         return replace(metric, worst=worst, tolerance=TOLERATED_SHARE * worst)
 
     def mount_of(self, config: MujocoConfig) -> str | None:
-        """The body of the model that sensors are on; None: they stand in the world."""
+        """Name of the body that carries the sensors; None: sensors in the world."""
         return config.mount_body
 
     def notes(self, config: MujocoConfig, space: DesignSpace) -> list[str]:
-        """What is found, by what, and how motions are split."""
+        """Notes on targets, known pieces, and the split of motions."""
         model, recordings = model_of(config), _recordings(config)
         names = ", ".join(target.name for target in model.targets)
         found = [f"targets: {names}; {len(model.pieces)} visible pieces, {int(model.known.sum())} of them known"]
@@ -174,16 +174,16 @@ class MujocoTask:
         return found + doubtful_times({one.name: one.time_s for one in recordings})
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
-        """By the metric of the configuration; see `measures`."""
+        """Score by the metric of the configuration; see `measures`."""
         return score(scene, returns)
 
     def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
-        """What returns tell, by the metric of the configuration."""
+        """Information of returns by the metric of the configuration."""
         return informs(scene, returns)
 
 
 def model_of(config: MujocoConfig) -> Model:
-    """The model of a configuration; raises ConfigError where none is set, or nothing is to be found."""
+    """The model of a configuration; raises ConfigError without a model or targets."""
     if config.model is None:
         raise ConfigError("no model is set", where="task.model", hint="--set model=robot.xml")
     if not config.targets:
@@ -211,7 +211,7 @@ def _trajectories(config: MujocoConfig, model: Model, split: Split, seed: int) -
 
 
 def _corners_m(config: MujocoConfig, model: Model) -> np.ndarray:
-    """Where the corners of the targets' boxes are as they move, (targets, F, 8, 3) [m]; of random motions, a few."""
+    """Corners of the targets' boxes over all recordings or a few random motions, shape (targets, F, 8, 3) [m]."""
     recordings = _recordings(config)
     if recordings:
         thinned = [one.qpos[:: max(1, len(one.qpos) // SPACE_MOMENTS)] for one in recordings]
@@ -222,7 +222,7 @@ def _corners_m(config: MujocoConfig, model: Model) -> np.ndarray:
 
 
 def _bounds(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box around all targets wherever they move, (3,) each [m]."""
+    """Lower and upper corner of a box around all targets in all frames, (3,) each [m]."""
     return corners_m.min(axis=(0, 1, 2)), corners_m.max(axis=(0, 1, 2))
 
 

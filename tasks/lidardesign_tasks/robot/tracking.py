@@ -1,4 +1,4 @@
-"""Paths of what moves, from the returns on it: one place per frame, gaps filled in time."""
+"""Paths of moving targets from returns: one position per frame, with gaps interpolated in time."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from lidardesign.task import Information
 # A ball hit evenly over its disc is hit, on average, this share of its radius in front of its centre's plane
 MEAN_DEPTH = 2 / 3
 FEWEST_FRAMES = 2
-# A return tells of the path as far as what is tracked moves in so many frames, in the mean over the path. From 1 to 8
-# chosen rays track held-out paths of the arm alike.
+# Reach of a return's information along the path, in mean steps per frame. Values from 1 to 8 give equally good tracks
+# of held-out paths of the arm.
 REACH_FRAMES = 2.0
 
 
 def tracked_places(
     returns: Sequence[Returns], taken: Sequence[np.ndarray], depth_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames with a return on what is tracked and its place in each, (K,) and (K, 3) [m].
+    """Frames with a return on a target, and its position in each, (K,) and (K, 3) [m].
 
-    A place is the mean, over the frame's returns on it, of the measured point moved along its ray by the depth at which
-    the centre is expected.
+    A position is the mean, over the frame's returns on it, of the measured point moved along its ray by the expected
+    depth of the centre.
 
     Arguments:
         returns: One per frame.
-        taken: Which of the rays' returns are taken for it, shape (N,) each.
-        depth_m: From the returns to its middle, in the mean [m].
+        taken: Mask of rays whose returns are taken for the target, shape (N,) each.
+        depth_m: Mean depth of its centre behind the returns [m].
     """
     frames, places = [], []
     for one, mine in zip(returns, taken, strict=True):
@@ -41,12 +41,12 @@ def tracked_places(
 
 
 def filled_path(frames: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:
-    """A place for every frame, shape (count, 3) [m]: a monotone cubic spline in time, held at both ends.
+    """Position in every frame, shape (count, 3) [m]: a monotone cubic spline in time, constant beyond both ends.
 
     Arguments:
         frames: Increasing indices of the tracked frames, shape (K,), at least two.
-        places: Where it was in them, shape (K, 3) [m].
-        count: Frames of the scene; they are equally far apart in time.
+        places: Positions in these frames, shape (K, 3) [m].
+        count: Number of frames of the scene, equally spaced in time.
     """
     from scipy.interpolate import PchipInterpolator
 
@@ -61,17 +61,17 @@ def path_information(
     least_m: float = 0.0,
     harm: np.ndarray | None = None,
 ) -> Information:
-    """What returns tell about places in every frame: max(0, D - path), path the way in between.
+    """Information of returns about positions in every frame: max(0, D - path), path the length in between.
 
-    Gaps are filled in time, so a return also tells about frames shortly before and after, the less the further its
-    body moves until then.
+    Gaps are interpolated in time, so a return also informs about frames shortly before and after, less the further its
+    body moves in between.
 
     Arguments:
         returns: One per frame.
-        bodies: The indices of each target's bodies in the scene.
-        places_m: Where the targets are in each frame, shape (T, F, 3) [m].
-        least_m: D is at least this, for what hardly moves [m].
-        harm: How far off each return is that is mistaken for a target's, shape (F, N) [m]; at most D counts.
+        bodies: Indices of each target's bodies in the scene.
+        places_m: Positions of the targets in each frame, shape (T, F, 3) [m].
+        least_m: Lower limit of D, for targets that hardly move [m].
+        harm: Error of each return that is mistaken for a target's, shape (F, N) [m]; limited to D.
     """
     steps = np.linalg.norm(np.diff(places_m, axis=1), axis=2)
     walked = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
