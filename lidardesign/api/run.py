@@ -54,7 +54,7 @@ class LearnedQuality:
         return self._verdict.word
 
     def advice(self, preset: str) -> str | None:
-        """Why it is not better, and what to do next after a preset; None where it is good."""
+        """The reason for the verdict and the next step after a preset; None where it is good."""
         return self._verdict.advice(preset) if self._verdict.why else None
 
     @property
@@ -187,7 +187,7 @@ class Run(RunFolder):
     def summary(self) -> dict[str, Any]:
         """The quality of the density, the designs with their last scores, and commands that go on from here.
 
-        Also how large the cache is of what training scenes show of rays, where fits have left one.
+        Also the size of the cache of training information, where fits have left one.
 
         Raises:
             DataError: The manifest is damaged.
@@ -277,7 +277,7 @@ class Run(RunFolder):
             notes: Called with every note.
 
         Raises:
-            ConfigError: Choices that cannot be.
+            ConfigError: Invalid choices.
             DataError: There are no designs, or one is not there.
         """
         from lidardesign.api.scores import ScoreOptions, ScoreRequest

@@ -1,7 +1,7 @@
 """Several runs of one task that differ in their seed: designs of one name scored in the same held-out scenes.
 
-Every run brings its own designs, and rivals that are built from its own training scenes: what is repeated is the whole
-way from learning to the score.
+Every run brings its own designs and its baselines, built from its own training scenes: the whole experiment is
+repeated, from learning to the score.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SEED = "seed"
 
 
 def differing_seeds(targets: Sequence[Path], notes: Notes = log_note) -> list[RunFolder]:
-    """The runs that targets are, where they differ in their seed alone; none where targets are something else.
+    """The targets as runs, where these differ in their seed alone; else an empty list.
 
     Raises:
         DataError: A folder is no run, or damaged.
@@ -223,7 +223,7 @@ def _check_runs(runs: Sequence[RunFolder]) -> None:
 
 
 def _other_setting(first: RunFolder, second: RunFolder) -> str | None:
-    """The first key beside the seed in which two runs differ."""
+    """The first configuration key other than the seed in which two runs differ; None without one."""
     ours, theirs = (_flat(run.config.as_document()) for run in (first, second))
     differing = (key for key in [*ours, *theirs] if key != SEED and ours.get(key) != theirs.get(key))
     return next(differing, None)
@@ -247,7 +247,7 @@ def _check_options(options: ScoreOptions) -> None:
 
 
 def _common_names(runs: Sequence[RunFolder], wanted: Sequence[str]) -> list[str]:
-    """The names of designs that all runs have: those that are wanted, or all."""
+    """The wanted names of designs that all runs have; all common names by default."""
     sets = [{path.stem for path in run.design_paths()} for run in runs]
     for run, names in zip(runs, sets, strict=True):
         if not names:
