@@ -72,7 +72,7 @@ class _Sample:
 
     @property
     def aims(self) -> bool:
-        """Whether points can be aimed at: both angles are free."""
+        """True where rays can be aimed at points: both angles are free."""
         return AZIMUTH in self.space.free and ELEVATION in self.space.free
 
     def rays_at(self, blur_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +93,7 @@ class _Sample:
         return np.concatenate(parts), np.concatenate(of)
 
     def first_hits(self, points: np.ndarray, column: np.ndarray) -> _Met:
-        """What rays (N, 6) meet first in their columns (N,)."""
+        """First hits of rays (N, 6) in their columns (N,)."""
         met = _Met(np.full(len(points), np.inf), np.zeros(len(points), dtype=bool), np.zeros(len(points)))
         for number in np.unique(column):
             rows, (index, frame) = np.flatnonzero(column == number), self.columns[number]
@@ -106,7 +106,7 @@ class _Sample:
         return met
 
     def inside_share(self, points: np.ndarray, column: np.ndarray) -> float:
-        """The share of rays (N, 6) that leave closed targets once more than they enter them: they start inside."""
+        """The share of rays (N, 6) that start inside closed targets: those with an odd number of crossings."""
         odd = np.zeros(len(points), dtype=bool)
         for number in np.unique(column):
             rows, (index, frame) = np.flatnonzero(column == number), self.columns[number]
@@ -131,7 +131,7 @@ def _directions(points: np.ndarray) -> np.ndarray:
 
 @phase("scale")
 def scale_notes(scenes: Sequence[Scene], config: RunConfig) -> list[str]:
-    """What is wrong with the lengths of training scenes, design space and sigma, and what to do; mostly nothing.
+    """Notes on lengths of training scenes, design space and sigma that do not fit together, each with a remedy.
 
     Arguments:
         scenes: The training scenes.
@@ -155,7 +155,7 @@ def _in_angles(space: DesignSpace, points: np.ndarray) -> np.ndarray:
 
 
 def _unit_doubt(one_m: float, other_m: float) -> str:
-    """A question, where two lengths differ by so much that they are more likely in different units."""
+    """A question about units where two lengths differ by a factor that suggests different ones; else empty."""
     return " (are all lengths in metres?)" if max(one_m, other_m) > OTHER_UNIT * min(one_m, other_m) else ""
 
 
@@ -164,7 +164,7 @@ def _visible(points: np.ndarray, met: _Met) -> np.ndarray:
 
 
 def _view_notes(sample: _Sample, points: np.ndarray, column: np.ndarray, met: _Met) -> list[str]:
-    """What of the targets rays of the space can reach."""
+    """Notes on targets that rays of the space cannot reach."""
     space, reach_m = sample.space, sample.space.high[RANGE]
     viewed, across_m = _in_angles(space, points), float(np.ptp(observed_point(points), axis=0).max())
     shapes = [body.shape for scene in sample.scenes for body in scene.bodies if body.is_target]
@@ -207,7 +207,7 @@ def _view_notes(sample: _Sample, points: np.ndarray, column: np.ndarray, met: _M
 
 
 def _sigma_notes(sample: _Sample, points: np.ndarray, met: _Met, config: RunConfig) -> list[str]:
-    """What sigma leaves of what can be seen."""
+    """Notes on a sigma that does not suit the visible surface."""
     sigma_m = config.density.sigma_m
     seen = _in_angles(sample.space, points) & _visible(points, met)
     if seen.sum() < FEWEST_RAYS:
@@ -239,7 +239,7 @@ def _sigma_notes(sample: _Sample, points: np.ndarray, met: _Met, config: RunConf
 
 
 def _thin_notes(sample: _Sample, config: RunConfig, least_m: float) -> list[str]:
-    """Whether rays that the density prefers pass what they listen for: things thinner than sigma."""
+    """A note where rays that the density prefers miss targets thinner than sigma."""
     optics = Optics.of(config.density)
     share = _returning_share(sample, optics)
     if share >= LEAST_RETURNING:
@@ -255,7 +255,7 @@ def _thin_notes(sample: _Sample, config: RunConfig, least_m: float) -> list[str]
 
 
 def _returning_share(sample: _Sample, optics: Optics) -> float:
-    """The share of the target density's mass whose rays meet a target; 1 where nothing of it is found.
+    """The share of the target density's mass whose rays meet a target; 1 where too few samples are found.
 
     Blurring surfaces by sigma in all directions gives the density without its visibility, where they are flat.
     """

@@ -68,9 +68,8 @@ class NearSurfaces(Protocol):
 class Surfaces:
     """The surfaces that p* is near to, one column per scene and frame.
 
-    `log_column_weights` are the columns' own weights (columns,), `importance` is how much the surfaces count,
-    `rows_at_once` how many points keep the memory bounded, `grid_steps_m` the grid steps of all meshes, `can_propose`
-    whether `propose` draws them all.
+    `log_column_weights` are the columns' own weights (columns,), `importance` weights the surfaces, `rows_at_once` is
+    the chunk size in points, `grid_steps_m` the grid steps of all meshes, `can_propose` whether `propose` can draw.
     """
 
     log_column_weights: np.ndarray
@@ -81,11 +80,11 @@ class Surfaces:
 
     @property
     def log_peak(self) -> float:
-        """What no surface term of a single column exceeds."""
+        """An upper bound of the surface term of a single column."""
         return float(self.log_column_weights.max()) + (0.0 if self.importance is None else self.importance.peak)
 
     def near(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> NearSurfaces:
-        """What matters at scene points (N, 3): columns within a tolerance of the best one there."""
+        """Surface terms at scene points (N, 3) of the columns within a tolerance of the largest term there."""
 
     def log_proximity(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> np.ndarray:
         """log of the sum of surface terms at scene points, (N, 3) to (N,)."""

@@ -96,12 +96,12 @@ class Pool:
         return drawn / drawn[-1]
 
     def emphasised(self, flow: DesignFlow, coordinates: Coordinates) -> Pool:
-        """The same proposals, each drawn by how much the flow starves it now: in proportion to p* (1 + p* / p)."""
+        """The same proposals, drawn in proportion to p* (1 + p* / p): those that the flow starves more often."""
         log_weights = self.log_target - log_prob_of_unit(flow, coordinates, self.unit).to(self.log_target)
         # E_pi[p / p*] = 1 / Z
         log_z = -torch.logsumexp(torch.log(self.weights) - log_weights, dim=0)
         starved = (log_weights - log_z).clamp(max=float(np.log(LARGEST_EMPHASIS))).exp()
-        # a flow that lost its numbers says nothing of what it starves
+        # a flow with non-finite parameters gives no emphasis
         return replace(self, emphasis=1.0 + torch.nan_to_num(starved, nan=0.0))
 
     def draw(self, count: int, generator: torch.Generator, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
