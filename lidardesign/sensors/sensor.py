@@ -1,4 +1,4 @@
-"""A sensor: where it stands, where it looks, how wide, and when it listens.
+"""A sensor: origin, boresight, field of view and gate.
 
 It is one component of a mixture over design space, a product q(d) = N(x) N(u) N(r): the origin with its covariance, the
 direction in the tangent plane of the boresight, the range. Tangent coordinates u = (horizontal, vertical) are true
@@ -72,13 +72,13 @@ class Sensor:
     Arguments:
         name: Unique within its design.
         weight: Share of the rays, 0 to 1, where rays are even.
-        origin_m: Where it stands [m], shape (3,); the middle of a region.
+        origin_m: Its origin, or the mean of a region [m], shape (3,).
         azimuth_rad, elevation_rad, roll_rad: The boresight.
         field_of_view_rad: Full horizontal and vertical angles in the boresight's tangent plane.
-        gate_m: Start and end of the ranges that it listens in.
+        gate_m: Start and end of its gate.
         origin_covariance_m2: Of the origins of its rays where they start all over a region [m^2], shape (3, 3); None
             where they start at one place.
-        part: The part of the catalogue that it is, where it is one.
+        part: The name of its part in the catalogue, where it is one.
     """
 
     name: str
