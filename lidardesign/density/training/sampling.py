@@ -11,8 +11,8 @@ and weights of max(w, Z) A. Nothing is lost: what is left out weighs little. Whe
 and A are those of a condition's group, and of every group as many are kept as of the one that keeps fewest. So that a
 group which was learned badly takes no samples from the others, it is thinned at less than Z, to a quarter at most.
 
-Beside the samples that are kept stand points that know nothing of the flow, where both densities p and q are known at
-all points. What is drawn from either has the density m = (1 - s) p + s q, with their shares as they are, and weights
+The samples that are kept are joined by points independent of the flow, where both densities p and q are known at all
+points. What is drawn from either has the density m = (1 - s) p + s q, with their shares as they are, and weights
 p* / m (Veach and Guibas 1995). q is known up to a constant, which is estimated by the optimal bridge between p and q.
 
 References:
