@@ -30,7 +30,7 @@ SAME_PLACE_M = 0.005
 
 
 class Captured(IntEnum):
-    """Whether a ray was captured, else the reason why not."""
+    """The capture of a ray: captured, or the reason why not."""
 
     YES = 0
     OTHER_PLACE = 1
