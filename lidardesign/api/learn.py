@@ -46,7 +46,7 @@ CHECKPOINTS = "checkpoint*"
 LEARNED_FILES = (
     CONFIGURATION, MANIFEST, "progress.jsonl", "checkpoint.safetensors", "flow.safetensors", SAMPLES, "snapshots/",
 )  # fmt: skip
-# A misplaced share that can be told apart from nothing and from all; a longer time is a mistake in the unit.
+# Tolerances of the misplaced share that can be measured; a longer time budget is a mistake in the unit.
 TOLERANCES, TIME_BUDGETS_S = (1e-4, 0.9999), (1.0, 366 * 24 * 3600.0)
 # A tolerance is met where the measured share is at most so many standard errors above it.
 STANDARD_ERRORS = 2.0

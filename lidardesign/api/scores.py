@@ -56,17 +56,17 @@ class ScoreOptions:
         seed: Seed of all random numbers; the run's by default.
         effects: auto, all, none, audit, or names of effects between commas.
         detector: The name of a detector, or its file.
-        range_tolerance_mm: What all skipped effects together may change of ranges.
-        return_tolerance: Share of returns that all skipped effects together may change.
+        range_tolerance_mm: Largest change of ranges by all skipped effects together [mm].
+        return_tolerance: Largest share of returns changed by all skipped effects together.
         settings: Settings of the task to judge by other scenes than were learned.
         workers: Processes that score scenes, or the address of a scheduler.
         cma_seconds: Wall time of each search of the baseline cma [s].
-        accuracy: Whether what accuracy costs will be measured, too.
+        accuracy: Whether the sweeps of accuracy are measured, too.
         scenes_seed: Root of the held-out scenes; `seed` by default.
         designs: Names of the designs that are scored; all by default.
-        mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
-        fail_above: What no design may be worse than, in the metric's unit; `Scores.check` sees to it.
-        fail_unless_better: A baseline or design that every other design must be better than; so does this.
+        mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
+        fail_above: Limit of the designs' values, in the metric's unit, for `Scores.check`.
+        fail_unless_better: Baseline or design that every other design must be better than, likewise.
 
     Raises:
         ConfigError: An option out of range or unknown.

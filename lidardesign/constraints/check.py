@@ -30,7 +30,7 @@ AGREEMENT = COARSE_SLACK
 # The bandwidth model counts a width this share above whole bins as whole bins.
 BIN_ROUNDING = SLACK
 LIGHT_M_PER_S = 299792458.0
-# Places are told to the millimetre: an origin pinned so near to the only one that the space has is that one [m].
+# Places are given to the millimetre: an origin fixed this close to the space's own place means that place [m].
 SAME_PLACE_M = 1e-3
 PICOSECOND_S = 1e-12
 AXES = ("x_m", "y_m", "z_m")

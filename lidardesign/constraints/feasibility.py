@@ -262,7 +262,7 @@ def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least
     numbers = [_Bound(1, ""), least] + ([given] if given.value is not None else [])
     common, least_of_all = least_width(constraints.rules[-1]), min(width for width, _ in widths)
     narrowest = [(0.0, []), (least_of_all, [name for _, names in widths for name in names])]
-    # what all sensors must keep says more than what single ones must besides
+    # bounds on all sensors make a shorter conflict than those of single ones
     narrowest += [common] if common[0] <= least_of_all else []
     # the fewest names first: one ray of any gate, then as many as are asked for, then as wide as is asked for
     for (width, names), rays in sorted(itertools.product(narrowest, numbers), key=lambda pair: len(pair[0][1])):

@@ -27,8 +27,8 @@ from lidardesign.space import DIMENSIONS, DesignSpace
 PINNED_BOX_M = SLACK
 # Gaps between excluded boxes narrower than this, in metres and relative to coordinates, leave no place.
 SMALLEST_GAP = HALF_DIGITS
-# An origin that is pinned no further than this from where the space fixes it is meant to be there [m]: tables, robot
-# models and drawings say places to the millimetre, and no sensor is mounted more exactly.
+# An origin fixed this close to the space's own place means that place [m]: tables, robot models and drawings give
+# places to the millimetre, and no sensor is mounted more exactly.
 SAME_PLACE_M = 1e-3
 
 Mount = tuple[float, float, float]

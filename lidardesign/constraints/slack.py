@@ -16,7 +16,7 @@ from lidardesign.constraints.check import ConstraintCheck
 TIGHT_SHARE = 0.01
 # Bounds of the design space hold for every sensor, whatever was asked for.
 SPACE_MARK = "space."
-# Where the bandwidth is the only bound whose name says nothing of its side.
+# Names of bounds by their side; the budgets are upper bounds without `.max`.
 UPPER_ENDS = (".max", ".high_m", "budget.bandwidth_mbps", "budget.power_w")
 LOWER_ENDS = (".min", ".low_m")
 FULL_TURN_DEG = 360.0

@@ -49,7 +49,7 @@ CALL_SECONDS = 60.0
 # The geometry and the scores of so many training scenes are looked at.
 LOOKED_AT = 3
 DEEPEST = 40  # nesting of a value that has a digest
-# What of scenes and bodies no ray meets, or what is told apart otherwise.
+# Fields of scenes and bodies without effect on rays, or compared in another way.
 UNSEEN = ("name", "group", "notes", "truth", "bodies", "poses", "importance")
 # So often rays at targets are drawn until they are enough; of a scene that moves, so many frames are aimed at.
 DRAW_ROUNDS, MOST_FRAMES = 12, 8

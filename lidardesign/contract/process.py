@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from lidardesign.contract.contract import Contract
     from lidardesign.task import Task
 
-# A call that takes longer than it may ends within this many times as long, so that it can be told how long it took.
+# A call beyond its limit may run this many times as long, so that its time can be reported.
 OVERTIME = 3
-# The key of a line that says what is called now; empty once the call has ended.
+# The key of a line with the present call; empty once the call has ended.
 CALLED = "called"
 FINDING_KEYS = {"law", "group", "statement", "outcome", "detail", "seconds", "figures"}
 REFUSALS = {"config": ConfigError, "data": DataError}

@@ -122,7 +122,7 @@ def choose_rays(
         informed, held_back = picked[1:]
     elif is_trial:
         informed = training.inform(CHOICE, selection.rays, selection.visits, 0, FEW_SCENES)
-        held_back = informed  # nobody asks how well a trial's rays do elsewhere
+        held_back = informed  # not used in trials
     else:
         # too few of a pool are inside the sensors: the run goes on keeping the pool
         inform = cached_information if pool is None and training.keeps else inform_enough

@@ -49,7 +49,7 @@ from lidardesign.workers import Starmap
 if TYPE_CHECKING:
     from lidardesign.rays.pool import CandidatePool
 
-# A larger share of scenes about which a design tells nothing is told.
+# A larger share of scenes without information from a design is noted.
 MOST_SILENT = 0.5
 # As many samples as the standard preset of `learn` leaves.
 TWIN_SAMPLES = 100_000

@@ -78,7 +78,7 @@ def choose_parts(
     Raises:
         ConfigError: A part that is not there; a density with conditions.
         InfeasibleError: Constraints that contradict each other, or that no part keeps; fewer rays than parts.
-        DataError: No part tells anything about the scenes.
+        DataError: No part has information about the scenes.
     """
     started, space, wanted = perf_counter(), samples.space, constraints.parts
     check_feasible(constraints, space, sensors=count, rays=rays)

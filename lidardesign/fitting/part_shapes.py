@@ -6,10 +6,10 @@ component's roll stays within an eighth of a turn, so a part that is turned is a
 exchanged.
 
 To cast every one of thousands of parts at poses would be millions of rays. Parts at one place share rays: their
-directions are taken apart in cells of a sphere, each cell is cast once from each place, and a part at a pose tells what
-the cells of its rays tell, inside its own gate. Of dense patterns an even subset stands for all, and of many items a
-random draw. Cells are as small as the number of rays to be cast allows. The cell's ray is that of one of the parts, so
-that patterns in a plane stay in it.
+directions are binned in cells of a sphere, each cell is cast once from each place, and the information of a part at a
+pose is that of the cells of its rays, inside its own gate. Of dense patterns an even subset is used, and of many items
+a random draw. Cells are as small as the number of rays to be cast allows. The cell's ray is that of one of the parts,
+so that patterns in a plane stay in it.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from lidardesign.task import Information, random_generator
 BOUNDED = ("field_of_view.horizontal_deg", "field_of_view.vertical_deg", "gate.start_m", "gate.end_m", "gate.width_m")
 MOST_CAST = 60_000  # rays of a scene, over all places
 MOST_CASTS = 1_000_000  # of a scene, over all its frames
-MOST_MEMBERS = 20_000_000  # rays of all parts' patterns that are told apart
+MOST_MEMBERS = 20_000_000  # rays kept of all parts' patterns
 MOST_ITEMS = 60  # of a scene: the choice of a few parts needs few
-SIZED = 10  # one in so many parts says how large cells are, at first
+SIZED = 10  # one part in so many is used for the first size of cells
 COARSE_CELL_RAD = math.radians(3.0)  # from which the size of cells is found
 
 

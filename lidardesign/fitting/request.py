@@ -43,7 +43,7 @@ COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
 CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones would only leave candidates out
 # Of designs: names that a file may have everywhere.
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
-# Keys by which tasks are told where sensors may be.
+# Keys of tasks for the places of sensors.
 PLACE_KEYS = ("origin_m", "origin_box_m")
 # In the provenance of designs, and what to do where it cannot be understood.
 KEY = "weighting"

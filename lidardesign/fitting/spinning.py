@@ -39,10 +39,10 @@ from lidardesign.sensors.sensor import Sensor
 from lidardesign.space import DesignSpace
 from lidardesign.task import Information
 
-CHANNELS = 16  # of a sensor, where nobody says how many
+CHANNELS = 16  # of a sensor by default
 POINTS_PER_TURN = 1800  # of a channel: every fifth of a degree, as scanners do at ten turns per second
-EVEN_SHARE = 0.25  # of the candidate elevations that are even; the others lie where even ones tell most
-FIRST_SHARE = 0.2  # of the scenes, that say where this is
+EVEN_SHARE = 0.25  # of candidate elevations that are even; the others are denser where even ones gain most
+FIRST_SHARE = 0.2  # of the scenes, for these gains
 PLACES = np.array([(0.5, 0.5, 0.5), (0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 0)])  # in a box, no corners on one edge
 MOST_SETS, MOST_BOUNDED = 500, 20  # of places: that are tried, and that are bounded one by one
 

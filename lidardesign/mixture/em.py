@@ -44,13 +44,13 @@ SEED_LLOYD_ITERATIONS = 4
 # A component that rests on fewer effective samples is no sensor: it begins again where there are more.
 LEAST_SAMPLES = 20.0
 MOST_REVIVALS = 3
-# So many samples usually tell that there are more different ones than components.
+# The first samples checked for more distinct ones than components: usually enough.
 FEW_SAMPLES = 256
 # Shorter boresight steps than this share are as good as none.
 SMALLEST_STEP = 0.02
 # Mass that stands for an empty cell, so that its mean is finite.
 SMALLEST_CELL = TINY
-# Up to so many centres, looking at all of them costs as little as a tree, and nothing to import.
+# Up to so many centres a brute-force search is as fast as a tree, and imports nothing.
 FEW_CENTRES = 10
 # The iteration stops when no centre moves by more than this share of the features' extent: far below the
 # spacing of any ray layout, far above rounding.

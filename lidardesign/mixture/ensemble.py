@@ -29,7 +29,7 @@ from lidardesign.sensors.sensor import Sensor
 from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 
-# So many samples tell apart mounts whose shares differ by a hundredth.
+# Enough samples to distinguish mounts whose shares differ by a hundredth.
 MOUNT_SAMPLES = 4000
 
 

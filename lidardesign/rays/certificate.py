@@ -31,7 +31,7 @@ PRICE_BISECTIONS = 12
 PATIENCE = 5  # rounds without a lower bound after which steps are halved
 PROGRESS = 0.02  # of what the bound exceeds the value by: a bound that is lower by less is not lower
 PROXY = "mean over items of what the returns of the chosen rays leave unknown, by the task's informs"
-PRICES = 7  # of the curve beside none: each half of the one before, from twice what the bits of a free choice are worth
+PRICES = 7  # of the curve, besides 0: each half of the one before, from twice the worth per bit of a free choice
 MEMORY = 0.7  # how much of its last direction a step keeps
 
 

@@ -20,16 +20,16 @@ from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Scene
 from lidardesign.task import Information, Task
 
-# On so many scenes rays are chosen at first, and at most; as many as at first are held back.
+# Numbers of scenes that rays are chosen on, at first and at most; as many as at first are held back.
 FEW_SCENES, MOST_SCENES = 50, 400
-# Rays: what candidates of more tell of scenes takes long, and gigabytes.
+# Rays of a design: the information of candidates for more takes long, and gigabytes.
 MOST_SELECTED = 5000
 MOST_ENTRIES = 10_000_000  # of a table, some 200 MB: scenes of few items may be more
-MOST_ITEMS = 100  # of a scene, drawn at random: what many scenes ask is known well enough by a part of it
-# Of the candidates' returns so many are chosen, or about so many: lengths follow from it, and they are no thresholds.
+MOST_ITEMS = 100  # of a scene, drawn at random: enough over many scenes
+# The share of candidates that is chosen, roughly: it sets the reach of returns, which is no threshold.
 CHOSEN_SHARE = 0.2
-# A return tells about what is nearer than so many mean spacings of the chosen ones: sqrt(5), so that on a surface it is
-# five of the candidates' spacings. Few places of a surface are further than this from all chosen returns.
+# The reach of a return in mean spacings of the chosen ones: sqrt(5), so that on a surface it is five of the
+# candidates' spacings. Few places of a surface are further than this from all chosen returns.
 REACH_SPACINGS = math.sqrt(5.0)
 
 

@@ -30,7 +30,7 @@ MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes retur
 # Chosen on, and held back from the choice.
 CHOICE, HELD_BACK = "choice", "held back"
 Informs = Callable[[Scene, Sequence[Returns]], Information]
-LARGEST = np.zeros(0)  # the table of sums of items that count the largest worth
+LARGEST = np.zeros(0)  # the table of sums of items whose largest worth counts
 
 
 class TrainingScenes:

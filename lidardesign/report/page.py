@@ -57,7 +57,7 @@ CURVE_PX, SMALL_PX, PLANE_PX = 440, 250, 400
 # Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
 DENSITY_POINTS = 3000
 COMMAND = "evaluate"  # whose report it is, and which is not over yet
-# Of the first section: sentences of designs, which a table says of all, and notes that are not folded.
+# In the first section: sentences about designs (a table has all), and notes that are not folded.
 MOST_SENTENCES, MOST_NOTES = 3, 2
 
 

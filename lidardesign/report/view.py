@@ -37,7 +37,7 @@ from lidardesign.scenes.scene import Body
 from lidardesign.sensors.pattern import field_on_sphere
 from lidardesign.sensors.sensor import Sensor, interval_factor
 
-MOST_SENSORS = 40  # drawn as frusta and switched one by one; a scan has hundreds, and its rays say it all
+MOST_SENSORS = 40  # drawn as frusta and switched one by one; of more only rays are drawn
 MOST_BODIES = 2000  # of a scene, the largest first
 MARGIN = 1.0  # of the scene's extent: rays that go farther are cut there
 BESIDE_DEG, ABOVE_DEG = 129.0, 26.0  # of the first view: from where sensors look, and above the ground

@@ -23,7 +23,7 @@ from lidardesign.run.inputs import ARRAYS, MOST_COLUMNS, MOST_ROWS, Kind, check_
 
 NUMERIC_KINDS = "buif"
 LARGEST_HEADER_BYTES = 10_000
-# What an archive says at its end, and of how large a list of arrays.
+# Marks at the end of an archive, and the largest size of its list of arrays.
 END_MARK, END_MARK_64 = b"PK\5\6", b"PK\6\7"
 END_BYTES, LARGEST_LIST_BYTES = 1 << 16, 1_000_000
 Result = TypeVar("Result")

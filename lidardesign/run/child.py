@@ -27,7 +27,7 @@ PROGRAM = (
 BEGUN = b"begun\n"
 # Python and this package are loaded within this time [s].
 START_SECONDS = 60.0
-# Work that limits its own time has ended by then, and said so [s].
+# Time for work that limits its own time to end and answer [s].
 GRACE_SECONDS = 2.0
 # The exit code of a process whose stream of answers was closed.
 UNANSWERED = 117

@@ -71,7 +71,7 @@ def read_manifest(run: Path) -> dict[str, Any]:
         raise DataError(f"the manifest cannot be read: {error}", where=str(path), hint="learn the run again") from None
     if not isinstance(manifest, dict) or not isinstance(manifest.get("files"), dict):
         raise DataError("the manifest lists no files", where=str(path), hint="learn the run again")
-    # Refuse entries that nothing of this program writes, before anybody works with them
+    # Refuse entries that this program does not write
     for name, entry in manifest["files"].items():
         contents = [entry, entry.get("replaces") or entry] if isinstance(entry, dict) else [entry]
         if not all(

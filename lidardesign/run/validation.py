@@ -149,7 +149,7 @@ def _explain(
     found = f": found {_short(detail['input'])}"
     more = f" (and {len(details) - 1} more)" if len(details) > 1 and len(detail["loc"]) == len(path) else ""
     if detail["type"] in ("value_error", "assertion_error"):
-        # a mapping says nothing that the text does not
+        # the text describes a mapping already
         found = "" if not path or isinstance(detail["input"], Mapping) else found
         return ConfigError(f"{name}: {text}{found}{more}" if name else f"{text}{more}", where=where)
     return ConfigError(f"{name}{found}{more}".removeprefix(": "), where=where, allowed=_allowed(detail["type"], text))

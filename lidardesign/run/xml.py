@@ -19,7 +19,7 @@ MOST_ELEMENTS = 500_000
 LONGEST_QUOTE = 80
 # The parser hands text over in pieces of so much, not line by line: each is joined to what already exists.
 PIECE_BYTES = 1 << 20
-# What the parser says at the end of a file that goes on.
+# Messages of the parser at the end of a truncated file.
 CUT_SHORT = frozenset(
     expat.errors.codes[text]
     for text in (

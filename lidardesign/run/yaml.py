@@ -27,7 +27,7 @@ MAX_DIGITS = 100
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _BaseDumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 QUOTE_HINT = 'quote text that begins with a sign or has a colon in it, such as "*hand"'
-# What libyaml and its Python twin say of text without them.
+# Messages of libyaml and its Python twin about text without quotes.
 UNQUOTED = ("found character", "mapping values", "did not find expected alphabetic")
 
 _NULL = re.compile(r"~|null|Null|NULL|")

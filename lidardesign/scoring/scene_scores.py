@@ -30,7 +30,7 @@ from lidardesign.workers import Starmap
 RaysPerCondition = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000
-# So many scenes and frames show whether targets return anything; a larger share of them in which nothing does is told.
+# Frames that are checked for returns from targets; a larger share without any is noted.
 WATCHED, MOST_SILENT = 16, 0.5
 
 

@@ -22,7 +22,7 @@ from lidardesign.numerics import sphere_exp, sphere_log
 from lidardesign.space import angles, direction
 
 DEFAULT_LEVEL = 0.95
-# Beyond these an interval is next to nothing, or next to everything, of a normal distribution.
+# Beyond these an interval holds almost none or almost all of a normal distribution.
 LEVELS = (0.01, 0.999999)
 # Returns of so many fill some 100 MB per scene; no scanner fires more in a frame.
 MOST_RAYS = 1_000_000
@@ -116,7 +116,7 @@ class Sensor:
         """Angles from the boresight of unit vectors (N, 3), shape (N, 2) [rad]; 0 where its field has no width."""
         tangent = tangent_coordinates(self.frame, directions)
         fan = np.array(self.field_of_view_rad) > 0
-        # in a fan of rays only the angle along the fan says where a point lies
+        # in a fan of rays only the angle along the fan counts
         tangent[:, ~fan & fan.any()] = 0.0
         return tangent
 

@@ -149,7 +149,7 @@ def near_columns(bodies, group_edges, points, log_weights, group_weights, precis
                 leader = g
         best, kept = -np.inf, 0
         for turn in range(groups):
-            # the most promising group first: it tells how much the others may miss
+            # the most promising group first: it sets the bound that others must reach
             g = leader if turn == 0 else (0 if turn == leader else turn)
             if hopes[g] < best - tolerance:
                 continue

@@ -34,7 +34,7 @@ MAXIMUM_POINTS = 1024
 # The share of probed rays that quadrature may see through although ray casting finds them opaque.
 MISSED_SHARE_TO_CARE = 0.005
 OPAQUE, TRANSPARENT = 0.01, 0.1
-# Shares of a grid step: sigma below the first blurs curved surfaces, below the second nothing curved is told apart.
+# Shares of a grid step: sigma below the first blurs curved surfaces, below the second they are not resolved.
 BLURRED_SHARE, UNRESOLVED_SHARE = 0.5, 0.01
 # Roundings of coordinates that a distance passes through.
 ROUNDINGS = 4

@@ -133,7 +133,7 @@ class ProposedPoints:
     Arguments:
         points: Shape (N, 6), inside the space.
         log_density: Per chart volume, up to one constant, shape (N,).
-        surface_range_m: The range of the surface that each listens at, without the range error, shape (N,).
+        surface_range_m: The range of the surface that each observes, without the range error, shape (N,) [m].
         column: The column of that surface, an index into `columns`, shape (N,).
         columns: Scene and frame of the columns that were drawn from.
     """

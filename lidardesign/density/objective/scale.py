@@ -1,7 +1,7 @@
 """A check that lengths fit together: the targets, where sensors are, how far they reach, and sigma. Needs no torch.
 
 Rays are aimed from random origins of the design space at points that are uniform in area on the targets of a few scenes
-and frames, and cast. What they meet tells, before anything is learned, that the space looks past the targets or ends
+and frames, and cast. Their hits show, before anything is learned, that the space looks past the targets or ends
 before them, that they are hidden, that they are seen edge-on, and that sigma blurs them away. Where an angle is fixed
 hardly any point can be aimed at: uniform rays of the space take their place.
 
@@ -29,13 +29,13 @@ from lidardesign.task import random_generator
 
 RAYS = 8192
 MOST_COLUMNS = 64
-# Of fewer rays no share is told.
+# Shares of fewer rays are not reported.
 FEWEST_RAYS = 32
 # Casting finds a point again within this share of its range.
 SAME_PLACE = 1e-3
 # Below this share of the targets' surface in the space's angles, or in its angles and range, it looks past them.
 LEAST_IN_VIEW = 0.01
-# Above this share of the surface that rays meet out of range, most of what can be seen is not heard.
+# Above this share of the visible surface out of range, a note is given.
 MOST_OUT_OF_RANGE = 0.5
 # Above this share of the rays, other bodies hide the targets.
 MOST_HIDDEN = 0.99

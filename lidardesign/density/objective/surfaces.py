@@ -1,10 +1,10 @@
 """The target surfaces of all columns, and which columns can matter at a scene point: everything of p* but visibility.
 
-One interface, two forms. `SceneTable` evaluates every column at every point: meshes at rest share a table in which
+Two forms of one interface. `SceneTable` evaluates every column at every point: meshes at rest share a table in which
 that costs next to nothing. `MovingFrames` are thousands of columns of bodies in their own frames: bounding boxes tell
 which columns can come within a tolerance of the best surface term at a point, and only these are evaluated.
 
-Both also draw design points that listen at random surfaces and know the density of these draws:
+Both also draw design points that observe random surfaces, with the density of these draws:
 
 - `SceneTable`: a point is drawn uniform in area on a random scene's targets, moved along the normal by a normal offset
   of the target's own sigma, and observed from a random origin. Its density per volume is q(s) = sum_i N(SDF_i(s);

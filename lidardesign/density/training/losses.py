@@ -1,7 +1,7 @@
 """The two losses of learning: reverse KL along paths, then balancing by values.
 
 The path-wise loss (paper, eq. 7) moves samples along the gradient of log p* and finds the surfaces while sigma is
-annealed. It cannot tell how much mass belongs on either side of a silhouette, because there p* jumps as one scene
+annealed. It cannot find how much mass belongs on either side of a silhouette, because there p* jumps as one scene
 after another is hidden and its gradient has no term for the jump: on faces it stays at a KL of 0.25 nats with the neck
 starved by a factor of three. Balancing needs the values of p* only. For flow samples it follows the gradient of
 the reverse KL in its log-variance form. For samples of p* from independent proposals it follows that of the mean

@@ -139,11 +139,11 @@ def coverage(
     return Estimate(float(mass[covered].sum() / mass.sum()), error)
 
 
-# Where log Z is found to: far below what samples can tell.
+# Tolerance of the root log Z, far below its statistical error.
 LOG_Z_TOLERANCE_NATS = SLACK
 # A group of fewer points than this on either side is judged by the groups that have more.
 LEAST_POINTS = 8
-# Densities that share less than this share nothing, and the division by it is safe.
+# An overlap below this counts as none, so that dividing by it is safe.
 LEAST_SHARED = TINY
 # Beyond so many nats a ratio of densities is no number that can be summed.
 LARGEST_NATS = 300.0

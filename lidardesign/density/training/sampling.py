@@ -44,9 +44,9 @@ POINTS_AT_ONCE = 16384
 CONDITION_GROUPS = 32
 # Of the independent points that there are: what is tried beside the flow's samples.
 MIXED_SHARES = (0.0, 0.25, 0.5, 1.0)
-# By how much independent points must be foretold to raise what samples are worth: less may be the pilots' luck.
+# Least predicted gain in effective samples by independent points; less may be noise of the pilots.
 LEAST_GAIN = 1.05
-# Beyond so many nats two densities have next to nothing in common.
+# Log ratios of densities are clipped here: beyond, two densities hardly overlap.
 LARGEST_NATS = 300.0
 # Of the samples of a condition group: what thinning leaves at least.
 LEAST_GROUP_SHARE = 0.25
@@ -309,7 +309,7 @@ class MixedSamples:
 
     @classmethod
     def of_flow_alone(cls, samples: Samples, constant: Estimate | None = None) -> Self:
-        """Samples of a flow, and nothing beside them."""
+        """Samples of a flow without independent points."""
         return cls(samples, 0, samples.independent, samples.independent, constant)
 
 

@@ -33,7 +33,7 @@ from lidardesign.simulate.plan import EffectPlan, Planner, predicted_seconds
 from lidardesign.simulate.returns import build_casters
 from lidardesign.task import conditions_of, random_generator
 
-# Measured where the evaluation's own detector asks for nothing.
+# The detector for sweeps where the evaluation's own has no effects.
 STAND_IN = "single-photon"
 FOOTPRINT_RAYS = (1, 4, 16, 64, 256)
 # Rays in all frames and positions of a scene: the largest number of rays below this is simulated, else the smallest.

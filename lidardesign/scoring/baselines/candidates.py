@@ -20,7 +20,7 @@ from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
-# A gate without width hears nothing, since gates are open at their end. Ranges that never vary get the width
+# A gate without width receives nothing, since gates are open at their end. Ranges that never vary get the width
 # of the default 100 ps bin around them.
 SMALLEST_GATE_M = 0.015
 # Bandwidth grows almost in proportion to the number of rays: a few steps find the largest number that fits.

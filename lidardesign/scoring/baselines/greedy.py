@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from lidardesign.rays.training import InformedScene, TrainingScenes
 
 GREEDY = "greedy"
-USUAL_SCENES = 200  # that rays are chosen on where no design says on how many it was
+USUAL_SCENES = 200  # that rays are chosen on where no design has a number of its own
 # Rays over all values of a condition: choosing more would take longer than all else in an evaluation.
 MOST_CHOSEN = 2000
 SMALLEST_SHARE = 0.1  # of even rays that return: where fewer do, candidates are those that return most often

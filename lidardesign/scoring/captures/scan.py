@@ -188,7 +188,7 @@ def measured(
     place, photons = np.full(len(pixel), np.nan), np.zeros(len(pixel))
     for begin, end in _chunks(last - first):
         lengths = np.maximum(last - first, 0)[begin:end]
-        # the counts that rays hear one after the other, and where each begins in them
+        # the counts in the gates of all rays, concatenated, and the first of each ray
         offset = np.concatenate([[0], np.cumsum(lengths)])
         at = np.arange(offset[-1]) - np.repeat(offset[:-1] - first[begin:end], lengths)
         counts = capture.counts[np.repeat(pixel[begin:end], lengths), at].astype(np.int64)

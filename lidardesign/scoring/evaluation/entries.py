@@ -36,8 +36,8 @@ from lidardesign.task import conditions_of
 # Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
 # at a fraction of the held-out scenes' cost.
 JUDGED_SCENES = 8
-# The strongest baseline is found on training scenes that no baseline's rays were chosen on: whoever picks the best of
-# several by their scores on held-out scenes holds designs against a lucky one.
+# The strongest baseline is found on training scenes that no baseline's rays were chosen on: picking the best
+# of several by their scores on held-out scenes would favour a lucky one.
 MOST_RIVAL_SCENES = 20
 FEWEST_RIVAL_SCENES = 5
 LARGEST_RIVAL_SHARE = 0.1  # of the rays that an evaluation fires may be fired to find it
