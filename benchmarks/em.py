@@ -31,7 +31,7 @@ SPACE = DesignSpace((-2.0, -2.0, 0.0, -3.0, -1.4, 0.05), (2.0, 2.0, 2.0, 3.0, 1.
 
 
 def planted(count: int, seed: int, plan_seed: int) -> np.ndarray:
-    """Samples of a mixture that is Gaussian in azimuth and elevation: the rival's own model."""
+    """Samples of a mixture that is Gaussian in azimuth and elevation: its own model."""
     plan = np.random.default_rng(plan_seed)
     low, high = np.array(SPACE.low), np.array(SPACE.high)
     means = low + (high - low) * plan.uniform(0.25, 0.75, (SENSORS, 6))
@@ -60,7 +60,7 @@ def constrained() -> Bounds:
     return Bounds(**values)
 
 
-def rival(points: np.ndarray, iterations: int) -> float:
+def peer(points: np.ndarray, iterations: int) -> float:
     """Seconds per iteration of scikit-learn, as the difference of a long and a short run."""
     spent = []
     for steps in (2, 2 + iterations):
@@ -123,7 +123,7 @@ def main() -> None:
     bounds = constrained()
     with threadpool_limits(1):
         pairs = [
-            (ours(features, bounds, options.iterations), rival(points, options.iterations))
+            (ours(features, bounds, options.iterations), peer(points, options.iterations))
             for _ in range(options.rounds)
         ]
         mine, theirs = np.median(np.array(pairs), axis=0)
@@ -134,14 +134,14 @@ def main() -> None:
         model = GaussianMixture(SENSORS, covariance_type="diag", n_init=1, max_iter=200, tol=1e-5, random_state=0)
         start = time.perf_counter()
         model.fit(points)
-        rival_fitted = time.perf_counter() - start
+        peer_fitted = time.perf_counter() - start
     # scikit-learn's density is per azimuth and elevation; per solid angle it is larger by 1 / cos(elevation)
-    rival_score = (model.score_samples(held) - np.log(np.cos(held[:, 4]))).mean()
+    peer_score = (model.score_samples(held) - np.log(np.cos(held[:, 4]))).mean()
     score = log_density(trace.mixture, test).mean()
     columns = ["way", "ms per iteration", "whole fit s", "steps", "held-out log-likelihood"]
     rows = [
         ["lidardesign", 1e3 * mine, fitted, len(trace.history), f"{score:.5f}"],
-        ["scikit-learn diag", 1e3 * theirs, rival_fitted, model.n_iter_, f"{rival_score:.5f}"],
+        ["scikit-learn diag", 1e3 * theirs, peer_fitted, model.n_iter_, f"{peer_score:.5f}"],
     ]
     report(
         f"EM: {SENSORS} components on {len(points)} samples",

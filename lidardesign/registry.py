@@ -43,7 +43,7 @@ class Probe:
     contained: bool = False
 
 
-def probed(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:
+def probe_plugins(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:
     """What each of some plugins does, found out side by side; None where no process could tell.
 
     Arguments:
@@ -99,12 +99,12 @@ class TaskListing:
 @phase("tasks")
 def list_tasks() -> list[TaskListing]:
     """Every installed task by name, broken ones with their reason."""
-    found = sorted(_offers().items())
+    found = sorted(_entry_points_by_name().items())
     foreign = [offers[0] for _, offers in found if len(offers) == 1 and _is_foreign(offers[0])]
     probes: dict[str, Probe | None] = {}
     for start in range(0, len(foreign), SIDE_BY_SIDE):
         some = foreign[start : start + SIDE_BY_SIDE]
-        probes.update(zip((offer.name for offer in some), probed(some, IMPORT_SECONDS), strict=True))
+        probes.update(zip((offer.name for offer in some), probe_plugins(some, IMPORT_SECONDS), strict=True))
     listings = []
     for name, offers in found:
         distribution, probe = ", ".join(_distribution(offer) for offer in offers), probes.get(name)
@@ -133,7 +133,7 @@ class UnknownTaskError(ConfigError):
 
 
 def _known(name: str) -> list[EntryPoint]:
-    offers = _offers()
+    offers = _entry_points_by_name()
     if name not in offers:
         close = difflib.get_close_matches(name, offers, n=1)
         raise UnknownTaskError(
@@ -177,7 +177,7 @@ def text_of(error: BaseException) -> str:
         return "no message"
 
 
-def _offers() -> dict[str, list[EntryPoint]]:
+def _entry_points_by_name() -> dict[str, list[EntryPoint]]:
     """Entry points by name; one that is found twice on the path (an editable install) counts once."""
     try:
         offers = list(entry_points(group=GROUP))
@@ -199,13 +199,13 @@ def _distribution(offer: EntryPoint) -> str:
 
 
 def _load(name: str, offers: list[EntryPoint]) -> Task:
-    offer = _only(name, offers)
+    offer = _unique_entry_point(name, offers)
     if _is_foreign(offer):
         _check_containable(name, offer.value, tuple(sys.path))
     return import_task(offer, IMPORT_SECONDS)
 
 
-def _only(name: str, offers: list[EntryPoint]) -> EntryPoint:
+def _unique_entry_point(name: str, offers: list[EntryPoint]) -> EntryPoint:
     if len(offers) > 1:
         packages = " and ".join(f"{_distribution(offer)} ({offer.value})" for offer in offers)
         raise PluginError(f"is offered by {packages}", where=f"task {name}", hint="uninstall only one of them")
@@ -237,20 +237,20 @@ def _check_containable(name: str, value: str, path: tuple[str, ...]) -> None:
     Raises:
         PluginError: It hangs, or ends the process.
     """
-    (probe,) = probed([EntryPoint(name, value, GROUP)], IMPORT_SECONDS)
+    (probe,) = probe_plugins([EntryPoint(name, value, GROUP)], IMPORT_SECONDS)
     if probe is not None and probe.contained:
         raise PluginError(str(probe.error), where=f"task {name}", hint=AUTHOR_HINT)
 
 
 def distribution_of(name: str) -> str:
     """The installed package that a task comes with, and its version; empty where that is not known."""
-    offers = _offers().get(name, [])
+    offers = _entry_points_by_name().get(name, [])
     return _distribution(offers[0]) if len(offers) == 1 and offers[0].dist else ""
 
 
 def task_names() -> list[str]:
     """The names of all installed tasks, with nothing imported."""
-    return sorted(_offers())
+    return sorted(_entry_points_by_name())
 
 
 def offer_of(name: str) -> EntryPoint:
@@ -260,7 +260,7 @@ def offer_of(name: str) -> EntryPoint:
         ConfigError: No installed package offers it; the message lists what there is.
         PluginError: Several do.
     """
-    return _only(name, _known(name))
+    return _unique_entry_point(name, _known(name))
 
 
 def answer_probe(request: dict[str, Any], _: object) -> dict[str, Any]:

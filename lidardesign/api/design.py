@@ -293,7 +293,7 @@ def collect_designs(
     return list(seen.values())
 
 
-def named(designs: list[Design], names: Sequence[str]) -> list[Design]:
+def select_by_name(designs: list[Design], names: Sequence[str]) -> list[Design]:
     """The designs of these names; all of them without names.
 
     Raises:
@@ -332,7 +332,7 @@ def name_apart(designs: list[Design]) -> list[Design]:
     return designs
 
 
-def judging_run(designs: Sequence[Design], judge: RunFolder | None, notes: Notes = log_note) -> RunFolder:
+def scoring_run(designs: Sequence[Design], judge: RunFolder | None, notes: Notes = log_note) -> RunFolder:
     """The run in whose scenes designs are scored: the named one, else the one that they came from.
 
     Arguments:

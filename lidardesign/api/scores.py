@@ -11,7 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.api.design import Design, collect_designs, html_table, judging_run, name_apart, named
+from lidardesign.api.design import Design, collect_designs, html_table, name_apart, scoring_run, select_by_name
 from lidardesign.config import with_task_settings
 from lidardesign.errors import MAX_SEED, ConfigError, check_number, names_arguments
 from lidardesign.fitting.fit import twin_samples, twin_without_visibility
@@ -185,13 +185,13 @@ class ScoreRequest:
             DataError: A design or a run is not there, or damaged.
         """
         planner, audit = options.planner()
-        designs = named(collect_designs(targets, judge, notes), options.designs)
-        run = learned = judging_run(name_apart(designs), judge, notes)
+        designs = select_by_name(collect_designs(targets, judge, notes), options.designs)
+        run = learned = scoring_run(name_apart(designs), judge, notes)
         for note in learned.input_notes():
             notes(note)
-        rival = options.fail_unless_better
-        _check_rival(rival, [design.name for design in designs])
-        baselines = [*ALWAYS, *options.baselines, *([rival] if rival in BASELINES else [])]
+        baseline = options.fail_unless_better
+        _check_baseline(baseline, [design.name for design in designs])
+        baselines = [*ALWAYS, *options.baselines, *([baseline] if baseline in BASELINES else [])]
         if NONE in options.baselines:
             baselines = []
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
@@ -403,8 +403,8 @@ def check_scores(scores: Scores) -> None:
     check_audit(scores.evaluation)
 
 
-def _check_rival(name: str | None, designs: Sequence[str]) -> None:
-    """Refuse a rival that is unknown or the only design."""
+def _check_baseline(name: str | None, designs: Sequence[str]) -> None:
+    """Refuse a baseline or design that is unknown, or the only design."""
     where = "--fail-unless-better"
     if name is None or name in BASELINES:
         return

@@ -1,7 +1,7 @@
 """Several runs of one task that differ in their seed: designs of one name scored in the same held-out scenes.
 
-Every run brings its own designs and its baselines, built from its own training scenes: the whole experiment is
-repeated, from learning to the score.
+Every run brings its own designs, and baselines built from its own training scenes: the whole experiment is repeated,
+from learning to the score.
 """
 
 from __future__ import annotations

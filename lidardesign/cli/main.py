@@ -95,7 +95,7 @@ PAGES = {
     "learn": "run-folder.md, accuracy.md",
     "fit": "design-file.md, selection.md, parts.md, importance.md",
     "constrain": "constraints.md, catalog.md",
-    "evaluate": "evaluate.md, rivals.md, detectors.md, shell.md",
+    "evaluate": "evaluate.md, baselines.md, detectors.md, shell.md",
     "export": "formats.md, design-file.md",
     "capture": "captures.md",
     "show": "design-file.md, rigs.md, formats.md",

@@ -103,9 +103,9 @@ class DeviceTarget(Target):
         importance = self.surfaces.importance
         return None if importance is None else _Table(importance, self.device)
 
-    def drawn(self, columns: np.ndarray) -> DeviceTarget:
+    def subsample(self, columns: np.ndarray) -> DeviceTarget:
         """See `Target`; what is on the device stays there."""
-        few = super().drawn(columns)
+        few = super().subsample(columns)
         vars(few).update(_table=self._table, _occluders=self._occluders, _weights=self._weights)
         return few
 

@@ -264,7 +264,7 @@ def best_origins(
         limits: Admitted parameters.
         old_mean, old_covariance: Kept where they are admitted and nothing better is found.
     """
-    point, covariance = _anywhere(mean, scatter, limits)
+    point, covariance = _best_unconstrained(mean, scatter, limits)
     if not (np.isfinite(limits.free_low).any() or np.isfinite(limits.free_high).any()):
         return point, covariance
     rows = np.flatnonzero(~_holding(point, covariance, limits).any(axis=1))
@@ -274,7 +274,7 @@ def best_origins(
     return point, covariance
 
 
-def _anywhere(mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
+def _best_unconstrained(mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
     """The best mean in its box and covariance within its bounds, without excluded boxes."""
     bounds = limits.least, limits.most, limits.thinnest
     covariance = clipped_eigenvalues(scatter, *bounds)
@@ -301,7 +301,7 @@ def _between_boxes(
     """The best parameters of each origin in a few boxes, in the box of its old ones, or the old ones themselves."""
     floored = clipped_eigenvalues(scatter, limits.least)
     usable, held = _usable(old_mean, old_covariance, limits)
-    boxes = np.concatenate([_promising(mean, floored, limits), held[:, None]], axis=1)
+    boxes = np.concatenate([_candidate_boxes(mean, floored, limits), held[:, None]], axis=1)
     count, tried = boxes.shape
     many, rows = limits.inside(boxes), np.repeat(np.arange(count), tried)
     start, spread = project_into_boxes(mean[rows], floored[rows], many)
@@ -328,7 +328,7 @@ def _usable(point: np.ndarray, covariance: np.ndarray, limits: OriginLimits) -> 
     return kept, holding.argmax(axis=1)
 
 
-def _promising(mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits) -> np.ndarray:
+def _candidate_boxes(mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits) -> np.ndarray:
     """The few boxes of each origin with the smallest sum of `axis_losses`, shape (N, B)."""
     count, many = limits.free_low.shape[:2]
     boxes = np.broadcast_to(np.arange(many), (count, many))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
-FAR_SHARE = 0.5  # of the worst design's score: rivals that are always worse by more are hidden at first
+FAR_SHARE = 0.5  # of the worst design's score: baselines that are always worse by more are hidden at first
 # One hue from light to dark: it reads the same without colour vision and on paper.
 SCALE = [[0.0, "#ffffff"], [0.2, "#d6e6f4"], [0.45, "#6baed6"], [0.7, "#2171b5"], [1.0, "#08306b"]]
 FILL, INK, QUIET = "#b8c1cb", "#1f2933", "#7b8794"
@@ -42,16 +42,16 @@ LAYOUT = {
 MOST_DRAWN_RAYS = 2000  # of a design: more lines are no picture
 
 
-def far_rivals(evaluation: Evaluation) -> set[str]:
+def far_baselines(evaluation: Evaluation) -> set[str]:
     """Names of baselines far worse than all designs at every number of rays, to hide at first in a plot."""
-    sign, rival = (1.0 if evaluation.metric.better == "lower" else -1.0), evaluation.strongest_rival
+    sign, baseline = (1.0 if evaluation.metric.better == "lower" else -1.0), evaluation.strongest_baseline
     worst: dict[int, float] = {}
     for row in evaluation.rows:
         if not row.baseline:
             worst[row.rays] = max(sign * row.value, worst.get(row.rays, -math.inf))
-    rivals = [row for row in evaluation.rows if row.baseline and row.rays in worst]
-    near = {row.design for row in rivals if sign * row.value - worst[row.rays] <= FAR_SHARE * abs(worst[row.rays])}
-    return {row.design for row in rivals} - near - {rival.name if rival is not None else ""}
+    baselines = [row for row in evaluation.rows if row.baseline and row.rays in worst]
+    near = {row.design for row in baselines if sign * row.value - worst[row.rays] <= FAR_SHARE * abs(worst[row.rays])}
+    return {row.design for row in baselines} - near - {baseline.name if baseline is not None else ""}
 
 
 def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[str] = ()) -> dict[str, Any]:

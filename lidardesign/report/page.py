@@ -19,7 +19,7 @@ from lidardesign.constraints.slack import ConstraintSlack
 from lidardesign.estimates import figure_and_interval
 from lidardesign.report.choice import choice_section
 from lidardesign.report.density_views import DensityView, density_view
-from lidardesign.report.figures import FONT, MOST_DESIGNS, curve_figure, far_rivals, marginal_figure, plane_figure
+from lidardesign.report.figures import FONT, MOST_DESIGNS, curve_figure, far_baselines, marginal_figure, plane_figure
 from lidardesign.report.markup import embedded, figure, folded, page, paragraphs, section, swatch, switch
 from lidardesign.report.pareto import PANEL_PX, accuracy_tables, pareto_figures
 from lidardesign.report.scene_figure import SceneFigure, constraint_slack_of, evaluated_scene
@@ -227,32 +227,34 @@ def headline(evaluation: Evaluation, pair: Paired) -> str:
 
 
 def _table(evaluation: Evaluation, rows: dict[str, Row], pairs: dict[str, Paired]) -> str:
-    metric, rival = evaluation.metric, evaluation.strongest_rival
-    shown = [*rows.values(), *evaluation.rival_rows]
+    metric, baseline = evaluation.metric, evaluation.strongest_baseline
+    shown = [*rows.values(), *evaluation.baseline_rows]
     headings = ["design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "Mbit/s"]
-    if rival is not None:
-        headings += [f"difference to {rival.name}", "design is"]
+    if baseline is not None:
+        headings += [f"difference to {baseline.name}", "design is"]
     lines = []
     for row in shown:
         value, value_interval = _figures(row.value, row)
         cells = [row.design, str(row.rays), value, value_interval, f"{row.bandwidth_mbps:.3g}"]
         pair = pairs.get(row.design)
-        if rival is not None:
+        if baseline is not None:
             cells += ["", ""] if pair is None else ["{} ({})".format(*_figures(pair.difference, pair, sign="+")), ""]
         lines.append((cells, "" if pair is None else verdict(evaluation, pair), row.baseline))
-    return table(headings, lines, text_columns=1, caption="Designs, and the strongest rival on training scenes.")
+    return table(headings, lines, text_columns=1, caption="Designs, and the strongest baseline on training scenes.")
 
 
 def _about(evaluation: Evaluation) -> list[str]:
-    metric, rival = evaluation.metric, evaluation.strongest_rival
+    metric, baseline = evaluation.metric, evaluation.strongest_baseline
     about = (
         f"Means over {held_out_scenes(evaluation.scenes)}; a scene in which too few "
         f"rays return counts as {metric.worst:g} {metric.unit}."
     )
-    if rival is None:
+    if baseline is None:
         return [about]
-    best = f"the best of {len(rival.values)}" if len(rival.values) > 1 else "the only one"
-    return [f"{about} The strongest rival is {rival.name}, {best} on {counted(rival.scenes, 'training scene')}."]
+    best = f"the best of {len(baseline.values)}" if len(baseline.values) > 1 else "the only one"
+    return [
+        f"{about} The strongest baseline is {baseline.name}, {best} on {counted(baseline.scenes, 'training scene')}."
+    ]
 
 
 def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list[str]:
@@ -278,7 +280,7 @@ def _figures(value: float, item: Row | Paired, sign: str = "") -> tuple[str, str
 
 def _scores(evaluation: Evaluation) -> str:
     """Both curves with one legend, whose boxes switch curves in both, and all tables of scores, folded."""
-    far = far_rivals(evaluation)
+    far = far_baselines(evaluation)
     legend = "".join(
         switch(
             curve.name,
@@ -305,7 +307,7 @@ def _scores(evaluation: Evaluation) -> str:
         f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>{said}{figures}'
         + folded("All scores", rows_table(evaluation), len(evaluation.rows))
         + paired_tables(evaluation)
-        + folded("Designs against rivals at equal bandwidth", bandwidth_table(evaluation), matched)
+        + folded("Designs against baselines at equal bandwidth", bandwidth_table(evaluation), matched)
     )
 
 

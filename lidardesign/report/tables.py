@@ -90,13 +90,13 @@ def mounting_table(evaluation: Evaluation) -> str:
 
 
 def paired_tables(evaluation: Evaluation) -> str:
-    """All paired differences with a verdict in words, folded: designs against rivals, then against each other."""
+    """All paired differences with a verdict in words, folded: designs against baselines, then against each other."""
     if not evaluation.paired:
         return "<p>There is nothing to compare with.</p>"
-    rivals = {row.design for row in evaluation.rows if row.baseline}
+    baselines = {row.design for row in evaluation.rows if row.baseline}
     kinds = {
-        "Designs against rivals": [pair for pair in evaluation.paired if pair.b in rivals],
-        "Designs against designs": [pair for pair in evaluation.paired if pair.b not in rivals],
+        "Designs against baselines": [pair for pair in evaluation.paired if pair.b in baselines],
+        "Designs against designs": [pair for pair in evaluation.paired if pair.b not in baselines],
     }
     return "".join(folded(name, _paired_table(evaluation, pairs), len(pairs)) for name, pairs in kinds.items() if pairs)
 
@@ -116,11 +116,11 @@ def _paired_table(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
 
 
 def bandwidth_table(evaluation: Evaluation) -> str:
-    """Each design against rivals that were given as many rays as fit in its bandwidth; empty where there are none."""
+    """Each design against baselines of as many rays as fit in its bandwidth; empty where there are none."""
     if not evaluation.equal_bandwidth:
         return ""
     unit = evaluation.metric.unit
-    headings = ["design", "rival", "rays", "its rays", "Mbit/s", f"design [{unit}]", f"rival [{unit}]"]
+    headings = ["design", "baseline", "rays", "its rays", "Mbit/s", f"design [{unit}]", f"baseline [{unit}]"]
     headings += ["difference (95 % interval)", "design is"]
     own = {(row.design, row.rays): row for row in evaluation.rows if not row.baseline}
     pairs = zip(evaluation.equal_bandwidth, evaluation.paired_bandwidth, strict=True)
@@ -131,7 +131,7 @@ def bandwidth_table(evaluation: Evaluation) -> str:
         cells += [four_digits(row.value), f"{four_digits(pair.difference)} ({interval(pair)})", ""]
         begins = bool(index and row.design == evaluation.equal_bandwidth[0].design)
         lines.append((cells, verdict(evaluation, pair), begins))
-    caption = "Each design against rivals with as many rays (their rays) as fit in its bandwidth."
+    caption = "Each design against baselines with as many rays (their rays) as fit in its bandwidth."
     return table(headings, lines, text_columns=2, caption=caption)
 
 

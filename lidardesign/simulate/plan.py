@@ -3,8 +3,8 @@
 Each effect's `bound` (`simulate.effects`) says what it could change at most. The smallest are skipped as long as all
 that is skipped stays within a tolerance together: errors of range add up in the worst case, and so do shares of
 returns. That is promised of what a detector reports, rounded and from the photons that chance brings, ray by ray with
-the same random numbers (`with_steps`; tests/soak/promise.py tries it). Where nothing calls for an effect, that is
-seen without casting a ray.
+the same random numbers (`add_quantisation_bounds`; tests/soak/promise.py tries it). Where nothing calls for an effect,
+no ray is cast to see it.
 
 What simulating an effect takes is predicted per ray and frame, as measured on one core (2.5 GHz) with a face of 20,000
 triangles, some hundred photons per ray and a gate of 1 m, each effect added to photon noise alone. Elsewhere the
@@ -346,7 +346,7 @@ def _frame_bounds(counts: Counts, present: Sequence[str]) -> dict[str, EffectBou
     stretched = 1 / counts.first_hits.path_per_range**2
     bounds = {
         name: replace(bound, squared_m2=bound.squared_m2 * stretched)
-        for name, bound in with_steps(counts, bounds).items()
+        for name, bound in add_quantisation_bounds(counts, bounds).items()
     }
     led = bounds["specular"].lost if "specular" in bounds else np.zeros(0)
     if not led.any():
@@ -389,7 +389,7 @@ class _BoundSum:
         return Bound(float(np.sqrt(squared_m2.max())), float(lost.max()), self._reason)
 
 
-def with_steps(counts: Counts, bounds: dict[str, EffectBound]) -> dict[str, EffectBound]:
+def add_quantisation_bounds(counts: Counts, bounds: dict[str, EffectBound]) -> dict[str, EffectBound]:
     """What effects change of what a detector reports, by what they change of the light; names to bounds.
 
     Behind rounding, what moves a range by little moves it by a whole bin, or not at all. An edge that is nearer than

@@ -52,7 +52,7 @@ def runs(made, tmp_path):
 def without_times(scores):
     found = scores.as_dict() if not isinstance(scores, dict) else scores
     rows = [{**row, "seconds": None} for key in ("rows", "equal_bandwidth") for row in found[key]]
-    return rows, [found[key] for key in ("paired", "paired_equal_bandwidth", "strongest_rival", "metric", "scenes")]
+    return rows, [found[key] for key in ("paired", "paired_equal_bandwidth", "strongest_baseline", "metric", "scenes")]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -95,7 +95,7 @@ def test_without_baselines_designs_score_and_pair_as_beside_them(lidardesign, ru
         (row.design, row.value) for row in scores.rows[:2]
     ]
     assert found["paired"] == [scores.paired[0].as_dict()]
-    assert (found["equal_bandwidth"], found["strongest_rival"]) == ([], None)
+    assert (found["equal_bandwidth"], found["strongest_baseline"]) == ([], None)
     verdict = difference_text(scores.paired[0], scores.evaluation.metric.better, scores.evaluation.metric.unit)
     assert verdict in lidardesign("evaluate", *options).out
     assert "scene by scene" in lidardesign("evaluate", *options, "--report", "page.html", "-v").out

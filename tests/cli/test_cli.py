@@ -98,7 +98,7 @@ def test_evaluate_scores_designs_and_baselines_and_holds_a_threshold(lidardesign
     assert "held-out" in lidardesign("evaluate", flat, "--rays", 16).out
 
 
-def test_evaluate_fails_unless_designs_are_better_than_a_rival(lidardesign, flat):
+def test_evaluate_fails_unless_designs_are_better_than_a_baseline(lidardesign, flat):
     for sensors in (1, 2):
         lidardesign("fit", flat, "--layout", "even", "--sensors", sensors, "--rays", 16, "--name", f"s{sensors}")
     both = [flat / "designs" / f"s{sensors}.yaml" for sensors in (1, 2)]
@@ -112,10 +112,10 @@ def test_evaluate_fails_unless_designs_are_better_than_a_rival(lidardesign, flat
     (pair,) = [pair for pair in found["s1"].json["paired"] if (pair["a"], pair["b"]) == ("s1", "s2")]
     assert found["s1"].code == int(not pair["ci_low"] > 0)
     assert found["s2"].code == int(not pair["ci_high"] < 0)
-    for rival, other in (("s1", "s2"), ("s2", "s1")):
-        if found[rival].code:
-            assert f"{other} and {rival} was found at 16 rays" in found[rival].err or (
-                f"{other} is worse than {rival} by" in found[rival].err
+    for baseline, other in (("s1", "s2"), ("s2", "s1")):
+        if found[baseline].code:
+            assert f"{other} and {baseline} was found at 16 rays" in found[baseline].err or (
+                f"{other} is worse than {baseline} by" in found[baseline].err
             )
     # a baseline that is not always there stands beside the designs then
     scores = package.open_run(flat).evaluate(both[1:], rays=[16], settings={"test": 10}, fail_unless_better="lloyd")

@@ -55,7 +55,7 @@ def pair(name, low, high):
     return Paired(name, "greedy", 20, (low + high) / 2, low, high)
 
 
-END = "; greedy is the strongest rival on training scenes"
+END = "; greedy is the strongest baseline on training scenes"
 
 
 @pytest.mark.parametrize(
@@ -63,10 +63,11 @@ END = "; greedy is the strongest rival on training scenes"
     [
         ([pair("fit", -3, -1)], "lower", f"fit is better than greedy by 2.0 mm (1.0 to 3.0) at 20 rays{END}"),
         ([pair("a", -3, -1), pair("b", -2, -1), pair("c", -1, 1)], "lower",
-         "against greedy, the strongest rival on training scenes: a and b are better; no difference was found for c"),
+         "against greedy, the strongest baseline on training scenes: a and b are better; "
+         "no difference was found for c"),
     ],
 )  # fmt: skip
-def test_a_sentence_says_what_designs_are_against_the_strongest_rival(pairs, better, said):
+def test_a_sentence_says_what_designs_are_against_the_strongest_baseline(pairs, better, said):
     evaluation = SimpleNamespace(metric=SimpleNamespace(unit="mm", better=better))
     assert sentence(evaluation, pairs) == said
 

@@ -229,16 +229,16 @@ def test_a_run_says_what_it_has_and_what_can_be_done_next(lidardesign, finished)
     shown = lidardesign("show", finished).out
     assert follow(lidardesign, shown) == ["constrain", "export"]
     (row,) = [row for row in scores["rows"] if row["design"] == "fit"]
-    rival = scores["strongest_rival"]["name"]
-    (pair,) = [pair for pair in scores["paired"] if (pair["a"], pair["b"]) == ("fit", rival)]
+    baseline = scores["strongest_baseline"]["name"]
+    (pair,) = [pair for pair in scores["paired"] if (pair["a"], pair["b"]) == ("fit", baseline)]
     (design,) = lidardesign("show", finished, "--json").json["designs"]
     kept = design["score"]
-    assert (design["name"], design["sensors"], kept["rays"], kept["rival"]) == ("fit", 1, 9, rival)
+    assert (design["name"], design["sensors"], kept["rays"], kept["baseline"]) == ("fit", 1, 9, baseline)
     assert {name: kept[name] for name in ("value", "ci_low", "ci_high")} == {
         name: row[name] for name in ("value", "ci_low", "ci_high")
     }
     assert kept["difference"] == pair["difference"]
-    assert f"to {rival}" in shown
+    assert f"to {baseline}" in shown
 
 
 def test_a_score_is_of_the_design_as_it_was_scored(lidardesign, finished):

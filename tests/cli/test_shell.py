@@ -198,7 +198,7 @@ def test_the_shell_script_fails_with_a_bad_design_and_says_why(gate, tmp_path):
     assert "worse than 1e-6 with 9 rays" in done.stdout
     assert (tmp_path / "gate" / "rows.csv").is_file()
     # the design is no better than itself
-    done = gate("sh design_gate.sh runs/gate 1e6 runs/gate/designs/fit.yaml", RAYS="9", RIVAL="fit")
+    done = gate("sh design_gate.sh runs/gate 1e6 runs/gate/designs/fit.yaml", RAYS="9", BASELINE="fit")
     assert done.returncode == 2
     assert "no other design to compare fit with" in done.stderr
     assert "not scored: exit code 2" in done.stdout

@@ -110,13 +110,13 @@ def test_a_step_has_the_same_loss_and_gradient(loss):
 def test_columns_that_are_drawn_stand_for_all_on_the_device_too(weighted):
     host, device = targets(FIXED, "quadrature", weighted)
     chosen, unit = np.array([0, 2]), torch.zeros(4, 3, dtype=torch.float64)
-    few = device.drawn(chosen)
+    few = device.subsample(chosen)
     assert isinstance(few, DeviceTarget)
     # its tables went to the device once, not for every step's columns anew
     for name in ("_table", "_occluders", "_weights"):
         assert getattr(few, name) is getattr(device, name)
     points = FIXED.from_unit(unit.numpy())
-    np.testing.assert_allclose(few.log_density_of_unit(unit), host.drawn(chosen).log_density(points), rtol=1e-4)
+    np.testing.assert_allclose(few.log_density_of_unit(unit), host.subsample(chosen).log_density(points), rtol=1e-4)
 
 
 def test_what_needs_rays_cast_stays_on_the_processor():

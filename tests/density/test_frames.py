@@ -134,7 +134,7 @@ def test_parts_of_all_frames_average_to_the_whole():
     target = build_target(scenes, CEILING, ALL, "raycast")
     points = near_points(target)
     order = np.random.default_rng(3).permutation(target.columns)
-    parts = [target.drawn(np.sort(part)).log_density(points) for part in np.split(order, 3)]
+    parts = [target.subsample(np.sort(part)).log_density(points) for part in np.split(order, 3)]
     np.testing.assert_allclose(np.exp(parts).mean(axis=0), np.exp(target.log_density(points)), rtol=1e-9)
 
 

@@ -213,8 +213,8 @@ def test_a_few_drawn_columns_estimate_the_weighted_density(make):
     target = built(make, "off", ball(sideways))
     points = SPACE.sample(300, np.random.default_rng(7))
     every = np.arange(target.columns)
-    assert np.allclose(target.drawn(every).log_density(points), target.log_density(points), atol=1e-9)
-    singles = np.stack([target.drawn(every[[c]]).log_density(points) for c in every], axis=1)
+    assert np.allclose(target.subsample(every).log_density(points), target.log_density(points), atol=1e-9)
+    singles = np.stack([target.subsample(every[[c]]).log_density(points) for c in every], axis=1)
     naive = logsumexp(singles - np.log(len(every)), axis=1)
     assert np.allclose(naive, target.log_density(points), atol=1e-5)
 

@@ -173,11 +173,11 @@ def test_one_narrow_component_equals_the_sample_moments_of_scikit_learn():
     generator = np.random.default_rng(11)
     points = np.zeros((4000, 6))
     points[:, 3:] = [1.0, 0.0, 3.0] + np.array([0.004, 0.003, 0.2]) * generator.standard_normal((4000, 3))
-    rival = mixture_module.GaussianMixture(
+    baseline = mixture_module.GaussianMixture(
         2, covariance_type="diag", random_state=0, tol=1e-9, max_iter=500, reg_covar=0
     )
-    rival.fit(points[:, 3:])
-    start = rival.predict(points[:, 3:])
+    baseline.fit(points[:, 3:])
+    start = baseline.predict(points[:, 3:])
     features = features_of(points, POINT)
     ours = run_em(
         mixture_of_labels(features, start, Bounds.unbounded(2, Z)),
@@ -186,7 +186,7 @@ def test_one_narrow_component_equals_the_sample_moments_of_scikit_learn():
         tolerance_nats=1e-10,
         iterations=2000,
     )
-    theirs = rival.score(points[:, 3:])
+    theirs = baseline.score(points[:, 3:])
     # rolls are one parameter more each, so the fit may only be better
     assert ours.log_likelihood > theirs - 1e-3
     assert ours.log_likelihood == pytest.approx(theirs, abs=0.02)

@@ -130,8 +130,8 @@ def test_patterns_of_several_sizes_are_ranked_with_all_their_rays(call, run, tmp
     assert all(f"{name}</th><td>{rays}</td>" in page for name, rays in own.items())
     kept = {entry["name"]: entry["score"] for entry in call("show", folder, "--json").json["designs"]}
     assert {name: str(kept[name]["rays"]) for name in names} == own
-    assert kept["few"]["rival"] == kept["some"]["rival"] is not None
-    assert kept["scanner"]["rival"] is None
+    assert kept["few"]["baseline"] == kept["some"]["baseline"] is not None
+    assert kept["scanner"]["baseline"] is None
 
 
 def test_numbers_that_no_design_fires_are_refused(call, run):

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import chi2, norm
+from support.baselines import SceneBaselines
 from support.chi_square import UNLIKELY, counts_of_cells, mass_of_cells, p_value
 from support.designs import sensor
 from support.flows import FLOWS, draw, flow_of
 from support.mixtures import POINT, features_of, random_mixture
 from support.mixtures import drawn as drawn_from_mixture
-from support.rivals import Rivals
 
 from lidardesign.constraints.document import Constraints
 from lidardesign.density.coordinates import Coordinates
@@ -375,7 +375,7 @@ def test_even_rays_are_even_over_a_wide_field_of_view_on_the_sphere():
 @pytest.mark.parametrize("name", ["random", "uniform"])
 def test_rays_of_the_plain_baselines_are_uniform_in_what_they_say(name, measure):
     space = DesignSpace((-1, 0, 0, 0.5, -1.2, 0.5), (1, 0, 0, 2.5, 1.4, 3.0), measure=measure)
-    rays = Rivals(space, (), 3).positions(name, 4000)[0]
+    rays = SceneBaselines(space, (), 3).positions(name, 4000)[0]
     azimuth, elevation = angles(rays.direction)
     # even placements divide the angles; random ones are uniform in the space's own measure
     by_area = measure == "solid_angle" and name == "random"

@@ -120,8 +120,8 @@ def test_the_log_density_of_every_flow_that_is_compared_is_that_of_its_jacobian(
         assert flow.jacobian_error(contestant, base) < 1e-9, name
 
 
-def rival_document(difference=-0.5, low=-0.9, high=-0.1):
-    """What `evaluate` prints about `fit` against one rival, at one number of rays."""
+def baseline_document(difference=-0.5, low=-0.9, high=-0.1):
+    """What `evaluate` prints about `fit` against one baseline, at one number of rays."""
     row = {"rays": 10, "ci_low": 0.0, "ci_high": 9.0, "bandwidth_mbps": 2.0}
     pair = {"a": "fit", "b": "bounding", "rays": 10, "difference": difference, "ci_low": low, "ci_high": high}
     return {
@@ -134,34 +134,34 @@ def rival_document(difference=-0.5, low=-0.9, high=-0.1):
     }
 
 
-def test_a_rival_is_beaten_where_the_interval_says_so(script):
-    rivals = script("rivals")
+def test_a_baseline_is_beaten_where_the_interval_says_so(script):
+    baselines = script("baselines")
     cases = {"better": (-0.5, -0.9, -0.1), "worse": (0.5, 0.1, 0.9), "no difference": (-0.1, -0.5, 0.4)}
     for word, numbers in cases.items():
-        found = rival_document(*numbers)
-        (row,) = [row for row in rivals.equal_rays(found) if row[1] == "bounding"]
+        found = baseline_document(*numbers)
+        (row,) = [row for row in baselines.equal_rays(found) if row[1] == "bounding"]
         assert word in row[-1]
         assert row[-1].startswith(f"{100 * numbers[0] / 5:+.1f} (")
-        (matched,) = rivals.equal_bandwidth(found)
+        (matched,) = baselines.equal_bandwidth(found)
         assert word in matched[-1]
-        assert all(line.startswith("holds") == (word == "better") for line in rivals.verdicts(found)[::2])
+        assert all(line.startswith("holds") == (word == "better") for line in baselines.verdicts(found)[::2])
 
 
 def test_a_page_takes_what_was_measured_between_its_marks_and_keeps_the_rest(script, tmp_path):
     page = tmp_path / "page.md"
     page.write_text("before\n\n<!-- face -->\n\nold\n\n<!-- face -->\n\nafter\n")
-    found = {**rival_document(), "where": "Measured here."}
-    script("rivals").write_page(page, {"face": found})
+    found = {**baseline_document(), "where": "Measured here."}
+    script("baselines").write_page(page, {"face": found})
     once = page.read_text()
     assert once.startswith("before\n\n<!-- face -->\n\nError in mm on 3 held-out scenes. Measured here.")
     assert once.endswith("<!-- face -->\n\nafter\n")
     assert "| `bounding` | -10.0 (-18.0 to -2.0), better" in " ".join(once.split())
-    assert "better than rivals that choose no rays in 1 of 1 comparisons" in once
+    assert "better than baselines that choose no rays in 1 of 1 comparisons" in once
     assert "old" not in once
-    script("rivals").write_page(page, {"face": found})
+    script("baselines").write_page(page, {"face": found})
     assert page.read_text() == once
     with pytest.raises(SystemExit, match=r"arm.* 0 times"):
-        script("rivals").write_page(page, {"arm": found})
+        script("baselines").write_page(page, {"arm": found})
 
 
 def test_a_journey_is_compared_command_by_command_and_what_is_kept_is_not_measured_again(script, monkeypatch, tmp_path):
@@ -213,7 +213,7 @@ SMALLEST = [
     ("learn", [*FACE, "--preset", "draft", *ROUGH, "--goals", "0.95", "--kl", "1000"]),
     ("occlusion", [*SMALL_ARM, "--preset", "draft", "--rays", "20", "40", "--further-rays", "60"]),
     ("raycasting", [*FACE, "--rays", "2000", "--checked", "100"]),
-    ("rivals", ["--folder", "kept", "--task", "warehouse", "--preset", "draft", *SMALL_WAREHOUSE, "--rays", "6"]),
+    ("baselines", ["--folder", "kept", "--task", "warehouse", "--preset", "draft", *SMALL_WAREHOUSE, "--rays", "6"]),
     ("selection", [*FACE, "--scenes", "4", "8", "--candidates", "100", "200", "--count", "25", "--problems", "2"]),
     ("target", [*FACE, "--scenes", "2", "--batch", "128", "--points", "8", "--resolution", "24"]),
     ("warehouse", ["--preset", "draft", *SMALL_WAREHOUSE, "--rays", "4", "--fit-rays", "4", "--at", "0", "0.37"]),

@@ -1,10 +1,10 @@
-"""The simple rivals: exact numbers of rays, inside the space, the same every time."""
+"""The simple baselines: exact numbers of rays, inside the space, the same every time."""
 
 import math
 
 import numpy as np
 import pytest
-from support.rivals import Rivals, balls
+from support.baselines import SceneBaselines, balls
 
 from lidardesign.errors import ConfigError
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
@@ -28,7 +28,7 @@ BUILT = ["uniform", "random", "bounding", "silhouette", "occupancy"]
 
 def build_baseline(name, space, train, count, seed, judge=None):
     """A baseline at so many rays, for a space without conditions."""
-    return Rivals(space, train, seed, judge).positions(name, count)[0]
+    return SceneBaselines(space, train, seed, judge).positions(name, count)[0]
 
 
 CASES = {
@@ -50,7 +50,7 @@ def design_points(rays):
 @pytest.mark.parametrize("name", BUILT)
 def test_any_number_of_rays_is_met_exactly_inside_the_space_and_repeats(case, name):
     space, train = CASES[case]
-    source, same = (Rivals(space, train, seed=4) for _ in range(2))
+    source, same = (SceneBaselines(space, train, seed=4) for _ in range(2))
     for count in (0, 1, 2, 7, 36, 101):
         (rays,) = source.positions(name, count)
         (again,) = same.positions(name, count)
@@ -141,7 +141,7 @@ def test_bounding_without_any_return_is_uniform():
 def test_as_many_rays_as_fit_in_a_bandwidth_fit_and_one_more_does_not(case, name, limit):
     space, train = CASES[case]
     bandwidth = Bandwidth()
-    source = Rivals(space, train, seed=0)
+    source = SceneBaselines(space, train, seed=0)
     (rays,) = source.positions_within(name, limit, bandwidth)
     assert bandwidth.mbps(rays) <= limit
     fitting = [

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.rivals import balls
+from support.baselines import balls
 from support.scoring import HitTask, MissTask
 from support.sensors import normal_sensor
 

@@ -284,7 +284,8 @@ class TestDrawnScenes:
         points = draw_probes(target, 200, 0, "test").points
         # culled by other best terms, scenes that are left out add less than exp(-16) of the largest term
         means = [
-            np.exp(target.drawn(np.array(chosen)).log_density(points)) for chosen in itertools.combinations(range(4), 2)
+            np.exp(target.subsample(np.array(chosen)).log_density(points))
+            for chosen in itertools.combinations(range(4), 2)
         ]
         assert np.mean(means, axis=0) == pytest.approx(np.exp(target.log_density(points)), rel=1e-5, abs=1e-7)
 
@@ -300,7 +301,7 @@ class TestDrawnScenes:
 
         target.visibility.transmittance = watched
         points = draw_probes(target, 100, 0, "test").points
-        values, slopes = target.drawn(np.array([1])).log_density_and_gradient(points)
+        values, slopes = target.subsample(np.array([1])).log_density_and_gradient(points)
         assert np.isfinite(values).all()
         assert np.isfinite(slopes).all()
         assert not seen[0][:, [0, 2]].any()

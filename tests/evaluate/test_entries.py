@@ -110,7 +110,7 @@ def test_every_row_scores_what_its_rays_return_when_simulated_alone():
     assert [(row.design, row.rays) for row in rows] == [(entry.name, entry.rays) for entry in entries]
     for row, entry in zip(rows, entries, strict=True):
         for index, scene in enumerate(request.test):
-            alone = [one for rays in entry.drawn(index) for one in simulate(scene, rays)]
+            alone = [one for rays in entry.rays_in(index) for one in simulate(scene, rays)]
             assert row.per_scene[index] == task.score(scene, alone).value
         assert row.details["hit"] == pytest.approx(row.per_scene.mean() * row.rays * len(PLACES) / 100)
 
@@ -135,7 +135,7 @@ def test_baselines_lie_in_what_the_condition_leaves_free(place):
     inside = AISLE.at({"x_m": PLACES[place]})
     for entry in entries_of(request):
         for scene in range(2):
-            rays = entry.drawn(scene)[place]
+            rays = entry.rays_in(scene)[place]
             azimuth, elevation = angles(rays.direction)
             middle = np.clip(rays.gate_m.mean(axis=1), inside.low[5], inside.high[5])
             points = np.column_stack([rays.origin_m, azimuth, elevation, middle])
@@ -148,10 +148,10 @@ def test_baselines_lie_in_what_the_condition_leaves_free(place):
 def test_drawn_baselines_differ_from_scene_to_scene_and_from_place_to_place():
     request = aisle_request(SeenTask(PLACES))
     for entry in entries_of(request):
-        drawn = [rays.direction for scene in range(2) for rays in entry.drawn(scene)]
+        drawn = [rays.direction for scene in range(2) for rays in entry.rays_in(scene)]
         if entry.name in ("random", "occupancy") and entry.rays:
             assert len({one.tobytes() for one in drawn}) == len(drawn)
-        assert entry.drawn(1)[0].direction.tobytes() == entry.drawn(1)[0].direction.tobytes()
+        assert entry.rays_in(1)[0].direction.tobytes() == entry.rays_in(1)[0].direction.tobytes()
 
 
 def test_conditions_that_a_task_does_not_name_are_even():

@@ -25,15 +25,15 @@ def make_row(name, values, baseline=False, rays=9):
     return Row(name, rays, values.mean(), 0.0, 1.0, 0, 1.0, 2.0 + baseline, values, baseline)
 
 
-def of_scores(own, rival, tmp_path):
-    evaluation = Evaluation(METRIC, len(own), [make_row("own", own), make_row("bounding", rival, True)], [])
+def of_scores(own, baseline, tmp_path):
+    evaluation = Evaluation(METRIC, len(own), [make_row("own", own), make_row("bounding", baseline, True)], [])
     return AccuracyRequest(None, tmp_path, make_request(), evaluation)
 
 
 def test_half_widths_fall_with_the_root_of_the_number_of_scenes(tmp_path):
     generator = np.random.default_rng(3)
-    own, rival = generator.normal(0, 3, 400), np.zeros(400)
-    (sweep,) = sweeps.scenes_sweeps(of_scores(own, rival, tmp_path))
+    own, baseline = generator.normal(0, 3, 400), np.zeros(400)
+    (sweep,) = sweeps.scenes_sweeps(of_scores(own, baseline, tmp_path))
     assert [measurement.setting for measurement in sweep.measurements] == ["5", "10", "20", "50", "100", "200", "400"]
     for measurement in sweep.measurements[2:]:
         closed_form = 1.96 * 3 / math.sqrt(int(measurement.setting))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, SphericalVoronoi, cKDTree
 from scipy.spatial.transform import Rotation
-from support.rivals import Rivals, balls
+from support.baselines import SceneBaselines, balls
 
 from lidardesign.scenes.scene import Body, Box, Scene, rigid
 from lidardesign.scoring.baselines.candidates import LayoutSite
@@ -155,7 +155,7 @@ def test_turning_the_world_turns_bounding():
             )
             for i in range(4)
         ]
-        (rays,) = Rivals(SPHERE, box, 0).positions("bounding", 196)
+        (rays,) = SceneBaselines(SPHERE, box, 0).positions("bounding", 196)
         local = rays.direction @ turn
         areas.append(ConvexHull(local[:, 1:] / local[:, :1]).volume)
     # rolls go in steps of 5 degrees, and few of the rays over the whole sphere see the box

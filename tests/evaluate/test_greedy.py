@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from support.rivals import Rivals, balls
+from support.baselines import SceneBaselines, balls
 from support.scoring import MissTask, design, make_request, rows_by_key
 
 from lidardesign.rays import information
@@ -118,8 +118,8 @@ def test_returns_are_nearer_to_surfaces_than_those_of_even_and_random_rays_in_no
     space, held_out, count = SUBJECTS[subject], scenes(900, count=20), COUNTS[-1]
     ratios = []
     for seed in range(4):
-        rivals = Rivals(space, scenes(seed), seed, gates_per_ray=True)
-        (even,), (random,) = (rivals.positions(name, count) for name in ("bounding", "random"))
+        baselines = SceneBaselines(space, scenes(seed), seed, gates_per_ray=True)
+        (even,), (random,) = (baselines.positions(name, count) for name in ("bounding", "random"))
         (chosen,) = candidate(space, [Fired(count, BANDWIDTH.mbps(even))], seed=seed).positions([space], count)
         assert BANDWIDTH.mbps(chosen) <= BANDWIDTH.mbps(even)
         ratios.append([distance(chosen, held_out) / distance(other, held_out) for other in (even, random)])
@@ -179,10 +179,10 @@ def test_many_rays_at_many_places_take_too_long():
 
 def aimed(counts=COUNTS):
     """The design beside `greedy`: even rays, each with a gate of its own that is longer than those of baselines."""
-    rivals = Rivals(AHEAD, scenes(1), 3)
+    baselines = SceneBaselines(AHEAD, scenes(1), 3)
     patterns = []
     for count in counts:
-        (rays,) = rivals.positions("bounding", count)
+        (rays,) = baselines.positions("bounding", count)
         longer = np.linspace(0.2, 0.21, count)[:, None] * [-1, 1]
         patterns.append(Pattern.of(replace(rays, gate_m=rays.gate_m + longer)))
     return replace(design(), layout="chosen", patterns=tuple(patterns))

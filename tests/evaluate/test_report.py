@@ -22,7 +22,7 @@ from support.report_pages import (
     ray_segments,
 )
 
-from lidardesign.report.figures import curve_figure, far_rivals, marginal_figure, plane_figure
+from lidardesign.report.figures import curve_figure, far_baselines, marginal_figure, plane_figure
 from lidardesign.report.markup import asset
 from lidardesign.report.page import report_html
 from lidardesign.report.scene_figure import (
@@ -58,7 +58,7 @@ from lidardesign.report.view import (
 )
 from lidardesign.scenes.rays import Outcome
 from lidardesign.scenes.scene import Body, Box, Capsule, Cylinder, Ellipsoid, Mesh, Plane, Scene, Sphere, rigid
-from lidardesign.scoring.evaluation.entries import StrongestRival
+from lidardesign.scoring.evaluation.entries import StrongestBaseline
 from lidardesign.scoring.evaluation.results import Evaluation, leading_detail, verdict
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
@@ -208,14 +208,14 @@ def test_a_verdict_needs_an_interval_that_excludes_zero_and_the_metrics_directio
     ("better", "strongest", "far"),
     [("lower", "close", {"awful"}), ("lower", "awful", set()), ("higher", "close", set())],
 )
-def test_rivals_are_hidden_at_first_where_they_are_far_worse_than_all_designs(better, strongest, far):
+def test_baselines_are_hidden_at_first_where_they_are_far_worse_than_all_designs(better, strongest, far):
     rows = [make_row("d", 9, 10.0), make_row("close", 9, 14.0, True), make_row("awful", 9, 90.0, True)]
     # one that is far worse with few rays alone
     rows += [make_row("d", 25, 8.0), make_row("late", 9, 90.0, True), make_row("late", 25, 8.0, True)]
     rows += [make_row("awful", 25, 60.0, True)]
     metric = Metric("score", "mm", better, worst=200.0, tolerance=0.1)
-    rival = StrongestRival(strongest, 9, 20, {})
-    assert far_rivals(Evaluation(metric, 1, rows, [], strongest_rival=rival)) == far
+    baseline = StrongestBaseline(strongest, 9, 20, {})
+    assert far_baselines(Evaluation(metric, 1, rows, [], strongest_baseline=baseline)) == far
 
 
 EGG = Ellipsoid((0.1, 0.2, 0.3))

@@ -311,7 +311,7 @@ def test_the_keyboard_reaches_every_control_and_shows_where_it_is(page):
     assert page.evaluate("() => reached.size") == wanted > 40
 
 
-def test_curves_are_switched_in_both_figures_and_far_rivals_wait_for_it(page):
+def test_curves_are_switched_in_both_figures_and_far_baselines_wait_for_it(page):
     shown = "() => all('.curves').map(one => one._fullData.filter(trace => trace.visible === true).length)"
     assert page.evaluate(shown) == [4, 4]
     page.locator("[data-curve='2']").check()

@@ -1,4 +1,4 @@
-"""The report's first section: designs against the strongest rival at the middle number of rays."""
+"""The report's first section: designs against the strongest baseline at the middle number of rays."""
 
 import re
 from dataclasses import replace
@@ -7,20 +7,20 @@ import pytest
 from support.report_pages import NASTY, make_evaluation, make_row, make_sensor
 
 from lidardesign.report.page import headline, result_section
-from lidardesign.scoring.evaluation.entries import StrongestRival
+from lidardesign.scoring.evaluation.entries import StrongestBaseline
 from lidardesign.scoring.evaluation.results import Evaluation, Paired
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.task import Metric
 
-RIVAL = StrongestRival("greedy", 25, 20, {"greedy": 5.5, "uniform": 20.0})
+BASELINE = StrongestBaseline("greedy", 25, 20, {"greedy": 5.5, "uniform": 20.0})
 
 
-def evaluation_of(*pairs, better="lower", rival=RIVAL, notes=()):
+def evaluation_of(*pairs, better="lower", baseline=BASELINE, notes=()):
     names = list(dict.fromkeys(pair.a for pair in pairs)) or ["f"]
     rows = [make_row(name, rays, value) for name in names for rays, value in ((9, 10.0), (25, 5.0), (64, 2.0))]
     rows += [make_row(name, rays, 5.5, True) for name in ("greedy", "uniform") for rays in (9, 25, 64)]
     metric = Metric("score", "mm", better, worst=200.0, tolerance=0.1)
-    return Evaluation(metric, 8, rows, pairs, notes=notes, strongest_rival=rival)
+    return Evaluation(metric, 8, rows, pairs, notes=notes, strongest_baseline=baseline)
 
 
 def pair(difference, low, high, rays=25, name="f"):
@@ -44,7 +44,7 @@ def test_only_pairs_at_the_number_of_rays_of_its_row_are_told():
     assert evaluation.headline_pairs == {"f": told}
     text = result_section(evaluation, [])
     assert text.count('class="verdict"') == 1
-    assert "The strongest rival is greedy, the best of 2 on 20 training scenes." in text
+    assert "The strongest baseline is greedy, the best of 2 on 20 training scenes." in text
 
 
 def test_a_design_without_the_middle_number_of_rays_is_shown_at_the_closest():
@@ -54,8 +54,8 @@ def test_a_design_without_the_middle_number_of_rays_is_shown_at_the_closest():
     assert {name: row.rays for name, row in fewer.headline_rows.items()} == {"f": 25, "g": 30}
 
 
-def test_without_rivals_every_design_has_its_score():
-    text = result_section(evaluation_of(rival=None), [])
+def test_without_baselines_every_design_has_its_score():
+    text = result_section(evaluation_of(baseline=None), [])
     assert "f: 5 mm at 25 rays." in text
     assert "difference" not in text
 
@@ -78,5 +78,5 @@ def test_the_certificate_of_the_rays_that_are_told_about_is_told(rays):
 
 def test_no_name_becomes_markup():
     evaluation = make_evaluation(NASTY)
-    rival = StrongestRival("uniform", 9, 1, {"uniform": 20.0})
-    assert "<img" not in result_section(replace(evaluation, strongest_rival=rival, notes=[NASTY] * 4), [])
+    baseline = StrongestBaseline("uniform", 9, 1, {"uniform": 20.0})
+    assert "<img" not in result_section(replace(evaluation, strongest_baseline=baseline, notes=[NASTY] * 4), [])

@@ -13,7 +13,7 @@ from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.report.figures import scores_figure
 from lidardesign.report.tables import paired_tables
 from lidardesign.scoring.baselines import candidates
-from lidardesign.scoring.evaluation.entries import FEWEST_RIVAL_SCENES
+from lidardesign.scoring.evaluation.entries import FEWEST_BASELINE_SCENES
 from lidardesign.scoring.evaluation.results import csv_text, verdict
 from lidardesign.scoring.evaluation.score import evaluate
 from lidardesign.scoring.evaluation.thresholds import worse_than_threshold
@@ -214,8 +214,8 @@ def test_rows_that_fire_the_same_rays_are_scored_once():
 
     evaluate(make_request(task=Counting(), baselines=("uniform",), rays=(25, 25), test=scenes(2, 2)))
     # one design and one baseline at 25 rays, and the baseline at the design's bandwidth, in two scenes each; and the
-    # baseline in the training scenes that the strongest rival is found on
-    assert len(calls) == 6 + FEWEST_RIVAL_SCENES
+    # baseline in the training scenes that the strongest baseline is found on
+    assert len(calls) == 6 + FEWEST_BASELINE_SCENES
 
 
 class BrokenTask(MissTask):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from support.rivals import Rivals, balls
+from support.baselines import SceneBaselines, balls
 
 from lidardesign.scenes.casting import SceneCaster
 from lidardesign.scoring.baselines.candidates import LayoutSite
@@ -96,18 +96,18 @@ def test_lloyd_has_more_rays_where_returns_are_frequent_and_surfaces_large():
 
 
 @pytest.mark.parametrize("name", MAKE)
-def test_where_nothing_returns_there_is_no_candidate_and_the_rival_is_uniform(name):
+def test_where_nothing_returns_there_is_no_candidate_and_the_baseline_is_uniform(name):
     nothing = balls(np.array([-3.0, 0, 0]))
     assert MAKE[name](TrainingViews(AHEAD, nothing)) == []
-    rivals = Rivals(AHEAD, nothing, 0)
-    assert np.array_equal(rivals.positions(name, 9)[0].direction, rivals.positions("uniform", 9)[0].direction)
+    baselines = SceneBaselines(AHEAD, nothing, 0)
+    assert np.array_equal(baselines.positions(name, 9)[0].direction, baselines.positions("uniform", 9)[0].direction)
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.1])
 @pytest.mark.parametrize("name", MAKE)
 def test_a_bandwidth_is_kept_and_used(name, limit):
     space, scenes = SUBJECTS["ahead"]
-    (rays,) = Rivals(space, scenes, 0).positions_within(name, limit, Bandwidth())
+    (rays,) = SceneBaselines(space, scenes, 0).positions_within(name, limit, Bandwidth())
     cost = Bandwidth().mbps(rays)
     assert cost <= limit
     assert cost >= 0.9 * limit - 0.003

@@ -13,10 +13,12 @@ TOOK = re.compile(r"took [\w. ]+ s")
 TIMES = "where the time went"
 # What a comparison of numbers may turn out to be.
 VERDICTS = re.compile(r"\b(?:better|worse|not told apart|yes, tight|yes|no)\b")
-# Lines and words that follow from the numbers alone: which rival is the strongest, which constraint is tight.
-VARYING = re.compile(r"tight: |no constraint is tight|the constraints leave |.*the strongest rival on training scenes")
-RIVAL = re.compile(r"\bdifference to \w+")
-RIVAL_ROW = re.compile(r"\b(?:uniform|random|bounding|silhouette|greedy) (?=# )")
+# Lines and words that follow from the numbers alone: which baseline is the strongest, which constraint is tight.
+VARYING = re.compile(
+    r"tight: |no constraint is tight|the constraints leave |.*the strongest baseline on training scenes"
+)
+BASELINE = re.compile(r"\bdifference to \w+")
+BASELINE_ROW = re.compile(r"\b(?:uniform|random|bounding|silhouette|greedy) (?=# )")
 # Said only where the numbers ask for it.
 OCCASIONAL = re.compile(r", # rays in all(?=:)|, rays #$|<(?=#)| \(# %\)(?= verdict)")
 
@@ -24,7 +26,7 @@ OCCASIONAL = re.compile(r", # rays in all(?=:)|, rays #$|<(?=#)| \(# %\)(?= verd
 def masked(text: str) -> str:
     """The words of a text in one line, without the lines of tables, a # for every number."""
     words = " ".join(NUMBER.sub("#", BOXES.sub(" ", text)).split())
-    words = RIVAL_ROW.sub("rival ", RIVAL.sub("difference to it", VERDICTS.sub("verdict", words)))
+    words = BASELINE_ROW.sub("baseline ", BASELINE.sub("difference to it", VERDICTS.sub("verdict", words)))
     return OCCASIONAL.sub("", words)
 
 

@@ -8,7 +8,7 @@ from lidardesign.scoring.evaluation.request import EvaluationRequest
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
-from support.rivals import balls
+from support.baselines import balls
 from support.sensors import normal_sensor
 
 SPACE = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))

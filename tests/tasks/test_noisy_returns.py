@@ -140,7 +140,7 @@ class Remembering:
         return Score(0.0)
 
 
-def test_chance_is_the_same_for_rival_rays_and_another_one_at_each_position():
+def test_chance_is_the_same_for_baseline_rays_and_another_one_at_each_position():
     wall = Body(Box((0.05, 2, 2)), "wall", poses=rigid(translation_m=(1.05, 0, 0)))
     scene, count = Scene((wall,)), 50
     rays = rays_along(np.tile((1.0, 0.0, 0.0), (count, 1)), (0.5, 2.0))

@@ -160,9 +160,9 @@ def _design_row(entry: dict[str, Any]) -> list[str]:
     if score is None:
         return [*shape, number(entry["rays"]), "-", "-", "-"]
     difference = "-"
-    if None not in (score["rival"], score["difference"]):
+    if None not in (score["baseline"], score["difference"]):
         ends = {"ci_low": score["difference_low"], "ci_high": score["difference_high"]}
-        difference = f"{difference_cell({**score, **ends}, sign='+')} to {score['rival']}"
+        difference = f"{difference_cell({**score, **ends}, sign='+')} to {score['baseline']}"
     under = [*score["settings"], *([score["detector"]] if score["detector"] != IDEAL else [])]
     return [*shape, number(score["rays"]), *value_cells(score), ", ".join([difference, *under])]
 

@@ -36,12 +36,12 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
-    """Print a row per design with its difference to the strongest rival, and a line on each further result."""
+    """Print a row per design with its difference to the strongest baseline, and a line on each further result."""
     from lidardesign.scoring.evaluation.thresholds import difference_text
 
     rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
-    rival = evaluation.strongest_rival
-    shown = [row.as_dict() for row in (*rows.values(), *evaluation.rival_rows)]
+    baseline = evaluation.strongest_baseline
+    shown = [row.as_dict() for row in (*rows.values(), *evaluation.baseline_rows)]
     values, intervals = zip(*map(value_cells, shown), strict=True)
     columns = {
         "rays": [str(row["rays"]) for row in shown],
@@ -55,9 +55,9 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
         del columns["rays"]
     if not any(row["failures"] for row in shown):
         del columns["failures"]
-    if pairs and rival is not None:
+    if pairs and baseline is not None:
         apart = {name: difference_cell(pair.as_dict(), sign="+") for name, pair in pairs.items()}
-        columns[f"difference to {rival.name}"] = [apart.get(row["design"], "-") for row in shown]
+        columns[f"difference to {baseline.name}"] = [apart.get(row["design"], "-") for row in shown]
     metric, names = evaluation.metric, [row["design"] for row in shown]
     rays = f" at {shown[0]['rays']} rays" if len(counts) == 1 else ""
     title = f"{metric.name} [{metric.unit}]{rays}, {_scenes(document)} ({metric.better} is better)"
@@ -66,7 +66,7 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
     print_table(None, ("design", *columns), list(zip(names, *columns.values(), strict=True)), rich)
     if pairs:
         rich.print(sentence(evaluation, list(pairs.values())), soft_wrap=True)
-    elif rival is None:
+    elif baseline is None:
         for pair in evaluation.paired:
             if pair.rays == rows[pair.a].rays:
                 rich.print(difference_text(pair, metric.better, metric.unit), soft_wrap=True)
@@ -80,21 +80,21 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
 
 
 def sentence(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
-    """A sentence that compares designs with the strongest rival."""
+    """A sentence that compares designs with the strongest baseline."""
     from lidardesign.scoring.evaluation.results import verdict
     from lidardesign.scoring.evaluation.thresholds import difference_text
 
-    metric, rival = evaluation.metric, pairs[0].b
+    metric, baseline = evaluation.metric, pairs[0].b
     if len(pairs) == 1:
         apart = difference_text(pairs[0], metric.better, metric.unit)
-        return f"{apart}; {rival} is the strongest rival on training scenes"
+        return f"{apart}; {baseline} is the strongest baseline on training scenes"
     parts = []
     for word in ("better", "worse", "open"):
         names = [pair.a for pair in pairs if verdict(evaluation, pair) == word]
         listed = " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
         is_word = f"{listed} {'are' if len(names) > 1 else 'is'} {word}"
         parts += [f"no difference was found for {listed}" if word == "open" else is_word] * bool(names)
-    return f"against {rival}, the strongest rival on training scenes: {'; '.join(parts)}"
+    return f"against {baseline}, the strongest baseline on training scenes: {'; '.join(parts)}"
 
 
 def _scenes(document: Entry) -> str:

@@ -92,9 +92,9 @@ class _Sample:
             of.append(np.full(len(points), number))
         return np.concatenate(parts), np.concatenate(of)
 
-    def first_hits(self, points: np.ndarray, column: np.ndarray) -> _Met:
+    def first_hits(self, points: np.ndarray, column: np.ndarray) -> _SampledHits:
         """First hits of rays (N, 6) in their columns (N,)."""
-        met = _Met(np.full(len(points), np.inf), np.zeros(len(points), dtype=bool), np.zeros(len(points)))
+        met = _SampledHits(np.full(len(points), np.inf), np.zeros(len(points), dtype=bool), np.zeros(len(points)))
         for number in np.unique(column):
             rows, (index, frame) = np.flatnonzero(column == number), self.columns[number]
             directions = _directions(points[rows])
@@ -117,7 +117,7 @@ class _Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class _Met:
+class _SampledHits:
     """Ranges of first hits [m], whether they are on targets, and the cosines of incidence, each (N,)."""
 
     range_m: np.ndarray
@@ -159,11 +159,11 @@ def _unit_doubt(one_m: float, other_m: float) -> str:
     return " (are all lengths in metres?)" if max(one_m, other_m) > OTHER_UNIT * min(one_m, other_m) else ""
 
 
-def _visible(points: np.ndarray, met: _Met) -> np.ndarray:
+def _visible(points: np.ndarray, met: _SampledHits) -> np.ndarray:
     return met.target & (met.range_m >= (1 - SAME_PLACE) * points[:, RANGE])
 
 
-def _view_notes(sample: _Sample, points: np.ndarray, column: np.ndarray, met: _Met) -> list[str]:
+def _view_notes(sample: _Sample, points: np.ndarray, column: np.ndarray, met: _SampledHits) -> list[str]:
     """Notes on targets that rays of the space cannot reach."""
     space, reach_m = sample.space, sample.space.high[RANGE]
     viewed, across_m = _in_angles(space, points), float(np.ptp(observed_point(points), axis=0).max())
@@ -206,7 +206,7 @@ def _view_notes(sample: _Sample, points: np.ndarray, column: np.ndarray, met: _M
     return notes
 
 
-def _sigma_notes(sample: _Sample, points: np.ndarray, met: _Met, config: RunConfig) -> list[str]:
+def _sigma_notes(sample: _Sample, points: np.ndarray, met: _SampledHits, config: RunConfig) -> list[str]:
     """Notes on a sigma that does not suit the visible surface."""
     sigma_m = config.density.sigma_m
     seen = _in_angles(sample.space, points) & _visible(points, met)

@@ -89,7 +89,7 @@ class Surfaces:
     def log_proximity(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> np.ndarray:
         """log of the sum of surface terms at scene points, (N, 3) to (N,)."""
 
-    def drawn(self, columns: np.ndarray) -> Surfaces:
+    def subsample(self, columns: np.ndarray) -> Surfaces:
         """Some columns alone, weighted to stand for all."""
 
     def raycast(self, scenes: Sequence[Scene]) -> Visibility:
@@ -172,7 +172,7 @@ class SceneTable(Surfaces):
         distances = self.field.distances(observed).astype(np.float64)
         return logsumexp(self.terms(observed, distances, sigma_m), axis=1)
 
-    def drawn(self, columns: np.ndarray) -> SceneTable:
+    def subsample(self, columns: np.ndarray) -> SceneTable:
         """See `Surfaces`; the others stay in the table without weight."""
         count = len(self.log_column_weights)
         weights = np.full(count, -np.inf)
@@ -295,7 +295,7 @@ class MovingFrames(Surfaces):
         near = self.near(observed, sigma_m, tolerance_nats)
         return row_log_sums(near.surface, near.columns)[0]
 
-    def drawn(self, columns: np.ndarray) -> MovingFrames:
+    def subsample(self, columns: np.ndarray) -> MovingFrames:
         """See `Surfaces`; the others are taken away."""
         weights = self.log_column_weights[columns] + np.log(self.bodies.columns / len(columns))
         bodies = self.bodies.take(columns)

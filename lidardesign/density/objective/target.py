@@ -77,9 +77,9 @@ class Target:
         receiver = common_receiver(self.scenes)
         return replace(self, visibility=way if receiver is None else BistaticVisibility(way, receiver))
 
-    def drawn(self, columns: np.ndarray) -> Target:
+    def subsample(self, columns: np.ndarray) -> Target:
         """An estimate of p* from some columns alone, weighted to stand for all; the others need no visibility."""
-        return replace(self, surfaces=self.surfaces.drawn(columns), visibility=self.visibility.take(columns))
+        return replace(self, surfaces=self.surfaces.subsample(columns), visibility=self.visibility.take(columns))
 
     def log_proximity(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
         """log of the sum of surface terms at the scene points that design points (N, 6) observe, shape (N,)."""

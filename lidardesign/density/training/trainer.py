@@ -402,7 +402,7 @@ class Trainer(LearnedFlow):
         if self.target.columns <= self.settings.frames:
             return self.target
         chosen = torch.randperm(self.target.columns, generator=self.generator)[: self.settings.frames]
-        return self.target.drawn(np.sort(chosen.numpy()))
+        return self.target.subsample(np.sort(chosen.numpy()))
 
     def _skip(self) -> None:
         self.skipped, self.skipped_in_a_row = self.skipped + 1, self.skipped_in_a_row + 1

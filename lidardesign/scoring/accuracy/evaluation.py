@@ -46,7 +46,7 @@ MOST_THIN_RAYS = 6_000_000
 # Effects that take longer than this in one pass over the scenes are left out of all passes [s].
 MOST_SECONDS = 2.0
 # The baseline that numbers of held-out scenes are tried on, and those that are tried where there are more.
-RIVAL = "bounding"
+BASELINE = "bounding"
 COUNTS = (5, 10, 20, 50, 100, 200)
 # So many sets of scenes are drawn for each; a mean half-width is then known to a few percent beside the scenes' own.
 DRAWS = 32
@@ -268,16 +268,16 @@ def scenes_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     rows = request.evaluation.rows
     first = next((row.design for row in rows if not row.baseline), None)
     pairs = [
-        (row, rival)
+        (row, baseline)
         for row in rows
-        for rival in rows
-        if row.design == first and rival.design == RIVAL and rival.rays == row.rays
+        for baseline in rows
+        if row.design == first and baseline.design == BASELINE and baseline.rays == row.rays
     ]
     if not pairs:
         return []
     # at most rays designs are closest
-    design, rival = max(pairs, key=lambda pair: pair[0].rays)
-    differences = np.asarray(design.per_scene, dtype=np.float64) - np.asarray(rival.per_scene, dtype=np.float64)
+    design, baseline = max(pairs, key=lambda pair: pair[0].rays)
+    differences = np.asarray(design.per_scene, dtype=np.float64) - np.asarray(baseline.per_scene, dtype=np.float64)
     if design.groups is not None:  # scenes of one group stand for each other
         differences = np.bincount(design.groups, differences) / np.bincount(design.groups)
     return [_scenes_sweep(differences, design, request)] if len(differences) > 1 else []
@@ -299,7 +299,7 @@ def _scenes_sweep(differences: np.ndarray, design: Row, request: AccuracyRequest
         note = f"{needed:,} {units} would tell differences of {tolerance:g} {metric.unit} apart"
     return Sweep(
         knob=f"held-out {units}",
-        error_of=f"half-width of the 95 % interval of {design.design} minus {RIVAL} at {design.rays} rays",
+        error_of=f"half-width of the 95 % interval of {design.design} minus {BASELINE} at {design.rays} rays",
         unit=metric.unit,
         against=f"all {units} that there could be",
         tolerance=tolerance,

@@ -190,7 +190,7 @@ def _frames_measure(
 
     def drawn(number: int) -> np.ndarray:
         chosen = np.sort(generator.permutation(columns)[:count])
-        target = steps.target if count == columns else steps.target.drawn(chosen)
+        target = steps.target if count == columns else steps.target.subsample(chosen)
         return gradient(flow, steps.pathwise(target), number, steps.settings.clip_norm)
 
     _, seconds, memory = timed(lambda: drawn(seeds[0]))

@@ -208,7 +208,7 @@ def projected(frame: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return local[:, 1:] * np.sqrt(2.0 / np.maximum(1.0 + local[:, :1], TINY))
 
 
-def central(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def central_interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Ends of the central 99 % of each column, (N, ...) to two of shape (...)."""
     tail = (1 - 0.99) / 2
     low, high = np.quantile(values, [tail, 1 - tail], axis=0)
@@ -226,24 +226,24 @@ def central_field(space: DesignSpace, azimuth_rad: np.ndarray, elevation_rad: np
     looking = direction(azimuth_rad, elevation_rad)
     mean = looking.mean(axis=0)
     frame = boresight_frame(*(float(angle) for angle in angles(mean)))
-    if np.linalg.norm(mean) > 0 and central(looking @ unit_vectors(mean))[0] > 0:
+    if np.linalg.norm(mean) > 0 and central_interval(looking @ unit_vectors(mean))[0] > 0:
         patch = _smallest_patch(space, frame, projected(frame, looking))
         if patch.admitted_share >= SMALLEST_SHARE:
             return patch
-    low, high = central(np.column_stack([azimuth_rad, elevation_rad]))
+    low, high = central_interval(np.column_stack([azimuth_rad, elevation_rad]))
     return Zone(low, high)
 
 
 def _smallest_patch(space: DesignSpace, frame: np.ndarray, plane: np.ndarray) -> Patch:
     turns = [np.array([[math.cos(roll), math.sin(roll)], [-math.sin(roll), math.cos(roll)]]) for roll in ROLLS_RAD]
-    ends = [central(plane @ turn.T) for turn in turns]
+    ends = [central_interval(plane @ turn.T) for turn in turns]
     areas = np.array([np.prod(high - low) for low, high in ends])
     areas[0] *= 1.0 - WORTH_A_ROLL
     best = int(np.argmin(areas))
     return Patch(np.vstack([frame[:1], turns[best] @ frame[1:]]), *ends[best], space)
 
 
-def even_unit(count: int, extents: np.ndarray) -> np.ndarray:
+def quasi_random_points(count: int, extents: np.ndarray) -> np.ndarray:
     """Exactly `count` even points in the unit cube of the axes given by their extents, shape (count, k).
 
     No axis gives equal points, one a cell-centred line, two a cell-centred grid with cells as square as
@@ -280,7 +280,7 @@ def even_placement(low: np.ndarray, high: np.ndarray, count: int, field: SphereF
     extents = (high - low)[free]
     if len(free) == 2 and free[0] < AZIMUTH <= free[1]:
         extents = np.ones(2)
-    points[:, free] += even_unit(count, extents) * (high - low)[free]
+    points[:, free] += quasi_random_points(count, extents) * (high - low)[free]
     return np.clip(points, low, high)
 
 
@@ -358,7 +358,7 @@ def _cropped(name: str, views: TrainingViews, crop_of: CropOf, gates_per_ray: bo
 
 def box_crop(views: TrainingViews, space: DesignSpace, observed: Observed) -> Crop:
     """The central 99 % of returns in origin, direction and range."""
-    low, high = central(observed.points)
+    low, high = central_interval(observed.points)
     directions = None
     if {AZIMUTH, ELEVATION} <= set(space.free) - set(space.conditioned):
         directions = central_field(space, observed.points[:, AZIMUTH], observed.points[:, ELEVATION])
@@ -374,7 +374,7 @@ def _parallel_crop(views: TrainingViews, space: DesignSpace, observed: Observed)
     """
     azimuth, elevation = parallel_angles(space, observed)
     looking = direction(azimuth, elevation)
-    low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in central(observed.hits_m))
+    low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in central_interval(observed.hits_m))
     for axis in np.flatnonzero(np.abs(looking) > ALIGNED):
         low[axis] = high[axis] = space.low[axis] if looking[axis] > 0 else space.high[axis]
     low, high = np.append(low, [azimuth, elevation]), np.append(high, [azimuth, elevation])
@@ -382,7 +382,7 @@ def _parallel_crop(views: TrainingViews, space: DesignSpace, observed: Observed)
     ranges = table().range_m[table().returned]
     if not len(ranges):
         return None
-    return Crop(low, high, None, opened_gate(*central(ranges)), table)
+    return Crop(low, high, None, opened_gate(*central_interval(ranges)), table)
 
 
 def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, float]:

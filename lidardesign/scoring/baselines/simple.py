@@ -35,7 +35,7 @@ from lidardesign.scenes.scene import Scene
 from lidardesign.scenes.surface import sample_body
 from lidardesign.scoring.baselines.candidates import BaselineLayout, Candidate, LayoutSite, opened_gate, whole_range
 from lidardesign.scoring.baselines.cma import CMA
-from lidardesign.scoring.baselines.even import bounding, central, even_placement
+from lidardesign.scoring.baselines.even import bounding, central_interval, even_placement
 from lidardesign.scoring.baselines.greedy import GREEDY, Fired
 from lidardesign.scoring.baselines.silhouette import lloyd, silhouette
 from lidardesign.scoring.baselines.views import RAY_AXES, TrainingViews, spread_frames
@@ -303,7 +303,7 @@ def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> Baseline
     if not len(points):
         return None
     drawn = random_generator(seed, "occupancy gate").choice(len(points), GATE_POINTS, p=weights / weights.sum())
-    nearest, furthest = central(points[drawn, RANGE])
+    nearest, furthest = central_interval(points[drawn, RANGE])
     known: dict[int, AimedPoints] = {}
 
     def place(count: int, site: LayoutSite) -> np.ndarray:

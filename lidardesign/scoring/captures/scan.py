@@ -19,7 +19,7 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.formats.galvo import degree_frame, middle_boresight_deg, scan_angles_deg, scan_directions
 from lidardesign.numerics import EPSILON
 from lidardesign.scenes.rays import Rays
-from lidardesign.scoring.baselines.even import even_unit
+from lidardesign.scoring.baselines.even import quasi_random_points
 from lidardesign.scoring.captures.capture import Capture
 from lidardesign.simulate.detector.physics import FWHM_PER_SIGMA, Estimator
 
@@ -133,7 +133,7 @@ def uniform_rays(capture: Capture, count: int) -> Rays:
     low, high = seen.min(axis=0) - half, seen.max(axis=0) + half
     # a scan along a line, or of a single pixel, has no extent across it
     extents = np.maximum(high - low, EPSILON)
-    looking = scan_directions(frame, low + even_unit(count, extents) * (high - low))
+    looking = scan_directions(frame, low + quasi_random_points(count, extents) * (high - low))
     none = np.zeros(count)
     gates_m = np.tile(_listening_windows_m(capture), (count, 1))
     return Rays(np.tile(capture.origin_m, (count, 1)), looking, gates_m, none, none)

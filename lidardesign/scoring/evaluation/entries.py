@@ -38,9 +38,9 @@ from lidardesign.task import conditions_of
 JUDGED_SCENES = 8
 # The strongest baseline is found on training scenes that no baseline's rays were chosen on: picking the best
 # of several by their scores on held-out scenes would favour a lucky one.
-MOST_RIVAL_SCENES = 20
-FEWEST_RIVAL_SCENES = 5
-LARGEST_RIVAL_SHARE = 0.1  # of the rays that an evaluation fires may be fired to find it
+MOST_BASELINE_SCENES = 20
+FEWEST_BASELINE_SCENES = 5
+LARGEST_BASELINE_SHARE = 0.1  # of the rays that an evaluation fires may be fired to find it
 MILLIMETRES = 1000.0
 
 
@@ -74,7 +74,7 @@ class Entry:
         """The bandwidth of its rays, averaged over condition values [Mbit/s]."""
         return mean_mbps(self.positions, bandwidth)
 
-    def drawn(self, scene: int) -> RaysPerCondition:
+    def rays_in(self, scene: int) -> RaysPerCondition:
         """The rays that it fires in a held-out scene."""
         return self.positions if self.redraw is None else self.redraw(scene)
 
@@ -237,8 +237,8 @@ def _judge(request: EvaluationRequest, lists: Sequence[RaysPerCondition]) -> lis
     return objective.values(lists).mean(axis=0).tolist()
 
 
-@phase("strongest rival")
-def strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: int) -> StrongestRival | None:
+@phase("strongest baseline")
+def strongest_baseline(request: EvaluationRequest, entries: Sequence[Entry], rays: int) -> StrongestBaseline | None:
     """The best of all baselines at a number of rays, under the effects of the evaluation; None without baselines.
 
     Arguments:
@@ -246,21 +246,21 @@ def strongest_rival(request: EvaluationRequest, entries: Sequence[Entry], rays: 
         entries: All its entries.
         rays: The number of rays.
     """
-    rivals = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
-    if not rivals or not request.train:
+    baselines = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
+    if not baselines or not request.train:
         return None
     fired = sum(entry.rays for entry in entries) * len(request.test)
-    affordable = int(LARGEST_RIVAL_SHARE * fired / (rays * len(rivals)))
-    scenes = held_back_scenes(request, min(max(affordable, FEWEST_RIVAL_SCENES), MOST_RIVAL_SCENES))
-    scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in rivals], request.planner)
+    affordable = int(LARGEST_BASELINE_SHARE * fired / (rays * len(baselines)))
+    scenes = held_back_scenes(request, min(max(affordable, FEWEST_BASELINE_SCENES), MOST_BASELINE_SCENES))
+    scene_pass = request.scene_pass(lambda number: [entry.rays_in(number) for entry in baselines], request.planner)
     found = score_scenes(replace(scene_pass, scenes=scenes))
     means = np.mean([[score.value for score, _ in scene.scores] for scene in found], axis=0).tolist()
-    values = dict(zip((entry.name for entry in rivals), means, strict=True))
-    return StrongestRival.best_of(values, request.metric.better, rays, len(scenes))
+    values = dict(zip((entry.name for entry in baselines), means, strict=True))
+    return StrongestBaseline.best_of(values, request.metric.better, rays, len(scenes))
 
 
 @dataclass(frozen=True)
-class StrongestRival:
+class StrongestBaseline:
     """The best of all baselines at one number of rays.
 
     Arguments:
@@ -276,7 +276,7 @@ class StrongestRival:
     values: Mapping[str, float]
 
     @classmethod
-    def best_of(cls, values: Mapping[str, float], better: str, rays: int, scenes: int) -> StrongestRival:
+    def best_of(cls, values: Mapping[str, float], better: str, rays: int, scenes: int) -> StrongestBaseline:
         """The best of mean scores by name; the first of equal ones."""
         choose = min if better == "lower" else max
         return cls(choose(values, key=lambda name: values[name]), rays, scenes, dict(values))
@@ -292,15 +292,15 @@ def held_back_scenes(request: EvaluationRequest, count: int) -> list[Scene]:
     return list(itertools.islice(scenes, count))
 
 
-def mean_rival(found: Iterable[StrongestRival | None], better: str) -> StrongestRival | None:
-    """The strongest rival of several seeds, by its mean score over them; None where one seed has none."""
+def mean_baseline(found: Iterable[StrongestBaseline | None], better: str) -> StrongestBaseline | None:
+    """The strongest baseline of several seeds, by its mean score over them; None where one seed has none."""
     each = list(found)
     known = [one for one in each if one is not None]
     if not known or len(known) < len(each):
         return None
     names = [name for name in known[0].values if all(name in one.values for one in known)]
     values = {name: float(np.mean([one.values[name] for one in known])) for name in names}
-    return StrongestRival.best_of(values, better, known[0].rays, sum(one.scenes for one in known))
+    return StrongestBaseline.best_of(values, better, known[0].rays, sum(one.scenes for one in known))
 
 
 def effect_summaries(plans: Sequence[EffectPlan]) -> list[EffectSummary]:

@@ -28,8 +28,8 @@ class LastScore:
         value, ci_low, ci_high: The mean score over them, and its 95 % interval.
         detector: The name of the detector.
         settings: Settings of the task other than those that were learned with.
-        rival: The strongest rival; None where no rival was scored.
-        difference, difference_low, difference_high: The design minus the rival, scene by scene.
+        baseline: The strongest baseline; None where no baseline was scored.
+        difference, difference_low, difference_high: The design minus the baseline, scene by scene.
     """
 
     sha256: str
@@ -40,7 +40,7 @@ class LastScore:
     ci_high: float | None
     detector: str
     settings: tuple[str, ...] = ()
-    rival: str | None = None
+    baseline: str | None = None
     difference: float | None = None
     difference_low: float | None = None
     difference_high: float | None = None

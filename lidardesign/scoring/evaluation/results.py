@@ -27,7 +27,7 @@ from lidardesign.task import Metric
 
 if TYPE_CHECKING:
     from lidardesign.scoring.baselines.cma import SearchRecord
-    from lidardesign.scoring.evaluation.entries import StrongestRival
+    from lidardesign.scoring.evaluation.entries import StrongestBaseline
 
 ROW_KEYS = (
     "design", "rays", "value", "ci_low", "ci_high", "half_width", "failures", "bandwidth_mbps", "seconds",
@@ -187,7 +187,7 @@ class Evaluation:
         accuracy: The sweeps of accuracy, where that was asked for.
         searches: The searches of the baseline `cma`, where it was asked for.
         seeds: Of learning and fitting, where rows and differences are means over several.
-        strongest_rival: The best baseline at `middle_rays` on training scenes; None where no rival was scored.
+        strongest_baseline: The best baseline at `middle_rays` on training scenes; None where no baseline was scored.
     """
 
     metric: Metric
@@ -205,7 +205,7 @@ class Evaluation:
     accuracy: Accuracy | None = None
     searches: Sequence[SearchRecord] = ()
     seeds: Sequence[int] = ()
-    strongest_rival: StrongestRival | None = None
+    strongest_baseline: StrongestBaseline | None = None
 
     @property
     def middle_rays(self) -> int:
@@ -221,16 +221,16 @@ class Evaluation:
 
     @property
     def headline_pairs(self) -> dict[str, Paired]:
-        """Every design against the strongest rival, by the design's name, at its number of rays in `headline_rows`."""
-        rival, counts = self.strongest_rival, {name: row.rays for name, row in self.headline_rows.items()}
-        against = [pair for pair in self.paired if rival and pair.b == rival.name]
+        """Each design against the strongest baseline at its number of rays in `headline_rows`, by the design's name."""
+        baseline, counts = self.strongest_baseline, {name: row.rays for name, row in self.headline_rows.items()}
+        against = [pair for pair in self.paired if baseline and pair.b == baseline.name]
         return {pair.a: pair for pair in against if pair.rays == counts[pair.a]}
 
     @property
-    def rival_rows(self) -> list[Row]:
-        """The strongest rival's rows at the numbers of rays of `headline_rows`; none where no rival was scored."""
-        rival, counts = self.strongest_rival, {row.rays for row in self.headline_rows.values()}
-        return [row for row in self.rows if rival and row.design == rival.name and row.rays in counts]
+    def baseline_rows(self) -> list[Row]:
+        """The strongest baseline's rows at the numbers of rays of `headline_rows`; empty where none was scored."""
+        baseline, counts = self.strongest_baseline, {row.rays for row in self.headline_rows.values()}
+        return [row for row in self.rows if baseline and row.design == baseline.name and row.rays in counts]
 
     @property
     def groups(self) -> int:
@@ -270,7 +270,7 @@ class Evaluation:
             "seeds": list(self.seeds),
             "rows": [row.as_dict() for row in self.rows],
             "paired": [pair.as_dict() for pair in self.paired],
-            "strongest_rival": None if self.strongest_rival is None else self.strongest_rival.as_dict(),
+            "strongest_baseline": None if self.strongest_baseline is None else self.strongest_baseline.as_dict(),
             "equal_bandwidth": [row.as_dict() for row in self.equal_bandwidth],
             "paired_equal_bandwidth": [pair.as_dict() for pair in self.paired_bandwidth],
             "detector": self.detector,

@@ -24,7 +24,7 @@ from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.scenes.triangles import SecondCasts
 from lidardesign.scoring.baselines.cma import CMA
 from lidardesign.scoring.baselines.greedy import GREEDY, greedy_rays
-from lidardesign.scoring.evaluation.entries import Entry, effect_notes, effect_summaries, entries_of, strongest_rival
+from lidardesign.scoring.evaluation.entries import Entry, effect_notes, effect_summaries, entries_of, strongest_baseline
 from lidardesign.scoring.evaluation.mounting import MountError
 from lidardesign.scoring.evaluation.request import EvaluationRequest, left_out
 from lidardesign.scoring.evaluation.results import Audit, Evaluation, Mounting, Paired, Row, audit_rows, middle_rays
@@ -93,7 +93,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         audit=audit,
         mounting=mounting,
         searches=searches,
-        strongest_rival=strongest_rival(request, entries, middle_rays(plain)),
+        strongest_baseline=strongest_baseline(request, entries, middle_rays(plain)),
     )
 
 
@@ -147,7 +147,7 @@ def _mounting(
 
 
 def _misplaced(error: MountError, entry: Entry, seed: int, scene: int) -> RaysPerCondition:
-    return error.misplaced(entry.drawn(scene), seed, scene)
+    return error.misplaced(entry.rays_in(scene), seed, scene)
 
 
 @phase("held-out scenes")
@@ -160,7 +160,7 @@ def _score_all(
 ) -> _Scored:
     """Score all entries in all scenes, here or by workers; `known` plans are not made again."""
     jobs = {entry.key: entry for entry in entries}
-    scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in jobs.values()], planner, known)
+    scene_pass = request.scene_pass(lambda number: [entry.rays_in(number) for entry in jobs.values()], planner, known)
     scenes = score_scenes(scene_pass, progress, request.starmap)
     of_entries = zip(*(scene.scores for scene in scenes), strict=True)
     return _Scored(

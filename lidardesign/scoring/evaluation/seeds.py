@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lidardesign.errors import NumericalError
-from lidardesign.scoring.evaluation.entries import mean_rival
+from lidardesign.scoring.evaluation.entries import mean_baseline
 from lidardesign.scoring.evaluation.results import Evaluation, Mounting, Paired, Row
 from lidardesign.scoring.statistics import LEVEL, Interval, student_interval
 
@@ -98,7 +98,7 @@ def over_seeds(evaluations: Sequence[Evaluation], seeds: Sequence[int], scenes_s
         searches=[search for each in evaluations for search in each.searches],
         mounting=_mean_mounting(evaluations, rows),
         seeds=tuple(seeds),
-        strongest_rival=mean_rival((each.strongest_rival for each in evaluations), first.metric.better),
+        strongest_baseline=mean_baseline((each.strongest_baseline for each in evaluations), first.metric.better),
     )
 
 

@@ -1,4 +1,4 @@
-"""Thresholds of designs: no worse than a limit, better than a rival, and moved by no effect that was skipped.
+"""Thresholds of designs: no worse than a limit, better than a baseline, and moved by no effect that was skipped.
 
 Each check raises a `ThresholdError`, with which commands exit 1.
 """

@@ -1,11 +1,11 @@
-"""Our designs against every rival on faces, the aisle and the arm, over several seeds, at equal rays and bandwidth.
+"""Our designs against every baseline on faces, the aisle and the arm, over several seeds, at equal rays and bandwidth.
 
 For each seed a density is learned and designs are fitted as `fit RUN` does without options (`fit`), and with a gate of
-its own for every ray (`per-ray`); each run brings rivals that are built from its own training scenes. All are scored in
-the held-out scenes of one seed, on which nothing was chosen. Intervals are over seeds and scenes. What was measured is
+its own for every ray (`per-ray`); each run brings baselines built from its own training scenes. All are scored in the
+held-out scenes of one seed, on which nothing was chosen. Intervals are over seeds and scenes. What was measured is
 kept in the folder, and measured again only where it is missing.
 
-    python benchmarks/rivals.py --folder rivals --page docs/rivals.md --picture docs/rivals.png
+    python benchmarks/baselines.py --folder baselines --page docs/baselines.md --picture docs/baselines.png
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Case:
     Arguments:
         title: For tables.
         rays: Numbers of rays.
-        baselines: Rivals beside those that `evaluate` always has.
+        baselines: Baselines beside those that `evaluate` always has.
         designs: Which of our designs.
     """
 
@@ -116,13 +116,13 @@ def told(pair: Mapping[str, Any] | None, other: float, better: str) -> str:
 
 
 def ours_of(found: Mapping[str, Any]) -> list[str]:
-    """Which of our designs the rivals are held against."""
+    """Which of our designs the baselines are held against."""
     there = {row["design"] for row in found["rows"]}
     return [name for name in DESIGNS if name in there]
 
 
 def equal_rays(found: Mapping[str, Any]) -> list[list[object]]:
-    """One row per number of rays and design or rival, with how much better ours are."""
+    """One row per number of rays and design or baseline, with how much better ours are."""
     pairs = {(pair["a"], pair["b"], pair["rays"]): pair for pair in found["paired"]}
     rows: list[list[object]] = []
     for row in sorted(found["rows"], key=lambda row: row["rays"]):
@@ -134,7 +134,7 @@ def equal_rays(found: Mapping[str, Any]) -> list[list[object]]:
 
 
 def equal_bandwidth(found: Mapping[str, Any]) -> list[list[object]]:
-    """One row per number of rays, design and rival in its bandwidth."""
+    """One row per number of rays, design and baseline in its bandwidth."""
     spent = {(row["design"], row["rays"]): row["bandwidth_mbps"] for row in found["rows"]}
     pairs = {(pair["a"], pair["b"], pair["rays"]): pair for pair in found["paired_equal_bandwidth"]}
     rows = []
@@ -146,7 +146,7 @@ def equal_bandwidth(found: Mapping[str, Any]) -> list[list[object]]:
 
 
 def standings(found: Mapping[str, Any], name: str, key: str) -> tuple[dict[str, bool], dict[str, bool]]:
-    """Where a design is better than rivals that choose no rays, and where it is not worse than `greedy`."""
+    """Where a design is better than baselines that choose no rays, and where it is not worse than `greedy`."""
     others, greedy = {}, {}
     for pair in found[key]:
         if pair["a"] != name or pair["b"] in DESIGNS:
@@ -163,13 +163,13 @@ PAIRED = {"paired": "rays", "paired_equal_bandwidth": "bandwidth"}
 
 
 def verdicts(found: Mapping[str, Any]) -> list[str]:
-    """What is claimed of our designs, over all numbers of rays: of rivals that choose no rays, and of `greedy`."""
+    """What is claimed of our designs, over all numbers of rays: of baselines that choose no rays, and of `greedy`."""
     lines = []
     for name in ours_of(found):
         for key, where in PAIRED.items():
             others, greedy = standings(found, name, key)
             lines.append(
-                verdict(f"{name} is better by the interval than rivals that choose no rays, equal {where}", others)
+                verdict(f"{name} is better by the interval than baselines that choose no rays, equal {where}", others)
             )
             lines.append(verdict(f"{name} is not worse than greedy by the interval, equal {where}", greedy))
     return lines
@@ -181,8 +181,8 @@ def counted(found: Mapping[str, Any], name: str) -> str:
     first, second = (f"{sum(stands.values())} of {len(stands)}" for stands in others)
     third, fourth = (f"{len(stands) - sum(stands.values())} of {len(stands)}" for stands in greedy)
     return (
-        f"`{name}` is better than rivals that choose no rays in {first} comparisons at equal rays and in {second} at "
-        f"equal bandwidth; it is worse than `greedy` in {third} and in {fourth}."
+        f"`{name}` is better than baselines that choose no rays in {first} comparisons at equal rays and in {second} "
+        f"at equal bandwidth; it is worse than `greedy` in {third} and in {fourth}."
     )
 
 
@@ -219,7 +219,7 @@ def tables_of(title: str, found: Mapping[str, Any]) -> dict[str, tuple[list[str]
             equal_rays(found),
         ),
         f"{title}, equal bandwidth, {scenes}": (
-            ["rays", "design", "Mbit/s", "rival", "its rays", metric, "design against it, %"],
+            ["rays", "design", "Mbit/s", "baseline", "its rays", metric, "design against it, %"],
             equal_bandwidth(found),
         ),
     }
@@ -258,7 +258,7 @@ def draw(everything: Mapping[str, dict[str, Any]], path: Path) -> None:
 
 
 def curves(found: Mapping[str, Any]) -> dict[str, dict[str, list[float]]]:
-    """Rays, bandwidths and scores of each design and rival, at ascending numbers of rays."""
+    """Rays, bandwidths and scores of each design and baseline, at ascending numbers of rays."""
     lines: dict[str, dict[str, list[float]]] = {}
     for row in sorted(found["rows"], key=lambda row: row["rays"]):
         line = lines.setdefault(row["design"], {"rays": [], "bandwidth_mbps": [], "value": []})
@@ -307,7 +307,7 @@ def main() -> None:
     for task, found in everything.items():
         tables |= tables_of(CASES[task].title, found)
         lines += [f"{CASES[task].title}: {line}" for line in verdicts(found)]
-    report("Rivals", tables, lines, options.json)
+    report("Baselines", tables, lines, options.json)
     if options.page is not None:
         write_page(options.page, everything)
     if options.picture is not None:

@@ -17,7 +17,7 @@ def balls(centre, radius=0.4, jitter=0.05, count=3, seed=8):
     ]
 
 
-class Rivals(Baselines):
+class SceneBaselines(Baselines):
     def positions(self, name, count):
         return self.best([(name, self.options(name, count))])[0].positions
 
