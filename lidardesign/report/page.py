@@ -196,7 +196,7 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
 
 
 def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str:
-    """The section of the result: differences to the strongest rival, certificates of chosen rays, and notes.
+    """The section of the result: differences to the strongest baseline, certificates of chosen rays, and notes.
 
     Arguments:
         evaluation: The scores.
