@@ -102,7 +102,7 @@ def _default(info: FieldInfo) -> Any:
 
 
 def kind_of_value(annotation: Any) -> str:
-    """What a key takes, in words: `number`, `3 numbers`, `auto or mm or m`, `path or null`."""
+    """The type of a key in words: `number`, `3 numbers`, `auto or mm or m`, `path or null`."""
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return kind_of_value(parts[0])
@@ -120,10 +120,10 @@ def kind_of_value(annotation: Any) -> str:
 def config_template(
     task: Task, *, preset: str | None = None, overrides: Sequence[str] = (), seed: int | None = None
 ) -> tuple[dict[str, Any], str]:
-    """The configuration of a task and the text of a file to begin with, where only what is chosen here is set.
+    """The configuration of a task and the text of a starting file that sets only what is given here.
 
     Raises:
-        ConfigError: A choice says nothing that the task takes.
+        ConfigError: A preset or setting that the task does not take.
     """
     chosen = {
         (str(path[0]), str(path[1])) if path[0] in SECTIONS and len(path) > 1 else ("task", str(path[0]))
@@ -143,7 +143,7 @@ def config_template(
 
 
 def default_document(task: Task, preset: str) -> dict[str, Any]:
-    """The defaults of a task that has none for something that it needs, so that no configuration follows."""
+    """The defaults of a task with required keys, from which alone no valid configuration follows."""
 
     def defaults_of(model: type[BaseModel], suggested: Mapping[str, Any]) -> dict[str, Any]:
         return {key: suggested.get(key, _default(info)) for key, info in model.model_fields.items()}
@@ -215,7 +215,7 @@ def _bounds(info: FieldInfo) -> Sequence[str]:
 
 
 def _comment(text: str, indent: str = "") -> list[str]:
-    """Lines of comment; a task's own words may hold anything."""
+    """Text as wrapped comment lines, without control characters."""
     lines = []
     for part in text.split("\n"):
         plain = UNREADABLE.sub(" ", " ".join(part.split()))
@@ -235,7 +235,7 @@ def schema_of(kind: str, task: Task | None = None) -> dict[str, Any]:
 
     Arguments:
         kind: config, constraints, design or evaluate.
-        task: Whose keys the section `task` of a configuration has; any by default.
+        task: The task whose keys the section `task` of a configuration has; any by default.
     """
     if kind == "config":
         return _config_schema(task)

@@ -307,10 +307,10 @@ def select_by_name(designs: list[Design], names: Sequence[str]) -> list[Design]:
 
 
 def name_apart(designs: list[Design]) -> list[Design]:
-    """Designs that share a name take in front their run's name, or behind their file's ending, as tells them apart.
+    """Make the names of designs distinct, by their run's folder in front or their file's suffix behind.
 
     Raises:
-        ConfigError: Two are still called the same.
+        ConfigError: Two names are still equal.
     """
     alike: dict[str, list[Design]] = {}
     for design in designs:
@@ -333,7 +333,7 @@ def name_apart(designs: list[Design]) -> list[Design]:
 
 
 def scoring_run(designs: Sequence[Design], judge: RunFolder | None, notes: Notes = log_note) -> RunFolder:
-    """The run in whose scenes designs are scored: the one that was named, or else the one that they came from.
+    """The run in whose scenes designs are scored: the named one, else the one that they came from.
 
     Arguments:
         designs: The designs; of those from a run of other settings a note says whether they fit here.
@@ -372,7 +372,7 @@ def scoring_run(designs: Sequence[Design], judge: RunFolder | None, notes: Notes
 
 
 def _settings(run: RunFolder) -> tuple[Any, ...]:
-    """Equal for runs whose designs can be scored in the same scenes."""
+    """A key that is equal for runs whose designs can be scored in the same scenes."""
     return run.config.task_name, scoring_settings(run.task, run.config.task), run.config.space
 
 

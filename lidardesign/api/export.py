@@ -23,7 +23,7 @@ WITHOUT_RAYS = ("sensors-csv", "stl")
 
 
 class DesignSource:
-    """A design with what its rays may follow from.
+    """A design with its run, from which its number of rays may follow.
 
     Arguments:
         specification: The design.
@@ -73,7 +73,7 @@ class DesignSource:
             notes: Called with every note.
 
         Raises:
-            ConfigError: The design is nowhere at such a condition, or does not fire so many rays.
+            ConfigError: The design is not defined at this condition, or cannot fire so many rays.
         """
         design = self.specification
         design = design.at_condition(at or {}) if at or design.condition else design
@@ -84,15 +84,15 @@ class DesignSource:
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """What an export wrote.
+    """The result of an export.
 
     Arguments:
         path: The file or folder.
         format: The format's name.
-        rays: How many rays it holds.
-        sensors: How many sensors.
-        bytes: The size of what was written; None for what is no file, as a pipe.
-        notes: What the format cannot hold.
+        rays: Number of rays.
+        sensors: Number of sensors.
+        bytes: Size of what was written; None for a pipe or a device.
+        notes: Properties of the design that the format cannot hold.
     """
 
     path: Path
@@ -115,7 +115,7 @@ class Exported:
 
 @dataclass(frozen=True, eq=False)
 class ExportRequest:
-    """What is exported: how many rays, at which condition, at how many frames per second, to where.
+    """A request to export a design's rays in a format.
 
     Arguments:
         source: The design.
@@ -143,7 +143,7 @@ class ExportRequest:
         self.exporter.check_rate(self.rate_hz)
 
     def _robot(self) -> RobotFile | None:
-        """The robot's model, and what the run of a mounted design says of it."""
+        """The robot's model that the sensors are put into; None for sensors alone."""
         mounted = self.source.specification.mount is not None
         run = self.source.opened_run() if self.exporter.robotic and (mounted or self.robot) else None
         task = None if run is None else run.config.task
@@ -188,10 +188,10 @@ def exporter_of(name: str | None, path: Path | None = None) -> Exporter:
 
 
 def export_target(path: Path | None, out: Path | None, exporter: Exporter) -> Path:
-    """Where to write a design: where a user says, or beside its file.
+    """The path that an export is written to: the given one, else beside the design's file.
 
     Raises:
-        ConfigError: Over the design, or nowhere that is known.
+        ConfigError: It is the design's own file, or neither path is given.
     """
     if out is None and path is None:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Learning a task into a run folder: what is asked for, and the folder started, resumed, or taken away again."""
+"""Learning a task into a run folder: the request, and the folder as it is started, resumed or removed."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ CHECKPOINTS = "checkpoint*"
 LEARNED_FILES = (
     CONFIGURATION, MANIFEST, "progress.jsonl", "checkpoint.safetensors", "flow.safetensors", SAMPLES, "snapshots/",
 )  # fmt: skip
-# A misplaced share that can be told apart from nothing and from all; a longer time is a mistake in the unit.
+# Tolerances of the misplaced share that can be measured; a longer time budget is a mistake in the unit.
 TOLERANCES, TIME_BUDGETS_S = (1e-4, 0.9999), (1.0, 366 * 24 * 3600.0)
 # A tolerance is met where the measured share is at most so many standard errors above it.
 STANDARD_ERRORS = 2.0
@@ -69,10 +69,10 @@ class LearnOptions:
         overwrite: Replace a run that is in the folder, once the new one is learned.
         tolerance: The setting learning.misplaced, which has to be reached.
         time_budget_s: Steps are taken until this time has passed, however many they are [s].
-        command: What the manifest says that the run was made by.
+        command: The command line for the manifest.
 
     Raises:
-        ConfigError: A device, a tolerance or a time that cannot be.
+        ConfigError: An unknown device, or a tolerance or time out of range.
     """
 
     out: Path | str | None = None
@@ -111,7 +111,7 @@ class LearnRequest:
         folder: The run folder.
         settings: The whole configuration.
         options: The user's choices.
-        begun: Whether a run is gone on with.
+        begun: Whether a started run is resumed.
         replaces: Whether a run is in the folder, to be replaced once the new one is learned.
     """
 
@@ -165,11 +165,11 @@ class LearnRequest:
 
     @property
     def place(self) -> Path:
-        """The folder that is learned in: beside the run's own as long as that holds the run to be replaced."""
+        """The folder to learn in: beside the run's own while that holds the run to be replaced."""
         return next_to(self.folder, NEW) if self.replaces else self.folder
 
     def _lost_designs(self) -> str:
-        """The designs that go with the run that is replaced, in words."""
+        """The designs that replacing the run deletes, in words; empty where there are none."""
         designs = ", ".join(sorted(path.stem for path in (self.folder / DESIGN_FOLDER).glob("*.yaml")))
         return f", with its designs ({designs})" if designs else ""
 
@@ -220,7 +220,7 @@ class LearnRequest:
         }
 
     def run(self, progress: Callable[[LearnProgress], None] | None = None, remark: Notes | None = None) -> LearnResult:
-        """Learn into the folder; what failed before anything was learned is taken away again.
+        """Learn into the folder; a run that fails before anything was learned is removed.
 
         Arguments:
             progress: Called about every tenth step.
@@ -278,7 +278,7 @@ class LearnRequest:
         return replace(result, notes=(*result.notes, BackgroundNote(f"{result.steps} steps in {budget_s:g} s")))
 
     def resume_hint(self) -> str:
-        """The last checkpoint and the command that goes on from there, after an interruption."""
+        """The last checkpoint and the command that resumes from it, for people."""
         checkpoints = sorted(path.name for path in self.place.glob(CHECKPOINTS))
         if checkpoints:
             rest = f"the last checkpoint is {self.place / checkpoints[-1]}"
@@ -291,7 +291,7 @@ class LearnRequest:
 
     @contextlib.contextmanager
     def _undone_on_failure(self) -> Iterator[None]:
-        """When a new run fails before anything was learned, take away what was put there."""
+        """Remove the files of a new run that fails before anything was learned."""
         try:
             yield
         except BaseException:
@@ -319,13 +319,13 @@ def result_document(result: LearnResult) -> dict[str, Any]:
 
 
 def check_tolerance(result: LearnResult, tolerance: float | None) -> None:
-    """Exit 1 where a tolerance was not reached.
+    """Check that learning reached a tolerance.
 
     Raises:
-        ThresholdError: With what was reached.
+        ThresholdError: It did not; the message has the share that was reached.
     """
     error = result.error_estimates["misplaced"].error
-    # without coverage nothing knows what the density dropped
+    # without coverage the mass that the density missed is unknown
     if tolerance is None or (result.coverage > 0 and result.misplaced <= tolerance + STANDARD_ERRORS * (error or 0.0)):
         return
     doubt = "" if error is None else f" +- {error:.2g}"
@@ -375,7 +375,7 @@ def _holds_run(folder: Path) -> bool:
     """True where a folder has a run to replace; a folder without anything in it has none.
 
     Raises:
-        ConfigError: It holds something else, somebody is writing it, or what replaced a run before is left.
+        ConfigError: It holds something else, is being written, or an earlier replacement was killed halfway.
     """
     where, aside = f"--out {folder}", next_to(folder, OLD)
     if aside.exists():
@@ -393,13 +393,13 @@ def _holds_run(folder: Path) -> bool:
 
 
 def next_to(folder: Path, suffix: str) -> Path:
-    """The folder of another name beside a run's, wherever a link to it leads."""
+    """A run's folder with a suffix; of a link to it, beside the folder that the link leads to."""
     folder = folder.resolve() if folder.is_symlink() or folder.name in ("", "..") else folder
     return folder.with_name(folder.name + suffix)
 
 
 def put_in_place(folder: Path) -> None:
-    """Put the run that was learned beside a folder into its place; the old one goes last.
+    """Move the run that was learned beside a folder into its place, then delete the old one.
 
     Raises:
         DataError: Somebody is writing the old one, or the folders cannot be renamed; both are kept.
@@ -422,7 +422,7 @@ def put_in_place(folder: Path) -> None:
 
 
 def _was_killed_before_it_began(run: Path) -> bool:
-    """True for a folder that is empty, or holds only what a start that was killed leaves."""
+    """True for a folder that is empty or holds only the files of a killed start."""
     names = {entry.name for entry in run.iterdir()}
     return CONFIGURATION not in names and all(
         name in STARTED_FILES or name == LOCK or is_temporary(name) for name in names
@@ -430,14 +430,14 @@ def _was_killed_before_it_began(run: Path) -> bool:
 
 
 def _with_inputs(settings: RunConfig) -> RunConfig:
-    """The configuration of a new run with the files that are there now, where its task keeps them."""
+    """The configuration of a new run, with the hashes of the input files where its task records them."""
     if not isinstance(settings.task, FolderConfig):
         return settings
     return replace(settings, task=settings.task.model_copy(update={INPUTS: input_hashes(settings.task)}))
 
 
 def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tuple[Task, RunConfig]:
-    """The task and configuration of a run; another configuration is refused, repeating its own options is fine."""
+    """The task and configuration of a run to resume; settings that differ from its own are refused."""
     task, stored = load_run_config(run)
     wanted = resolve(
         task if task.name == plugin.name else plugin,
@@ -448,7 +448,7 @@ def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tu
     )
     old, new = dict(leaves(stored.as_document())), dict(leaves(wanted.as_document()))
     for path in [*old, *new]:
-        # what was there at first is no setting of a user's
+        # hashes of input files are recorded, not set
         if path[:2] != ("task", INPUTS) and old.get(path) != new.get(path):
             raise ConfigError(
                 f"the run was started with {'.'.join(map(str, path))} = {old.get(path)!r}, not {new.get(path)!r}",
@@ -460,7 +460,7 @@ def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tu
 
 @contextlib.contextmanager
 def _new_folder(run: Path) -> Iterator[None]:
-    """Make the folder; after a failure take it away again where it is empty."""
+    """Make the folder; remove it after a failure if it is empty."""
     new = [folder for folder in (run, *run.parents) if not folder.exists()]
     try:
         run.mkdir(parents=True, exist_ok=True)

@@ -54,7 +54,7 @@ class LearnedQuality:
         return self._verdict.word
 
     def advice(self, preset: str) -> str | None:
-        """Why it is not better, and what to do next after a preset; None where it is good."""
+        """The reason for the verdict and the next step after a preset; None where it is good."""
         return self._verdict.advice(preset) if self._verdict.why else None
 
     @property
@@ -185,9 +185,9 @@ class Run(RunFolder):
         return [Design(read_design(path), self, path) for path in self.design_paths()]
 
     def summary(self) -> dict[str, Any]:
-        """The quality of the density, the designs with their last scores, and commands that go on from here.
+        """The quality of the density, the designs with their last scores, and commands of the next steps.
 
-        Also how large the cache is of what training scenes show of rays, where fits have left one.
+        Also the size of the cache of training information, where fits have left one.
 
         Raises:
             DataError: The manifest is damaged.
@@ -214,7 +214,7 @@ class Run(RunFolder):
         }
 
     def _next_commands(self, designs: Sequence[Mapping[str, Any]], *, finished: bool) -> list[str]:
-        """Command lines that go on from here."""
+        """Command lines of the next steps."""
         run = quote(str(self.folder))
         if not finished:
             return [f"lidardesign learn {self.config.task_name} --out {run} --resume"]
@@ -264,20 +264,20 @@ class Run(RunFolder):
             scenes_seed: Seed of the held-out scenes; `seed` by default.
             effects: Physical effects: "auto", "all", "none", "audit" or names separated by commas.
             detector: The name of a detector, or a YAML file.
-            range_tolerance_mm: What all skipped effects together may change of ranges [mm].
-            return_tolerance: Share of returns that all skipped effects together may change.
+            range_tolerance_mm: Largest change of ranges by all skipped effects together [mm].
+            return_tolerance: Largest share of returns changed by all skipped effects together.
             settings: Settings of the task, to score in scenes other than the learned ones.
-            mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
+            mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
             workers: Processes that score scenes, or the address of a dask scheduler, tcp://HOST:PORT.
             cma_seconds: Wall time of each search of the baseline cma [s].
-            accuracy: Whether what accuracy costs is measured, too; takes minutes.
-            fail_above: What no design may be worse than, in the metric's unit; `Scores.check()` sees to it.
-            fail_unless_better: A baseline or design that every other design must be better than; so does this.
+            accuracy: Whether the sweeps of accuracy are measured, too; takes minutes.
+            fail_above: Limit of the designs' values, in the metric's unit, for `Scores.check()`.
+            fail_unless_better: Baseline or design that every other design must be better than, likewise.
             progress: Called with the name of the scene, the scenes done, and all scenes.
             notes: Called with every note.
 
         Raises:
-            ConfigError: Choices that cannot be.
+            ConfigError: Invalid choices.
             DataError: There are no designs, or one is not there.
         """
         from lidardesign.api.scores import ScoreOptions, ScoreRequest

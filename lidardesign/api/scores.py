@@ -1,4 +1,4 @@
-"""Scoring designs on held-out scenes: what is asked for, resolved by runs and designs, and the scores that it gives."""
+"""Scoring designs on held-out scenes: the request, resolved by runs and designs, and the scores."""
 
 from __future__ import annotations
 
@@ -56,20 +56,20 @@ class ScoreOptions:
         seed: Seed of all random numbers; the run's by default.
         effects: auto, all, none, audit, or names of effects between commas.
         detector: The name of a detector, or its file.
-        range_tolerance_mm: What all skipped effects together may change of ranges.
-        return_tolerance: Share of returns that all skipped effects together may change.
+        range_tolerance_mm: Largest change of ranges by all skipped effects together [mm].
+        return_tolerance: Largest share of returns changed by all skipped effects together.
         settings: Settings of the task to judge by other scenes than were learned.
         workers: Processes that score scenes, or the address of a scheduler.
         cma_seconds: Wall time of each search of the baseline cma [s].
-        accuracy: Whether what accuracy costs will be measured, too.
+        accuracy: Whether the sweeps of accuracy are measured, too.
         scenes_seed: Root of the held-out scenes; `seed` by default.
         designs: Names of the designs that are scored; all by default.
-        mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
-        fail_above: What no design may be worse than, in the metric's unit; `Scores.check` sees to it.
-        fail_unless_better: A baseline or design that every other design must be better than; so does this.
+        mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
+        fail_above: Limit of the designs' values, in the metric's unit, for `Scores.check`.
+        fail_unless_better: Baseline or design that every other design must be better than, likewise.
 
     Raises:
-        ConfigError: One of them says nothing that can be done.
+        ConfigError: An option out of range or unknown.
     """
 
     rays: Sequence[int] | None = None
@@ -122,7 +122,7 @@ class ScoreOptions:
         return None if self.mount_error is None else MountError.parse(self.mount_error)
 
     def planner(self) -> tuple[Planner, bool]:
-        """The choice of effects, and True where it is audited.
+        """The planner of effects, and True where skipped effects are audited.
 
         Raises:
             ConfigError: An unknown effect or detector.
@@ -143,7 +143,7 @@ class ScoreRequest:
     """An evaluation with nothing left open.
 
     Arguments:
-        run: The run whose task judges, by the settings that are judged by.
+        run: The run whose task scores, with the settings to score by.
         learned: The same run as it was learned.
         designs: The designs, by distinct names.
         rays: Numbers of rays.
@@ -181,7 +181,7 @@ class ScoreRequest:
             notes: Called with every note.
 
         Raises:
-            ConfigError: Runs that differ, or choices that cannot be.
+            ConfigError: Runs that differ, or invalid choices.
             DataError: A design or a run is not there, or damaged.
         """
         planner, audit = options.planner()
@@ -394,7 +394,7 @@ class Scores:
 
 
 def check_scores(scores: Scores) -> None:
-    """As `Scores.check`, with errors that name options."""
+    """As `Scores.check`, with errors in terms of command-line options."""
     options = scores.request.options
     if options.fail_above is not None:
         check_limit(scores.evaluation, options.fail_above)
@@ -404,7 +404,7 @@ def check_scores(scores: Scores) -> None:
 
 
 def _check_baseline(name: str | None, designs: Sequence[str]) -> None:
-    """Refuse a baseline that nothing can be better than."""
+    """Refuse a baseline or design that is unknown, or the only design."""
     where = "--fail-unless-better"
     if name is None or name in BASELINES:
         return

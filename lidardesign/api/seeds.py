@@ -1,6 +1,6 @@
 """Several runs of one task that differ in their seed: designs of one name scored in the same held-out scenes.
 
-Every run brings its own designs, and baselines built from its own training scenes: what is repeated is the whole way
+Every run brings its own designs, and baselines built from its own training scenes: the whole experiment is repeated,
 from learning to the score.
 """
 
@@ -31,7 +31,7 @@ SEED = "seed"
 
 
 def differing_seeds(targets: Sequence[Path], notes: Notes = log_note) -> list[RunFolder]:
-    """The runs that targets are, where they differ in their seed alone; none where targets are something else.
+    """The targets as runs, where these differ in their seed alone; else an empty list.
 
     Raises:
         DataError: A folder is no run, or damaged.
@@ -77,14 +77,14 @@ def evaluate_seeds(
         scenes_seed: Seed of the held-out scenes; the first run's by default.
         effects: Physical effects: "auto", "all", "none" or names separated by commas.
         detector: The name of a detector, or a YAML file.
-        range_tolerance_mm: What all skipped effects together may change of ranges [mm].
-        return_tolerance: Share of returns that all skipped effects together may change.
+        range_tolerance_mm: Largest change of ranges by all skipped effects together [mm].
+        return_tolerance: Largest share of returns changed by all skipped effects together.
         settings: Settings of the task, to score in scenes other than the learned ones.
-        mount_error: Standard deviations of how sensors are misplaced in further rows, as "5mm,0.5deg".
+        mount_error: Standard deviations of mounting errors of sensors in further rows, as "5mm,0.5deg".
         workers: Processes that score scenes, or the address of a dask scheduler, tcp://HOST:PORT.
         cma_seconds: Wall time of each search of the baseline cma [s].
-        fail_above: What no design may be worse than, in the metric's unit; `Scores.check()` sees to it.
-        fail_unless_better: A baseline or design that every other design must be better than; so does this.
+        fail_above: Limit of the designs' values, in the metric's unit, for `Scores.check()`.
+        fail_unless_better: Baseline or design that every other design must be better than, likewise.
         progress: Called with the name of the scene, the scenes done, and all scenes.
         notes: Called with every note.
 
@@ -223,7 +223,7 @@ def _check_runs(runs: Sequence[RunFolder]) -> None:
 
 
 def _other_setting(first: RunFolder, second: RunFolder) -> str | None:
-    """The first key beside the seed in which two runs differ."""
+    """The first configuration key other than the seed in which two runs differ; None without one."""
     ours, theirs = (_flat(run.config.as_document()) for run in (first, second))
     differing = (key for key in [*ours, *theirs] if key != SEED and ours.get(key) != theirs.get(key))
     return next(differing, None)
@@ -247,7 +247,7 @@ def _check_options(options: ScoreOptions) -> None:
 
 
 def _common_names(runs: Sequence[RunFolder], wanted: Sequence[str]) -> list[str]:
-    """The names of designs that all runs have: those that are wanted, or all."""
+    """The wanted names of designs that all runs have; all common names by default."""
     sets = [{path.stem for path in run.design_paths()} for run in runs]
     for run, names in zip(runs, sets, strict=True):
         if not names:

@@ -1,8 +1,8 @@
-"""The independent checker: does a written design keep a written constraint file?
+"""The independent checker of a written design against a written constraint file.
 
 It reads plain documents only and shares no code with the fit; `document` has the definitions. Chosen rays are held
-against their own sensors' fields and gates. An excluded box is broken where an interval of origins reaches into its
-interior along all three axes. A sensor that is to be a part has the part's field of view and range, and fires rays of
+against their own sensors' fields and gates. An excluded box is violated where an interval of origins reaches into its
+interior along all three axes. A sensor that names a part has the part's field of view and range, and fires rays of
 the part's pattern.
 """
 
@@ -30,7 +30,7 @@ AGREEMENT = COARSE_SLACK
 # The bandwidth model counts a width this share above whole bins as whole bins.
 BIN_ROUNDING = SLACK
 LIGHT_M_PER_S = 299792458.0
-# Places are told to the millimetre: an origin pinned so near to the only one that the space has is that one [m].
+# Places are given to the millimetre: an origin fixed this close to the space's own place means that place [m].
 SAME_PLACE_M = 1e-3
 PICOSECOND_S = 1e-12
 AXES = ("x_m", "y_m", "z_m")
@@ -43,9 +43,9 @@ class ConstraintCheck:
 
     Arguments:
         name: Sensor and key, as `s0.gate.width_m.max`.
-        bound: What was asked for.
-        value: What the design has.
-        satisfied: Whether it keeps the bound.
+        bound: The bound of the constraint file.
+        value: The design's value.
+        satisfied: Whether the value keeps the bound.
     """
 
     name: str
@@ -94,7 +94,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
 
 
 def _over(common: Mapping[str, Any], special: Mapping[str, Any] | None) -> dict[str, Any]:
-    """An entry of `each` over the common keys."""
+    """The common keys overridden by an entry of `each`, key by key at every depth."""
     result = dict(common)
     for key, value in (special or {}).items():
         both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
@@ -110,12 +110,12 @@ def _get(values: Any, *keys: str) -> Any:
 
 
 def _slack(bound: float) -> float:
-    """Rounding of means, spreads, their product and conversions between radians and degrees."""
+    """The tolerance of a bound for rounding of means, spreads and unit conversions."""
     return ROUNDING * max(abs(bound), 1.0)
 
 
 def _between(name: str, value: float, rules: Any, highest: float | None = None) -> list[ConstraintCheck]:
-    """Checks of `min` on a value and of `max` on it, or on a higher one, where they are given."""
+    """Checks of `min` on a value and of `max` on it or on `highest`, where they are given."""
     checks, highest = [], value if highest is None else highest
     low, high = _get(rules, "min"), _get(rules, "max")
     if low is not None:
@@ -126,7 +126,7 @@ def _between(name: str, value: float, rules: Any, highest: float | None = None) 
 
 
 def _within_space(name: str, key: str, space: Mapping[str, Any], *values: float) -> ConstraintCheck:
-    """A check of a value, or of the first and the last of several, against both ends of the space along a dimension."""
+    """A check of a value, or of the first and last of several, against the space's bounds along a dimension."""
     low, high = (float(end) for end in space[key])
     kept = values[0] >= low - _slack(low) and values[-1] <= high + _slack(high)
     value = list(values) if len(values) > 1 else values[0]
@@ -136,7 +136,7 @@ def _within_space(name: str, key: str, space: Mapping[str, Any], *values: float)
 def _origin(
     name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Mapping[str, Any] | None
 ) -> list[ConstraintCheck]:
-    """Origins in their boxes; one that is pinned next to where the space fixes it is kept by standing there."""
+    """Checks of an origin; one fixed within `SAME_PLACE_M` of the space's own place must stand at that place."""
     mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"].get("covariance") or np.zeros((3, 3))
     checks = []
     tests = {
@@ -164,7 +164,7 @@ def _origin(
 
 
 def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:
-    """Elevation, and azimuth on the circle; an end that is not given is the space's.
+    """Checks of a boresight's elevation and azimuth (on the circle); a missing end is the space's.
 
     Without a space a single bound says little: it is then read as the half circle beyond it.
     """
@@ -187,7 +187,7 @@ def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], s
 
 
 def _intervals(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
-    """Gate and field of view."""
+    """Checks of a sensor's gate and field of view."""
     view, (start, end) = sensor["field_of_view_rad"], (sensor["gate_m"][key] for key in ("start", "end"))
     values = {f"field_of_view.{axis}_deg": math.degrees(view[axis]) for axis in ANGLES}
     values |= {"gate.start_m": start, "gate.end_m": end, "gate.width_m": end - start}
@@ -198,7 +198,7 @@ def _intervals(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -
 
 
 def _inside_space(name: str, sensor: Mapping[str, Any], space: Mapping[str, Any]) -> list[ConstraintCheck]:
-    """Gates and mean origins inside the design space; origins are listed where they are not."""
+    """Checks of gates and mean origins inside the design space; origins are listed only where they are outside."""
     gate = _within_space(name, "range_m", space, float(sensor["gate_m"]["start"]), float(sensor["gate_m"]["end"]))
     places = zip(AXES, sensor["origin_m"]["mean"], strict=True)
     origins = [_within_space(name, axis, space, value) for axis, value in places]
@@ -206,7 +206,7 @@ def _inside_space(name: str, sensor: Mapping[str, Any], space: Mapping[str, Any]
 
 
 def _mounts(sensors: Sequence[Mapping[str, Any]], own_rules: Sequence[Mapping[str, Any]]) -> list[ConstraintCheck]:
-    """Every mounted sensor is at one of its mounts without any spread, and no other one is there."""
+    """Checks that every mounted sensor stands at one of its mounts, without spread, and alone."""
     checks, taken = [], []
     for index, (sensor, own) in enumerate(zip(sensors, own_rules, strict=True)):
         mounts, mean = _get(own, "origin", "mounts_m"), list(sensor["origin_m"]["mean"])
@@ -221,7 +221,7 @@ def _mounts(sensors: Sequence[Mapping[str, Any]], own_rules: Sequence[Mapping[st
 
 
 def _excluded(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
-    """The interval mean -+ z spread of a sensor's origin along each axis, against every excluded box."""
+    """Checks of the interval mean -+ z spread of a sensor's origin against every excluded box."""
     mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"].get("covariance") or np.zeros((3, 3))
     reach = [z * math.sqrt(max(covariance[axis][axis], 0.0)) for axis in range(3)]
     low, high = ([m + sign * r for m, r in zip(mean, reach, strict=True)] for sign in (-1, 1))
@@ -229,7 +229,7 @@ def _excluded(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z:
 
 
 def _outside(name: str, low: list[float], high: list[float], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
-    """An interval of origins against every excluded box."""
+    """Checks of an interval of origins against every excluded box."""
     value = {"low_m": low, "high_m": high}
     return [
         ConstraintCheck(f"{name}.origin.exclude[{index}]", box, value, not _reaches_into(low, high, box))
@@ -242,7 +242,7 @@ def _boxes(rules: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def _reaches_into(low: Sequence[float], high: Sequence[float], box: Mapping[str, Any]) -> bool:
-    """Whether an interval of origins meets the interior of a box by more than rounding; flat boxes have none."""
+    """True where an interval of origins meets the interior of a box by more than rounding; never for flat boxes."""
     return all(
         bottom < top and end > bottom + _slack(bottom) and start < top - _slack(top)
         for start, end, bottom, top in zip(low, high, box["low_m"], box["high_m"], strict=True)
@@ -252,7 +252,7 @@ def _reaches_into(low: Sequence[float], high: Sequence[float], box: Mapping[str,
 def _pattern(
     pattern: Mapping[str, Any], own_rules: Sequence[Mapping[str, Any]], space: Mapping[str, Any] | None
 ) -> list[ConstraintCheck]:
-    """The gates of rays, and where they start, against the bounds of their sensors, at every knot.
+    """Checks of rays' gates and origins against the bounds of their sensors, at every knot.
 
     Between knots they are linear, and these bounds are convex. Only broken ones are listed, but for the ends of a
     pattern along a condition, which must lie in the design space.
@@ -282,7 +282,7 @@ def _pattern(
 
 
 def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]]) -> list[ConstraintCheck]:
-    """The chosen rays that look out of their sensor's field of view, or listen out of its gate, at any knot."""
+    """Failed checks of chosen rays inside their sensor's field of view and gate, at any knot."""
     owner, failed = np.asarray(pattern["sensor"]), []
     for index, sensor in enumerate(sensors):
         own, view, gate = np.flatnonzero(owner == index), sensor["field_of_view_rad"], sensor["gate_m"]
@@ -309,7 +309,7 @@ def _astray(pattern: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]]) ->
 
 
 def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[ConstraintCheck]:
-    """The number of rays, and their bandwidth: rays times whole bins times bits times frames [Mbit/s]."""
+    """Checks of the number of rays and their bandwidth: rays times whole bins times bits times frames [Mbit/s]."""
     bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * PICOSECOND_S / 2
     widths = [_pattern_widths(pattern, bin_m) for pattern in document.get("patterns") or ()]
     asked, limit, checks = budget.get("rays"), budget.get("bandwidth_mbps"), []
@@ -330,7 +330,7 @@ def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[Cons
 
 
 def _even_widths(sensors: Sequence[Mapping[str, Any]], rays: int) -> np.ndarray:
-    """The gate width of each of so many even rays, shared out by weight with the largest remainders [m]."""
+    """The gate width of each even ray, rays split by weight with largest remainders, shape (rays,) [m]."""
     quotas = np.array([sensor["weight"] for sensor in sensors]) * rays
     counts = np.floor(quotas + AGREEMENT)
     for index in np.argsort(-(np.round(quotas - counts, 9)), kind="stable")[: rays - int(counts.sum())]:
@@ -340,10 +340,10 @@ def _even_widths(sensors: Sequence[Mapping[str, Any]], rays: int) -> np.ndarray:
 
 
 def _pattern_widths(pattern: Mapping[str, Any], bin_m: float) -> np.ndarray:
-    """Gate widths of a pattern where they cost most [m].
+    """Gate widths of a pattern at the condition value where they cost most bandwidth, shape (rays,) [m].
 
-    They are linear between knots, so bins change only where one crosses a whole number, and one place between each two
-    of these tells all.
+    They are linear between knots, so the number of bins changes only where a width crosses a whole number of bins; one
+    value between each two crossings is tried.
     """
     width = np.array(pattern["gate_end_m"], dtype=np.float64) - np.array(pattern["gate_start_m"], dtype=np.float64)
     places = [width]
@@ -361,7 +361,7 @@ def _pattern_widths(pattern: Mapping[str, Any], bin_m: float) -> np.ndarray:
 
 
 def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list[ConstraintCheck]:
-    """Whether every sensor is the part that it says to be, one that was asked for, and no part comes too often."""
+    """Checks that every sensor is an admitted part as its file describes it, within the numbers and power allowed."""
     if parts is None:
         return []
     named = [] if parts.get("names", "catalog") == "catalog" else list(parts["names"])
@@ -385,7 +385,7 @@ def _parts(document: Mapping[str, Any], parts: Mapping[str, Any] | None) -> list
 
 
 def _admitted_part(name: str, named: Sequence[str]) -> Part | None:
-    """The part that a sensor names, if the constraints admit it."""
+    """The part of a name; None where it is unknown or the constraints do not admit it."""
     from lidardesign.parts.catalogue import SUFFIX, load_library
 
     # an entry is a name or a path, with a mode behind it or not
@@ -411,7 +411,7 @@ def _admitted_part(name: str, named: Sequence[str]) -> Part | None:
 
 
 def _differences(part: Part, index: int, sensor: Mapping[str, Any], pattern: Mapping[str, Any] | None) -> str | None:
-    """What a sensor is that the part is not; None where both are the same."""
+    """The first difference of a sensor from its part, in words; None where they agree."""
     view = sensor["field_of_view_rad"]
     for key, expected in zip(ANGLES, part.field_of_view_rad, strict=True):
         if abs(view[key] - expected) > COARSE_SLACK:
@@ -434,6 +434,6 @@ def _differences(part: Part, index: int, sensor: Mapping[str, Any], pattern: Map
     starts = np.stack([np.asarray(pattern[f"origin_{axis}"][0], dtype=np.float64)[own] for axis in AXES], axis=1)
     moved = np.abs(starts - np.asarray(sensor["origin_m"]["mean"])).max(axis=1, initial=0.0) > COARSE_SLACK
     same = len(part.directions) - len(np.unique(part.directions, axis=0))
-    # rays that are none of its part's, or are fired from elsewhere or twice
+    # rays that are not in the part's pattern, start elsewhere or repeat
     strays = int(((away > COARSE_SLACK) | moved).sum()) + max(len(ray) - len(np.unique(ray)) - same, 0)
     return f"{strays} rays that the part does not have" if strays else None

@@ -1,6 +1,6 @@
-"""The constraint file (design contract, section 6): its keys, its checks, and what each sensor must keep.
+"""The constraint file (design contract, section 6): its keys, its checks, and the rules of each sensor.
 
-What the bounds mean, here and in `check`, which verifies them on the finished file:
+The meaning of the bounds, here and in `check`, which verifies them on the finished file:
 
 - `gate` and `field_of_view` bound the reported intervals, mean -+ z spread;
 - `origin.low_m`, `high_m` bound the sensor's mean origin; samples are taken from inside the box too;
@@ -45,7 +45,7 @@ Positive = Annotated[float, Field(ge=SHORTEST_M, le=FARTHEST_M)]
 Angle = Annotated[float, Field(ge=-360 * MOST_TURNS, le=360 * MOST_TURNS)]
 # The boxes between excluded ones grow faster than their number: with so many a fit still takes seconds.
 MOST_EXCLUDED = 32
-# So many components of a mixture over all samples fill some 100 MB; a scan has its rays instead.
+# Responsibilities of so many sensors over all samples fill some 100 MB.
 MOST_FITTED = 1000
 Count = Annotated[int, Field(ge=1, le=MOST_FITTED)]
 
@@ -119,7 +119,7 @@ class ExcludedBox(_Keys):
 
 
 class Origin(_Keys):
-    """Where a sensor may sit [m]."""
+    """Bounds on the origin of a sensor [m]."""
 
     low_m: Vector | None = None
     high_m: Vector | None = None
@@ -137,21 +137,21 @@ class Origin(_Keys):
 
 
 class Boresight(_Keys):
-    """Where it may point."""
+    """Bounds on the boresight of a sensor [degrees]."""
 
     azimuth_deg: AngleRange = AngleRange()
     elevation_deg: ElevationRange = ElevationRange()
 
 
 class FieldOfView(_Keys):
-    """How wide it may see, horizontally and vertically in its own frame."""
+    """Bounds on the full angles of a field of view, horizontal and vertical in the sensor's frame [degrees]."""
 
     horizontal_deg: FieldRange = FieldRange()
     vertical_deg: FieldRange = FieldRange()
 
 
 class Gate(_Keys):
-    """When it may listen, as one-way distances [m]."""
+    """Bounds on the start, end and width of a gate, as one-way distances [m]."""
 
     start_m: DistanceRange = DistanceRange()
     end_m: DistanceRange = DistanceRange()
@@ -170,7 +170,7 @@ class Budget(_Keys):
 
 
 class MostOfPart(_Keys):
-    """`{max: 1}`: how many of a part a design has at most."""
+    """The largest number of a part in a design, as `{max: 1}`."""
 
     max: Count
 
@@ -180,9 +180,9 @@ class Parts(_Keys):
 
     Arguments:
         names: Names, `NAME:MODE`, or paths of part files and folders; `catalog` is all that are shipped.
-        count: How many parts; `--sensors` goes before.
-        each: By the name of a part how many of it there may be.
-        power_w: What all of them may consume [W]; parts of which no source says it are left out.
+        count: Number of parts; `--sensors` takes precedence.
+        each: The largest number of a part, by its name.
+        power_w: Largest power of all parts [W]; parts without a stated power are left out.
     """
 
     names: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | Literal["catalog"] = "catalog"
@@ -202,7 +202,7 @@ class SensorConstraints(_Keys):
 
 @dataclass(frozen=True, eq=False)
 class SensorRules:
-    """What one sensor must keep, its entry of `each` laid over the common keys, and where the file says so.
+    """The rules of one sensor: the common keys overridden by its entry of `each`.
 
     Arguments:
         origin, boresight, field_of_view, gate: The bounds.
@@ -218,7 +218,7 @@ class SensorRules:
     own_keys: frozenset[str]
 
     def path(self, key: str) -> str:
-        """Where the file has one of the keys, as `each[1].gate.width_m.max`."""
+        """The path of a key in the constraint file, as `each[1].gate.width_m.max`."""
         return f"each[{self.index}].{key}" if key in self.own_keys else key
 
 
@@ -228,7 +228,7 @@ def rules_of(rules: Sequence[SensorRules], sensor: int) -> SensorRules:
 
 
 class Constraints(SensorConstraints):
-    """What a design must satisfy: fields of view, gates, places, rays and bandwidth; every key is optional.
+    """Constraints on a design: fields of view, gates, origins, rays and bandwidth; every key is optional.
 
     Keys and units are those of a constraint file (docs/constraints.md): for all sensors, or by sensor in `each`.
 
@@ -280,7 +280,7 @@ class Constraints(SensorConstraints):
 
     @cached_property
     def rules(self) -> tuple[SensorRules, ...]:
-        """What each sensor must keep: by its entry of `each`, and last what every further sensor must."""
+        """The rules of the sensor of each entry of `each`, and last those of every further sensor."""
         common = self.model_dump(exclude_none=True, include=set(SensorConstraints.model_fields))
         rules = []
         for index, entry in enumerate([*self.each, SensorConstraints()]):
@@ -296,7 +296,7 @@ class Constraints(SensorConstraints):
 
 
 def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain values with others laid over them, key by key at every depth."""
+    """Plain values overridden by others, key by key at every depth."""
     result = dict(base)
     for key, value in over.items():
         both = isinstance(value, Mapping) and isinstance(result.get(key), dict)

@@ -1,9 +1,9 @@
-"""Contradictions among constraints, found before anything is sampled, by the smallest set that conflicts.
+"""Contradictions among constraints, as smallest conflicting sets, found before anything is sampled.
 
 Start, end and width of a gate are difference constraints on two numbers, so every contradiction is a cycle
 through at most three bounds: all five kinds of cycle are checked with the tightest bound of each kind.
 
-Keeping a bandwidth budget: how many rays it pays for, and which common gate width.
+The bandwidth budget: the number of rays and the common gate width that it affords.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Fitted = TypeVar("Fitted")
 
 @dataclass(frozen=True)
 class _Bound:
-    """One bound and the name it is found under; an empty name needs no mention."""
+    """A bound and its name; an empty name is left out of messages."""
 
     value: float
     name: str
@@ -123,7 +123,7 @@ def _origin_limits(rules: SensorRules, axis: int, space: DesignSpace) -> tuple[l
 
 
 def _check_origin(rules: SensorRules, space: DesignSpace) -> None:
-    """The box of the origin, and the place where it is fixed, inside the design space."""
+    """Refuse an origin box or a fixed origin outside the design space."""
     fixed = None if rules.origin.fixed_m is None else snap_place_to_space(rules.origin.fixed_m, space)
     for axis in range(3):
         lows, highs = _origin_limits(rules, axis, space)
@@ -137,7 +137,7 @@ def _check_origin(rules: SensorRules, space: DesignSpace) -> None:
 
 
 def _check_excluded(rules: SensorRules, space: DesignSpace) -> None:
-    """Excluded boxes leave room for a sensor's origin, or some of its mounts."""
+    """Refuse excluded boxes that leave no room for a sensor's origin, or no mount."""
     origin, name = rules.origin, rules.path("origin.exclude")
     if not origin.exclude:
         return
@@ -211,7 +211,7 @@ def _check_field(rules: SensorRules, space: DesignSpace) -> None:
 
 
 def _check_gate(rules: SensorRules, space: DesignSpace) -> None:
-    """Every cycle through bounds of any kind is looked at, and one that needs the fewest of them is told."""
+    """Refuse contradictory bounds on a gate, with the conflict of the fewest bounds."""
 
     def bounds(part: str, end: str, *others: _Bound) -> list[_Bound]:
         value = getattr(getattr(rules.gate, part), end)
@@ -248,7 +248,7 @@ def _check_gate(rules: SensorRules, space: DesignSpace) -> None:
 
 
 def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least: _Bound, asked: int | None) -> None:
-    """Rays for all sensors, and a bandwidth that pays for their narrowest gates."""
+    """Refuse fewer rays than sensors, or a bandwidth below that of their narrowest gates."""
     budget = constraints.budget
     if asked is not None and budget.rays is not None and asked != budget.rays:
         _refuse(f"{asked} and {budget.rays} rays requested", ["--rays", "budget.rays"])
@@ -262,7 +262,7 @@ def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least
     numbers = [_Bound(1, ""), least] + ([given] if given.value is not None else [])
     common, least_of_all = least_width(constraints.rules[-1]), min(width for width, _ in widths)
     narrowest = [(0.0, []), (least_of_all, [name for _, names in widths for name in names])]
-    # what all sensors must keep says more than what single ones must besides
+    # bounds on all sensors make a shorter conflict than those of single ones
     narrowest += [common] if common[0] <= least_of_all else []
     # the fewest names first: one ray of any gate, then as many as are asked for, then as wide as is asked for
     for (width, names), rays in sorted(itertools.product(narrowest, numbers), key=lambda pair: len(pair[0][1])):
@@ -273,7 +273,7 @@ def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least
 
 
 def most_rays(constraints: Constraints) -> int | None:
-    """The number of rays that the bandwidth pays for with the narrowest gates, at least 1; None without a limit."""
+    """The number of rays that the bandwidth affords with the narrowest gates, at least 1; None without a limit."""
     budget = constraints.budget
     if budget.bandwidth_mbps is None:
         return None
@@ -283,7 +283,7 @@ def most_rays(constraints: Constraints) -> int | None:
 
 
 def least_width(rules: SensorRules) -> tuple[float, list[str]]:
-    """The narrowest gate that a sensor's rules admit [m], and the names of those that keep it so wide."""
+    """The narrowest gate that a sensor's rules admit [m], and the names of the bounds that set it."""
     gate = rules.gate
     widths: list[tuple[float, list[str]]] = [(0.0, [])]
     if gate.width_m.min is not None:
@@ -302,7 +302,7 @@ class BandwidthBudget:
         model: Bins, bits and rate.
         limit_mbps: The budget; None is none.
         rays: Rays per frame; None leaves them to the budget.
-        names: What stands in the way of a smaller bandwidth: the number of rays, and least widths of gates.
+        names: The bounds that keep the bandwidth from being smaller: number of rays, least gate widths.
     """
 
     model: Bandwidth
@@ -312,7 +312,7 @@ class BandwidthBudget:
 
     @classmethod
     def of(cls, constraints: Constraints, rays: int | None) -> BandwidthBudget:
-        """The read-out that a constraint file and an option ask for."""
+        """The budget of a constraint file and an option."""
         budget = constraints.budget
         names = ["budget.rays"] if budget.rays is not None else ["--rays"] if rays is not None else []
         names += [name for rules in constraints.rules for name in least_width(rules)[1]]
@@ -325,11 +325,11 @@ class BandwidthBudget:
         return self.model.mbps_of_widths(widths_m, split_budget(weights, rays))
 
     def fits(self, widths_m: np.ndarray, weights: np.ndarray, rays: int) -> bool:
-        """Whether that many rays keep the budget."""
+        """True where this number of rays keeps the budget."""
         return self.limit_mbps is None or self.mbps(widths_m, weights, rays) <= self.limit_mbps
 
     def affordable_rays(self, widths_m: np.ndarray, weights: np.ndarray) -> int:
-        """The number of rays that the budget pays for, at least one per sensor (which may exceed it)."""
+        """The number of rays that the budget affords, at least one per sensor (which may exceed it)."""
         bins_per_ray = float(np.dot(weights / np.sum(weights), self.model.bins(widths_m)))
         rays = int((self.limit_mbps or 0.0) / (bins_per_ray * self.model.mbps_of_widths(np.zeros(1), 1)))
         # largest remainders may hand spare rays to the wider gates
@@ -344,7 +344,7 @@ def fit_within_budget(
     shape: Callable[[Fitted], tuple[np.ndarray, np.ndarray]],
     budget: BandwidthBudget,
 ) -> tuple[Fitted, int | None]:
-    """A design that keeps the bandwidth budget, and its number of rays.
+    """A fit that keeps the bandwidth budget, and its number of rays.
 
     Where the fit is too expensive its gates are narrowed to a common number of bins and it is refitted from
     where it was, until the count of whole bins keeps the budget.

@@ -1,8 +1,8 @@
 """Places of sensors: origin boxes less excluded boxes, mounts, and the places that a design space fixes.
 
-What is left is not convex, so it is described by its maximal boxes: a box avoids the interiors of all excluded boxes
-just where it lies in one of the maximal boxes between them. So an interval of origins, which is a box of its own, is
-kept out of all excluded boxes by keeping it in one maximal box, and nothing is lost.
+The remaining region is not convex, so it is described by its maximal boxes: a box avoids the interiors of all excluded
+boxes exactly where it lies in one of the maximal boxes between them. So an interval of origins, itself a box, is kept
+out of all excluded boxes by keeping it in one maximal box, without loss of generality.
 
 Excluded boxes that take part of the origin box divide what is left of it, and an interval keeps to one of its parts:
 it would otherwise balance on an edge of the origin box, half of it outside, to cover other parts. Where none does,
@@ -27,8 +27,8 @@ from lidardesign.space import DIMENSIONS, DesignSpace
 PINNED_BOX_M = SLACK
 # Gaps between excluded boxes narrower than this, in metres and relative to coordinates, leave no place.
 SMALLEST_GAP = HALF_DIGITS
-# An origin that is pinned no further than this from where the space fixes it is meant to be there [m]: tables, robot
-# models and drawings say places to the millimetre, and no sensor is mounted more exactly.
+# An origin fixed this close to the space's own place means that place [m]: tables, robot models and drawings give
+# places to the millimetre, and no sensor is mounted more exactly.
 SAME_PLACE_M = 1e-3
 
 Mount = tuple[float, float, float]
@@ -66,7 +66,7 @@ def excluded_boxes(rules: SensorRules) -> Boxes:
 
 
 def inside_excluded(origins_m: np.ndarray, rules: SensorRules) -> np.ndarray:
-    """Which origins (N, 3) lie in the interior of an excluded box, shape (N,) bool."""
+    """Mask of the origins (N, 3) in the interior of an excluded box, shape (N,) bool."""
     inside = np.zeros(len(origins_m), dtype=bool)
     for low, high in zip(*excluded_boxes(rules), strict=True):
         inside |= ((origins_m > low) & (origins_m < high)).all(axis=1)
@@ -74,9 +74,9 @@ def inside_excluded(origins_m: np.ndarray, rules: SensorRules) -> np.ndarray:
 
 
 def free_boxes(rules: SensorRules, space: DesignSpace) -> Boxes:
-    """The maximal boxes between the excluded ones that hold a sensor's intervals; none where all is excluded.
+    """The maximal boxes between the excluded ones for a sensor's intervals; none where all is excluded.
 
-    Where no excluded box meets the origin box they may reach beyond it; along axes without freedom they are the line.
+    They end at the origin box only where an excluded box meets it, and are unbounded along fixed axes.
     """
     low, high = origin_box(rules, space)
     fixed = high - low <= PINNED_BOX_M
@@ -96,7 +96,7 @@ def free_boxes(rules: SensorRules, space: DesignSpace) -> Boxes:
 def _without(
     boxes: Boxes, bottom: np.ndarray, top: np.ndarray, low: np.ndarray, high: np.ndarray, axes: np.ndarray
 ) -> Boxes:
-    """The maximal boxes inside some others that avoid one more, cut along some axes, with room in [low, high]."""
+    """The maximal boxes inside given ones that avoid a further box, cut along `axes`, with room in [low, high]."""
     met = ((boxes.low_m < top) & (boxes.high_m > bottom) | ~axes).all(axis=1)
     lows, highs = [], []
     for axis in np.flatnonzero(axes):
@@ -109,11 +109,11 @@ def _without(
     if not lows:
         return Boxes(old[:, :3], -old[:, 3:])
     fresh = np.concatenate([np.concatenate(lows), -np.concatenate(highs)], axis=1)
-    # those that leave next to no room inside [low, high] along some axis are none
+    # drop boxes with next to no room inside [low, high] along some axis
     needed = np.minimum(SMALLEST_GAP * np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0), (high - low) / 2)
     room = np.minimum(-fresh[:, 3:], high) - np.maximum(fresh[:, :3], low)
     fresh = fresh[(room > needed)[:, axes].all(axis=1)]
-    # no old box lies in a fresh one, which is part of another old box
+    # no old box lies in a fresh one: fresh boxes are parts of other old ones
     fresh = np.unique(fresh, axis=0)
     holds = (np.concatenate([old, fresh])[None] <= fresh[:, None]).all(axis=2)
     corners = np.concatenate([old, fresh[holds.sum(axis=1) == 1]])
@@ -135,12 +135,12 @@ def mounts_of(rules: SensorRules) -> list[Mount]:
 
 
 def is_mounted(rules: Sequence[SensorRules]) -> bool:
-    """Whether any sensor sits at a mount."""
+    """True where any sensor stands at a mount."""
     return any(mounts_of(one) for one in rules)
 
 
 def most_mounted(rules: Sequence[SensorRules]) -> int | None:
-    """The largest number of sensors that all find a mount; None where the number is not limited.
+    """The largest number of sensors that can all be mounted; None where the number is not limited.
 
     Sensors beyond the entries of `each` share the common list.
     """
@@ -153,7 +153,7 @@ def most_mounted(rules: Sequence[SensorRules]) -> int | None:
 
 
 def mounts_suffice(options: Sequence[Sequence[Mount]]) -> bool:
-    """Whether each of some mounted sensors can have a mount of its own; one without any left cannot."""
+    """True where mounted sensors can all have distinct mounts, by maximum bipartite matching."""
     if not options or not all(options):
         return not options
     # loaded here because few constraint files have mounts
@@ -179,7 +179,7 @@ def fix_origins(rules: Sequence[SensorRules], places: Sequence[Mount | None]) ->
 
 
 def placement_notes(rules: Sequence[SensorRules]) -> tuple[str, ...]:
-    """What rules say without effect: mounts in excluded boxes, and excluded boxes without volume."""
+    """Notes on rules without effect: mounts in excluded boxes, and excluded boxes without volume."""
     notes = []
     for one in rules:
         listed, name = one.origin.mounts_m or [], one.path("origin.exclude")
@@ -194,7 +194,7 @@ def placement_notes(rules: Sequence[SensorRules]) -> tuple[str, ...]:
 
 
 def snap_place_to_space(origin_m: Sequence[float], space: DesignSpace) -> list[float]:
-    """An origin (3,) [m], with those coordinates of the space that it differs from by less than anyone mounts."""
+    """An origin (3,) with coordinates within `SAME_PLACE_M` of the space's fixed ones replaced by these [m]."""
     place = [float(value) for value in origin_m]
     for axis in {0, 1, 2} - set(space.free):
         if abs(place[axis] - space.low[axis]) <= SAME_PLACE_M:
@@ -203,7 +203,7 @@ def snap_place_to_space(origin_m: Sequence[float], space: DesignSpace) -> list[f
 
 
 def snap_to_space(constraints: Constraints, space: DesignSpace) -> tuple[Constraints, list[str]]:
-    """Constraints whose fixed origins and mounts are where the space fixes them, and a note of those moved there.
+    """Constraints with fixed origins and mounts snapped to the space's fixed coordinates, and notes on them.
 
     The same object where nothing moves.
     """
@@ -228,7 +228,7 @@ def snap_to_space(constraints: Constraints, space: DesignSpace) -> tuple[Constra
 
 
 def axes_outside(low_m: Sequence[float], high_m: Sequence[float], space: DesignSpace) -> list[int]:
-    """The axes on which a box of origins lies outside the design space, but for conditions, along which it moves."""
+    """The axes, other than conditions, on which a box of origins lies outside the design space."""
     return [
         axis
         for axis in range(3)

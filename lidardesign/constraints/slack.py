@@ -1,6 +1,6 @@
-"""The room that a design leaves under each of its constraints: what one would have to loosen to gain anything.
+"""The slack of each constraint of a design: the tight ones are those to loosen.
 
-Works on what the independent checker found; bounds that many sensors share are told once, by the closest sensor.
+Computed from the independent checks; a bound that several sensors share has one row, that of the tightest sensor.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from lidardesign.constraints.check import ConstraintCheck
 TIGHT_SHARE = 0.01
 # Bounds of the design space hold for every sensor, whatever was asked for.
 SPACE_MARK = "space."
-# Where the bandwidth is the only bound whose name says nothing of its side.
+# Names of bounds by their side; the budgets are upper bounds without `.max`.
 UPPER_ENDS = (".max", ".high_m", "budget.bandwidth_mbps", "budget.power_w")
 LOWER_ENDS = (".min", ".low_m")
 FULL_TURN_DEG = 360.0
@@ -56,7 +56,7 @@ class ConstraintSlack:
 
 
 class Room(NamedTuple):
-    """How far a value is inside its bound; both are None without a distance.
+    """The slack of a bound; both values are None where the bound has no distance.
 
     Arguments:
         room: In the bound's unit; negative beyond the bound.
@@ -68,15 +68,15 @@ class Room(NamedTuple):
 
     @property
     def is_tight(self) -> bool:
-        """Whether next to nothing of the bound is left."""
+        """True where the slack is at most `TIGHT_SHARE` of the bound, or no more than 0."""
         return self.room is not None and (self.room <= 0 if self.share is None else self.share <= TIGHT_SHARE)
 
 
 def constraint_slack(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) -> list[ConstraintSlack]:
-    """How tight each bound is, in the order in which the checker comes to them.
+    """The slack of each bound, in the order of the checks.
 
     Arguments:
-        checks: What the checker found on a design.
+        checks: The checks of a design.
         sensors: The names of the design's sensors.
     """
     groups: dict[tuple[str, str], list[tuple[str, ConstraintCheck, Room]]] = {}
@@ -85,7 +85,7 @@ def constraint_slack(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) 
         groups.setdefault((key, repr(check.bound)), []).append((owner, check, room_of(check)))
     rows = []
     for (key, _), group in groups.items():
-        # the first broken one that is furthest beyond, else the closest
+        # the check furthest beyond its bound, else the closest to it
         order = [(check.satisfied, math.inf if room.room is None else room.room) for _, check, room in group]
         owner, check, (room, share) = group[order.index(min(order))]
         tight = sum(check.satisfied and room.is_tight for _, check, room in group)
@@ -103,9 +103,9 @@ def split_name(name: str, sensors: Sequence[str]) -> tuple[str, str]:
 
 
 def room_of(check: ConstraintCheck) -> Room:
-    """How far the value of a check is inside its bound."""
+    """The slack of a check."""
     bound, value = _numbers(check.bound), _numbers(check.value)
-    # room and what it is a share of, at every end
+    # room and the scale of its share, at each end
     ends: list[tuple[float, float]] = []
     if check.name.endswith(UPPER_ENDS) and len(bound) == len(value):
         ends = [(limit - found, abs(limit)) for limit, found in zip(bound, value, strict=True)]

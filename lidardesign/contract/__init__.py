@@ -1,4 +1,4 @@
-"""The contract of task plugins as laws that can be tried: from Python, by `tasks check` and in pytest.
+"""The contract of task plugins as testable laws: from Python, by `tasks check` and in pytest.
 
 `check_task(MyTask())` tries all of them; the modules are the groups of laws: `interface`, `scenes`,
 `scoring` and `contract`. The names here are loaded when they are used.

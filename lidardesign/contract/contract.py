@@ -1,6 +1,6 @@
 """The whole contract of a task plugin, law by law, each tried once.
 
-The laws of random state and time stand here, those of what a task gives in the modules beside.
+The laws of random state and time are here, the others in the modules of their groups.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def contract_of(
         task: The task.
         overrides: `KEY=VALUE` as `--set` takes it.
         config: A whole configuration instead.
-        limit_s: What one call of the task's code may take [s].
+        limit_s: Time limit of one call of the task's code [s].
 
     Raises:
         PluginError: The task lacks a member of the interface.
@@ -152,7 +152,7 @@ def check_task(task: Task, *, overrides: Sequence[str] = (), limit_s: float = CA
     Arguments:
         task: The task.
         overrides: `KEY=VALUE` as `--set` takes it.
-        limit_s: What one call of the task's code may take [s].
+        limit_s: Time limit of one call of the task's code [s].
 
     Raises:
         BrokenLawError: A law does not hold; the message names all that do not.

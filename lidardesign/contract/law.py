@@ -1,7 +1,7 @@
-"""Laws of the task contract, the task that they are tried on, and what became of each of them.
+"""Laws of the task contract, the task that they are tried on, and their findings.
 
-What several laws need is here too: digests that are equal for equal content, whatever the process; rays that see a
-scene's targets; and their returns, disturbed.
+Helpers of several laws are here too: digests that are equal for equal content in any process; rays that see a
+scene's targets; and perturbed returns.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ CALL_SECONDS = 60.0
 # The geometry and the scores of so many training scenes are looked at.
 LOOKED_AT = 3
 DEEPEST = 40  # nesting of a value that has a digest
-# What of scenes and bodies no ray meets, or what is told apart otherwise.
+# Fields of scenes and bodies without effect on rays, or compared in another way.
 UNSEEN = ("name", "group", "notes", "truth", "bodies", "poses", "importance")
 # So often rays at targets are drawn until they are enough; of a scene that moves, so many frames are aimed at.
 DRAW_ROUNDS, MOST_FRAMES = 12, 8
@@ -63,14 +63,14 @@ class BrokenLawError(PluginError):
 
 
 class LawHolds(NamedTuple):
-    """A law that holds: what was measured, in words, and the same as numbers by name with their unit."""
+    """A law that holds: its measurements in words, and as numbers by name with their unit."""
 
     words: str
     figures: Mapping[str, float] = {}
 
 
 class NotApplicable(NamedTuple):
-    """A law that says nothing about this task, and why."""
+    """A law that does not apply to this task, with the reason."""
 
     reason: str
 
@@ -82,10 +82,10 @@ class Law:
     Arguments:
         name: Short and unique, for tables and test names.
         group: The part of the contract that it belongs to.
-        statement: What a task keeps to, in one sentence.
+        statement: The requirement on a task, in one sentence.
         check: Tries it on a task; raises BrokenLawError where it does not hold.
-        needs: Names of laws without which it cannot be tried.
-        after: Names of laws that are tried before it, whatever comes of them: it looks at what they did.
+        needs: Names of laws that must hold for it to be tried.
+        after: Names of laws to be tried before it in any case, since it checks their side effects.
     """
 
     name: str
@@ -103,10 +103,10 @@ class Finding:
     Arguments:
         law: Its name.
         group: Its group.
-        statement: What it says.
+        statement: Its statement.
         outcome: Whether it holds.
-        detail: What was measured where it holds; else why it does not, or was not tried.
-        seconds: How long that took [s].
+        detail: Measurements where it holds; else the reason why it does not, or was not tried.
+        seconds: Time of the check [s].
         figures: Numbers by name.
     """
 
@@ -119,7 +119,7 @@ class Finding:
     figures: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """The form that it has in JSON."""
+        """The JSON form."""
         return {
             "law": self.law,
             "group": self.group,
@@ -132,11 +132,11 @@ class Finding:
 
 
 def error_words(error: LidardesignError) -> str:
-    """A finding's words for an error: what was found, what is allowed, what to do."""
+    """An error in words for a finding: the message, allowed values and the hint."""
     parts = [error.message]
     if error.allowed:
         parts.append(f"allowed: {error.allowed}")
-    # whoever checks a plugin is its author
+    # plugins are checked by their authors
     if error.hint and AUTHOR_HINT not in error.hint:
         parts.append(f"try: {error.hint}")
     return "; ".join(parts)
@@ -145,7 +145,7 @@ def error_words(error: LidardesignError) -> str:
 def place_of(error: BaseException) -> str:
     """The place in other code than this package's that an error comes from, as " (task.py:52)"; empty if unknown.
 
-    Of several places the last one counts that is in no installed library, unless there is none but in libraries.
+    The innermost place outside installed libraries is taken, or the innermost one in them where there is no other.
     """
     while error.__cause__ is not None:
         error = error.__cause__
@@ -164,11 +164,11 @@ def place_of(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def restore_random_states(drawn: list[str], what: str) -> Iterator[None]:
-    """Put global random states back as they were before, and note those that had changed.
+    """A context that restores global random states at its end, and notes those that had changed.
 
     Arguments:
-        drawn: Gets the states that changed, in words.
-        what: What runs meanwhile.
+        drawn: The list that the notes are added to.
+        what: The work inside, in words.
     """
     before = _random_states()
     try:
@@ -200,9 +200,9 @@ class Subject:
     Arguments:
         task: The plugin.
         config: Its resolved configuration.
-        limit_s: What one call of its code may take [s].
-        drawn: Global random states that its code drew from or seeded, and when.
-        on_call: Called with what is called before every call of its code, and "" after it.
+        limit_s: Time limit of one call of its code [s].
+        drawn: Global random states that its code drew from or seeded, with the call.
+        on_call: Called with a description before every call of its code, and with "" after it.
     """
 
     task: Task
@@ -220,10 +220,10 @@ class Subject:
 
     @contextlib.contextmanager
     def calling(self, what: str) -> Iterator[None]:
-        """Run the task's code: what it raises breaks the law that is tried, and the longest time is kept.
+        """A context for a call of the task's code: an exception breaks the law, and the longest time is kept.
 
         Raises:
-            BrokenLawError: Whatever it raised.
+            BrokenLawError: It raised an exception.
         """
         self.on_call(what)
         started = time.perf_counter()
@@ -251,14 +251,14 @@ class Subject:
 
     @property
     def looked_at(self) -> list[Scene]:
-        """The first training scenes."""
+        """The first training scenes, which the laws check."""
         scenes = self.scenes("train")[:LOOKED_AT]
         if not self._as_made:
             self._as_made = [fingerprint(scene) for scene in scenes]
         return scenes
 
     def touched(self) -> list[str]:
-        """The names of scenes that are looked at and are not as they were made."""
+        """The names of checked scenes that were changed since they were made."""
         return [
             scene.name for scene, made in zip(self.looked_at, self._as_made, strict=True) if fingerprint(scene) != made
         ]
@@ -316,7 +316,7 @@ def fingerprint(value: Any) -> str:
 
 
 def geometry_fingerprint(scene: Scene) -> str:
-    """The same of what rays meet in a scene and what light does there, whatever it and its bodies are called."""
+    """SHA-256 of the geometry and optical properties of a scene, without names."""
     return fingerprint([*((np.round(body.poses, 12), *_others(body)) for body in scene.bodies), *_others(scene)])
 
 
@@ -357,13 +357,13 @@ def _parts(value: Any) -> list[Any]:
 
 
 def rays_at_targets(scene: Scene, space: DesignSpace, casters: Sequence[SceneCaster], count: int) -> Rays:
-    """Rays of a design space to visible points of targets, even over their area, listening all the way.
+    """Rays of a design space to visible points of targets, even over their area, with gates over the whole range.
 
     Arguments:
-        scene: Whose targets; of moving ones, places in several frames.
+        scene: The scene of the targets; of a moving one, several frames.
         space: The design space at one condition value.
         casters: One per frame.
-        count: How many at most; fewer where little can be seen.
+        count: Largest number of rays; fewer where little can be seen.
     """
     generator = np.random.default_rng(SEED)
     frames = np.unique(np.linspace(0, scene.frames - 1, min(scene.frames, MOST_FRAMES)).astype(int))
@@ -378,7 +378,7 @@ def rays_at_targets(scene: Scene, space: DesignSpace, casters: Sequence[SceneCas
 
 
 def full_rays(points: np.ndarray, space: DesignSpace) -> Rays:
-    """Rays of design points (N, 6) that listen over the whole range of a design space."""
+    """Rays of design points (N, 6) with gates over the whole range of a design space."""
     low, high = space.low[RANGE], space.high[RANGE]
     gate = (low, high) if low < high else (low * (1 - HALF_GATE), high * (1 + HALF_GATE))
     looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
@@ -392,11 +392,11 @@ def rays_that_meet(
     """Rays of a design space towards targets that meet a target first, observed design points of shape (K, 6).
 
     Arguments:
-        scene: Whose targets, at one of its frames.
+        scene: The scene of the targets.
         space: The design space at one condition value.
         caster: Of that frame.
         frame: Its number.
-        count: How many are tried.
+        count: Number of tries.
         generator: Draws origins and places.
     """
     origins = space.sample(count, generator)[:, :3]
@@ -412,7 +412,7 @@ def rays_that_meet(
 
 
 def shuffled(returns: Sequence[Returns], generator: np.random.Generator) -> list[Returns]:
-    """The same returns with their rays in another order, each list in one of its own."""
+    """The returns with the rays of each list in a random order of its own."""
     return [returns_of_rays(one, generator.permutation(len(one.rays))) for one in returns]
 
 
@@ -423,7 +423,7 @@ def returns_of_rays(returns: Returns, chosen: np.ndarray) -> Returns:
 
 
 def without_returns(returns: Sequence[Returns]) -> list[Returns]:
-    """The same rays, none of which received anything."""
+    """The returns of the same rays where all miss."""
     return [
         Returns(
             one.rays,

@@ -1,6 +1,6 @@
 """The contract of task plugins in pytest: a test that asks for `task_law` runs once per task and law.
 
-Which tasks is said by the setting `lidardesign_tasks` of the project's pytest configuration, one a line, each with
+The tasks are those of the setting `lidardesign_tasks` in the project's pytest configuration, one a line, each with
 settings as `--set` takes them:
 
     [tool.pytest.ini_options]
@@ -35,7 +35,7 @@ class TaskLaw:
         self.contract, self.name = contract, name
 
     def check(self) -> str:
-        """Try it; what was measured. A law that does not apply skips the test, one that does not hold fails it."""
+        """Try the law and return its measurements; skip the test where it does not apply, fail it where broken."""
         finding = self.contract.finding(self.name)
         if finding.outcome == "skip":
             pytest.skip(finding.detail)
@@ -65,7 +65,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture(scope="session")
 def _task_contracts() -> dict[str, Contract]:
-    """Contracts by what the setting says of them: scenes are made once for all laws."""
+    """A cache of contracts by lines of the setting, so that scenes are made once for all laws."""
     return {}
 
 

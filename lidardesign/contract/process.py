@@ -1,7 +1,7 @@
-"""The contract tried in a process of its own: a plugin that hangs or crashes harms nobody.
+"""The contract tried in a child process, which contains plugins that hang or crash.
 
-The process says by lines of JSON when it calls the task's code and what it found; whoever asks waits for each line no
-longer than a call may take. It works in an empty folder and has temporary files of its own.
+The child writes lines of JSON for each call of the task's code and each finding; the parent waits for each line no
+longer than a call may take. The child works in an empty folder and has temporary files of its own.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from lidardesign.contract.contract import Contract
     from lidardesign.task import Task
 
-# A call that takes longer than it may ends within this many times as long, so that it can be told how long it took.
+# A call beyond its limit may run this many times as long, so that its time can be reported.
 OVERTIME = 3
-# The key of a line that says what is called now; empty once the call has ended.
+# The key of a line with the present call; empty once the call has ended.
 CALLED = "called"
 FINDING_KEYS = {"law", "group", "statement", "outcome", "detail", "seconds", "figures"}
 REFUSALS = {"config": ConfigError, "data": DataError}
@@ -37,14 +37,14 @@ REFUSALS = {"config": ConfigError, "data": DataError}
 
 @dataclass(frozen=True)
 class CheckRequest:
-    """A task that is checked in a process of its own.
+    """A task to check in a child process.
 
     Arguments:
         name: The task, as `learn` takes it.
         config_file: A YAML file of its configuration.
         overrides: `KEY=VALUE` as `--set` takes it.
-        seed: Root of all chance.
-        limit_s: What one call of the task's code may take [s].
+        seed: Root of all random numbers.
+        limit_s: Time limit of one call of the task's code [s].
     """
 
     name: str
@@ -83,7 +83,7 @@ def check_in_process(request: CheckRequest) -> Iterator[Finding]:
 
 
 def _read_findings(child: Child, seconds: float) -> Iterator[Finding]:
-    """Findings as they come; where the process is lost, the law that it tried does not hold."""
+    """Findings as they arrive; where the child is lost, the law under trial does not hold."""
     for number in range(len(_laws()) + 1):
         found = _next_finding(child, seconds, loading=number == 0)
         if isinstance(found, str):
@@ -97,12 +97,12 @@ def _read_findings(child: Child, seconds: float) -> Iterator[Finding]:
 
 
 def _next_finding(child: Child, seconds: float, *, loading: bool) -> dict[str, Any] | str:
-    """The next line that is a finding, or how the process was lost; every call of the task's code has time of its own.
+    """The next finding, or the reason why the child was lost; the time limit holds for each call of the task's code.
 
     Arguments:
-        child: The process.
-        seconds: How long a call may take.
-        loading: Whether it loads the plugin, which is one call.
+        child: The child process.
+        seconds: Time limit of a call [s].
+        loading: Whether the call loads the plugin.
     """
     # between calls libraries are loaded, fields built and other processes waited for
     allowed = seconds if loading else START_SECONDS + OVERTIME * seconds
@@ -121,7 +121,7 @@ def _next_finding(child: Child, seconds: float, *, loading: bool) -> dict[str, A
 
 
 def _finding(found: dict[str, Any]) -> Finding:
-    """The finding of a line; where the configuration was refused, the error that it was refused with."""
+    """The finding of a line; raises the error of a refused configuration."""
     if "refused" not in found:
         return Finding(**found)
     told = found["refused"]
@@ -131,7 +131,7 @@ def _finding(found: dict[str, Any]) -> Finding:
 
 
 def _all_lost(number: int, reason: str) -> Iterator[Finding]:
-    """The law that was tried does not hold, and those behind it are not reached; number 0 is that it loads."""
+    """A failure of law `number` (0: the plugin loads), and findings that later laws were not reached."""
     name, group, statement = LOADS if number == 0 else _named(number)
     yield Finding(name, group, statement, "fail", reason)
     yield from _not_reached(number + 1)
@@ -154,7 +154,7 @@ def _named(number: int) -> tuple[str, str, str]:
 
 
 def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
-    """In that process: try all laws and say what was found."""
+    """In the child: try all laws and write their findings."""
     _settle(request)
     contract = _begin(request, result)
     if contract is None:
@@ -166,7 +166,7 @@ def answer_check(request: dict[str, Any], result: BinaryIO) -> dict[str, Any]:
 
 
 def _settle(request: dict[str, Any]) -> None:
-    """Provide a place for temporary files, and write no compiled Python beside the plugin's sources."""
+    """Set a folder for temporary files, and keep Python from writing bytecode next to the plugin's sources."""
     tempfile.tempdir = os.environ["TMPDIR"] = _make_folder(request, "temporary")
     os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
 
@@ -178,7 +178,7 @@ def _make_folder(request: dict[str, Any], name: str) -> str:
 
 
 def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
-    """Import the plugin and resolve its configuration; None where that is the end of it, which is told."""
+    """Import the plugin and resolve its configuration; write the finding, and return None after a failure."""
     drawn: list[str] = []
     started = time.perf_counter()
     try:
@@ -195,7 +195,7 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     except BaseException as error:
         write_line(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}").as_dict())
         return None
-    # not before: a plugin that fails to load is named without the libraries that the laws need
+    # imported late: a plugin that fails to load is reported without the libraries that the laws need
     from lidardesign.contract.contract import Contract
     from lidardesign.contract.law import Subject
 

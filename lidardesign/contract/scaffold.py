@@ -1,4 +1,4 @@
-"""A new task as an installable package: written from templates, complete, and keeping the contract as it is."""
+"""A new task as an installable package, written from templates, which keeps the contract unchanged."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def new_task(name: str, folder: Path | None = None) -> list[Path]:
 
     Arguments:
         name: The task's name, as `learn` will take it.
-        folder: Where to, a folder that is not there or is empty; None: lidardesign-NAME here.
+        folder: A new or empty folder; None: lidardesign-NAME in the working folder.
 
     Returns:
         The files that were written.

@@ -1,7 +1,6 @@
-"""Laws of what a task says about itself, and of its scenes.
+"""Laws of a task's description (configuration, metric, defaults, design space) and of its scenes.
 
-It has a configuration, a metric, defaults and a design space. Scenes that are made again are the same, splits share
-none, and they travel to other processes.
+Scenes are reproducible, splits share none, and scenes can be sent to other processes.
 """
 
 from __future__ import annotations
@@ -100,7 +99,7 @@ def check_disjoint(subject: Subject) -> LawHolds:
 
 
 def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
-    """A worker process makes the same scenes: nothing hangs on the order of sets or on what ran before."""
+    """A worker process makes the same scenes, whatever the order of sets or earlier calls."""
     kind = type(subject.task)
     if kind.__module__ == "__main__" or "<locals>" in kind.__qualname__ or find_spec(kind.__module__) is None:
         return NotApplicable("the task's class cannot be imported in another process")
@@ -117,12 +116,12 @@ def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
 
 
 def fingerprints_in_process(config: RunConfig, kind: type, seconds: float) -> dict[str, list[str]]:
-    """Fingerprints of all scenes by split, made in a process of its own.
+    """Fingerprints of all scenes by split, made in a child process.
 
     Arguments:
-        config: Whose scenes.
+        config: The configuration of the scenes.
         kind: The task's class; it must be importable.
-        seconds: How long the scenes of one split may take there.
+        seconds: Time limit of the scenes of one split [s].
 
     Raises:
         BrokenLawError: It failed there, or took longer.
@@ -146,7 +145,7 @@ def fingerprints_in_process(config: RunConfig, kind: type, seconds: float) -> di
 
 
 def answer_fingerprints(request: dict[str, Any], _: object) -> dict[str, Any]:
-    """In that process: make the scenes, and say their fingerprints or what went wrong."""
+    """In the child: make the scenes, and return their fingerprints or the error."""
     try:
         with plugin_guard(request["name"]):
             task = attrgetter(request["name"])(importlib.import_module(request["module"]))()
@@ -160,7 +159,7 @@ def answer_fingerprints(request: dict[str, Any], _: object) -> dict[str, Any]:
 
 
 def check_picklable(subject: Subject) -> LawHolds:
-    """Scenes and the configuration survive pickling, which any engine of workers may do with them."""
+    """Scenes and the configuration survive pickling, which worker processes need."""
     size = 0
     for scene in (*subject.looked_at, subject.config.task):
         try:
@@ -206,7 +205,7 @@ SCENE_LAWS = (
 
 
 def check_config(subject: Subject) -> LawHolds:
-    """Unknown keys and NaN are refused, values come back from JSON as they were, every key says what it is."""
+    """Unknown keys and NaN are refused, values survive JSON, every key has a description."""
     kind, config = type(subject.config.task), subject.config.task
     with subject.calling("Config"):
         if _takes(kind, {**config.model_dump(), "no_such_key": 1}):
@@ -261,7 +260,7 @@ def _is_finite(value: object) -> bool:
 
 
 def check_defaults(subject: Subject) -> LawHolds:
-    """Suggested rays, level and settings are ones that the commands accept, in every preset."""
+    """Suggested rays, level and settings are valid in every preset."""
     defaults = subject.task.defaults
     allowed = "rays of 1 or more, a level between 0 and 1"
     wrong = {

@@ -1,4 +1,4 @@
-"""Laws of a task's targets and score: in reach; a number, best on the truth, moved by nothing but returns."""
+"""Laws of a task's targets, which are in reach, and of its score, which depends on returns alone."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _dense(subject: Subject, number: int) -> list[Returns]:
 
 
 def _worse(subject: Subject, value: float, than: float) -> float:
-    """By how much a value is worse than another, in the metric's unit; negative where it is better."""
+    """The amount by which a value is worse than another, in the metric's unit; negative where it is better."""
     return value - than if subject.metric.better == "lower" else than - value
 
 
@@ -43,7 +43,7 @@ def _scenes(subject: Subject) -> list[tuple[int, Scene]]:
 
 
 def check_reach(subject: Subject) -> LawHolds:
-    """Rays of the design space meet targets in every scene that is looked at."""
+    """Rays of the design space meet targets in every checked scene."""
     counts = [sum(map(len, subject.rays(number, DENSE))) for number, _ in _scenes(subject)]
     if not min(counts):
         raise BrokenLawError(
@@ -69,7 +69,7 @@ def check_number(subject: Subject) -> LawHolds:
 
 
 def check_nothing(subject: Subject) -> LawHolds:
-    """No rays at all and rays that hear nothing are scored, and no better than returns are."""
+    """No rays and rays without returns are scored, and no better than returns."""
     found = []
     for number, scene in _scenes(subject):
         none = [rays.subset(np.zeros(0, dtype=int)) for rays in subject.rays(number, SPARSE)]
@@ -151,7 +151,7 @@ def check_untouched(subject: Subject) -> LawHolds:
 
 
 def check_information(subject: Subject) -> LawHolds | NotApplicable:
-    """Rays tell about items by their own returns alone: once, alike in any order, and nothing without a return."""
+    """Information depends on a ray's own returns alone: one pair per item and frame, in any order of rays."""
     if not informs_rays(subject.task):
         return NotApplicable("the task has no method informs, so rays of its designs cannot be chosen")
     pairs, rays = 0, 0
@@ -183,7 +183,7 @@ def check_information(subject: Subject) -> LawHolds | NotApplicable:
 
 
 def _pairs(found: Information, rays: np.ndarray) -> np.ndarray:
-    """Item, ray, frame and worth of all pairs, sorted, (E, 4); rays have the numbers (N,)."""
+    """Item, ray, frame and worth of all pairs, sorted, (E, 4), with rays numbered by `rays` (N,)."""
     columns = [found.item, rays[found.ray], found.source, found.worth]
     return np.column_stack(columns)[np.lexsort(columns[2::-1])]
 

@@ -35,7 +35,7 @@ CORNERS = torch.tensor([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """Which free dimensions are learned and which are conditions, and what a unit volume is worth.
+    """The split of the free dimensions into learned and conditioning ones, and their chart volume.
 
     Unit points list the free dimensions in the space's order, each scaled to [-1, 1].
     """
@@ -207,7 +207,7 @@ def on_device(target: Target, device: torch.device) -> Target:
 
 
 def stays_on(target: Target, device: torch.device) -> bool:
-    """Whether steps of a flow on a device need no evaluation elsewhere."""
+    """True where steps of a flow on a device evaluate the target on the same device."""
     return device.type == "cpu" or isinstance(target, DeviceTarget)
 
 

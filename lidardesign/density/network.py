@@ -44,7 +44,7 @@ MINIMUM_SLOPE = 1e-4
 
 
 class _Constant(nn.Module):
-    """Spline parameters that all points share, where there is nothing to see."""
+    """Spline parameters shared by all points, of a dimension without inputs."""
 
     def __init__(self, outputs: int) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ def _network(inputs: int, hidden: int, outputs: int) -> nn.Module:
 
 
 def _seen(values: Tensor, periodic: bool) -> Tensor:
-    """What networks see of a coordinate, (N,) to (N, features)."""
+    """Network inputs of a coordinate: itself unless periodic, and its waves, (N,) to (N, features)."""
     angles = math.pi * values[:, None] * torch.tensor(WAVES).to(values)
     waves = torch.cat([torch.cos(angles), torch.sin(angles)], dim=1)
     return waves if periodic else torch.cat([values[:, None], waves], dim=1)
@@ -131,7 +131,7 @@ class DesignFlow(nn.Module):
     def _chained(
         self, given: Tensor, context: Tensor | None, *, inverted: bool = False, held: bool = False
     ) -> tuple[Tensor, Tensor]:
-        """Each dimension's values after the other's, and the log density at the samples' end."""
+        """Values of all dimensions, each given those before it, and the log density of the samples."""
         log_prob, columns = torch.full_like(given[:, 0], self.log_base), []
         seen = [] if context is None else [_seen(column, False) for column in context.unbind(dim=1)]
         for n, (network, periodic) in enumerate(zip(self.networks, self._periodic, strict=True)):
@@ -147,7 +147,7 @@ class DesignFlow(nn.Module):
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
         """Uniform base points, shape (count, D), and uniform conditions, shape (count, context), or None without any.
 
-        Both are in the parameters' type and place.
+        Both have the parameters' dtype and device.
         """
         conditions = self._uniform(count, self.context, generator) if self.context else None
         return self._uniform(count, self.features, generator), conditions
@@ -212,7 +212,7 @@ class BoundedSpline(MonotonicRQSTransform):
 
 
 def _softness(layers: int) -> float:
-    """How soon the splines of a stack give way to what their slopes may be."""
+    """The soft-clipping constant c that bounds the slopes of a stack of splines, see `spline_kernels`."""
     return 2 * layers / abs(math.log(MINIMUM_SLOPE))
 
 

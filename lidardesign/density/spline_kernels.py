@@ -82,7 +82,7 @@ def _slopes(raw, k, softness, periodic):  # noqa: ANN001, ANN202
 
 @njit(**OPTIONS)
 def _turned(value, periodic):  # noqa: ANN001, ANN202
-    """A coordinate on a circle half a turn on."""
+    """A coordinate half a turn further on its circle; itself where it is not periodic."""
     if not periodic:
         return value
     return value - BOUND if value >= 0.0 else value + BOUND
@@ -155,7 +155,7 @@ def forward(parameters, values, periodic, softness, edge, shares, bins, places, 
 
 @njit(**OPTIONS)
 def inverse(parameters, values, periodic, softness, edge, shares, bins, places, out, log_slopes) -> None:  # noqa: ANN001
-    """Where stacks take `values`, and their summed log slopes there; arguments as of `forward`."""
+    """Arguments at which stacks have `values`, and their summed log slopes there; arguments as of `forward`."""
     count = parameters.shape[2] // 3
     for n in range(parameters.shape[0]):
         value, total = float(values[n]), 0.0

@@ -1,9 +1,8 @@
 """Rays that are chosen on training scenes for fitted sensors: the second to the fifth step from a density to rays.
 
-The density proposes rays inside the sensors, scenes that nothing was learned from say what each of them tells, and
-those are chosen that are most informative together. Fields of view and gates then shrink to the rays that are fired.
-Along a condition, as a robot's position, rays are chosen at each of its values that the task judges at, and become a
-pattern.
+The density proposes rays inside the sensors, training scenes that it was not learned from give their information, and
+a set of rays with the most information is chosen. Fields of view and gates then shrink to the chosen rays. Along a
+condition, as a robot's position, rays are chosen at each of its values that designs are scored at, and form a pattern.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ class ChosenRays(NamedTuple):
         patterns: One for each number of rays, ascending.
         certificates: Of the numbers of rays that were certified.
         idle: Indices of sensors that fire no ray at the largest number.
-        silent: The share of scenes held back about which the largest number of rays tells nothing.
+        silent: The share of scenes held back about which the largest number of rays has no information.
     """
 
     sensors: tuple[Sensor, ...]
@@ -80,11 +79,11 @@ def choose_rays(
         training: Training scenes of the run.
         samples: Of the density, at all values of its condition.
         fitted: The sensors.
-        constraints: What sensors and rays keep.
+        constraints: The constraints on sensors and rays.
         counts: Numbers of rays, ascending; along a condition, at each of its values.
         level: The share of each marginal that the sensors' intervals hold.
         gates: "sensor" or "ray": one gate per sensor, or one per ray.
-        pool: What is known of rays at their place; None casts candidates anew.
+        pool: The pool of candidates at their place; None casts candidates anew.
         certified: The numbers of rays for which a bound is found.
         each_fires: Whether every sensor has to fire a ray.
         is_trial: Whether the first few scenes are enough where candidates are cast anew.
@@ -92,7 +91,7 @@ def choose_rays(
 
     Raises:
         ConfigError: More rays than can be chosen.
-        DataError: No ray inside the sensors tells anything about the training scenes.
+        DataError: No ray inside the sensors has information about the training scenes.
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
     check_number(counts[-1], "--rays", 1, MOST_SELECTED)
@@ -123,7 +122,7 @@ def choose_rays(
         informed, held_back = picked[1:]
     elif is_trial:
         informed = training.inform(CHOICE, selection.rays, selection.visits, 0, FEW_SCENES)
-        held_back = informed  # nobody asks how well a trial's rays do elsewhere
+        held_back = informed  # not used in trials
     else:
         # too few of a pool are inside the sensors: the run goes on keeping the pool
         inform = cached_information if pool is None and training.keeps else inform_enough
@@ -159,7 +158,7 @@ def _drawn(
 def _picked(
     pool: CandidatePool, proposals: Proposals, conditions: Sequence[dict[str, float]], count: int, least: np.ndarray
 ) -> tuple[list[Rays], list[InformedScene], list[InformedScene]] | None:
-    """The first so many rays of a pool inside the sensors at each condition, and what they tell; None of too few."""
+    """The first `count` rays of a pool inside the sensors per condition, with their information; None if too few."""
     number, known, lists = np.full(len(pool.points), -1), 0, []
     for visit, at in zip(pool.visits, conditions, strict=True):
         sensors, points = proposals.sensors_at(at), pool.points[visit]

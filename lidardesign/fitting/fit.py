@@ -1,11 +1,11 @@
 """One road from a density to a design: fit sensors, propose, inform, choose, certify; then check what is written.
 
-Where nobody says how many sensors it has, designs of a few and of more are fitted alike, at the middle number of rays
-and in the bandwidth of those of most sensors. The task scores them on training scenes that were held back; the fewest
-sensors win that are no worse than the best by more than a standard error.
+Where the number of sensors is open, designs of several numbers are fitted at the middle number of rays, in the
+bandwidth of the one with most sensors, and scored on training scenes that were held back. The fewest sensors within a
+standard error of the best are taken.
 
-A design's twin is fitted to the density without its occlusion term: it shows what occlusion is worth, without learning
-again.
+A design's twin is fitted to the density without its occlusion term, without learning again: the baseline
+`no-visibility`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from lidardesign.workers import Starmap
 if TYPE_CHECKING:
     from lidardesign.rays.pool import CandidatePool
 
-# A larger share of scenes about which a design tells nothing is told.
+# A larger share of scenes without information from a design is noted.
 MOST_SILENT = 0.5
 # As many samples as the standard preset of `learn` leaves.
 TWIN_SAMPLES = 100_000
@@ -68,7 +68,7 @@ def fit_design(
     """Fit the design of a request and check it; nothing is written but what the run keeps of its scenes.
 
     Arguments:
-        request: What is asked for.
+        request: The request.
         notes: Called with every note.
         progress: Called with every step, as "choosing 361 rays".
         starmap: How training scenes are informed: in this process, or by workers.
@@ -131,7 +131,7 @@ class Fitter:
         request, notes, progress, starmap, samples, target: See `fit_design`.
 
     Raises:
-        ConfigError: A setting that cannot be, or a name that is not a condition of the density.
+        ConfigError: An invalid setting, or a name that is not a condition of the density.
         DataError: The density is too rough, with or without the settings.
     """
 
@@ -169,7 +169,7 @@ class Fitter:
         self.is_pooled = samples is None and not settings and not request.at and is_fixed
 
     def _check_effective(self, samples: Samples, hint: str) -> None:
-        """Refuse samples of which too few are effective to fit anything to, whatever the constraints."""
+        """Refuse samples with an effective number below `LEAST_SAMPLES`."""
         effective = samples.independent
         if effective < LEAST_SAMPLES:
             raise DataError(
@@ -191,7 +191,7 @@ class Fitter:
 
     @cached_property
     def pool(self) -> CandidatePool | None:
-        """What is known of rays at the sensors' place; None where their origins are free."""
+        """The pool of candidate rays at the sensors' place; None where their origins are free."""
         if not self.is_pooled:
             return None
         # compiled, which even rays do without
@@ -211,7 +211,7 @@ class Fitter:
         return self._fitted(request)
 
     def _without_idle(self, count: int) -> FitResult:
-        """The design of at most so many sensors that all have something to do, no fewer than constraints ask for."""
+        """The design of at most `count` sensors, fewer while any would fire no ray or rest on too few samples."""
         bounds = self.request.constraints
         least = max(bounds.sensors.min or 1, len(bounds.each))
         while count > least:
@@ -300,12 +300,12 @@ class Fitter:
         return replace(result, notes=(*notes, *result.notes))
 
     def _best_count(self) -> int:
-        """The number of sensors that scores best on training scenes; says what was tried."""
+        """The number of sensors that scores best on training scenes, with a note on those tried."""
         request, metric = self.request, self.request.run.metric
         check_feasible(request.constraints, request.run.config.space, rays=request.rays)
         scenes = self.training.first(HELD_BACK)
         if not self.is_pooled:
-            # every trial casts its candidates into the same ones
+            # all trials cast their candidates into the same scenes
             self.training.first(CHOICE)
 
         def fit(trial: FitRequest) -> DesignSpec:
@@ -363,7 +363,7 @@ class Trial(NamedTuple):
 
 @phase("trials")
 def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRequest], DesignSpec]) -> list[Trial]:
-    """Designs of few sensors and of more, in the bandwidth of those of most: the gates of many fit best.
+    """Designs of several numbers of sensors, all in the bandwidth of the one with most: its gates are the narrowest.
 
     Arguments:
         request: What is asked for, but for the number of sensors.
@@ -371,7 +371,7 @@ def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRe
         fit: Fits the design of a request.
 
     Raises:
-        InfeasibleError: No number of sensors keeps the constraints; says why the fewest do not.
+        InfeasibleError: No number of sensors keeps the constraints; the message is that of the fewest.
     """
     from lidardesign.scoring.scene_scores import score_lists
     from lidardesign.simulate.returns import build_casters
@@ -416,7 +416,7 @@ def best_of(trials: Sequence[Trial], scenes: Sequence[Scene]) -> Trial:
 
 
 def _within(constraints: Constraints, mbps: float) -> Constraints:
-    """Constraints with a bandwidth, where they have none."""
+    """The constraints with this bandwidth where they have none [Mbit/s]."""
     document = constraints.as_document()
     budget = document.get("budget") or {}
     return Constraints.from_mapping({**document, "budget": {"bandwidth_mbps": mbps, **budget}})
@@ -456,8 +456,8 @@ def twin_without_visibility(
         design: The design whose number of sensors, layout, constraints, level, gates and seed are taken.
         run: The run that judges.
         rays: Rays per frame.
-        bandwidth_mbps: The most that its rays may cost, by the read-out model of evaluations; None: what the design's
-            constraints say, by theirs.
+        bandwidth_mbps: Its largest bandwidth, by the read-out model of evaluations; None: that of the design's
+            constraints, by their model.
         samples: The samples, which several twins may share; None draws them.
 
     Raises:

@@ -1,8 +1,8 @@
 """Real parts to buy, and where to mount them: `fit --parts`.
 
 Parts are proposed at the mounts, or at places in the box of origins, facing what the density looks at, upright and
-turned. Training scenes that nothing was learned from say what each would tell, and the best few are chosen, with a
-bound of what any others of those proposed could tell.
+turned. Training scenes that the density was not learned from give their information, and the best few are chosen,
+with a bound on the information of any other set of those proposed.
 """
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ def choose_parts(
     """The design of the best few parts at their best poses.
 
     Arguments:
-        samples: Of the density, which parts look at.
-        constraints: What parts there are, and what they keep.
-        count: How many parts at most.
-        rays: How many rays they fire; None is all that they have.
-        informs: What a task says of a scene's returns.
-        scenes: Training scenes without end for a purpose, `choice` or `held back`.
+        samples: Samples of the density.
+        constraints: The parts and their constraints.
+        count: Largest number of parts.
+        rays: Number of rays; None fires all that they have.
+        informs: The task's information of a scene's returns.
+        scenes: An endless stream of training scenes for a purpose, `choice` or `held back`.
         seed: Root of the random streams.
         name: The design's name.
         notes: Called with every note.
@@ -78,7 +78,7 @@ def choose_parts(
     Raises:
         ConfigError: A part that is not there; a density with conditions.
         InfeasibleError: Constraints that contradict each other, or that no part keeps; fewer rays than parts.
-        DataError: No part tells anything about the scenes.
+        DataError: No part has information about the scenes.
     """
     started, space, wanted = perf_counter(), samples.space, constraints.parts
     check_feasible(constraints, space, sensors=count, rays=rays)
@@ -143,10 +143,10 @@ def _chosen_set(
     seed: int,
     progress: Callable[[str], None],
 ) -> tuple[ChosenSet, Coverage, float, list[InformedScene]]:
-    """The best set, what all parts tell, its loss on scenes held back, and the scenes that it was chosen on.
+    """The best set, the information of all parts, the set's loss on scenes held back, and the scenes of the choice.
 
     Raises:
-        DataError: No part tells anything about the scenes.
+        DataError: No part has information about the scenes.
     """
     inform = partial(parts_inform, bundle, informs=informs, count=limits.count, seed=seed)
     held_back = list(itertools.islice(scenes("held back"), information.FEW_SCENES))
@@ -175,7 +175,7 @@ def _chosen_set(
 def _limits(
     placed: Sequence[PlacedPart], constraints: Constraints, count: int, most_rays: int, budget: BandwidthBudget
 ) -> SetLimits:
-    """How many parts, of which kind, one at each mount, and for what bandwidth and power."""
+    """Limits on sets of parts: their number, by kind and mount, their bandwidth and their power."""
     wanted = constraints.parts
     names = list(dict.fromkeys(one.part.name for one in placed))
     kinds = [
@@ -198,7 +198,7 @@ def _limits(
 
 @phase("candidates")
 def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, seed: int) -> list[PlacedPart]:
-    """Parts at poses that constraints allow.
+    """Candidate parts at poses that the constraints allow.
 
     Raises:
         InfeasibleError: None keeps the constraints.
@@ -239,7 +239,7 @@ def proposed(parts: Sequence[Part], constraints: Constraints, samples: Samples, 
 
 
 def _places(rules: SensorRules, samples: Samples, generator: np.random.Generator) -> np.ndarray:
-    """Mounts, or the one origin that there is, or origins of the density and an even set of their box, (P, 3) [m]."""
+    """Places for parts: mounts, the one origin, or the density's origins and even points of their box, (P, 3) [m]."""
     if rules.origin.mounts_m:
         return np.array(mounts_of(rules), dtype=np.float64).reshape(-1, 3)
     low, high = origin_box(rules, samples.space)
@@ -255,7 +255,7 @@ def _places(rules: SensorRules, samples: Samples, generator: np.random.Generator
 
 
 def _design(name: str, constraints: Constraints, placed: Sequence[PlacedPart], rays: int | None) -> DesignSpec:
-    """The design of chosen parts: explicit rays, of those of more than are asked for, or fit in a file, an even subset.
+    """The design of chosen parts with explicit rays, an even subset where they have more than wanted or a file holds.
 
     Raises:
         InfeasibleError: The parts have fewer rays than are asked for.

@@ -1,11 +1,11 @@
 """A few candidates out of many, where every set is small: real parts at poses, not rays by the hundred.
 
 Sets are filled greedily, then one or two members leave and the best come in, until that gains nothing. The bound is
-that of `certificate`. It also says which candidates are in no better set: with thresholds t, a set that holds c has
+that of `certificate`. It also excludes candidates that are in no better set: with thresholds t, a set that holds c has
 
     F(S) <= sum_u w_u t_u + excess(c) + the largest excesses of the others.
 
-What is left is bounded anew and, once few sets are left, searched through: branches end where what is known and
+The rest is bounded anew and, once few sets are left, searched by branch and bound: branches end where what is known and
 the largest gains together do no better than the best set (Nemhauser, Wolsey and Fisher 1978).
 """
 
@@ -30,12 +30,12 @@ MOST_LEAVING = 2  # members of a set that are exchanged at once
 
 @dataclass(frozen=True, eq=False)
 class SetLimits:
-    """Which sets of candidates may be chosen.
+    """The admissible sets of candidates.
 
     Arguments:
-        count: How many candidates a set has at most.
-        kinds: Pairs of the kind of each candidate, (M,), and how many of each kind there may be, (K,).
-        budgets: Pairs of what each candidate costs, (M,), and what a set may cost.
+        count: Largest number of candidates in a set.
+        kinds: Pairs of the kind of each candidate, (M,), and the largest number of each kind, (K,).
+        budgets: Pairs of the cost of each candidate, (M,), and the largest cost of a set.
     """
 
     count: int
@@ -43,7 +43,7 @@ class SetLimits:
     budgets: Sequence[tuple[np.ndarray, float]] = ()
 
     def may_join(self, chosen: Sequence[int], candidates: int) -> np.ndarray:
-        """Which of the candidates may be added to some, bool (M,)."""
+        """Mask of the candidates that may be added to a set, bool (M,)."""
         members = np.array(chosen, dtype=np.intp)
         may = np.full(candidates, len(members) < self.count)
         may[members] = False
@@ -54,7 +54,7 @@ class SetLimits:
         return may
 
     def of(self, rows: np.ndarray) -> SetLimits:
-        """The same for some of the candidates."""
+        """The limits of some of the candidates."""
         kinds = [(kind[rows], most) for kind, most in self.kinds]
         return SetLimits(self.count, kinds, [(cost[rows], limit) for cost, limit in self.budgets])
 
@@ -66,7 +66,7 @@ class ChosenSet:
     Arguments:
         members: In the order in which they were taken.
         value: F of the set.
-        bound: What no set exceeds.
+        bound: An upper bound of F over all sets.
     """
 
     members: tuple[int, ...]
@@ -78,8 +78,8 @@ def choose_set(coverage: Coverage, limits: SetLimits) -> ChosenSet:
     """The best set found, with its bound; the best there is where few sets could be better.
 
     Arguments:
-        coverage: What each candidate tells, through one gate.
-        limits: Which sets may be chosen.
+        coverage: The information of each candidate, through one gate.
+        limits: The admissible sets.
     """
     rows = np.arange(coverage.shape[0])
     best = _improved(coverage, limits)
@@ -117,7 +117,7 @@ def _value(coverage: Coverage, chosen: Sequence[int]) -> float:
 
 
 def _filled(coverage: Coverage, limits: SetLimits, chosen: Sequence[int]) -> tuple[int, ...]:
-    """Some candidates and those that gain most beside them, one after the other; none that gains nothing."""
+    """A set filled greedily with the candidate of the largest gain, until none gains."""
     chosen = tuple(chosen)
     while len(chosen) < limits.count:
         gains = np.where(limits.may_join(chosen, coverage.shape[0]), coverage.gains(_known(coverage, chosen))[:, 0], 0)
@@ -146,7 +146,7 @@ def _improved(coverage: Coverage, limits: SetLimits) -> tuple[int, ...]:
 
 
 class _Sets:
-    """What sets can sum to, for the steps of a certificate: within the count, and the narrowest kind alone."""
+    """Bounds on sums over admissible sets for the steps of a certificate, from the count and one kind at a time."""
 
     def __init__(self, limits: SetLimits, candidates: int) -> None:
         self.count = limits.count
@@ -154,7 +154,7 @@ class _Sets:
         self.total = 0.0
 
     def best(self, excess: np.ndarray) -> tuple[float, np.ndarray]:
-        """See `certificate`: the least of the largest sums, and the candidates of it, 0 or -1 each, (M,)."""
+        """The least over kinds of the largest sum of excess, and its candidates as gates 0, else -1, (M,)."""
         net = excess[:, 0]
         order = np.argsort(-net, kind="stable")
         order, sets = order[net[order] > 0], []
@@ -172,7 +172,7 @@ class _Sets:
 
 
 def _bounds(coverage: Coverage, limits: SetLimits, chosen: np.ndarray, value: float) -> tuple[float, np.ndarray]:
-    """What no set exceeds, and what no set with each of the candidates does, (M,)."""
+    """Upper bounds of F over all sets, and over the sets with each of the candidates, (M,)."""
     gate = np.full(coverage.shape[0], -1)
     gate[chosen] = 0
     sets = _Sets(limits, len(gate))
@@ -189,7 +189,7 @@ def _bounds(coverage: Coverage, limits: SetLimits, chosen: np.ndarray, value: fl
 
 
 def _searched(coverage: Coverage, limits: SetLimits, value: float) -> tuple[tuple[int, ...], bool]:
-    """The best set of more than a value, none if there is none, and whether every set was looked at."""
+    """The best set above a value, empty if there is none, and True where the search was complete."""
     candidates, best = coverage.shape[0], ()
     few = math.comb(candidates, min(limits.count, candidates)) <= FEW_SETS
     visits = FEW_SETS if few else MOST_WORK / max(len(coverage.item), 1)
@@ -212,7 +212,7 @@ def _searched(coverage: Coverage, limits: SetLimits, value: float) -> tuple[tupl
             if gains[place] > 0 and reached + gains[place] > value * (1 + SLACK):
                 value, best = reached + float(gains[place]), (*chosen, int(order[place]))
             continue
-        # the largest gains of those that may follow each candidate
+        # the sum of the largest gains of later candidates bounds the branch
         for place in np.flatnonzero(gains)[::-1]:
             further = np.sort(gains[place + 1 :])[::-1][: left - 1].sum()
             if reached + gains[place] + further > value * (1 + SLACK):

@@ -1,4 +1,4 @@
-"""Real parts at poses: components of fixed shape, and candidates of which each tells something about scenes.
+"""Real parts at poses: components of fixed shape, and their information about scenes as candidates.
 
 A part's field of view and range cannot be narrowed, only its pose is free; only outside the design space's range, where
 no task has anything, does its read-out stop. It may be mounted upright or turned by a quarter about its boresight. A
@@ -6,10 +6,10 @@ component's roll stays within an eighth of a turn, so a part that is turned is a
 exchanged.
 
 To cast every one of thousands of parts at poses would be millions of rays. Parts at one place share rays: their
-directions are taken apart in cells of a sphere, each cell is cast once from each place, and a part at a pose tells what
-the cells of its rays tell, inside its own gate. Of dense patterns an even subset stands for all, and of many items a
-random draw. Cells are as small as the number of rays to be cast allows. The cell's ray is that of one of the parts, so
-that patterns in a plane stay in it.
+directions are binned in cells of a sphere, each cell is cast once from each place, and the information of a part at a
+pose is that of the cells of its rays, inside its own gate. Of dense patterns an even subset is used, and of many items
+a random draw. Cells are as small as the number of rays to be cast allows. The cell's ray is that of one of the parts,
+so that patterns in a plane stay in it.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from lidardesign.task import Information, random_generator
 BOUNDED = ("field_of_view.horizontal_deg", "field_of_view.vertical_deg", "gate.start_m", "gate.end_m", "gate.width_m")
 MOST_CAST = 60_000  # rays of a scene, over all places
 MOST_CASTS = 1_000_000  # of a scene, over all its frames
-MOST_MEMBERS = 20_000_000  # rays of all parts' patterns that are told apart
+MOST_MEMBERS = 20_000_000  # rays kept of all parts' patterns
 MOST_ITEMS = 60  # of a scene: the choice of a few parts needs few
-SIZED = 10  # one in so many parts says how large cells are, at first
+SIZED = 10  # one part in so many is used for the first size of cells
 COARSE_CELL_RAD = math.radians(3.0)  # from which the size of cells is found
 
 
@@ -63,16 +63,16 @@ class PartShape:
     gate_m: tuple[float, float]
 
     def pose(self, origin_m: np.ndarray, azimuth_rad: float, elevation_rad: float, roll_rad: float, axes: Axes) -> Pose:
-        """The part's pose where its component has an origin and a boresight: the centre of its field looks there.
+        """The part's pose for a component's origin and boresight, with the centre of its field along the boresight.
 
-        Across a plane in which the design space holds all rays, its row or column nearest to the centre looks there.
+        Where the design space holds all rays in a plane, its row or column nearest to the centre lies in that plane.
         """
         roll_rad = roll_rad + math.pi / 2 if self.turned else roll_rad
         frame = boresight_frame(*self._aimed(axes)).T @ boresight_frame(azimuth_rad, elevation_rad, roll_rad)
         return Pose(np.asarray(origin_m, dtype=np.float64), *boresight_of(frame))
 
     def _aimed(self, axes: Axes) -> tuple[float, float]:
-        """Azimuth and elevation, in the part's frame, of what looks along the component's boresight."""
+        """Azimuth and elevation, in the part's frame, of the direction aligned with the component's boresight [rad]."""
         part = self.part
         if axes.angular == 2:
             return part.centre_rad
@@ -86,7 +86,7 @@ class PartShape:
 
 
 def gate_inside(part: Part, space: DesignSpace) -> tuple[float, float] | None:
-    """The ranges of a part inside a design space's [m], its own where that has one; None where they do not meet."""
+    """A part's range inside the design space's [m], its own where that is fixed; None where they do not meet."""
     near, far = part.range_m
     if RANGE not in space.free:
         return (near, far) if near <= space.low[RANGE] < far else None
@@ -104,7 +104,7 @@ def shapes_of(part: Part, space: DesignSpace) -> list[PartShape]:
 
 
 def broken_keys(shape: PartShape, rules: SensorRules) -> set[str]:
-    """Keys of the constraints that a part does not keep."""
+    """Keys of the constraints that a part violates."""
     start, end = shape.gate_m
     values = (*(math.degrees(angle) for angle in shape.part.field_of_view_rad), start, end, end - start)
     broken = set()
@@ -154,8 +154,8 @@ class PartBundle:
 
     Arguments:
         placed: The parts.
-        most_rays: As many rays as each fires at most, an even subset of its pattern.
-        frames: How often they are cast in a scene.
+        most_rays: The largest number of rays of each, an even subset of its pattern.
+        frames: Number of casts in a scene.
 
     `rays` are to be cast; those of part i are `members[first[i]:first[i + 1]]`, some more than once. Of them a part
     has `usual_rays` in the middle.
@@ -194,7 +194,7 @@ class PartBundle:
         return self._patterns[part.name] @ placed.pose.frame
 
     def _keys(self, placed: Sequence[PlacedPart], size_rad: float) -> list[np.ndarray]:
-        """The number of the cell and place of each part's rays."""
+        """A number for the cell and place of each ray, by part."""
         keys = []
         for one in placed:
             cell, cells = cells_of(self._looking(one), size_rad)
@@ -213,13 +213,13 @@ def parts_inform(
     first_scene: int = 0,
     among: Sequence[int] | None = None,
 ) -> list[InformedScene]:
-    """What every part tells about scenes; parts are the candidates.
+    """Information of every part, as a candidate, about each scene.
 
     Arguments:
         bundle: The parts and their rays.
         scenes: Training scenes.
-        informs: What a task says of a scene's returns.
-        count: How many parts a design has: what a return tells depends on how many there will be.
+        informs: The task's information of a scene's returns.
+        count: Number of parts of a design, on which the information of a return depends.
         seed: Root of the draws of items.
         first_scene: The number of the first scene, for these draws.
         among: Some of the parts, where others are not asked for.
@@ -229,7 +229,7 @@ def parts_inform(
     own = [bundle.members[bundle.first[row] : bundle.first[row + 1]] for row in rows]
     first, members = np.cumsum([0, *map(len, own)]), bundle.members if among is None else np.concatenate(own)
     gate_m = np.array([one.shape.gate_m for one in placed])
-    # of dense patterns each ray stands for many
+    # rays kept of a dense pattern stand for several each
     fired = np.minimum([one.part.rays for one in placed], bundle.most_rays)
     times = fired / np.minimum(fired, bundle.most_pattern)
     share, told = min(count * bundle.usual_rays / len(rays), 1.0), []
@@ -245,7 +245,7 @@ def parts_inform(
         every = np.empty((len(placed), len(informed.weight)), dtype=np.float32)
         kernels.gather_parts(entries, informed.range_m[order], first, members, gate_m, every)
         if len(informed.sums):
-            # more counts no more, and bounds are the lower for it
+            # beyond its end the table of sums is constant: capping changes no F and tightens bounds
             every = np.minimum(every * times[:, None], len(informed.sums) - 1, dtype=np.float32)
         part, item = np.nonzero(every)
         worth, item, part = every[part, item], item.astype(np.int32), part.astype(np.int32)
@@ -254,11 +254,11 @@ def parts_inform(
 
 
 def part_table(informed: Sequence[InformedScene], parts: int) -> Coverage:
-    """So many parts, each with one gate that is open, beside all items of scenes."""
+    """The table of `parts` parts, each with one open gate, over all items of scenes."""
     return gather(informed, np.tile([0.0, np.inf], (parts, 1, 1)), np.zeros((parts, 1)))
 
 
 def _fewer_items(informed: InformedScene, generator: np.random.Generator) -> InformedScene:
-    """A random draw of the items, without what returns spoil, which no part can gate."""
+    """A random draw of the items, without harm, since a part's gate cannot exclude returns."""
     none = {"spoiling": np.zeros(0, np.int32), "harm": np.zeros(0), "harm_range_m": np.zeros(0), "is_repeated": False}
     return replace(informed.with_fewer_items(MOST_ITEMS, generator), **none)

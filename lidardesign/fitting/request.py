@@ -1,4 +1,4 @@
-"""A fit: what it is asked for, what it came to, and the target density that it fits to.
+"""A fit: its request, its result, and the target density that it fits to.
 
 The choices of a user are resolved by the run, an earlier design, constraints and a rig; settings of the task may weight
 the run's samples and its target density.
@@ -43,7 +43,7 @@ COUNTS = (1, 2, 3, 4, 6, 8)  # of sensors, that are tried for that
 CHOSEN_LEVEL = 0.999  # rays are chosen inside fields and gates: narrower ones would only leave candidates out
 # Of designs: names that a file may have everywhere.
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
-# Keys by which tasks are told where sensors may be.
+# Keys of tasks for the places of sensors.
 PLACE_KEYS = ("origin_m", "origin_box_m")
 # In the provenance of designs, and what to do where it cannot be understood.
 KEY = "weighting"
@@ -52,10 +52,10 @@ FIT_AGAIN = "fit the design again: an earlier version refined it, or its file wa
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """What a user may choose for a fit; what is left out follows from an earlier design, the constraints or the task.
+    """A user's choices for a fit; defaults follow from an earlier design, the constraints or the task.
 
     Arguments:
-        sensors: How many sensors, or "best": as many as score best on training scenes.
+        sensors: Number of sensors, or "best": as many as score best on training scenes.
         constraints: Constraints, a mapping of them, or a YAML file of them.
         layout: chosen, even or spinning.
         rays: Rays per frame over all sensors.
@@ -71,7 +71,7 @@ class FitOptions:
         certify: Whether every number of rays gets a certificate, not the middle one alone.
 
     Raises:
-        ConfigError: A name, a layout or gates that cannot be.
+        ConfigError: An invalid name, layout or choice of gates.
     """
 
     sensors: int | str | None = None
@@ -116,17 +116,17 @@ class FitRequest:
         run: The run whose samples are fitted to.
         name: The design's name.
         seed: Root of the random streams.
-        constraints: What the design keeps; nothing where it is free.
-        is_constrained: Whether anybody asked for constraints, which the design is then checked against.
+        constraints: The constraints, without any key where the design is free.
+        is_constrained: Whether constraints were given, which the design is then checked against.
         at: Condition values that the design is for; without any, one for all of them.
         sensors: How many sensors, or "best"; None where constraints say so.
-        layout: How rays are laid out.
+        layout: The layout of rays.
         rays: Rays per frame; None takes the task's numbers, or leaves them open.
         gates: Whether chosen rays have their sensor's gate or their own.
         level: The share of each marginal that fields of view and gates hold.
         weighting: Settings of the task to whose scenes the density is weighted.
         channels: Rings of each sensor that spins.
-        names: What sensors are called, where there are as many; none numbers them.
+        names: Names of the sensors, where there are as many; none numbers them.
         certify: Whether every number of rays gets a certificate.
     """
 
@@ -209,7 +209,7 @@ class FitRequest:
 
     @property
     def command(self) -> str:
-        """For the design's provenance."""
+        """The command for the design's provenance: `constrain` or `fit`."""
         return "constrain" if self.is_constrained else "fit"
 
     @property
@@ -224,7 +224,7 @@ class Weighting:
 
     Arguments:
         settings: As KEY=VALUE; none leaves the density as it was learned.
-        origin: Where they were said: an option, or a design.
+        origin: Their source for messages: an option, or a design.
     """
 
     settings: tuple[str, ...] = ()
@@ -232,10 +232,10 @@ class Weighting:
 
     @classmethod
     def of(cls, design: DesignSpec) -> Weighting:
-        """What a design says about its samples.
+        """The weighting in a design's provenance.
 
         Raises:
-            ConfigError: It says something else.
+            ConfigError: It cannot be read.
         """
         document, where = design.provenance.get(KEY), f"{KEY} of design {design.name}"
         if document is None:
@@ -254,7 +254,7 @@ class Weighting:
 
 
 def _layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder, options: FitOptions) -> LayoutName:
-    """The user's layout; else the design's, else rays are chosen where scenes can say what they tell."""
+    """The user's layout, else the design's, else `chosen` for tasks with `informs` and `even` for others."""
     if options.layout is not None:
         return options.layout
     if constraints.parts is not None:
@@ -297,11 +297,11 @@ def _check_layout(layout: LayoutName, constraints: Constraints, run: RunFolder, 
 
 
 def _check_conditions(constraints: Constraints, space: DesignSpace) -> None:
-    """Refuse rays that cannot follow the conditions that are left open: they follow one place that nothing bounds.
+    """Refuse open conditions that rays cannot follow: all but one unbounded coordinate of the origin.
 
     Raises:
-        ConfigError: Several conditions, or one that is no place.
-        InfeasibleError: Constraints bound the place.
+        ConfigError: Several conditions, or one that is no coordinate of the origin.
+        InfeasibleError: Constraints bound the coordinate.
     """
     names = [DIMENSIONS[axis] for axis in space.conditioned]
     hint = "give " + " ".join(f"--at {name}=VALUE" for name in names)
@@ -324,7 +324,7 @@ def _check_conditions(constraints: Constraints, space: DesignSpace) -> None:
 def _with_rig(
     options: FitOptions, asked: Constraints | None, run: RunFolder, notes: Notes
 ) -> tuple[Constraints | None, tuple[str, ...]]:
-    """Constraints with those of a rig below them, and the rig's sensors' names; as asked without a rig."""
+    """Constraints completed by those of a rig, and the names of its sensors; unchanged without a rig."""
     if options.like is None:
         return asked, ()
     rig = read_design(Path(options.like), notes, reach_of([run]))
@@ -339,7 +339,7 @@ def _with_rig(
 
 
 def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) -> Constraints | None:
-    """The constraints with the parts that a user named, and how many where they say so."""
+    """The constraints with the parts that a user named, checked."""
     if options.parts is not None:
         document = {} if asked is None else asked.as_document()
         asked = Constraints.from_mapping({**document, "parts": {**document.get("parts", {}), "names": options.parts}})
@@ -367,7 +367,7 @@ def _with_parts(options: FitOptions, asked: Constraints | None, run: RunFolder) 
 def _sensors(
     asked: int | str | None, constraints: Constraints, base: DesignSpec | None, layout: LayoutName
 ) -> int | str | None:
-    """The number of sensors: the user's, then what the constraints ask for, the design's, the best."""
+    """The number of sensors: the user's, else that of the constraints, else the design's, else the best."""
     bounds = constraints.sensors
     if asked is not None:
         return asked
@@ -382,7 +382,7 @@ def _sensors(
 
 
 def _rays(asked: int | None, constraints: Constraints, base: DesignSpec | None) -> int | None:
-    """The number of rays: the user's, then the constraints', then the design's where it has a single one."""
+    """The number of rays: the user's, else that of the constraints, else the design's where it has a single one."""
     if asked is not None or constraints.parts is not None:
         return asked
     if constraints.budget.rays is not None:
@@ -391,7 +391,7 @@ def _rays(asked: int | None, constraints: Constraints, base: DesignSpec | None) 
 
 
 def _gates(asked: str | None, base: DesignSpec | None, space: DesignSpace, layout: LayoutName) -> Gates:
-    """The user's, then the design's; usually one per sensor, and along a condition one per ray."""
+    """The user's choice of gates, else the design's, else one per sensor, or per ray along a condition."""
     if asked is not None:
         return asked
     if base is not None and layout == base.layout == "chosen":
@@ -408,7 +408,7 @@ def _level(asked: float | None, base: DesignSpec | None, run: RunFolder, layout:
 
 
 def _weighting(settings: tuple[str, ...], base: DesignSpec | None) -> Weighting:
-    """How samples are weighted: by the user's settings, else as they were for the design."""
+    """The weighting of the samples: by the user's settings, else as for the design."""
     return Weighting(settings) if settings or base is None else Weighting.of(base)
 
 
@@ -418,7 +418,7 @@ def load_constraints(
     """Constraints of a mapping or a YAML file, with `--set` laid over them; None where nothing is given.
 
     Raises:
-        ConfigError: At file:line:column, or at the `--set` option; also for parts that there are none of.
+        ConfigError: At file:line:column, or at the `--set` option; also for unknown parts.
     """
     if isinstance(given, Constraints) or (given is None and not overrides):
         return given
@@ -445,7 +445,7 @@ def load_constraints(
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """A fitted design and how good it is.
+    """A fitted design with its quality and checks.
 
     Arguments:
         design: The design.
@@ -454,8 +454,8 @@ class FitResult:
         ess: Effective share of the samples that were admitted, 0 to 1.
         seconds: Wall time [s].
         constraints: The independent checks.
-        notes: What happened to sensors, one line each.
-        error_estimates: How far log_likelihood, ess and admissible_mass may be off.
+        notes: Lines on sensors.
+        error_estimates: Standard errors of log_likelihood, ess and admissible_mass.
     """
 
     design: DesignSpec
@@ -481,7 +481,7 @@ class FitResult:
 
     @property
     def satisfied(self) -> bool:
-        """Whether every constraint holds on the finished design."""
+        """True where every constraint holds on the finished design."""
         return all(check.satisfied for check in self.constraints)
 
     def as_dict(self) -> dict[str, Any]:
@@ -501,12 +501,12 @@ class FitResult:
 
 
 class RunTarget:
-    """log p* of a run, prepared when it is first asked for: most fits never do.
+    """log p* of a run, prepared at its first call, since few fits need it.
 
     Arguments:
         run: The run.
-        visibility: The visibility to take instead of what the run decided.
-        weighting: Settings of the task whose scenes it is of instead.
+        visibility: The visibility, instead of the run's own.
+        weighting: Settings of the task for the scenes, instead of the run's own.
     """
 
     def __init__(self, run: RunFolder, visibility: str | None = None, weighting: Weighting | None = None) -> None:
@@ -524,5 +524,5 @@ class RunTarget:
         return prepare_target(run.scenes("train", run.config.seed), run.config, visibility=decided, compiled=False)[0]
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Design points (N, 6) to (N,)."""
+        """log p* of design points, (N, 6) to (N,)."""
         return self._target.log_density(points)

@@ -1,8 +1,8 @@
-"""Spinning sensors of which scenes choose where they stand, and the elevation of each channel: the layout `spinning`.
+"""The layout `spinning`: spinning sensors whose places and channel elevations are chosen on training scenes.
 
-A candidate is a ring: the rays of one turn from one place at one elevation. Sensors stand upright. What a ring tells is
-what its rays tell together (`Coverage.grouped`), so rings are chosen as rays are, and with the same certificate. Every
-set of places is tried, and at each of its places as many rings are chosen as a sensor has channels.
+A candidate is a ring: the rays of one turn from one place at one elevation. Sensors stand upright. The information of a
+ring is that of its rays together (`Coverage.grouped`), so rings are chosen as rays are, and with the same certificate.
+Every set of places is tried, and at each of its places as many rings are chosen as a sensor has channels.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from lidardesign.sensors.sensor import Sensor
 from lidardesign.space import DesignSpace
 from lidardesign.task import Information
 
-CHANNELS = 16  # of a sensor, where nobody says how many
+CHANNELS = 16  # of a sensor by default
 POINTS_PER_TURN = 1800  # of a channel: every fifth of a degree, as scanners do at ten turns per second
-EVEN_SHARE = 0.25  # of the candidate elevations that are even; the others lie where even ones tell most
-FIRST_SHARE = 0.2  # of the scenes, that say where this is
+EVEN_SHARE = 0.25  # of candidate elevations that are even; the others are denser where even ones gain most
+FIRST_SHARE = 0.2  # of the scenes, for these gains
 PLACES = np.array([(0.5, 0.5, 0.5), (0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 0)])  # in a box, no corners on one edge
 MOST_SETS, MOST_BOUNDED = 500, 20  # of places: that are tried, and that are bounded one by one
 
@@ -52,10 +52,10 @@ class RingCandidates:
     """Candidate rings: every place with every elevation.
 
     Arguments:
-        places_m: Where sensors may stand, (P, 3) [m].
+        places_m: Possible places of sensors, (P, 3) [m].
         elevation_rad: Ascending, (E,).
         points: Rays of a ring.
-        range_m: From where to where they listen [m].
+        range_m: Start and end of their gates [m].
     """
 
     places_m: np.ndarray
@@ -72,7 +72,7 @@ class RingCandidates:
         return np.repeat(np.arange(len(self.places_m)), len(self.elevation_rad))
 
     def rays(self, rings: np.ndarray, sensor: np.ndarray) -> Rays:
-        """The rays of some rings, each ring of a sensor; a sensor's fire column by column, as a head turns."""
+        """The rays of some rings, each assigned to a sensor, fired column by column as the head turns."""
         turn = np.tile(FULL_TURN * ((np.arange(self.points) + 0.5) / self.points - 0.5), len(rings))
         column, ring = np.tile(np.arange(self.points), len(rings)), np.repeat(rings, self.points)
         order = np.lexsort((ring, column, np.repeat(sensor, self.points)))
@@ -92,7 +92,7 @@ class RingCandidates:
         informs: Callable[[Scene, Sequence[Returns]], Information],
         share: float = 1.0,
     ) -> tuple[Coverage, str]:
-        """What some rings tell about a share of the next few scenes, and the unit of that."""
+        """Information of some rings about a share of the next `FEW_SCENES` scenes, and its unit."""
         rays = self.rays(rings, np.arange(len(rings)))
         few = itertools.islice(scenes, round(share * information.FEW_SCENES))
         informed = [inform(scene, rays, [slice(0, len(rays))], informs) for scene in few]
@@ -115,18 +115,18 @@ def choose_rings(
 
     Arguments:
         samples: Of the density, whose design space says where rays may start and look.
-        constraints: Where sensors may stand, and what else the design keeps.
-        count: How many sensors.
+        constraints: Places of sensors and further constraints.
+        count: Number of sensors.
         channels: Rings of each.
         rays: Of all sensors per turn; None fires `POINTS_PER_TURN` for each channel, or what a file holds.
-        informs: What a task says of a scene's returns.
-        scenes: Training scenes without end for a purpose, `choice` or `held back`.
+        informs: The task's information of a scene's returns.
+        scenes: An endless stream of training scenes for a purpose, `choice` or `held back`.
         name: The design's name.
 
     Raises:
         ConfigError: Rays that rings cannot share, more channels than elevations, more sets of places than can be
             tried, or a density with conditions.
-        DataError: No ring tells anything about the scenes.
+        DataError: No ring has information about the scenes.
         InfeasibleError: Constraints that contradict each other.
     """
     started, space, rings = perf_counter(), samples.space, count * max(channels, 1)
@@ -179,10 +179,10 @@ def choose_rings(
 
 
 def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -> tuple[np.ndarray, int]:
-    """The even elevations of candidate rings, ascending [rad], and how many rays each ring has.
+    """The even elevations of candidate rings, ascending [rad], and the number of rays of a ring.
 
     Raises:
-        ConfigError: So many rings cannot be chosen, or cannot share the rays.
+        ConfigError: An invalid number of channels, rays that rings cannot share equally, or conditions.
     """
     rings = count * max(channels, 1)
     points = min(POINTS_PER_TURN, MOST_FILE_RAYS // rings) if rays is None else rays // rings
@@ -206,7 +206,7 @@ def ring_grid(space: DesignSpace, rays: int | None, count: int, channels: int) -
 
 
 def places_of(constraints: Constraints, space: DesignSpace) -> np.ndarray:
-    """Where spinning sensors may stand, (P, 3) [m]: all mounts, or the middle and corners of their box."""
+    """Candidate places of spinning sensors, (P, 3) [m]: all mounts, or the middle and corners of the origin box."""
     rules = constraints.rules[-1]
     if rules.origin.mounts_m:
         return np.array(mounts_of(rules), dtype=np.float64).reshape(-1, 3)
@@ -216,7 +216,7 @@ def places_of(constraints: Constraints, space: DesignSpace) -> np.ndarray:
 
 
 def refine_elevations(elevation_rad: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """As many elevations (E,) [rad]: some even ones, and others the denser the more even ones gain (E,)."""
+    """Refined elevations (E,) [rad]: a share even, the rest with a density in proportion to the gains (E,)."""
     count = len(elevation_rad)
     even = math.ceil(EVEN_SHARE * count)
     reached = np.cumsum(gains) / gains.sum()
@@ -227,12 +227,12 @@ def refine_elevations(elevation_rad: np.ndarray, gains: np.ndarray) -> np.ndarra
 
 
 def chosen_rings(coverage: Coverage, place: np.ndarray, count: int, channels: int) -> tuple[Choice, float, float]:
-    """The best rings found at as many places as there are sensors, what they lose, and what any others lose at least.
+    """The best rings found at `count` places, their loss, and a lower bound of the loss of any others.
 
     Arguments:
-        coverage: What the rings tell.
+        coverage: The information of the rings.
         place: The place of each, (N,).
-        count: How many sensors.
+        count: Number of sensors.
         channels: Rings of each.
 
     Raises:

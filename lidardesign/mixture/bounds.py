@@ -1,4 +1,4 @@
-"""From the rules of sensors to bounds on the parameters of components, as the arrays that the M-step works with.
+"""Bounds on the parameters of components, from the rules of sensors, as arrays for the M-step.
 
 Angles are internal ones (see `features`); gates and fields of view are bounds on reported intervals, which
 the factor z = `interval_factor(level)` ties to means and spreads. Sensors whose origins are pinned to one place
@@ -90,16 +90,16 @@ class Bounds:
         return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "interval"})
 
     def narrowed(self, width_m: float) -> Bounds:
-        """The same with gates no wider than a common cap [m], never below a component's least width.
+        """The bounds with gates no wider than a common cap [m], but never below a component's least width.
 
-        A gate that must start early and end late has a least width, too.
+        Bounds on start and end imply a least width, too.
         """
         least = np.maximum(self.width_low, self.end_low - self.start_high)
         return replace(self, width_high=np.maximum(np.minimum(self.width_high, width_m), least))
 
     @classmethod
     def unbounded(cls, count: int, interval: float) -> Bounds:
-        """Bounds that bind nowhere."""
+        """Bounds of infinite extent."""
         low, high = np.full(count, -math.inf), np.full(count, math.inf)
         return cls(
             interval=interval,
@@ -149,7 +149,7 @@ def clip_azimuth(azimuth_rad: np.ndarray, bounds: Bounds) -> np.ndarray:
 
 
 def inward(low: float, high: float) -> tuple[float, float]:
-    """The interval a little smaller; its middle where nothing would be left."""
+    """An interval shrunk by the share `INWARD` at both ends; its middle where nothing would be left."""
     size = max(abs(v) for v in (low, high, 0.0) if math.isfinite(v))
     smaller = low + INWARD * size, high - INWARD * size
     return smaller if smaller[0] <= smaller[1] else ((low + high) / 2, (low + high) / 2)
@@ -164,7 +164,7 @@ def pins_of(rules: SensorRules, space: DesignSpace) -> Pins:
 
 
 def sensor_groups(rules: Sequence[SensorRules], space: DesignSpace, count: int) -> list[Group]:
-    """The first sensors by their pinned origins, in order of first appearance."""
+    """Groups of the first `count` sensors by their pinned origins, in order of first appearance."""
     members: dict[Pins, list[int]] = {}
     for sensor in range(count):
         members.setdefault(pins_of(rules_of(rules, sensor), space), []).append(sensor)

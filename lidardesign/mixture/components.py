@@ -79,7 +79,7 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """What one pass over the samples leaves for the M-step, per component.
+    """Expected sufficient statistics of the components, for the M-step.
 
     Arguments:
         log_likelihood: Weighted mean log density of the samples.
@@ -276,7 +276,7 @@ def mean_directions(features: Features, labels: np.ndarray, count: int) -> tuple
 
 @dataclass(frozen=True)
 class Axes:
-    """Which factors of a component are random.
+    """The random factors of a component.
 
     Arguments:
         origin: Free origin axes, of 0, 1, 2.

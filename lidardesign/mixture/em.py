@@ -44,13 +44,13 @@ SEED_LLOYD_ITERATIONS = 4
 # A component that rests on fewer effective samples is no sensor: it begins again where there are more.
 LEAST_SAMPLES = 20.0
 MOST_REVIVALS = 3
-# So many samples usually tell that there are more different ones than components.
+# The first samples checked for more distinct ones than components: usually enough.
 FEW_SAMPLES = 256
 # Shorter boresight steps than this share are as good as none.
 SMALLEST_STEP = 0.02
 # Mass that stands for an empty cell, so that its mean is finite.
 SMALLEST_CELL = TINY
-# Up to so many centres, looking at all of them costs as little as a tree, and nothing to import.
+# Up to so many centres a brute-force search is as fast as a tree, and imports nothing.
 FEW_CENTRES = 10
 # The iteration stops when no centre moves by more than this share of the features' extent: far below the
 # spacing of any ray layout, far above rounding.
@@ -63,14 +63,14 @@ SMALLEST_WEIGHT = SQUARABLE
 
 @dataclass(frozen=True, eq=False)
 class EMResult:
-    """What one run of the loop did.
+    """The result of one run of the loop.
 
     Arguments:
         mixture: The last parameters.
         log_likelihood: Weighted mean log density [nats].
         history: Log-likelihood after every accepted step; it never decreases.
-        notes: What happened to components, one line each.
-        values: The log density of each sample [nats], shape (N,), where it is at hand.
+        notes: Lines on restarted components.
+        values: The log density of each sample [nats], shape (N,); None where it was not kept.
     """
 
     mixture: Mixture
@@ -165,7 +165,7 @@ def seed_mixture(features: Features, bounds: Bounds, generator: np.random.Genera
 
 
 def _match_cells(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarray:
-    """Labels renumbered so that each cell has the component whose bounds it violates least."""
+    """Labels renumbered to assign cells to components with the least violation of bounds in all."""
     count, unit = len(bounds), features.scale.max() if len(features.scale) else 1.0
     cost = np.zeros((count, count))
     azimuth, elevation = mean_directions(features, labels, count)
@@ -221,7 +221,7 @@ def fit_mixture(
 
 
 def _best_seed(features: Features, bounds: Bounds, generator: np.random.Generator, restarts: int) -> Mixture:
-    """The most promising of several seeds: short runs on a part of the samples, then of a few on all."""
+    """The seed of the largest likelihood after short runs: of all on a part of the samples, of the best few on all."""
     seeds = [seed_mixture(features, bounds, generator) for _ in range(restarts)]
     if restarts == 1:
         return seeds[0]
@@ -235,7 +235,7 @@ def _best_seed(features: Features, bounds: Bounds, generator: np.random.Generato
 
 
 def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
-    """Give components that rest on too few samples half of the heaviest one's, and go on, while fewer are left."""
+    """Restart components with too few samples on half of the heaviest one's, as long as their number falls."""
     notes: list[str] = []
     dead = _dead(result.mixture, features)
     for _ in range(MOST_REVIVALS):
@@ -257,7 +257,7 @@ def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator
 
 
 def _dead(mixture: Mixture, features: Features) -> np.ndarray:
-    """The components that rest on fewer than `LEAST_SAMPLES` effective samples, or their share of what there are."""
+    """Components with fewer effective samples than `LEAST_SAMPLES` or an equal share of all."""
     fewest = min(LEAST_SAMPLES, len(features) / len(mixture))
     own = responsibilities(mixture, features) * features.weights[:, None]
     return np.flatnonzero([effective_count(weights) < fewest for weights in own.T])
@@ -401,10 +401,10 @@ def _assign(nearest: Nearest, weights: np.ndarray, centres: np.ndarray) -> tuple
 
 
 class Nearest:
-    """Points that are asked for their nearest centres, again and again while centres move a little.
+    """Nearest centres of points, repeated for centres that move a little.
 
-    A point whose centre is nearer than any other can have become, by how far centres moved, is not asked about again
-    (Hamerly 2010). The answers are those of a search over all points.
+    A point whose centre is nearer than the triangle inequality allows any other to be is not searched again (Hamerly
+    2010). The results are those of a search over all points.
 
     Arguments:
         points: Shape (N, F).
@@ -414,9 +414,9 @@ class Nearest:
         self._points = points
         self._centres = np.empty((0, points.shape[1]))
         self._labels = np.empty(0, dtype=np.int64)
-        # how near any other centre may be
+        # a lower bound of the distance to any other centre
         self._others = np.empty(0)
-        # rounding of distances; what is nearer together than this is always asked about
+        # rounding of distances; bounds closer than this are always searched
         self._slack = SLACK * float(np.ptp(points, axis=0).max(initial=0.0))
 
     def of(self, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

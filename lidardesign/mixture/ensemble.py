@@ -1,8 +1,8 @@
-r"""Groups of sensors, each with its own samples, fitted as one design's mixture; and the mounts that sensors take.
+r"""Groups of sensors, each with its own samples, fitted as one design's mixture; and the choice of mounts.
 
-A mount is a pinned origin. How much of the density sensors at several mounts see together is, per sample, the
-most that any of them sees of its scene point (re-aimed and reweighted as in `support`), summed over samples
-drawn from the density. Mounts are taken one after the other, each time the one that newly sees most: this sum
+A mount is a pinned origin. The density that sensors at several mounts see together is, per sample, the largest
+weight of its scene point from any of them (re-aimed and reweighted as in `support`), summed over samples drawn
+from the density. Mounts are taken one after the other, each time the one that newly sees most: this sum
 is submodular, so the greedy choice sees at least 1 - 1/e of what the best choice sees (G. Nemhauser, L. Wolsey
 and M. Fisher 1978). Sensors with constraints of their own are placed together with their mount.
 """
@@ -29,7 +29,7 @@ from lidardesign.sensors.sensor import Sensor
 from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 
-# So many samples tell apart mounts whose shares differ by a hundredth.
+# Enough samples to distinguish mounts whose shares differ by a hundredth.
 MOUNT_SAMPLES = 4000
 
 
@@ -52,11 +52,11 @@ class GroupSamples:
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Fitted parts.
+    """Fitted groups of sensors.
 
     Arguments:
-        parts: What was fitted.
-        results: One per part.
+        parts: The groups with their samples.
+        results: One per group.
     """
 
     parts: tuple[GroupSamples, ...]
@@ -69,7 +69,7 @@ class Ensemble:
 
     @property
     def order(self) -> np.ndarray:
-        """The sensor that each component of all parts, one after the other, stands for."""
+        """The sensor of each component, group after group, shape (S,)."""
         return np.concatenate([np.array(part.group.sensors) for part in self.parts])
 
     @property
@@ -90,7 +90,7 @@ class Ensemble:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What happened to components."""
+        """Lines on restarted components."""
         return tuple(note for result in self.results for note in result.notes)
 
     def narrowed(self, width_m: float) -> Ensemble:
@@ -114,7 +114,7 @@ def fit_groups(parts: Sequence[GroupSamples], seed: int, restarts: int) -> Ensem
 
 
 def admitted_mixture(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
-    """The nearest parameters of a fit inside other bounds: one M-step from its own statistics."""
+    """The parameters of a fit inside other bounds: one M-step from its own statistics."""
     return maximise(mixture, expect(mixture, features), features, bounds, Floors.of(features), 0.0)
 
 
@@ -178,7 +178,7 @@ def choose_mounts(
 
     Raises:
         ConfigError: There is a choice, but no way to evaluate the target density.
-        InfeasibleError: No mount sees any of the density.
+        InfeasibleError: No mount sees any part of the density.
     """
     entries = len(rules) - 1
     count = count if mounts_of(rules[-1]) else entries
@@ -198,7 +198,7 @@ def _views(
     retarget: Retarget | None,
     seed: int,
 ) -> dict[tuple[int, Mount], np.ndarray]:
-    """What each sensor would see of each drawn sample's scene point from each of its mounts, (N,) each."""
+    """Weights of drawn samples re-aimed from each mount of each sensor, (N,) each; 0 where unseen."""
     drawn = systematic_draw(samples.weights, MOUNT_SAMPLES, random_generator(seed, "mounts"))
     last = len(rules) - 1
     views: dict[tuple[int, Mount], np.ndarray] = {}
@@ -220,7 +220,7 @@ def _views(
 
 
 def _greedy(views: dict[tuple[int, Mount], np.ndarray], options: list[list[Mount]]) -> dict[int, Mount]:
-    """The mount of each mounted sensor, of those that see most of the density together."""
+    """The mount of each mounted sensor, chosen greedily by the density seen together."""
     seen = np.zeros(len(next(iter(views.values()))))
     left = {sensor: list(mounts) for sensor, mounts in enumerate(options) if mounts}
     chosen: dict[int, Mount] = {}

@@ -2,8 +2,8 @@
 
 A sensor stands at one place, unless constraints allow its rays to start all over a region (`origin.spread_m`). Where
 origins are free the mixture is first fitted with them; then each sensor is fixed at the mean of its origins, and fitted
-to all that is seen from there. A field of view that may not hold all of this is fitted to what the mixture gave its
-sensor, so that narrow sensors share the work.
+to all samples seen from there. Where constraints keep a field of view from holding all of them, sensors are fitted to
+their own samples of the mixture instead, so that narrow sensors divide them.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ WIDEST = 0.999
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FitProblem:
-    """What sensors are fitted to.
+    """A fit of sensors to samples under constraints.
 
     Arguments:
         samples: Weighted samples of the learned density, at one value of its conditions.
-        constraints: What the sensors keep, where the space has them.
-        sensors: How many; None takes the constraints' or the usual number.
+        constraints: The constraints on the sensors.
+        sensors: Their number; None takes the constraints' or the usual number.
         rays: Rays per frame; None leaves them open.
         seed: Root of the random streams.
         level: The share of each marginal that intervals hold.
@@ -81,14 +81,14 @@ class FitProblem:
 
 @dataclass(frozen=True, eq=False)
 class FittedSensors:
-    """Sensors, and how well they stand for the samples.
+    """Fitted sensors and their likelihood.
 
     Arguments:
         sensors: In the order of the constraint file, or the heaviest first.
         log_likelihood: Weighted mean log density of the samples [nats].
         supports: The admitted samples of each group of sensors.
         rays: Rays per frame that the bandwidth allows; None leaves them open.
-        notes: What happened to sensors, one line each.
+        notes: Lines on sensors.
     """
 
     sensors: tuple[Sensor, ...]
@@ -169,7 +169,7 @@ def _sensor_count(problem: FitProblem, budget: BandwidthBudget) -> int:
 
 
 def _is_loose(rules: SensorRules, samples: Samples) -> bool:
-    """Whether a sensor has a free origin, and stands at one place all the same."""
+    """True where a sensor's origin is free but without spread, so that the fit chooses its place."""
     (group,) = sensor_groups((rules,), samples.space, 1)
     free = [axis for axis in range(3) if axis in samples.space.free and group.pins[axis] is None]
     return bool(free) and rules.origin.spread_m.max is None
@@ -190,7 +190,7 @@ def _supports(
         rules: Of all sensors.
         count: How many sensors there are.
         placed: Sensors whose place is the fit's own, not the constraints'.
-        shares: How much each of the samples belongs to each sensor, (N, S), where groups of one sensor share them out.
+        shares: Responsibilities of the sensors for each sample, (N, S), where they divide the samples.
     """
     supports, samples = [], problem.samples
     groups = sensor_groups(rules, samples.space, count)
@@ -212,7 +212,7 @@ def _supports(
 
 
 def _shared(samples: Samples, share: np.ndarray) -> Samples:
-    """The samples, drawn as if only a share of each (N,) were there."""
+    """The samples with their weights multiplied by shares (N,)."""
     return replace(samples, log_prob=samples.log_prob - np.log(np.maximum(share, TINY)))
 
 
@@ -248,7 +248,7 @@ def _group_samples(
 def _fixed(
     problem: FitProblem, rules: Sequence[SensorRules], ensemble: Ensemble, loose: Sequence[int], count: int
 ) -> tuple[Ensemble, Sequence[SensorRules], list[Support]]:
-    """The fit again, with loose sensors fixed at the means of their origins."""
+    """A new fit with loose sensors fixed at the means of their origins, with its rules and supports."""
     sensors = sensors_of(ensemble, problem.samples.space)
     places = [tuple(map(float, sensors[index].origin_m)) if index in loose else None for index in range(count)]
     fixed = fix_origins(rules, places)
@@ -263,12 +263,12 @@ def _fixed(
 
 
 def _is_widest(part: GroupSamples, spread_rad: np.ndarray) -> bool:
-    """Whether a constraint keeps a field of view from being wider, (K, 2) [rad]."""
+    """True where any angular spread (K, 2) [rad] is at its upper bound."""
     return bool((spread_rad >= WIDEST * part.bounds.spread_high).any())
 
 
 def _belonging(samples: Samples, ensemble: Ensemble, count: int) -> np.ndarray:
-    """How much each sample belongs to each sensor of a fit with free origins, (N, S)."""
+    """Responsibilities of the sensors of a fit with free origins for each sample, (N, S)."""
     shares = np.zeros((len(samples), count))
     for part, result in zip(ensemble.parts, ensemble.results, strict=True):
         features = Features(
@@ -301,8 +301,8 @@ def _too_few(sensor: int, count: int, found: float) -> InfeasibleError:
 def _likelihood(ensemble: Ensemble, supports: Sequence[Support]) -> Estimate:
     """The log-likelihood of a fit and its standard error over other samples [nats].
 
-    A fit on fewer samples than were admitted knows as much as they are worth, and one on more no more than those.
-    That the sensors were fitted to these very samples is not in it.
+    Of the samples of the fit and the effective number admitted the smaller counts. The bias of fitting to the same
+    samples is not included.
     """
     variance = 0.0
     for part, result, support in zip(ensemble.parts, ensemble.results, supports, strict=True):

@@ -1,6 +1,6 @@
 r"""The M-step of origins: means in boxes, bounded covariances, and intervals that keep out of excluded boxes.
 
-An interval x -+ z sigma along every axis keeps out of all excluded boxes just where it lies in one of the boxes
+An interval x -+ z sigma along every axis keeps out of all excluded boxes exactly where it lies in one of the boxes
 between them (see `origins`). Where the best parameters without this bound keep it, they are the best. Else every
 component moves to the best place in one of a few of these boxes, or goes on from where it was, and keeps its old
 parameters where it cannot gain, so that the likelihood never falls.
@@ -65,7 +65,7 @@ class OriginLimits(NamedTuple):
 
     @property
     def sides(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Both boxes' corners, that of the interval first."""
+        """Low and high corners of the interval's box, then of the mean's."""
         return self.free_low, self.free_high, self.low, self.high
 
     def take(self, rows: np.ndarray) -> OriginLimits:
@@ -73,7 +73,7 @@ class OriginLimits(NamedTuple):
         return OriginLimits(*(value if isinstance(value, float) else value[rows] for value in self))
 
     def inside(self, boxes: np.ndarray) -> OriginLimits:
-        """One row per origin and box of `boxes` (N, B), origin by origin."""
+        """The limits inside each of the boxes (N, B) of an origin, one row per origin and box."""
         rows = np.repeat(np.arange(len(boxes)), boxes.shape[1])
         free_low, free_high = (side[rows, boxes.ravel()] for side in (self.free_low, self.free_high))
         low = np.maximum(self.low[rows], free_low)
@@ -124,9 +124,9 @@ def improve_in_boxes(
 
 
 def project_into_boxes(mean: np.ndarray, scatter: np.ndarray, box: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
-    """The samples' own moments with one axis after the other moved to its best inside the box, the worst first.
+    """The samples' moments with one axis after the other moved to its optimum inside the box, the worst first.
 
-    The other axes keep their regressions on it.
+    The regressions of the other axes on it are kept.
     """
     point, covariance, rows = mean.copy(), scatter.copy(), np.arange(len(mean))
     for _ in range(mean.shape[1]):
@@ -148,7 +148,7 @@ def independent_axes(mean: np.ndarray, variance: np.ndarray, box: OriginLimits) 
 
 
 def axis_losses(precision: np.ndarray, shift: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """What bounds cost along axes as if independent, 0 where nothing is bounded, of any shape."""
+    """Increase of `objective` by the bounds of each axis, axes taken as independent, any shape; 0 where unbounded."""
     scale = np.square(precision) * variance
     return scale - np.log(scale) - 1 + np.square(shift)
 
@@ -275,7 +275,7 @@ def best_origins(
 
 
 def _best_unconstrained(mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
-    """The best mean in its box and covariance between its bounds, wherever its interval lies."""
+    """The best mean in its box and covariance within its bounds, without excluded boxes."""
     bounds = limits.least, limits.most, limits.thinnest
     covariance = clipped_eigenvalues(scatter, *bounds)
     point = np.clip(mean, limits.low, limits.high)
@@ -288,7 +288,7 @@ def _best_unconstrained(mean: np.ndarray, scatter: np.ndarray, limits: OriginLim
 
 
 def _holding(point: np.ndarray, covariance: np.ndarray, limits: OriginLimits) -> np.ndarray:
-    """Which boxes hold which intervals, shape (N, M) bool."""
+    """Mask of the boxes that hold each interval, shape (N, M) bool."""
     reach = limits.interval * np.sqrt(np.maximum(variances(covariance), 0.0))
     low, high = (point - reach)[:, None], (point + reach)[:, None]
     slack = SLACK * reach[:, None]
@@ -298,7 +298,7 @@ def _holding(point: np.ndarray, covariance: np.ndarray, limits: OriginLimits) ->
 def _between_boxes(
     mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits, old_mean: np.ndarray, old_covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters in the best of a few boxes for each origin, or better ones in the box of the old ones, or these."""
+    """The best parameters of each origin in a few boxes, in the box of its old ones, or the old ones themselves."""
     floored = clipped_eigenvalues(scatter, limits.least)
     usable, held = _usable(old_mean, old_covariance, limits)
     boxes = np.concatenate([_candidate_boxes(mean, floored, limits), held[:, None]], axis=1)
@@ -318,7 +318,7 @@ def _between_boxes(
 
 
 def _usable(point: np.ndarray, covariance: np.ndarray, limits: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
-    """Which parameters keep all bounds, shape (N,) bool, and the first box that holds them, or any, shape (N,)."""
+    """Mask of the parameters within all bounds, and the first box that holds each (0 where none does), (N,) each."""
     holding = _holding(point, covariance, limits)
     values = np.linalg.eigvalsh(covariance)
     kept = (values[:, 0] > 0) & (values[:, -1] <= limits.most * (1 + SLACK))
@@ -329,11 +329,11 @@ def _usable(point: np.ndarray, covariance: np.ndarray, limits: OriginLimits) -> 
 
 
 def _candidate_boxes(mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits) -> np.ndarray:
-    """A few boxes for each origin, those in which its axes lose least, one by one: shape (N, B)."""
+    """The few boxes of each origin with the smallest sum of `axis_losses`, shape (N, B)."""
     count, many = limits.free_low.shape[:2]
     boxes = np.broadcast_to(np.arange(many), (count, many))
     if many > BOXES_SCORED:
-        # about what each box costs: the shift that makes room for a spread that fits
+        # a rough cost of each box: the shift of the mean for a spread that fits
         centre, own = mean[:, None], variances(scatter)[:, None]
         widest = (limits.free_high - limits.free_low) / (2 * limits.interval)
         reach = limits.interval * np.minimum(np.sqrt(own), widest)

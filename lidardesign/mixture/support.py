@@ -1,6 +1,6 @@
 r"""The density restricted to what constrained sensors can measure: pinned origins, and one value of its conditions.
 
-Which constraints restrict the samples: the origin boxes less what they exclude, the ranges between the
+Constraints that restrict the samples: the origin boxes less what they exclude, the ranges between the
 earliest admitted gate start and the latest admitted gate end, and, where both boresight and field of view are
 bounded, the directions within half of the largest diagonal field of view of an admitted boresight. The others
 bound sensors, not rays. With `each`, a sample is kept where any sensor admits it.
@@ -13,10 +13,10 @@ The density at one value of its conditions, as weighted samples: nothing is lear
 
 Every sample d = (c, r) of the run is a draw of p(r | c) at its own condition c. Moved to the value v it is still a
 draw of that proposal, so with the weight $p^*(v, r) / p(r | c)$ its weighted mean is unbiased for the integral over
-$p^*(v, \cdot)$, however far c was: distance costs effective samples, never correctness. The nearest samples suit
-best; where the density moves quickly far ones get a few huge weights, so of the nearest `count`, half of them, a
-quarter, and so on, the part that is worth most equal weights is taken. (Learned shelves, 40,000 samples of ESS 0.2:
-worth 170 to 290 of the nearest 1000, 900 to 2400 of the nearest 20,000.)
+$p^*(v, \cdot)$, however far c was: distance costs effective samples, never correctness. The nearest samples have the
+most even weights; where the density moves quickly far ones get a few huge weights, so of the nearest `count`, half of
+them, a quarter, and so on, the part with the largest effective number is taken. (Learned shelves, 40,000 samples of
+ESS 0.2: effective numbers of 170 to 290 of the nearest 1000, 900 to 2400 of the nearest 20,000.)
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Support:
         points: Design points, shape (N, 6).
         weights: Unnormalised, shape (N,).
         total: The sum of weights relative to the whole density, where it has a meaning.
-        effective: The number of equal weights that are worth as much.
+        effective: The effective number of samples.
         mass: The share of the density inside the constraints; None where an origin is pinned.
     """
 
@@ -69,7 +69,7 @@ class Support:
 
 
 def admissible(points: np.ndarray, rules: Sequence[SensorRules], space: DesignSpace, group: Group) -> np.ndarray:
-    """Which design points some sensor of a group may measure, (N, 6) to (N,) bool."""
+    """Mask of the design points that some sensor of a group may measure, (N, 6) to (N,) bool."""
     keep = np.zeros(len(points), dtype=bool)
     for index in sorted({min(sensor, len(rules) - 1) for sensor in group.sensors}):
         one = rules[index]
@@ -132,7 +132,7 @@ def pin_samples(
 def reaim_samples(
     samples: Samples, chosen: np.ndarray, rules: Sequence[SensorRules], group: Group, retarget: Retarget | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Chosen samples aimed from the pins at what they observed, (N, 6), and their new weights, (N,); 0 where unseen.
+    """Samples re-aimed from the pins at their scene points, (N, 6), and their new weights, (N,); 0 where unseen.
 
     Raises:
         ConfigError: No way to evaluate the target density was given.
@@ -214,7 +214,7 @@ def at_condition(
     count: int,
     generator: np.random.Generator,
 ) -> Samples:
-    """Samples of p given that conditions have exactly these values, with the weights that lead to p*.
+    """Weighted samples of p* given exact values of conditions.
 
     Arguments:
         samples: Samples of the whole run: conditions uniform over their bounds.
@@ -228,7 +228,7 @@ def at_condition(
 
     Raises:
         ConfigError: A name that is no condition, a value outside its bounds, or no target density to ask.
-        DataError: The samples are worth too few to fit anything to.
+        DataError: The effective number of samples is too small for a fit.
         NumericalError: The target density is NaN somewhere.
     """
     space = samples.space.at(condition)

@@ -1,9 +1,7 @@
-"""The catalogue of real parts, and parts at places: their rays, their sensors, and designs of them.
+"""The catalogue of real parts, and parts at poses: their rays, their sensors, and designs of them.
 
-A real part at a place: its rays, its sensor in the design space, and a design of one or several of it.
-
-A part fires its own pattern. Of fewer rays than it has, the evenly spread subset is taken; more rays than it has take
-more parts, whose rays share the number equally.
+A part fires its own pattern, or an evenly spread subset where fewer rays are asked for. More rays than it has take more
+parts, which share them equally.
 """
 
 from __future__ import annotations
@@ -41,7 +39,7 @@ class Library:
 
     Arguments:
         files: The parts' files by the names of the parts.
-        origins: Where each file is, `lidardesign` for what is shipped.
+        origins: The path of each file, `lidardesign` for shipped ones.
     """
 
     files: dict[str, PartFile]
@@ -92,11 +90,11 @@ class Library:
 
 
 def load_library(own: Sequence[Path] = ()) -> Library:
-    """The shipped parts and those of a user's files or folders, which stand in for shipped ones of the same name.
+    """The shipped parts and those of a user's files or folders, which replace shipped ones of the same name.
 
     Raises:
-        ConfigError: A file or folder that cannot be read, holds no part, or says what is not possible; the message
-            names file, line and column. Two own parts of one name.
+        ConfigError: A file or folder that cannot be read, holds no part, or has an invalid value; the message names
+            file, line and column. Two own parts of one name.
     """
     files = dict(_shipped())
     origins = dict.fromkeys(files, SHIPPED)
@@ -202,7 +200,7 @@ def read_part(path: Path) -> PartFile:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where a part stands and how it is turned; its forward axis looks along the boresight.
+    """The pose of a part, whose forward axis is the boresight.
 
     Arguments:
         origin_m: Shape (3,).
@@ -221,16 +219,16 @@ class Pose:
 
 
 def looking_at(part: Part, origin_m: np.ndarray, azimuth_rad: float, elevation_rad: float) -> Pose:
-    """The pose in which the centre of a part's field looks somewhere, with its field upright there.
+    """The pose in which the centre of a part's field looks along a direction, with its field upright.
 
-    A part whose field is not centred on its forward axis is tilted by what the centre is off.
+    A part whose field is not centred on its forward axis is tilted by the offset of the centre.
     """
     frame = boresight_frame(*part.centre_rad).T @ boresight_frame(azimuth_rad, elevation_rad)
     return Pose(np.asarray(origin_m, dtype=np.float64), *boresight_of(frame))
 
 
 def parts_for(part: Part, count: int) -> int:
-    """How many parts of a kind fire `count` rays; at least one."""
+    """The number of parts of a kind that fire `count` rays, at least 1."""
     return max(-(-count // part.rays), 1)
 
 
@@ -238,10 +236,10 @@ def part_rays(part: Part, poses: Pose | Sequence[Pose], count: int | None = None
     """The rays of parts at poses, in the order in which each fires.
 
     Arguments:
-        part: The kind of part; its range is the gate of every ray, its rate says how long a frame lasts.
+        part: The kind of part; its range is the gate of every ray, its rate sets the length of a frame.
         poses: One part stands at each.
-        count: Rays in all; None is every ray of every part. The parts share them equally, the first ones take what
-            is left over, and each fires an evenly spread subset of its pattern.
+        count: Rays in all; None is every ray of every part. The parts share them equally, the first ones take the
+            remainder, and each fires an evenly spread subset of its pattern.
 
     Raises:
         ConfigError: No pose; more rays than the parts have, or than any design may.
@@ -284,7 +282,7 @@ def part_sensor(
     """The part as a component of design space: its field of view and its range are the component's intervals.
 
     The boresight is the centre of the field. A field of a full turn is a ring about the part's axis, of which the
-    component is the Gaussian of the same extents; what the part does see is said by its rays.
+    component is the Gaussian of the same extents; the part's rays have its true field.
     """
     azimuth, elevation, roll = boresight_of(boresight_frame(*part.centre_rad) @ pose.frame)
     return Sensor(
@@ -343,7 +341,7 @@ def side_by_side(part: Part, pose: Pose, number: int) -> list[Pose]:
 
 
 def interleaved(part: Part, pose: Pose, number: int) -> list[Pose]:
-    """Poses at one place that see the same, each with its rays between those of the others.
+    """Poses at one place with nearly the same field, each with its rays between those of the others.
 
     The shifts are an even grid in one cell of the pattern: four parts of 8 x 8 zones have 16 x 16.
     """

@@ -1,6 +1,6 @@
-"""A real part in one of its modes, as designs use it: its figures, and where its rays go in its own frame.
+"""A real part in one of its modes, as designs use it: its figures, and its pattern in its own frame.
 
-That frame has x forward, y to the left (growing azimuth), z up. What the two angles of a field of view mean depends on
+That frame has x forward, y to the left (growing azimuth), z up. The meaning of a field of view's two angles depends on
 the part: equal angles from the forward axis (`tangent`: zones behind a wide lens, rosettes), azimuth and elevation
 (`sphere`: whatever turns or steps), or angles in the horizontal and the vertical plane (`plane`: a camera whose pixels
 are even on its focal plane).
@@ -42,7 +42,7 @@ CONDITIONS = ("reflectance_percent", "illuminance_klux", "detection_percent", "a
 
 
 def projection_of(pattern: Any, view: PartFieldOfView) -> Projection:
-    """What the two angles of a part's field of view are."""
+    """The projection of the two angles of a part's field of view: `tangent`, `sphere` or `plane`."""
     if isinstance(pattern, Pixels):
         return "plane"
     if isinstance(pattern, Zones | Rosette) or (isinstance(pattern, Even) and view.shape == "ellipse"):
@@ -137,9 +137,9 @@ class Part:
         summary: One line for people.
         mode: The mode's name; None where the part has one only.
         modes: All modes' names.
-        figures: The statements of every field, the one that counts first.
+        figures: The statements of every field, the one in use first.
         sources: By the key that statements name.
-        origin: Where the part file is: `lidardesign`, or a path.
+        origin: `lidardesign` for a shipped part, else the path of its file.
     """
 
     name: str
@@ -171,13 +171,13 @@ class Part:
         )
 
     def value(self, name: str) -> float | None:
-        """The figure of a field that counts; None where no source gives one."""
+        """The figure in use of a field; None where no source gives one."""
         statements = self.figures.get(name)
         return None if statements is None else statements[0].value
 
     @property
     def pattern(self) -> Any:
-        """Where its rays go."""
+        """Its pattern of rays."""
         return self.figures["pattern"][0]
 
     @property
@@ -187,7 +187,7 @@ class Part:
 
     @property
     def projection(self) -> Projection:
-        """What the two angles of its field of view are."""
+        """The projection of the two angles of its field of view."""
         return projection_of(self.pattern, self.view)
 
     @property
@@ -214,7 +214,7 @@ class Part:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Columns and rows of its pattern; of one that has none, those of as many rays in square cells."""
+        """Columns and rows of its pattern; of one without a grid, those of as many rays in nearly square cells."""
         pattern = self.pattern
         if hasattr(pattern, "rows"):
             return pattern.columns, pattern.rows
@@ -225,7 +225,7 @@ class Part:
 
     @property
     def range_m(self) -> tuple[float, float]:
-        """From where to where it measures, under the conditions of the first statements; from 0 where none says."""
+        """The range that it measures, from and to, by the first statements [m]; from 0 where none states it."""
         return self.value("near_m") or 0.0, self.figures["far_m"][0].value
 
     @property
@@ -235,7 +235,7 @@ class Part:
 
     @property
     def histogram_mbps(self) -> float | None:
-        """What its histograms cost to read: their number x bins x bits x rate [Mbit/s]; None where it gives none."""
+        """The bandwidth of its histograms: their number x bins x bits x rate [Mbit/s]; None where it has none."""
         bins, bits = self.value("bins"), self.value("bits_per_bin")
         if bins is None or bits is None:
             return None
@@ -243,15 +243,15 @@ class Part:
 
     @property
     def processed_mbps(self) -> float | None:
-        """What its own results cost to read [Mbit/s]; None where no source says how long a frame is."""
+        """The bandwidth of its processed frames [Mbit/s]; None where no source states their size."""
         frame = self.value("frame_bytes")
         return None if frame is None else frame * BITS_PER_BYTE * self.rate_hz / BITS_PER_MEGABIT
 
     def under(self, *, reflectance_percent: float | None = None, illuminance_klux: float | None = None) -> Part:
-        """The same part with the range that its sources vouch for under conditions.
+        """The part with the largest range that its sources state for given conditions.
 
-        A statement vouches for targets at least as bright and light at most as strong as its own; of those that do,
-        the farthest counts. One that states no such condition says nothing about it.
+        A statement holds for targets at least as bright and ambient light at most as strong as its own. One that lacks
+        a given condition is left out.
 
         Raises:
             ConfigError: No source states a range under such conditions.
@@ -296,7 +296,7 @@ def conditions_of(statement: Statement) -> str:
 
 
 def disagreements(part: Part) -> list[str]:
-    """Fields of which two sources give different figures for the same conditions."""
+    """Names of fields for which two sources give different figures under the same conditions."""
     names = []
     for name, statements in part.figures.items():
         # source and figure of the statements under the same conditions

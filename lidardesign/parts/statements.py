@@ -41,7 +41,7 @@ class _Keys(BaseModel):
 
 
 class Source(_Keys):
-    """Where figures come from."""
+    """A source of figures."""
 
     title: Text
     kind: Literal["datasheet", "manual", "product page", "simulator file", "driver", "list", "paper", "measurement"]
@@ -56,9 +56,9 @@ class Statement(_Keys):
         source: Key of the source in the file's `sources`.
         reflectance_percent: Of the target that a range was measured on.
         illuminance_klux: Ambient light at the target; 0 is darkness.
-        detection_percent: How often the target was detected.
-        at: Which zone, channel, mode or echo, in words.
-        note: What else must be known.
+        detection_percent: Detection rate of the target.
+        at: Zone, channel, mode or echo, in words.
+        note: Further remarks.
     """
 
     source: Text
@@ -88,7 +88,7 @@ class Whole(Statement):
 
 
 class PartFieldOfView(Statement):
-    """From where to where a part sees, relative to its forward axis.
+    """Intervals of a part's field of view, relative to its forward axis [degrees].
 
     An `ellipse` touches its intervals in the middle; a `rectangle` fills them.
     """
@@ -168,7 +168,7 @@ class Rosette(Statement):
 
 
 class Even(Statement):
-    """Rays spread evenly over the field: what can be said of a pattern that its maker does not publish."""
+    """Rays spread evenly over the field, for a pattern that the maker does not publish."""
 
     kind: Literal["even"]
     rays: Count
@@ -184,8 +184,8 @@ class Figures(_Keys):
     """Fields of a part, or of one of its modes; each is a list of statements.
 
     Arguments:
-        pattern: Where its rays go.
-        field_of_view_deg: From where to where it sees.
+        pattern: Its pattern of rays.
+        field_of_view_deg: Its field of view.
         near_m, far_m: The ranges that it measures; the gate of its rays.
         rate_hz: Frames per second.
         returns: Echoes per ray at most.
@@ -194,7 +194,7 @@ class Figures(_Keys):
         accuracy_m, accuracy_percent: The largest error of a range, or its share.
         bins, bin_ps, bits_per_bin: The histogram that it gives per ray, where it gives one.
         histograms: Histograms per frame, where they are not one per ray.
-        frame_bytes: What it sends per frame when it processes histograms itself.
+        frame_bytes: Bytes per frame when it processes histograms itself.
         points_per_s: Points that it sends per second.
     """
 
@@ -277,7 +277,7 @@ class PartFile(Figures):
         maker, product: Its names on the market.
         kind: What sort of part it is.
         summary: One line for people.
-        sources: Where the figures come from, by the key that statements name.
+        sources: Sources of the figures, by the key that statements name.
         modes: Its settings, as 4x4 and 8x8, by name; their fields stand in for those of the part. The first is the
             one meant where none is named.
     """

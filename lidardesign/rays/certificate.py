@@ -1,4 +1,4 @@
-"""Certificates: how much better any other choice of the same candidates could be, an upper bound of F by duality.
+"""Certificates: an upper bound of F over all choices of the same candidates, by duality.
 
 For thresholds t >= 0 of items and a price lambda >= 0 of bandwidth, every admissible choice S has
 
@@ -31,18 +31,18 @@ PRICE_BISECTIONS = 12
 PATIENCE = 5  # rounds without a lower bound after which steps are halved
 PROGRESS = 0.02  # of what the bound exceeds the value by: a bound that is lower by less is not lower
 PROXY = "mean over items of what the returns of the chosen rays leave unknown, by the task's informs"
-PRICES = 7  # of the curve beside none: each half of the one before, from twice what the bits of a free choice are worth
+PRICES = 7  # of the curve, besides 0: each half of the one before, from twice the worth per bit of a free choice
 MEMORY = 0.7  # how much of its last direction a step keeps
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """A choice's objective beside what no choice of the candidates can exceed.
+    """The objective of a choice with an upper bound over all choices of the candidates.
 
     Arguments:
         value: F - price * bits - harm of the choice; without a price F - harm.
         bound: The least upper bound of it that was found, never below `value`.
-        rounds: How many rounds were made.
+        rounds: Number of rounds.
     """
 
     value: float
@@ -50,7 +50,7 @@ class Certificate:
     rounds: int
 
     def gap(self, complete: float) -> float:
-        """How much smaller the loss could be at most, relative; the loss is what the objective lacks of `complete`."""
+        """The largest possible reduction of the loss, relative to it; the loss is `complete` less the objective."""
         loss = complete - self.value
         return (self.bound - self.value) / loss if loss > 0 else 0.0
 
@@ -66,17 +66,17 @@ def certificate_document(
     scenes: int,
     unit: str,
 ) -> dict[str, Any]:
-    """What a design file, JSON and reports say of a choice.
+    """The certificate of a choice as plain values for design files, JSON and reports.
 
     Arguments:
-        rays: How many fire.
-        value: What the choice loses on the scenes that it was made on, in the unit.
-        bound: What any other loses at least.
-        held_back_value: What it loses on scenes held back.
-        candidates, gates, scenes: How many there were.
-        unit: Of the losses.
+        rays: Number of rays that fire.
+        value: Loss of the choice on the scenes that it was made on, in the unit.
+        bound: Lower bound of the loss of any other choice.
+        held_back_value: Its loss on scenes held back.
+        candidates, gates, scenes: Their numbers.
+        unit: Unit of the losses.
     """
-    # nothing loses less than nothing, but for rounding
+    # losses are not negative but for rounding
     value, bound, held_back_value = (max(float(loss), 0.0) for loss in (value, bound, held_back_value))
     return {
         "rays": rays,
@@ -98,11 +98,11 @@ def certify(
     """The bound for choices of the same candidates, counts, and price or budget.
 
     Arguments:
-        coverage: What the candidates tell.
-        counts: How many rays each sensor fires.
-        choice: What was chosen; its price is the bound's where there is no budget.
-        budget_mbps: The most that reading out may cost, if there is a budget.
-        rounds: How many thresholds are tried at most.
+        coverage: Information of the candidates.
+        counts: Numbers of rays by group.
+        choice: The choice; its price is the bound's where there is no budget.
+        budget_mbps: Largest bandwidth, if there is a budget [Mbit/s].
+        rounds: Largest number of steps.
     """
     value = choice.worth - choice.harm - (0.0 if budget_mbps is not None else choice.price * choice.bits)
     dual = Thresholds if len(coverage.table) == 0 else Tangents
@@ -116,7 +116,7 @@ def certify(
 
 
 class _Admissible:
-    """The choices that are admissible: so many rays of each sensor, at a price or within a budget."""
+    """Admissible choices: a number of rays per group, at a price or within a budget."""
 
     def __init__(self, coverage: Coverage, counts: RayCounts, price: float, budget_mbps: float | None) -> None:
         self.coverage, self.counts, self.budget_mbps = coverage, counts, budget_mbps
@@ -125,9 +125,9 @@ class _Admissible:
         self.bits = np.where(self.allowed, coverage.bits, 0.0)
 
     def best(self, excess: np.ndarray) -> tuple[float, np.ndarray]:
-        """The most that single gates' excess (N, G) can sum to, and the gates that do, -1 for none, (N,).
+        """The largest sum of single gates' excess (N, G), and its gates, -1 for none, (N,).
 
-        With a budget it is the least over prices of what choices are worth at that price and the budget's price.
+        With a budget it is the Lagrangian bound, minimised over prices.
         """
         if self.budget_mbps is None:
             return self._at(self.price, excess)
@@ -170,7 +170,7 @@ class _Admissible:
 
 
 class Thresholds:
-    """Subgradient descent of the bound for items that count their largest worth."""
+    """Subgradient descent of the bound for items whose largest worth counts."""
 
     def __init__(self, coverage: Coverage, admissible: _Admissible, choice: Choice) -> None:
         self.coverage, self.admissible = coverage, admissible
@@ -193,7 +193,7 @@ class Thresholds:
         if self.stale == PATIENCE:
             self.scale, self.stale = self.scale / 2, 0
         kernels.count_exceeding(coverage.entries, taken, self.threshold, self.count)
-        # per unit of an item's weight, so that rare items move as far as frequent ones
+        # per unit of an item's weight, so that steps are alike for items of all weights
         self.direction = 1.0 - self.count + MEMORY * self.direction
         slope = np.where((self.threshold <= 0) & (self.direction > 0), 0.0, self.direction)
         length = float(coverage.weight @ slope**2)
@@ -203,7 +203,7 @@ class Thresholds:
 
 
 class Tangents:
-    """Steps of Frank and Wolfe for concave sums: tangents at what a mixture of choices knows."""
+    """Steps of Frank and Wolfe for concave sums: tangents at the known sums of a mixture of choices."""
 
     def __init__(self, coverage: Coverage, admissible: _Admissible, choice: Choice) -> None:
         self.coverage, self.admissible = coverage, admissible
@@ -224,14 +224,14 @@ class Tangents:
 
 
 def price_curve(coverage: Coverage, counts: RayCounts, visits: int = 1) -> list[list[float]]:
-    """The loss of choices [in the unit of worth] against their bandwidth [Mbit/s], as pairs that rise and fall.
+    """The loss of choices [in the unit of worth] against their bandwidth [Mbit/s], as pairs by rising bandwidth.
 
     Choices that cost more and lose no less than others are left out.
 
     Arguments:
-        coverage: What the candidates tell.
-        counts: How many rays each sensor fires.
-        visits: Over how many values of a condition the bandwidth is a mean.
+        coverage: Information of the candidates.
+        counts: Numbers of rays by group.
+        visits: Number of condition values that the bandwidth is a mean over.
     """
     free = choose(coverage, counts, passes=0)
     prices = 2 * free.worth / free.bits * 0.5 ** np.arange(PRICES) if free.bits > 0 else []

@@ -1,9 +1,9 @@
 """Rays and gates chosen out of many: greedily, then by swaps, within a count per sensor and a bandwidth.
 
-Greedy on F - price * bits - harm takes the ray and gate that add most (Nemhauser, Wolsey and Fisher 1978). What every
-gate would add is kept true as rays come and go: few items change what is known of them, and few rays tell of an item.
-Then one ray at a time leaves and the best that is left comes in, until no swap gains. No constant is promised:
-`certificate` bounds what is lost.
+Greedy on F - price * bits - harm takes the ray and gate that add most (Nemhauser, Wolsey and Fisher 1978). The gains
+of all gates are updated as rays come and go: few items change their known worth, and few rays inform about an item.
+Then one ray at a time leaves and the best of the others comes in, until no swap gains. No approximation factor is
+guaranteed: `certificate` bounds the loss.
 
 Where all that can be known of the training scenes is known, further rays are chosen in another layer, as if none fired
 yet: of other scenes they see what the first ones just miss. A ceiling of 1000 rays over an arm is 12 to 20 % better by
@@ -30,14 +30,14 @@ LEAST_SHARE = 0.01  # of what a ray of a layer adds on average: where none adds 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Which rays fire, and through which gate.
+    """A choice of rays that fire, with a gate each.
 
     Arguments:
         gate: The gate of each candidate ray, -1 for those that do not fire, (N,).
         worth: F of the choice.
-        bits: What reading it out costs [Mbit/s].
-        harm: What it spoils, in the unit of worth.
-        price: What one Mbit/s was weighed with.
+        bits: Its bandwidth [Mbit/s].
+        harm: Its harm, in the unit of worth.
+        price: The price of one Mbit/s, in the unit of worth.
     """
 
     gate: np.ndarray
@@ -48,18 +48,18 @@ class Choice:
 
     @property
     def rays(self) -> np.ndarray:
-        """Which candidates fire, in their order."""
+        """Indices of the candidates that fire, ascending."""
         return np.flatnonzero(self.gate >= 0)
 
 
 @dataclass(frozen=True, eq=False)
 class RayCounts:
-    """How many rays may be chosen, by groups of candidates.
+    """Numbers of rays to choose, by groups of candidates.
 
     Arguments:
         group: The group of each candidate ray, (N,): a sensor, or a value of a condition.
         most: The number of rays of each group.
-        owner: The sensor of each candidate, (N,), where every sensor has to fire a ray; None where that is left open.
+        owner: The sensor of each candidate, (N,), where every sensor has to fire a ray; else None.
     """
 
     group: np.ndarray
@@ -68,12 +68,12 @@ class RayCounts:
 
     @staticmethod
     def of_one(rays: int, count: int) -> RayCounts:
-        """One group of which `count` rays may be chosen."""
+        """A single group with `count` rays to choose."""
         return RayCounts(np.zeros(rays, dtype=np.intp), np.array([count]))
 
 
 class _Search:
-    """A choice under way: what it knows, what each ray would add, and what is left of each sensor's count."""
+    """The state of a search: known worth of items, gains of all gates, and rays left of each group."""
 
     def __init__(self, coverage: Coverage, counts: RayCounts) -> None:
         self.coverage, self.group, self.left = coverage, counts.group, counts.most.copy()
@@ -86,7 +86,7 @@ class _Search:
         self.gains = coverage.first_gains.copy()
 
     def improve(self, price: float, limit_mbps: float, *, full: bool, passes: int) -> None:
-        """Takes rays at a price and within a bandwidth, then swaps them."""
+        """Take rays at a price and within a bandwidth, then swap them."""
         coverage = self.coverage
         self.cost = coverage.harm + price * np.where(np.isfinite(coverage.bits), coverage.bits, 0.0)
         self.limit_mbps = limit_mbps
@@ -100,7 +100,7 @@ class _Search:
                 return
 
     def choice(self, price: float) -> Choice:
-        """What was chosen so far."""
+        """The choice so far."""
         gate = np.maximum(self.gate, self.earlier)
         return Choice(gate, self.coverage.value_of(gate), *self.coverage.charge(gate), price)
 
@@ -110,21 +110,21 @@ class _Search:
         return bool((self.gate >= 0).any() and (self.left > 0).any())
 
     def begin_layer(self) -> None:
-        """Forgets what is known, and keeps the rays that fire."""
+        """Keep the rays that fire, and forget what they inform about."""
         self.earlier = np.maximum(self.gate, self.earlier)
         self.gate = np.full_like(self.gate, -1)
         self.known, self.worth, self.gains = np.zeros_like(self.known), 0.0, self.coverage.first_gains.copy()
         self.owner = None
 
     def best(self, among: np.ndarray | None = None) -> tuple[int, int, float]:
-        """The ray and gate that add most now, of all or of some, and what they add; -inf where none may be taken."""
+        """The ray and gate of the largest net gain, of all or of some, and that gain; -inf where none may be taken."""
         may_fire = (self.gate < 0) & (self.earlier < 0) & (self.left[self.group] > 0)
         may_fire = may_fire if among is None else may_fire & among
         room_mbps = self.limit_mbps - self.spent_mbps
         return kernels.best_gate(self.gains, self.cost, self.coverage.bits, may_fire, room_mbps)
 
     def take(self, ray: int, gate: int) -> None:
-        """Fires a ray through a gate."""
+        """Add a ray with a gate."""
         gain = self.gains[ray, gate]
         self._change(ray, gate, adding=True)
         self._count(ray, gate, gain)
@@ -136,7 +136,7 @@ class _Search:
         self.spent_mbps += self.coverage.bits[ray, gate]
 
     def drop(self, ray: int) -> None:
-        """Takes a ray out."""
+        """Remove a ray."""
         gate = int(self.gate[ray])
         self.gate[ray] = -1
         self._change(ray, gate, adding=False)
@@ -149,14 +149,14 @@ class _Search:
         kernels.change_choice(ray, gate, adding, coverage.entries, coverage.by_item, self.gate, self.known, self.gains)
 
     def take_one_of_each(self, owner: np.ndarray) -> None:
-        """Takes the best ray of every sensor that fires none."""
+        """Take the best ray of every sensor that fires none."""
         for sensor in np.setdiff1d(owner, owner[self.gate >= 0]):
             ray, gate, net = self.best(owner == sensor)
             if net > -np.inf:
                 self.take(ray, gate)
 
     def fill(self, full: bool) -> None:
-        """Takes rays greedily until counts or bandwidth are used up, or none gains: net or, where `full`, hardly."""
+        """Take rays greedily until counts or bandwidth are used up, or none gains: net or, where `full`, hardly."""
         rays = np.count_nonzero(self.gate >= 0)
         while True:
             ray, gate, net = self.best()
@@ -167,12 +167,12 @@ class _Search:
             rays += 1
 
     def fill_up(self) -> None:
-        """Takes whatever rays fit, until counts or bandwidth are used up."""
+        """Take whatever rays fit, until counts or bandwidth are used up."""
         while (found := self.best())[2] > -np.inf:
             self.take(*found[:2])
 
     def swap(self, full: bool, smallest: float) -> bool:
-        """Every chosen ray leaves once and the best comes in, where that gains; says whether anything changed."""
+        """Swap each chosen ray for the best other one where that gains; return whether anything changed."""
         changed, entries = False, self.coverage.entries
         for ray in np.flatnonzero(self.gate >= 0):
             gate = int(self.gate[ray])
@@ -205,11 +205,11 @@ def choose(
     """Rays and gates of large F - price * bits - harm.
 
     Arguments:
-        coverage: What the candidates tell.
-        counts: How many rays may be chosen.
-        price: What 1 Mbit/s costs, in the unit of worth.
-        full: Whether so many are chosen, also those that gain nothing.
-        passes: How often each ray may be swapped.
+        coverage: Information of the candidates.
+        counts: Numbers of rays to choose.
+        price: Price of 1 Mbit/s, in the unit of worth.
+        full: Whether counts are filled even with rays that gain nothing.
+        passes: Largest number of swaps of each ray.
     """
     return _choose_layers(coverage, counts, (price,), np.inf, full=full, passes=passes)
 
@@ -238,10 +238,10 @@ def choose_within(
     full: bool = True,
     passes: int = MOST_PASSES,
 ) -> Choice:
-    """The best choice found that a bandwidth allows; as `choose`, with a budget [Mbit/s] for a price.
+    """The best choice found within a bandwidth; as `choose`, with a budget [Mbit/s] instead of a price.
 
-    A price reaches only the convex hull of what choices cost and are worth. So the price is bisected, and what the
-    least price that keeps to the budget leaves over is spent at the next lower price, then at none.
+    A price reaches only the convex hull of bandwidth and worth. So the price is bisected, and the bandwidth left by the
+    least price within the budget is spent at the next lower price, then at none.
     """
     budget_mbps *= 1 + SLACK  # the same bits added up in another order
     free = choose(coverage, counts, full=full, passes=passes)

@@ -1,9 +1,9 @@
 """Information of every candidate ray about every item of many scenes, as one sparse table.
 
-A candidate is a ray with one of a few gates. Items are what scenes ask about: points of a visible surface, frames of
-a track, bodies. The worth of a choice S is F(S) = sum_u w_u phi_u(S), where phi is the largest worth of the returns
-that S hears of item u (facility location), or a concave table of their sum. Both are monotone and submodular
-(Nemhauser, Wolsey and Fisher 1978).
+A candidate is a ray with one of a few gates. Items are the quantities to measure in scenes: points of a visible
+surface, frames of a motion, bodies. The worth of a choice S is F(S) = sum_u w_u phi_u(S), where phi is the largest
+worth of the returns that S receives about item u (facility location), or a concave table of their sum. Both are
+monotone and submodular (Nemhauser, Wolsey and Fisher 1978).
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ MOST_GATES = 8  # of a ray: an entry keeps one bit for each
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """All candidates beside all items, with prices.
+    """The information of all candidates about all items, with the costs of candidates.
 
     Arguments:
-        start: Where the entries of each ray begin, (N + 1,).
+        start: The first entry of each ray, (N + 1,).
         item: The item of each entry, (E,).
         worth: Its worth, float32 (E,).
         gates: One bit for each gate of the ray that lets the return through, uint8 (E,).
-        weight: What items count; they sum to 1, (U,).
-        bits: What reading a ray out through each gate costs [Mbit/s], inf for a gate that is not allowed, (N, G).
-        harm: What a ray spoils through each gate, in the unit of worth, (N, G).
+        weight: Weights of items, summing to 1, (U,).
+        bits: Bandwidth of a ray with each gate [Mbit/s], inf for a gate that is not allowed, (N, G).
+        harm: Harm of a ray with each gate, in the unit of worth, (N, G).
         table: The concave table of sums, 0 at 0, or `LARGEST`.
-        complete: F where nothing is left to know: the loss of a choice is what it lacks of that.
+        complete: F of complete information; the loss of a choice is this less its F.
     """
 
     start: np.ndarray
@@ -60,7 +60,7 @@ class Coverage:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """How many rays, and how many gates each has."""
+        """The numbers of rays and of gates per ray, (N, G)."""
         return self.bits.shape
 
     @cached_property
@@ -75,18 +75,18 @@ class Coverage:
 
     @cached_property
     def by_item(self) -> kernels.ByItem:
-        """The table in the order of items, each from what tells most of it."""
+        """The table in the order of items, entries of an item by falling worth."""
         begin, order = self._order_by_item
         return kernels.ByItem(begin, self.ray[order], self.worth[order], self.gates[order], self.weight, self.table)
 
     @cached_property
     def _order_by_item(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where the entries of each item begin, and their order."""
+        """The first entry of each item, (U + 1,), and the order of entries by item, (E,)."""
         begin = _begins(self.item, len(self.weight))
         return begin, kernels.order_by_item(self.item, self.worth, begin)
 
     def of_rays(self, rays: slice) -> Coverage:
-        """The table of some rays, one after the other."""
+        """The table of a slice of the rays."""
         if rays == slice(0, len(self.bits)):
             return self
         first, last = self.start[rays.start], self.start[rays.stop]
@@ -101,7 +101,7 @@ class Coverage:
         )
 
     def through(self, gate: np.ndarray) -> Coverage:
-        """The table with one gate of each ray, (N,), and no other."""
+        """The table with only the given gate of each ray, (N,)."""
         rays = np.arange(len(gate))
         narrowed = replace(
             self,
@@ -113,12 +113,12 @@ class Coverage:
         return narrowed
 
     def grouped(self, groups: Sequence[np.ndarray]) -> Coverage:
-        """The table whose candidates are groups of rays that fire together, each through the gate of the same number.
+        """The table whose candidates are groups of rays that fire together, each with the gate of the same number.
 
-        A group tells of an item what its rays tell together; what its rays cost and spoil adds up.
+        The information of a group is that of its rays together; their bandwidth and harm add up.
 
         Arguments:
-            groups: The rays of each; a ray may be in several, and in one several times, where it counts so often.
+            groups: The rays of each; a ray may be in several groups, and repeated within one.
         """
         first = np.cumsum([0, *map(len, groups)])
         members = np.concatenate([np.zeros(0, dtype=np.intp), *groups]).astype(np.intp)
@@ -129,20 +129,20 @@ class Coverage:
         return replace(self, start=begin, item=item, worth=worth, gates=gates, bits=bits, harm=harm)
 
     def known(self, gate: np.ndarray) -> np.ndarray:
-        """What a choice of one gate per ray, -1 for none, (N,), knows about each item, (U,)."""
+        """The known worth of each item, (U,), by a choice of one gate per ray, -1 for none, (N,)."""
         known = np.empty(len(self.weight))
         kernels.know(self.entries, gate, known)
         return known
 
     def gains(self, known: np.ndarray) -> np.ndarray:
-        """What each gate of every ray would add to F, (N, G)."""
+        """The gain in F of each gate of every ray, (N, G)."""
         gains = np.empty(self.shape)
         kernels.gate_gains(self.by_item, known, gains)
         return gains
 
     @cached_property
     def first_gains(self) -> np.ndarray:
-        """What each gate of every ray would add where nothing is known, (N, G)."""
+        """The gain in F of each gate of every ray from the empty choice, (N, G)."""
         return self.gains(np.zeros(len(self.weight)))
 
     def value_of(self, gate: np.ndarray) -> float:
@@ -150,11 +150,11 @@ class Coverage:
         return float(self.weight @ self.counted(self.known(gate)))
 
     def loss_of(self, gate: np.ndarray) -> float:
-        """What F of a choice lacks of complete knowledge."""
+        """The loss of a choice: `complete` less its F."""
         return self.complete - self.value_of(gate)
 
     def counted(self, known: np.ndarray) -> np.ndarray:
-        """What known worths count, any shape."""
+        """phi of known worths or sums of worths, any shape."""
         return known if len(self.table) == 0 else np.interp(known, np.arange(len(self.table)), self.table)
 
     def charge(self, gate: np.ndarray) -> tuple[float, float]:
@@ -164,12 +164,12 @@ class Coverage:
 
 
 def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndarray) -> Coverage:
-    """The table over scenes, each of which counts as much as any other; its items are in an order of its own.
+    """The table over scenes of equal weight, with items renumbered.
 
     Arguments:
-        informed: What a task says of each scene.
-        gates_m: The gates of each ray, each from a start to before an end, shape (N, G, 2).
-        bits: What reading a ray out through each gate costs, inf for gates that are not allowed, (N, G) [Mbit/s].
+        informed: The task's information in each scene.
+        gates_m: The gates of each ray, start included and end not, shape (N, G, 2) [m].
+        bits: Bandwidth of a ray with each gate, inf for gates that are not allowed, (N, G) [Mbit/s].
 
     Raises:
         ConfigError: No scene, or more gates than an entry has bits.
@@ -201,7 +201,7 @@ def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndar
     order = np.argsort(ray, kind="stable")
     item, worth, opens = (_joined(column)[order] for column in columns[1:])
     start, best = _begins(ray, rays), np.empty(items, dtype=np.int32)
-    # items that one ray tells most of are numbered in a row: what follows rays to items finds them side by side
+    # items with the same best ray are numbered in a row: loops from rays to items then read neighbouring memory
     kernels.best_rays(start, item, worth, best)
     by_ray, number = np.argsort(best, kind="stable"), np.empty(items, dtype=np.int32)
     number[by_ray] = np.arange(items)
@@ -219,14 +219,14 @@ def gather(informed: Iterable[InformedScene], gates_m: np.ndarray, bits: np.ndar
 
 
 def _joined(parts: list[np.ndarray]) -> np.ndarray:
-    """Parts as one array; they are let go."""
+    """Parts as one array; the list is cleared to free memory."""
     joined = np.concatenate(parts)
     parts.clear()
     return joined
 
 
 def _begins(labels: np.ndarray, count: int) -> np.ndarray:
-    """Where each of `count` labels begins, and the last ends, once they are sorted, (count + 1,)."""
+    """The first position of each of `count` labels in sorted order, and the end of the last, (count + 1,)."""
     return np.concatenate([[0], np.cumsum(np.bincount(labels, minlength=count))])
 
 
@@ -238,7 +238,7 @@ def _passes(range_m: np.ndarray, ray: np.ndarray, gates_m: np.ndarray) -> np.nda
 
 
 def _largest_alone(scene: InformedScene, passes: np.ndarray, gates: int) -> np.ndarray:
-    """The gates (E,) without those through which a ray tells more about the same item in another frame."""
+    """The gates (E,) less those for which another frame has more worth of the same ray about the same item."""
     pair = scene.ray.astype(np.int64) * len(scene.weight) + scene.item
     order = np.lexsort((-scene.worth, pair))
     kept = np.zeros_like(passes)

@@ -1,7 +1,7 @@
-"""Gates of candidate rays: a few for each, from what the ray or its sensor returns, inside what constraints allow.
+"""Gates of candidate rays: a few for each, from what the ray or its sensor returns, inside constraints.
 
-Gates hold quantiles of what a ray, and rays near it, return that tells something. Narrow gates cost fewer bits and lose
-what lies outside; which of them pays is for the choice.
+Gates hold quantiles of the informative returns of a ray and of rays near it. Narrow gates cost fewer bits and lose
+returns outside; the choice decides between them.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ THINNEST_GATE_M = 1.5e-5
 
 @dataclass(frozen=True, eq=False)
 class GateLimits:
-    """What the gates of a design's rays keep.
+    """Limits of the gates of a design's rays.
 
     Arguments:
-        sensors: Those that fire the rays.
-        rules: What constraints ask of them.
+        sensors: The sensors that fire the rays.
+        rules: Their constraints.
         level: The share of each marginal that intervals hold.
         space: The design space.
-        margin_m: By how much gates that hold all returns are longer at both ends: other scenes differ.
+        margin_m: Margin at both ends of gates that hold all returns, for other scenes [m].
         is_shared: Whether all rays of a sensor have one gate.
     """
 
@@ -69,13 +69,13 @@ class GateLimits:
 
 
 def gate_choices(rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene], margin_m: float) -> np.ndarray:
-    """A few gates for each ray, inside its own, (N, G, 2) [m]; a ray that tells nothing has its own alone.
+    """A few gates for each ray, inside its own, (N, G, 2) [m]; a ray without information has its own alone.
 
     Arguments:
         rays: The candidates, with the widest gates that they may have.
         visits: The rays at each condition; only those of one are near each other.
         informed: What the task says of training scenes.
-        margin_m: By how much gates that hold all of a ray's returns are longer at both ends: other scenes differ.
+        margin_m: Margin at both ends of gates that hold all of a ray's returns, for other scenes [m].
     """
     count = len(rays)
     ray, range_m = _informative_returns(informed)
@@ -112,7 +112,7 @@ def sensor_gates(rays: Rays, visits: Sequence[slice], informed: Sequence[Informe
 
 
 def _inside(rays: Rays, ends_m: np.ndarray, levels: Sequence[float], margin_m: float) -> np.ndarray:
-    """Gates (N, L, 2) that hold these ends inside the rays' own, those of all returns longer at both; or their own."""
+    """Gates (N, L, 2) with these ends, clipped to the rays' own; NaN ends give the rays' own, level 1 a margin."""
     wider = np.where(np.array(levels) == 1.0, margin_m, 0.0)
     wider = np.stack([-wider, np.where(wider > 0, np.nextafter(wider, np.inf), 0.0)], axis=1)
     own = rays.gate_m[:, None]
@@ -120,13 +120,13 @@ def _inside(rays: Rays, ends_m: np.ndarray, levels: Sequence[float], margin_m: f
 
 
 def _informative_returns(informed: Sequence[InformedScene]) -> tuple[np.ndarray, np.ndarray]:
-    """Every return that tells something: its ray (K,) and range (K,) [m]."""
+    """All informative returns: their rays (K,) and ranges (K,) [m]."""
     returns = [scene.informative_returns for scene in informed]
     return tuple(np.concatenate(column) for column in zip(*returns, strict=True))
 
 
 def central_intervals(values: np.ndarray, cell: np.ndarray, cells: int, levels: Sequence[float]) -> np.ndarray:
-    """The central shares of the values in each cell, (K, L, 2), linear between them; NaN for cells without values.
+    """Ends of the central shares of the values in each cell, (K, L, 2), interpolated; NaN for cells without values.
 
     Arguments:
         values: Shape (N,).
@@ -148,10 +148,10 @@ def central_intervals(values: np.ndarray, cell: np.ndarray, cells: int, levels: 
 
 
 def admissible_gates(wanted_m: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
-    """The gates inside bounds that suit the wanted ones best: centre and spread, shape (K,) each [m].
+    """The gates inside bounds that are nearest to the wanted ones: centre and spread, shape (K,) each [m].
 
-    Best as the likelihood of ranges whose interval is the wanted gate, which is what the M-step maximises;
-    a gate that keeps its bounds stays as it is.
+    Nearest by the likelihood of ranges whose interval is the wanted gate, as in the M-step; a gate within its bounds
+    is unchanged.
 
     Arguments:
         wanted_m: Start and end, shape (K, 2) [m].

@@ -1,8 +1,7 @@
 """Information of returns about surfaces: the `informs` of tasks that reconstruct one, and the check of their answers.
 
-A return tells about all points of the surface that are near it, and the more the nearer they are: to choose the rays
-with the largest mean worth is to choose those whose returns are nearest to the points of the surface, as facilities are
-located near their clients.
+A return informs about all points of the surface near it, the more the nearer they are: the rays with the largest mean
+worth are those whose returns are nearest to the points of the surface, as in facility location.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Scene
 from lidardesign.task import Information, Task
 
-# On so many scenes rays are chosen at first, and at most; as many as at first are held back.
+# Numbers of scenes that rays are chosen on, at first and at most; as many as at first are held back.
 FEW_SCENES, MOST_SCENES = 50, 400
-# Rays: what candidates of more tell of scenes takes long, and gigabytes.
+# Rays of a design: the information of candidates for more takes long, and gigabytes.
 MOST_SELECTED = 5000
 MOST_ENTRIES = 10_000_000  # of a table, some 200 MB: scenes of few items may be more
-MOST_ITEMS = 100  # of a scene, drawn at random: what many scenes ask is known well enough by a part of it
-# Of the candidates' returns so many are chosen, or about so many: lengths follow from it, and they are no thresholds.
+MOST_ITEMS = 100  # of a scene, drawn at random: enough over many scenes
+# The share of candidates that is chosen, roughly: it sets the reach of returns, which is no threshold.
 CHOSEN_SHARE = 0.2
-# A return tells about what is nearer than so many mean spacings of the chosen ones: sqrt(5), so that on a surface it is
-# five of the candidates' spacings. Few places of a surface are further than this from all chosen returns.
+# The reach of a return in mean spacings of the chosen ones: sqrt(5), so that on a surface it is five of the
+# candidates' spacings. Few places of a surface are further than this from all chosen returns.
 REACH_SPACINGS = math.sqrt(5.0)
 
 
@@ -39,7 +38,7 @@ _chosen_share = ContextVar("chosen share", default=CHOSEN_SHARE)
 
 @contextmanager
 def choosing(share: float) -> Iterator[None]:
-    """What returns tell is asked for choices of another share of the candidates."""
+    """A context in which information is for choices of another share of the candidates."""
     token = _chosen_share.set(share)
     try:
         yield
@@ -48,15 +47,15 @@ def choosing(share: float) -> Iterator[None]:
 
 
 def informs_rays(task: Task) -> bool:
-    """Whether a task says what returns tell about a scene, so that its rays can be chosen."""
+    """True where a task has a method `informs`, so that its rays can be chosen."""
     return callable(getattr(task, "informs", None))
 
 
 def checked_information(task: Task, scene: Scene, returns: Sequence[Returns]) -> Information:
-    """What the returns of all candidate rays tell about a scene, by a task that says so.
+    """The information of the returns of all candidate rays about a scene, by the task, checked.
 
     Raises:
-        PluginError: The task's code raised, or returned something else, or what cannot be.
+        PluginError: The task's code raised, or returned something else or invalid values.
     """
     where = f"task {task.name}, informs, scene {scene.name}"
     try:
@@ -72,7 +71,7 @@ def checked_information(task: Task, scene: Scene, returns: Sequence[Returns]) ->
 
 
 def require_valid(information: Information, rays: int, frames: int, where: str = "task") -> None:
-    """Raises `PluginError` for pairs of rays and items that there are not, and for numbers that cannot be."""
+    """Raise `PluginError` for indices out of range, mismatched shapes and invalid numbers."""
     pairs, items = len(information.ray), len(information.frame)
     weight = np.ones(items) if information.weight is None else np.asarray(information.weight)
     harm = np.zeros((frames, rays)) if information.harm is None else np.asarray(information.harm)
@@ -110,19 +109,19 @@ def surface_information(
     weight: Sequence[np.ndarray] | None = None,
     dimensions: int = 2,
 ) -> Information:
-    """What returns tell about a surface: max(0, D - distance) of each of its points, D the reach of a return.
+    """Information of returns about a surface: max(0, D - distance) of each of its points, D the reach of a return.
 
-    A return of something else is taken for the surface, and spoils its share of all candidates' returns by its distance
-    from the surface, at most D. That is enough to choose gates that leave it out. Its share of the chosen returns would
-    be more than it spoils: others beside it meet the same thing, and a place without any ray is no better known.
+    A return of something else is taken for the surface: its harm is its distance from the surface, at most D, as a
+    share of all candidates' returns. That is enough to choose gates that exclude it. As a share of the chosen returns
+    it would be overestimated: neighbouring rays hit the same thing, and without rays the place is no better known.
 
     Arguments:
         points_m: Even points of the surface that each of the returns should show, (U, 3) [m]; few are enough. None at
             all where nothing is to be seen.
         returns: Of all candidate rays, through open gates.
-        is_target: Which bodies of the scene are of the surface.
+        is_target: Mask of the scene's bodies that form the surface.
         size: The area of the surface [m^2], the length of a curve [m]; over all of the returns.
-        weight: How much each of the points counts, (U,) each; None: all alike.
+        weight: Weights of the points, (U,) each; None: all alike.
         dimensions: 2 for a surface, 1 for a curve.
     """
     from scipy.spatial import cKDTree
@@ -159,11 +158,11 @@ def surface_information(
 
 
 def return_reach_m(size: float, count: int, dimensions: int = 2) -> float:
-    """How far a return tells: `REACH_SPACINGS` of the mean spacing that a choice's returns have; 0 without returns.
+    """The reach D of a return: `REACH_SPACINGS` times the mean spacing of a choice's returns [m]; 0 without returns.
 
     Arguments:
         size: The area of the surface [m^2], the length of a curve [m].
-        count: How many of the candidates' returns lie on it; `CHOSEN_SHARE` of them, or as `choosing` says, are chosen.
+        count: Number of candidates' returns on it, of which the share `CHOSEN_SHARE`, or that of `choosing`, is chosen.
         dimensions: 2 for a surface, 1 for a curve.
     """
     return REACH_SPACINGS * (size / (_chosen_share.get() * count)) ** (1 / dimensions) if count else 0.0

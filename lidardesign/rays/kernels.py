@@ -1,9 +1,9 @@
-"""Loops over the sparse table of what rays tell about items, compiled by numba.
+"""Loops over the sparse table of the information of rays about items, compiled by numba.
 
-Rays' entries lie one after another: those of ray r are `start[r]` to `start[r + 1]`. An entry says about which item a
-return tells, how much (its worth), and by one bit per gate which gates of the ray let the return through.
-What a choice knows about an item is one number: the largest worth of its entries, or their sum. `table` turns sums into
-what they count, by linear pieces between whole numbers; a table of no length stands for the largest worth.
+Rays' entries lie one after another: those of ray r are `start[r]` to `start[r + 1]`. An entry has the item that a
+return informs about, its worth, and one bit for each gate of the ray that lets the return through.
+The known worth of an item is one number: the largest worth of the chosen entries, or their sum. `table` is phi of sums,
+linear between whole numbers; an empty table stands for the largest worth.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from numba import njit
 
 
 class ByRay(NamedTuple):
-    """The entries of the table in the order of rays, and what items count.
+    """The entries of the table in the order of rays, and the weights of items.
 
     Arguments:
-        start: Where the entries of each ray begin, (N + 1,).
+        start: The first entry of each ray, (N + 1,).
         item, worth, gates: Of each entry, (E,).
         weight: Of each item, (U,).
-        table: What sums of worths count, of no length for the largest worth.
+        table: phi of sums of worths, empty for the largest worth.
     """
 
     start: np.ndarray
@@ -38,7 +38,7 @@ class ByItem(NamedTuple):
     Where an item's largest worth counts, only the first of its entries exceed what is known of it.
 
     Arguments:
-        start: Where the entries of each item begin, (U + 1,).
+        start: The first entry of each item, (U + 1,).
         ray, worth, gates: Of each entry, (E,).
         weight, table: As of `ByRay`.
     """
@@ -53,7 +53,7 @@ class ByItem(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def best_rays(start: np.ndarray, item: np.ndarray, worth: np.ndarray, best: np.ndarray) -> None:
-    """The ray that tells most of each item, one beyond the last for none: fills `best`, (U,)."""
+    """Fill `best`, (U,), with the ray of the largest worth for each item, one beyond the last for none."""
     most = np.zeros(len(best), dtype=worth.dtype)
     best[:] = len(start) - 1
     for ray in range(len(start) - 1):
@@ -87,7 +87,7 @@ def gates_passed(range_m: np.ndarray, ray: np.ndarray, gates_m: np.ndarray, pass
 
 @njit(cache=True, nogil=True)
 def counted(known: float, table: np.ndarray) -> float:
-    """What a known worth counts: itself, or the concave table of sums at it."""
+    """phi of a known worth: itself, or the concave table of sums at it."""
     last = len(table) - 1
     if last < 0:
         return known
@@ -99,14 +99,14 @@ def counted(known: float, table: np.ndarray) -> float:
 
 @njit(cache=True, nogil=True)
 def gain(known: float, worth: float, table: np.ndarray) -> float:
-    """What a further worth adds to what is known."""
+    """The gain in phi by a further worth."""
     after = max(known, worth) if len(table) == 0 else known + worth
     return counted(after, table) - counted(known, table)
 
 
 @njit(cache=True, nogil=True)
 def gate_gains(items: ByItem, known: np.ndarray, gains: np.ndarray) -> None:
-    """What each gate of every ray would add to what is known: fills `gains`, shape (N, G)."""
+    """Fill `gains`, shape (N, G), with the weighted gain of each gate of every ray."""
     gains[:] = 0.0
     for place in range(len(known)):
         for index in range(items.start[place], items.start[place + 1]):
@@ -123,7 +123,7 @@ def gate_gains(items: ByItem, known: np.ndarray, gains: np.ndarray) -> None:
 def best_gate(
     gains: np.ndarray, cost: np.ndarray, bits: np.ndarray, may_fire: np.ndarray, room_mbps: float
 ) -> tuple[int, int, float]:
-    """The ray that may fire (N,) and the gate, for no more bits, that add most; and what they add, -inf for none."""
+    """The ray of those that may fire (N,) and the gate, within bits, of the largest net gain, and it; -inf for none."""
     ray, gate, most = 0, 0, -np.inf
     for one in range(gains.shape[0]):
         if may_fire[one]:
@@ -136,7 +136,7 @@ def best_gate(
 
 @njit(cache=True, nogil=True)
 def know(entries: ByRay, chosen: np.ndarray, known: np.ndarray) -> None:
-    """What chosen gates, -1 for none, (N,), tell about each item: fills `known`, shape (U,)."""
+    """Fill `known`, shape (U,), with the known worth of each item by chosen gates, -1 for none, (N,)."""
     known[:] = 0.0
     for ray in range(len(entries.start) - 1):
         if chosen[ray] < 0:
@@ -158,10 +158,10 @@ def change_choice(
     known: np.ndarray,
     gains: np.ndarray,
 ) -> None:
-    """Adds a ray through a gate, or takes it out; keeps what is known (U,) and what all gates would add (N, G) true.
+    """Add a ray with a gate, or remove it, and update the known worths (U,) and the gains of all gates (N, G).
 
-    `chosen` holds the gates of the other rays, -1 for none, (N,). Only items of which something else is known
-    afterwards are followed to the rays that tell of them.
+    `chosen` holds the gates of the other rays, -1 for none, (N,). Only items whose known worth changes are followed
+    to their rays.
     """
     sums = len(entries.table) > 0
     for own in range(entries.start[ray], entries.start[ray + 1]):
@@ -200,7 +200,7 @@ def change_choice(
 
 @njit(cache=True, nogil=True)
 def weigh_excess(items: ByItem, weight: np.ndarray, threshold: np.ndarray, excess: np.ndarray) -> None:
-    """By how much each gate's worths exceed the items' thresholds, weighted: fills `excess`, shape (N, G)."""
+    """Fill `excess`, shape (N, G), with the weighted excess of each gate's worths over the items' thresholds."""
     excess[:] = 0.0
     for place in range(len(threshold)):
         for index in range(items.start[place], items.start[place + 1]):
@@ -214,7 +214,7 @@ def weigh_excess(items: ByItem, weight: np.ndarray, threshold: np.ndarray, exces
 
 @njit(cache=True, nogil=True)
 def count_exceeding(entries: ByRay, chosen: np.ndarray, threshold: np.ndarray, count: np.ndarray) -> None:
-    """How many of the chosen rays exceed each item's threshold: fills `count`, shape (U,)."""
+    """Fill `count`, shape (U,), with the number of chosen rays whose worth exceeds each item's threshold."""
     count[:] = 0
     for ray in range(len(entries.start) - 1):
         if chosen[ray] >= 0:
@@ -227,17 +227,17 @@ def count_exceeding(entries: ByRay, chosen: np.ndarray, threshold: np.ndarray, c
 def group_entries(
     entries: ByRay, first: np.ndarray, members: np.ndarray, gates: int, start: np.ndarray, fills: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The entries of groups of rays, one for each worth that some gates of a group have of an item.
+    """The entries of groups of rays, one for each distinct worth of a group's gates about an item.
 
     Arguments:
         entries: Those of the rays.
-        first, members: Where the rays of each group begin, (M + 1,), and all groups' rays.
-        gates: How many each ray has.
-        start: Where the entries of each group begin, (M + 1,); filled unless `fills`.
-        fills: Whether the entries are wanted; else only their number.
+        first, members: The first member of each group, (M + 1,), and all groups' rays.
+        gates: Number of gates per ray.
+        start: The first entry of each group, (M + 1,); filled unless `fills`.
+        fills: Whether to return the entries; else only `start` is filled.
 
     Returns:
-        Item, worth and gates of each entry, of no length unless `fills`.
+        Item, worth and gates of each entry, empty unless `fills`.
     """
     count = start[-1] if fills else 0
     item, worth = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.float32)
@@ -258,7 +258,7 @@ def group_entries(
                 for gate in range(gates):
                     if entries.gates[entry] >> gate & 1:
                         old, more = told[about, gate], entries.worth[entry]
-                        # beyond the end of the table more counts no more, and bounds are the lower for it
+                        # beyond its end the table is constant: capping changes no F and tightens bounds
                         told[about, gate] = min(old + more, last) if last >= 0 else max(old, more)
         for about in touched[:many]:
             for gate in range(gates):
@@ -282,12 +282,12 @@ def group_entries(
 def gather_parts(
     entries: ByRay, range_m: np.ndarray, first: np.ndarray, members: np.ndarray, gate_m: np.ndarray, told: np.ndarray
 ) -> None:
-    """What parts tell of each item: the largest worth of their rays' returns inside their gates, or the sum.
+    """Worth of parts about each item: the largest of their rays' returns inside their gates, or the sum.
 
     Arguments:
         entries: Those of the rays.
         range_m: The range of each entry's return, (E,) [m].
-        first, members: Where the rays of each part begin, (M + 1,), and all parts' rays.
+        first, members: The first member of each part, (M + 1,), and all parts' rays.
         gate_m: Of each part, (M, 2) [m].
         told: Filled, (M, U).
     """

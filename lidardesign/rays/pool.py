@@ -1,10 +1,10 @@
-"""What training scenes show of candidate rays: found once, kept in the run, and read by every fit that asks it again.
+"""Information of candidate rays about training scenes: computed once, cached in the run, and reused by later fits.
 
-Where origins are given a change of constraints changes neither the scenes nor what rays return there. So rays are drawn
-from the whole density, more than any design chooses from, and a fit picks those inside its sensors. Where origins are
-free the candidates of the last fit are kept: another bandwidth, or other gates, asks of the same ones. The file says
-what it was made of: with other rays, another mesh, setting, seed or version of the program or the task it is made anew,
-and what is read is bit for bit what is found without it.
+Where origins are given a change of constraints changes neither the scenes nor the returns there. So rays are drawn from
+the whole density, more than any design chooses from, and a fit picks those inside its sensors. Where origins are free
+the candidates of the last fit are kept for another bandwidth or other gates. The file has a hash of all that it depends
+on: with other rays, another mesh, setting, seed or version of the program or the task it is computed anew, and cached
+information is bit for bit that computed without the cache.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ MOST_BYTES = 300_000_000
 
 @dataclass(frozen=True, eq=False)
 class CandidatePool:
-    """Rays drawn from the whole density, and what they tell.
+    """Rays drawn from the whole density, with their information.
 
     Arguments:
         points: Their design points, shape (N, 6), in an order in which any first few are a fair draw.
-        visits: Which of them are at each value of the condition, one after the other.
-        informed: What their returns tell about the scenes that rays are chosen on.
-        held_back: The same of scenes that are held back.
+        visits: Slices of them at each value of the condition.
+        informed: Information about the scenes that rays are chosen on.
+        held_back: Information about scenes that are held back.
     """
 
     points: np.ndarray
@@ -69,7 +69,7 @@ class CandidatePool:
 def pool_of(
     run: RunFolder, samples: Samples, training: TrainingScenes, progress: Callable[[str], None]
 ) -> CandidatePool:
-    """The pool of a run: rays drawn from the whole density, and what scenes show of them.
+    """The pool of a run: rays drawn from the whole density, with their information.
 
     Arguments:
         run: The run, whose sensors stand at one place but for conditions.
@@ -78,7 +78,7 @@ def pool_of(
         progress: Called with every step.
 
     Raises:
-        DataError: No ray tells anything about the scenes.
+        DataError: No ray has information about the scenes.
     """
     conditions, counts = run.conditions(), sorted(run.task.defaults.rays)
     size = POOL_FACTOR * CANDIDATES_PER_RAY * min(counts[-1], MOST_SELECTED)
@@ -101,7 +101,7 @@ def pool_of(
 def cached_information(
     selection: Selection, training: TrainingScenes, count: int, progress: Callable[[str], None]
 ) -> tuple[list[InformedScene], list[InformedScene]]:
-    """See `inform_enough`: as it is kept in the run, or found anew and kept if it can be written."""
+    """As `inform_enough`: from the run's cache, else computed and cached where it can be written."""
     path, key = training.run.folder / FILE_NAME, _key(selection, training, count)
     with contextlib.suppress(LidardesignError, KeyError, ValueError):
         arrays = read_npz(path, SAMPLES)
@@ -120,7 +120,7 @@ def cached_information(
 
 
 def _key(selection: Selection, training: TrainingScenes, count: int) -> str:
-    """A hash of everything that information follows from."""
+    """A hash of everything that information depends on."""
     run, rays = training.run, selection.rays
     task = type(run.task)
     source = inspect.getsourcefile(task)
@@ -136,7 +136,7 @@ def _key(selection: Selection, training: TrainingScenes, count: int) -> str:
         "seed": training.seed,
         "versions": versions(),
         "task": [distribution_of(run.task.name), task.__module__, task.__qualname__],
-        # of programs that are being written: their source as well as its version
+        # a version says nothing of sources under development
         "source": [_stamp(path) for folder in folders for path in sorted(folder.rglob("*.py"))],
     }
     return hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()

@@ -1,8 +1,8 @@
 """Candidate rays inside sensors: the second step from a density to rays.
 
-They are drawn from the density's samples by weight, each at most once. How far apart rays should be is for the choice
-to find: candidates that were spaced evenly beforehand (by Lloyd's cells) gave designs that were 5 to 9 % worse on
-faces, at equal rays and bandwidth, over three seeds.
+They are drawn from the density's samples by weight, each at most once. Spacing is left to the choice:
+candidates that were spaced evenly beforehand (by Lloyd's cells) gave designs that were 5 to 9 % worse on faces, at
+equal rays and bandwidth, over three seeds.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ ROUNDING_M = SLACK
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
-    """What candidates are drawn from.
+    """A source of candidate rays: the density's samples inside sensors.
 
     Arguments:
-        sensors: Those that fire them.
-        rules: What constraints ask of them: where regions may be.
+        sensors: The sensors that fire them.
+        rules: Their constraints, which bound regions of origins.
         level: The share of each marginal that fields of view and gates hold.
-        samples: Of the density, at all values of its conditions.
+        samples: Samples of the density, at all values of its conditions.
     """
 
     sensors: Sequence[Sensor]
@@ -53,13 +53,13 @@ class Proposals:
     def draw(
         self, count: int, at: Mapping[str, float], generator: np.random.Generator, least: np.ndarray | None = None
     ) -> Rays:
-        """So many candidates at a value of the condition; even ones where too few samples are inside the sensors.
+        """Draw candidates at a value of the condition; even rays fill up where too few samples are inside the sensors.
 
         Arguments:
-            count: How many.
+            count: Their number.
             at: The value, by the condition's name.
-            generator: Decides which samples are drawn.
-            least: How many each sensor has at least, (S,), whatever their number then is; None leaves it open.
+            generator: Source of the draw.
+            least: Least number of each sensor, (S,), which may raise their number; None sets none.
         """
         samples, least = nearest_samples(self.samples, at), np.zeros(len(self.sensors)) if least is None else least
         sensors = self.sensors_at(at)
@@ -86,7 +86,7 @@ class Proposals:
 
 
 def draw_order(weights: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """The order in which all are drawn by weight (N,), none twice: any first few are such a draw of so many.
+    """A random order by weight (N,): its first n are a weighted draw of n without replacement.
 
     References:
         Weighted random sampling with a reservoir, Efraimidis and Spirakis 2006.
@@ -96,12 +96,12 @@ def draw_order(weights: np.ndarray, generator: np.random.Generator) -> np.ndarra
 
 
 def first_candidates(owner: np.ndarray, count: int, least: np.ndarray) -> np.ndarray:
-    """The first so many of candidates in their order, and further ones of sensors that have too few among them.
+    """The first `count` candidates, and further ones of sensors that have too few among them.
 
     Arguments:
         owner: The sensor of each, (N,).
-        count: How many.
-        least: How many each sensor has at least, where there are as many, (S,).
+        count: Number of candidates.
+        least: Least number of each sensor, where it has as many, (S,).
 
     Returns:
         Their indices, ascending.
@@ -121,7 +121,7 @@ def rays_of_points(points: np.ndarray, sensor: np.ndarray, sensors: Sequence[Sen
 
 
 def nearest_samples(samples: Samples, at: Mapping[str, float], share: float = NEAREST_SHARE) -> Samples:
-    """The share of samples whose condition is nearest to a value, as if it were there; all without a condition."""
+    """The share of samples whose condition is nearest to a value, moved to it; all samples without a condition."""
     if not at:
         return samples
     ((name, value),) = at.items()
@@ -139,7 +139,7 @@ def owners(
     """The sensor that fires each design point, -1 where none does, (N,), and the points as they are fired, (N, 6).
 
     A point belongs to the sensor whose component is densest there, the first where they tie, if that sees it. Rays of
-    a sensor at one place are aimed from it at the scene point that is observed; in a region they start where they do.
+    a sensor at one place are re-aimed from it at the observed scene point; in a region they keep their origins.
 
     Arguments:
         sensors: S of them, with the shares of the rays as weights.
@@ -194,12 +194,12 @@ def principal_axes(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
 def _in_region(
     origins_m: np.ndarray, away: np.ndarray, rules: SensorRules, level: float, space: DesignSpace
 ) -> np.ndarray:
-    """Which origins (N, 3) lie in a region: in its ellipsoid of the level, and where constraints allow it, (N,)."""
+    """Mask of the origins (N, 3) in a region: in its ellipsoid of the level and within constraints, (N,)."""
     # slow to import
     from scipy.special import chdtri
 
     low, high = origin_box(rules, space)
     inside = ((origins_m >= low - ROUNDING_M) & (origins_m <= high + ROUNDING_M)).all(axis=1)
     inside &= ~inside_excluded(origins_m, rules)
-    # so many standard deviations within which the level of a normal vector of so many dimensions lies
+    # the quantile of chi squared: the ellipsoid holds the level of a normal vector
     return inside & (np.square(away).sum(axis=1) <= float(chdtri(away.shape[1], 1 - level)))

@@ -1,7 +1,7 @@
 """Rays chosen from candidates, for several numbers of rays: the fourth step from a density to rays.
 
-Every number of rays is a choice of its own: swaps leave no prefixes. Where nobody says on how many scenes, they are
-doubled until a choice loses little more on scenes held back than on its own.
+Every number of rays is a choice of its own: after swaps, smaller choices are no prefixes of larger ones. The number of
+scenes is doubled until the loss of a choice is little more on scenes held back than on its own.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from lidardesign.run.clock import phase
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 
-# Where bandwidth has no limit ten percent more of it must bring two percent less loss, or so much more worth
+# Where bandwidth has no limit, ten percent more of it must bring two percent less loss or more worth.
 SHARE_PER_BANDWIDTH = 0.2
-# Of the loss on scenes held back: what twice the scenes must have gained, or a choice lose less on its own scenes, for
-# twice as many again to gain about a hundredth.
+# Scenes are enough once doubling them lowered the loss on scenes held back by less than the first share, and the loss
+# on its own scenes is lower by at most the second; doubling again would gain about a hundredth.
 SMALLEST_GAIN, SMALLEST_GAP = 0.02, 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What rays are chosen from, and for.
+    """A choice of rays to be made: candidates, their gates, and limits.
 
     Arguments:
         rays: Candidates with the widest gates that they may have.
-        visits: Which of them fire at each of the values of a condition, one after the other; all at once without.
-        gates: A few gates for each of some rays, (N, G, 2) [m], of what their returns tell about scenes.
-        bandwidth: What reading out costs.
-        limit_mbps: The most that it may cost; inf without a limit, where bits have a price.
+        visits: Slices of them that fire at each value of a condition; one slice of all without a condition.
+        gates: A few gates for each of some rays, (N, G, 2) [m], from their information about scenes.
+        bandwidth: The read-out model.
+        limit_mbps: The largest bandwidth; inf without a limit, where bits have a price [Mbit/s].
         shares: The share of the rays that each sensor fires, (S,); None leaves it to the choice.
         is_shared: Whether all rays of a sensor have one gate.
         each_fires: Whether every sensor has to fire a ray.
@@ -59,7 +59,7 @@ class Selection:
     name: str = "rays"
 
     def counts(self, count: int, visit: slice = slice(None)) -> RayCounts:
-        """How many of the candidates, or of some, may be chosen at each value of a condition."""
+        """Numbers of candidates, or of a slice of them, to choose at each value of a condition."""
         place = np.repeat(np.arange(len(self.visits)), [one.stop - one.start for one in self.visits])[visit]
         if self.shares is None:
             owner = self.rays.sensor[visit] if self.each_fires else None
@@ -68,15 +68,15 @@ class Selection:
         return RayCounts(place * len(self.shares) + self.rays.sensor[visit], most)
 
     def coverage(self, informed: Sequence[InformedScene], gates_m: np.ndarray) -> Coverage:
-        """What the candidates tell about scenes, with the cost of their gates."""
+        """Information of the candidates about scenes, with the bandwidth of their gates."""
         one_bin = self.bandwidth.mbps_of_widths(np.zeros(1))
         return gather(informed, gates_m, one_bin * self.bandwidth.bins(gates_m[..., 1] - gates_m[..., 0]))
 
     def check_informative(self, coverage: Coverage, scenes: int) -> None:
-        """Refuse candidates none of which tells anything.
+        """Refuse candidates without any information.
 
         Raises:
-            DataError: So it is.
+            DataError: None informs about any item.
         """
         if not len(coverage.item):
             raise DataError(
@@ -87,12 +87,12 @@ class Selection:
 
     @phase("choice")
     def choices(self, coverage: Coverage, count: int, passes: int = MOST_PASSES) -> list[Choice]:
-        """The choice of so many rays within the bandwidth, at each value of a condition.
+        """The choice of `count` rays within the bandwidth, at each value of a condition.
 
         Arguments:
-            coverage: What the candidates tell.
-            count: How many fire.
-            passes: How often each ray may be swapped.
+            coverage: Information of the candidates.
+            count: Number of rays.
+            passes: Largest number of swaps of each ray.
 
         Raises:
             InfeasibleError: So many rays do not fit.
@@ -120,11 +120,11 @@ class Selection:
         return choices
 
     def _price(self, coverage: Coverage, count: int) -> float:
-        """The price at which more bandwidth has to bring so much of the loss left, or of the worth gained if less.
+        """The price of bandwidth, from a share of the remaining loss or of the net worth, whichever is less.
 
-        Worth is what the rays of a free choice gain, less their harm: all that there is to pay with. Where little can
-        be known, nearly everything is left to lose, and a share of that would price out the rays that see something;
-        at a share of the worth no best choice gives up more than this share.
+        The net worth is that of a choice without a price, less its harm. Where little can be known, nearly all loss
+        remains, and a share of it would price out informative rays; at a share of the worth the best choice gives up no
+        more than this share.
         """
         free = choose(coverage, self.counts(count), passes=0)
         gained = free.worth - free.harm
@@ -133,7 +133,7 @@ class Selection:
 
     @phase("certificate")
     def certified(self, coverage: Coverage, choices: Sequence[Choice]) -> tuple[float, float]:
-        """What choices lose, and what any others of no more bandwidth lose at least.
+        """The loss of choices, and a lower bound of the loss of any others of no more bandwidth.
 
         Values of a condition share no items, so their losses sum.
         """
@@ -142,17 +142,17 @@ class Selection:
             found = certify(coverage.of_rays(visit), self.counts(len(choice.rays), visit), choice, budget_mbps=limit)
             worth, gap = worth + choice.worth - choice.harm, gap + found.bound - found.value
         loss = coverage.complete - worth
-        return loss, min(max(loss - gap, 0.0), loss)  # nothing loses less than nothing
+        return loss, min(max(loss - gap, 0.0), loss)  # losses are not negative
 
 
 def _shared_gates(coverage: Coverage, choice: Choice, sensor: np.ndarray, limit_mbps: float) -> np.ndarray:
-    """For each sensor the gate that its chosen rays share best, (S,): one sensor's after the other, until none gains.
+    """The best common gate of each sensor's chosen rays, (S,), by coordinate ascent over sensors.
 
     Arguments:
-        coverage: What the candidates tell through their sensors' gates, from wide to narrow.
-        choice: Of rays with gates of their own, and the price of bandwidth.
+        coverage: Information of the candidates through their sensors' gates, from wide to narrow.
+        choice: A choice of rays with gates of their own, and the price of bandwidth.
         sensor: The sensor of each candidate, (N,).
-        limit_mbps: What all rays may cost; narrower gates are taken where they cost more.
+        limit_mbps: The largest bandwidth; gates are narrowed until they keep it [Mbit/s].
     """
     gates, fires = coverage.shape[1], choice.gate >= 0
     shared = np.zeros(int(sensor.max()) + 1, dtype=np.intp)
@@ -187,14 +187,14 @@ def _gate_of(choices: Sequence[Choice]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """Chosen rays, and how far from the best they may be.
+    """Chosen rays with their certificate.
 
     Arguments:
-        rays: Those of each value of a condition, in the order of their sensors.
+        rays: The rays of each value of a condition, in the order of their sensors.
         certificate: `value` and `bound` of the loss on the scenes chosen on, `gap`, `held_back_value`, the numbers of
             `rays`, `candidates`, `gates` and `scenes`, and `curve`, the price curve as pairs of Mbit/s and loss; None
             where it was not asked for.
-        silent: The share of scenes held back about which the rays tell nothing.
+        silent: The share of scenes held back about which the rays have no information.
     """
 
     rays: Sequence[Rays]
@@ -213,15 +213,15 @@ def select(
     """The rays that are chosen at each of some numbers of rays, ascending.
 
     Arguments:
-        selection: What they are chosen from.
-        informed: What the candidates' returns tell about the scenes that they are chosen on.
-        held_back: The same of scenes that are held back.
+        selection: The candidates and limits.
+        informed: Information about the scenes that they are chosen on.
+        held_back: Information about scenes that are held back.
         counts: Numbers of rays.
         certified: Those of them for which a bound is found.
         progress: Called with every step.
 
     Raises:
-        DataError: No candidate tells anything about the scenes.
+        DataError: No candidate has information about the scenes.
         InfeasibleError: A bandwidth in which no choice of so many rays fits.
     """
     gates_m = selection.gates(selection.rays, selection.visits, informed)
@@ -229,7 +229,7 @@ def select(
     selection.check_informative(coverage, len(informed))
     rays = selection.rays
     if selection.is_shared:
-        # which gate sensors share, swaps hardly change
+        # swaps hardly change the best common gates
         choices = selection.choices(coverage, counts[len(counts) // 2], passes=0)
         choice = replace(choices[0], gate=_gate_of(choices))
         own = _shared_gates(coverage, choice, rays.sensor, selection.limit_mbps)[rays.sensor]
@@ -265,10 +265,10 @@ def select(
 
 
 def silent_share(scenes: Sequence[InformedScene], gate_m: np.ndarray) -> float:
-    """The share of scenes about which no return inside its ray's gate tells anything, 0 without scenes.
+    """The share of scenes without an informative return inside its ray's gate, 0 without scenes.
 
     Arguments:
-        scenes: What all rays tell through open gates.
+        scenes: Information of all rays through open gates.
         gate_m: The gate of each ray, closed where it does not fire, (N, 2) [m].
     """
     heard = [(gate_m[one.ray, 0] <= one.range_m) & (one.range_m < gate_m[one.ray, 1]) for one in scenes]
@@ -278,21 +278,21 @@ def silent_share(scenes: Sequence[InformedScene], gate_m: np.ndarray) -> float:
 def inform_enough(
     selection: Selection, training: TrainingScenes, count: int, progress: Callable[[str], None]
 ) -> tuple[list[InformedScene], list[InformedScene]]:
-    """What candidates tell about as many scenes as a choice of so many rays needs, and about others held back.
+    """Information of candidates about as many scenes as a choice of `count` rays needs, and about scenes held back.
 
     Arguments:
         selection: The candidates.
         training: The scenes.
-        count: How many rays will fire.
+        count: Number of rays that will fire.
         progress: Called with every step.
 
     Raises:
-        DataError: No candidate tells anything about the scenes.
+        DataError: No candidate has information about the scenes.
     """
     rays, visits = selection.rays, selection.visits
-    # each of a few values of a condition sees little of a scene
+    # with several values of a condition each sees little of a scene
     most_scenes = MOST_SCENES * (1 + (len(visits) > 1))
-    # how many scenes are needed hardly depends on gates, bits and sensors: so what is kept serves other choices too
+    # the scenes needed hardly depend on gates, bits and sensors: the cached information serves other choices too
     selection = Selection(rays, visits, selection.gates, Bandwidth(), share=selection.share, name=selection.name)
     open_gates = rays.gate_m[:, None]
     held_back = training.inform(HELD_BACK, rays, visits, 0, FEW_SCENES, selection.share)
@@ -313,11 +313,11 @@ def inform_enough(
 
 
 def are_enough(before: float, loss: float, own: float) -> bool:
-    """Whether a choice on twice the scenes would lose hardly less on others.
+    """True where doubling the scenes of a choice would hardly lower its loss on others.
 
     Arguments:
-        before: What the choice on half the scenes loses on scenes held back.
-        loss: What this one loses there.
-        own: What it loses on the scenes that it was chosen on.
+        before: Loss of the choice on half the scenes, on scenes held back.
+        loss: Loss of this choice there.
+        own: Its loss on the scenes that it was chosen on.
     """
     return loss >= (1 - SMALLEST_GAIN) * before and loss - own <= SMALLEST_GAP * loss

@@ -1,4 +1,4 @@
-"""Training scenes that nothing was learned from, and what returns of candidate rays tell about them by the task."""
+"""Training scenes that the density was not learned from, and the information of candidate rays about them."""
 
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ MARGIN_SIGMAS = 2.0  # by which gates are longer than what training scenes retur
 # Chosen on, and held back from the choice.
 CHOICE, HELD_BACK = "choice", "held back"
 Informs = Callable[[Scene, Sequence[Returns]], Information]
-LARGEST = np.zeros(0)  # the table of sums of items that count the largest worth
+LARGEST = np.zeros(0)  # the table of sums of items whose largest worth counts
 
 
 class TrainingScenes:
-    """The scenes of a run that rays are chosen on, without end, for each purpose.
+    """Endless streams of a run's scenes that rays are chosen on, one for each purpose.
 
     Arguments:
-        run: The run, whose task says what returns tell.
+        run: The run, whose task has the method `informs`.
         seed: Root of the random streams.
-        starmap: How scenes are informed: `itertools.starmap`, or by workers.
-        keeps: Whether what is found may be kept in the run.
+        starmap: Map over scenes: `itertools.starmap`, or by workers.
+        keeps: Whether information may be cached in the run.
     """
 
     def __init__(self, run: RunFolder, seed: int, starmap: Starmap = itertools.starmap, *, keeps: bool = False) -> None:
         self.run, self.seed, self._starmap, self.keeps = run, seed, starmap, keeps
         self._first: dict[str, list[Scene]] = {}
-        # of every draw so far, by purpose, and the last draw: what is skipped need not be made again
+        # sizes of all draws so far, by purpose, and the last draw: skipped draws are not made again
         self._sizes: dict[str, list[int]] = {}
         self._last: dict[str, tuple[int, list[Scene]]] = {}
 
     @property
     def margin_m(self) -> float:
-        """By how much gates are longer at both ends than what training scenes returned [m]."""
+        """The margin of gates at both ends beyond the returns of training scenes [m]."""
         return MARGIN_SIGMAS * self.run.config.density.sigma_m
 
     def scenes(self, purpose: str, start: int = 0) -> Iterator[Scene]:
-        """Scenes without end from a number on, drawn with further seeds for each purpose."""
+        """An endless stream of scenes from number `start`, drawn with further seeds for each purpose."""
         sizes = self._sizes.setdefault(purpose, [])
         for draw in itertools.count():
             if draw == len(sizes) or start < sizes[draw]:
@@ -71,7 +71,7 @@ class TrainingScenes:
             start = max(start - sizes[draw], 0)
 
     def first(self, purpose: str) -> list[Scene]:
-        """The first few scenes; they are kept, for whoever asks again."""
+        """The first `FEW_SCENES` scenes of a purpose, cached."""
         if purpose not in self._first:
             self._first[purpose] = list(itertools.islice(self.scenes(purpose), FEW_SCENES))
         return self._first[purpose]
@@ -80,12 +80,12 @@ class TrainingScenes:
     def inform(
         self, purpose: str, rays: Rays, visits: Sequence[slice], start: int, stop: int, share: float = CHOSEN_SHARE
     ) -> list[InformedScene]:
-        """What returns of some rays tell about the scenes from one number to before another.
+        """Information of rays about the scenes `start` to before `stop`.
 
         Arguments:
-            purpose: What the scenes are for.
+            purpose: The purpose of the scenes.
             rays: Candidates with the widest gates that they may have.
-            visits: Which of them fire at each condition.
+            visits: Slices of them that fire at each condition.
             start, stop: Numbers of scenes.
             share: The share of the candidates that will be chosen.
         """
@@ -99,20 +99,20 @@ class TrainingScenes:
 def informed_scene(
     task: Task, rays: Rays, visits: Sequence[slice], share: float, seed: int, purpose: str, scene: Scene, number: int
 ) -> InformedScene:
-    """What returns tell about one scene, of a random draw of its items."""
+    """Information of rays about a random draw of one scene's items."""
     with choosing(share):
         found = inform(scene, rays, visits, partial(checked_information, task))
     return found.with_fewer_items(MOST_ITEMS, random_generator(seed, "items", purpose, number))
 
 
 def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) -> InformedScene:
-    """What a task says of the returns of rays in a scene, through the rays' own gates.
+    """A task's information of the returns of rays in a scene, through the rays' own gates.
 
     Arguments:
         scene: The scene.
         rays: All candidates.
-        visits: The rays at each condition, one after the other; at the other conditions these have no returns.
-        informs: What the task says of a scene's returns.
+        visits: Slices of the rays at each condition; at the other conditions they have no returns.
+        informs: The task's information of a scene's returns.
     """
     fired = simulate_many(scene, [rays.subset(visit) for visit in visits])
     returns = [pad_returns(rays, visit, frame) for visit, frames in zip(visits, fired, strict=True) for frame in frames]
@@ -120,7 +120,7 @@ def inform(scene: Scene, rays: Rays, visits: Sequence[slice], informs: Informs) 
 
 
 def pad_returns(rays: Rays, fired: slice, returns: Returns) -> Returns:
-    """The returns of some rays among all rays, of which the others return nothing."""
+    """The returns of a slice of the rays extended to all rays, of which the others miss."""
     outcome, range_m, body = np.full(len(rays), Outcome.MISS), np.full(len(rays), np.nan), np.full(len(rays), -1)
     outcome[fired], range_m[fired], body[fired] = returns.outcome, returns.range_m, returns.body
     return Returns(rays, outcome, range_m, body, returns.frame)
@@ -128,18 +128,18 @@ def pad_returns(rays: Rays, fired: slice, returns: Returns) -> Returns:
 
 @dataclass(frozen=True, eq=False)
 class InformedScene:
-    """What a task says of a scene's returns, with the ranges that say through which gates they are heard.
+    """A task's information of a scene's returns, with their ranges, from which gates follow.
 
     Arguments:
         ray, item: Of each pair, int32 (E,).
         worth: Above 0, float32 (E,).
         range_m: The range of its return, (E,) [m].
-        weight: What items count, (U,); they sum to 1.
-        spoiling: Rays whose returns spoil something, one entry per return, (H,).
-        harm, harm_range_m: What each of these spoils, and its range [m], (H,).
+        weight: Weights of items, summing to 1, (U,).
+        spoiling: Rays of returns with harm, one entry per return, (H,).
+        harm, harm_range_m: Harm of these returns, and their ranges [m], (H,).
         sums: The table of sums, or `LARGEST`.
-        complete: What an item counts of which nothing is left to know.
-        is_repeated: Whether a ray may tell of an item by several frames, of which the largest worth counts.
+        complete: phi of an item with complete information.
+        is_repeated: Whether a ray may inform about an item in several frames, of which the largest worth counts.
         unit: Of worth.
     """
 
@@ -158,10 +158,10 @@ class InformedScene:
 
     @classmethod
     def of(cls, information: Information, returns: Sequence[Returns]) -> InformedScene:
-        """What is kept of the returns of all candidate rays, through open gates.
+        """The information of the returns of all candidate rays, through open gates.
 
         Raises:
-            PluginError: Pairs, weights or harm that cannot be.
+            PluginError: Invalid pairs, weights or harm.
         """
         range_m = np.stack([frame.range_m for frame in returns])
         require_valid(information, range_m.shape[1], len(returns))
@@ -181,7 +181,7 @@ class InformedScene:
             harm=harm[spoiling],
             harm_range_m=range_m[spoiling],
             sums=LARGEST if information.sums is None else np.asarray(information.sums, dtype=np.float64),
-            # of a scene in which nothing is to be seen nothing is left to know
+            # a scene without items has no loss
             complete=information.complete if count else 0.0,
             is_repeated=information.seen_in is not None,
             unit=information.unit,
@@ -197,7 +197,7 @@ class InformedScene:
         return ray[is_first].astype(np.intp), range_m[is_first]
 
     def of_rays(self, number: np.ndarray) -> InformedScene:
-        """The same of some rays alone, which get other numbers, (N,) to (N,); -1 for those that are left out."""
+        """The information of some rays under new numbers (N,), -1 for rays that are left out."""
         kept, spoils = number[self.ray] >= 0, number[self.spoiling] >= 0
         return replace(
             self,
@@ -211,7 +211,7 @@ class InformedScene:
         )
 
     def with_fewer_items(self, most: int, generator: np.random.Generator) -> InformedScene:
-        """A random draw of at most so many items, each as often as it counts; all where there are no more."""
+        """The information about a random draw of at most `most` items by weight; about all where there are no more."""
         if len(self.weight) <= most:
             return self
         drawn, times = np.unique(systematic_draw(self.weight, most, generator), return_counts=True)

@@ -1,7 +1,7 @@
-"""Chosen rays in the report: how far from the best they may be, what bandwidth buys, and the proxy beside the score.
+"""Chosen rays in the report: certificates, the price curve of bandwidth, and the proxy compared with the score.
 
-What rays are chosen by is a proxy, of training scenes. Its value on scenes that were held back from the choice stands
-beside the score of the same rays on held-out scenes; where both order what was tried alike, the proxy is a good one.
+Rays are chosen by a proxy of the score, on training scenes. Its value on scenes held back from the choice is compared
+with the score of the same rays on held-out scenes; where both order choices alike, the proxy is a good one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Points = Sequence[tuple[float, float]]
 
 
 def choice_section(designs: Sequence[DesignSpec], evaluation: Evaluation, looks: Mapping[str, Series]) -> str:
-    """Certificates of all designs with chosen rays, with both figures; empty where there is none."""
+    """The section of certificates of all designs with chosen rays, with both figures; empty where there is none."""
     chosen = {design.name: found for design in designs if (found := certificates_of(design))}
     if not chosen:
         return ""
@@ -74,11 +74,11 @@ def choice_section(designs: Sequence[DesignSpec], evaluation: Evaluation, looks:
 
 
 def correlation_sentence(pairs: Points, evaluation: Evaluation) -> str:
-    """The rank correlation of proxy and score over what was tried (Spearman), in a sentence; empty for too few to say.
+    """A sentence with the rank correlation of proxy and score over choices (Spearman); empty for too few.
 
     Arguments:
-        pairs: The proxy's loss and the score of each choice that was tried.
-        evaluation: Whose scores they are.
+        pairs: The proxy's loss and the score of each choice.
+        evaluation: The evaluation of the scores.
     """
     losses, scores = np.array(pairs).reshape(-1, 2).T
     if len(pairs) < FEWEST_POINTS or np.ptp(losses) == 0 or np.ptp(scores) == 0:
@@ -107,7 +107,7 @@ def _table(chosen: Mapping[str, Sequence[Mapping[str, Any]]], axis: str) -> str:
 
 
 def _curve(entries: Sequence[Mapping[str, Any]]) -> Points:
-    """The price curve of the number of rays that has one; nothing that a file does not hold whole."""
+    """The first undamaged price curve of the entries; empty without one."""
     for entry in entries:
         points = entry.get("curve")
         if isinstance(points, list) and all(isinstance(point, list) and _numbers(point) for point in points):

@@ -1,9 +1,8 @@
-"""The learned density as it can be looked at: over each dimension alone, and in space.
+"""Views of the learned density: marginals over each dimension, and projections in space.
 
-A density over six dimensions has no picture. Its marginals have: how much of it lies at each azimuth, elevation,
-range and origin, beside the same of designs, whose sensors stand for points spread evenly through their normal
-distributions. And every design point observes one point in space: how much of the density observes each place is a
-field that can be laid over the scene, seen along an axis.
+Marginals are taken along azimuth, elevation, range and origin, also of designs, whose sensors are represented by even
+points of their normal distributions. Every design point observes one point in space: the density of observed points,
+projected along an axis, is drawn over the scene.
 """
 
 from __future__ import annotations
@@ -45,14 +44,14 @@ NAMES = ("x", "y", "z", "azimuth", "elevation", "range")
 
 @dataclass(frozen=True, eq=False)
 class DensityView:
-    """Everything that is drawn of a learned density.
+    """The views of a learned density.
 
     Arguments:
         marginals: One per dimension that was learned, in the order of `DIMENSIONS`.
         planes: At most two, the one in which it is widest first.
-        samples: How many samples it is drawn from.
-        effective: How many equally weighted ones they are worth.
-        scene, frame: The scene that lies under the planes, and when.
+        samples: Number of samples.
+        effective: Their effective number.
+        scene, frame: The scene under the planes, and its frame.
     """
 
     marginals: tuple[Marginal, ...]
@@ -65,7 +64,7 @@ class DensityView:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """The density along one dimension, whatever the others are.
+    """The marginal density along one dimension.
 
     Arguments:
         dimension: Its name, as "azimuth_rad".
@@ -85,7 +84,7 @@ class Marginal:
 
     @property
     def top(self) -> float:
-        """The end of an axis of heights: what stands out far beyond the density is cut off."""
+        """The end of an axis of heights; designs far above the density are cut off."""
         most = float(self.heights.max(initial=0.0))
         beside = max((float(heights.max(initial=0.0)) for heights in self.designs.values()), default=0.0)
         return 1.05 * (min(max(most, beside), HIGHEST * most) if most > 0 else max(beside, 1.0))
@@ -93,7 +92,7 @@ class Marginal:
 
 @dataclass(frozen=True, eq=False)
 class PlaneDensity:
-    """The density that observes each place, seen along an axis: all of it is projected onto a plane.
+    """The density of observed points, projected along an axis onto a plane.
 
     Arguments:
         axes: The world axes across and up, as (1, 2) for y and z.
@@ -116,12 +115,12 @@ class PlaneDensity:
 def density_view(
     samples: Samples, scene: Scene, designs: Sequence[DesignSpec] = (), frame: int | None = None
 ) -> DensityView:
-    """The views of a density: marginals beside those of designs, and where in space it looks.
+    """The views of a density: marginals, with those of designs, and projections of its observed points.
 
     Arguments:
         samples: Weighted samples of it.
-        scene: What it is laid over.
-        designs: Whose sensors' marginals stand beside it.
+        scene: The scene under the projections.
+        designs: Designs with marginals to compare.
         frame: Of the scene; the one in the middle by default.
     """
     moment = scene.frames // 2 if frame is None else frame
@@ -130,7 +129,7 @@ def density_view(
 
 
 def marginals(samples: Samples, designs: Sequence[DesignSpec] = ()) -> tuple[Marginal, ...]:
-    """One per free dimension that the density is not conditioned on: over a condition it is even by definition."""
+    """The marginal of each free dimension but conditions, over which the density is uniform by definition."""
     space, weights = samples.space, samples.weights
     start = turn_start(samples.points[:, AZIMUTH], weights, space)
     points = _degrees_points(samples.points, start)
@@ -170,7 +169,7 @@ def _marginal(
 
 
 def _degrees_points(points: np.ndarray, start: float | None) -> np.ndarray:
-    """Design points with angles in degrees, azimuths moved by whole turns to beyond a start [rad]."""
+    """Design points with angles in degrees, azimuths wrapped to the turn from `start` on [rad]."""
     shown = np.array(points, dtype=np.float64)
     if start is not None:
         shown[:, AZIMUTH] = wrap_turn(shown[:, AZIMUTH], start)
@@ -216,7 +215,7 @@ def mixture_points(design: DesignSpec) -> tuple[np.ndarray, np.ndarray]:
 def sensor_points(sensor: Sensor, normal: np.ndarray, z: float) -> np.ndarray:
     """Design points of a sensor at standard normal coordinates, (N, 6) to (N, 6): origin, direction and range.
 
-    Ranges below 0 are none, and become 0.
+    Negative ranges become 0.
 
     Arguments:
         sensor: The sensor.
@@ -273,7 +272,7 @@ def _plane(
 
 
 def smoothed(held: np.ndarray) -> np.ndarray:
-    """Counts with half of each cell's shared with its neighbours along both axes; their sum stays."""
+    """Counts smoothed by weights 1/4, 1/2, 1/4 along both axes; their sum is kept."""
     for axis in (0, 1):
         inner = np.moveaxis(held, axis, 0)
         padded = np.concatenate([inner[:1], inner, inner[-1:]])
@@ -287,7 +286,7 @@ def silhouette(
     """Cells that targets (or the other bodies) cover in projection, shape (V, U) bool; infinite planes cover none.
 
     Arguments:
-        scene, frame: What is looked at.
+        scene, frame: The scene and its frame.
         axes: The world axes across and up.
         edges: Ends of the cells along both, evenly spaced [m], shapes (U + 1,) and (V + 1,).
         targets: Whether targets count, or everything else.
@@ -319,7 +318,7 @@ def silhouette(
 
 
 def _central(values: np.ndarray, weights: np.ndarray, tail: float) -> tuple[float, float]:
-    """Ends of the interval that leaves a share of the weight out on each side."""
+    """Weighted quantiles `tail` and 1 - `tail`."""
     order = np.argsort(values, kind="stable")
     cumulated = np.cumsum(weights[order])
     low, high = np.searchsorted(cumulated, [tail * cumulated[-1], (1 - tail) * cumulated[-1]])
@@ -327,6 +326,6 @@ def _central(values: np.ndarray, weights: np.ndarray, tail: float) -> tuple[floa
 
 
 def _widened(low: float, high: float) -> tuple[float, float]:
-    """An interval with a margin; one that is a point gets a width."""
+    """An interval with a margin at both ends; a point gets a small width."""
     margin = MARGIN * (high - low) if high > low else THINNEST * max(abs(low), 1.0)
     return low - margin, high + margin

@@ -43,7 +43,7 @@ MOST_DRAWN_RAYS = 2000  # of a design: more lines are no picture
 
 
 def far_baselines(evaluation: Evaluation) -> set[str]:
-    """Baselines so much worse than all designs, at every number of rays, that they only take room in a plot."""
+    """Names of baselines far worse than all designs at every number of rays, to hide at first in a plot."""
     sign, baseline = (1.0 if evaluation.metric.better == "lower" else -1.0), evaluation.strongest_baseline
     worst: dict[int, float] = {}
     for row in evaluation.rows:
@@ -86,7 +86,7 @@ def curve_figure(evaluation: Evaluation, against: Against, hidden: Collection[st
 
 
 def _scale(values: Sequence[float], shown: Sequence[float] = ()) -> dict[str, Any]:
-    """The scale of an axis that holds some values; as many ticks as are needed among those that are shown at first."""
+    """The scale of an axis for some values, with ticks that also suit those shown at first."""
     if not logarithmic(values):
         return {"type": "linear"}
     positive = [value for value in shown if value > 0]
@@ -172,7 +172,7 @@ def marginal_figure(marginal: Marginal, looks: Mapping[str, Series]) -> dict[str
 
 
 def plane_figure(plane: PlaneDensity) -> dict[str, Any]:
-    """The field of a plane as shades, and the outlines of what stands in it."""
+    """A heat map of a plane's density, with outlines of targets and other bodies."""
     across, up = ((edges[:-1] + edges[1:]) / 2 for edges in plane.edges)
     heat = {
         "type": "heatmap",

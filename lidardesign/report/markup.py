@@ -52,13 +52,13 @@ def definitions(values: Sequence[tuple[str, str]]) -> str:
 
 
 def folded(summary: str, content: str, rows: int | None = None) -> str:
-    """Content below a line that opens it, which says how many rows it has; empty where there is none."""
+    """Content that unfolds below a summary with its number of rows; empty without content."""
     count = "" if rows is None else f" ({rows} {'row' if rows == 1 else 'rows'})"
     return f"<details><summary>{html.escape(summary)}{count}</summary>{content}</details>" if content else ""
 
 
 def figure(document: dict[str, Any], identifier: str, height_px: int, caption: str, kind: str = "") -> str:
-    """A place for a plotly figure, the figure as data, and what it shows in words."""
+    """The container, caption and data of a plotly figure."""
     mark = f' class="{kind}"' if kind else ""
     name = html.escape(caption)
     return (
@@ -80,7 +80,7 @@ def script_safe(text: str) -> str:
 
 
 def swatch(colour: str, dash: str | None, mark: str | None = None) -> str:
-    """A piece of a line as it is drawn, with its mark; without a dash a filled box."""
+    """A legend sample of a line with its mark; without a dash a filled box."""
     width, height, middle = 34, 12, "translate(17.0 6.0)"
     if dash is None:
         drawn = f'<rect x="8" width="18" height="{height}" fill="{colour}"/>'
@@ -95,7 +95,7 @@ def swatch(colour: str, dash: str | None, mark: str | None = None) -> str:
 
 
 def switch(label: str, *, picture: str = "", count: str = "", checked: bool = True, **data: str) -> str:
-    """A box to tick with its label, the look of what it switches, and a place for a count."""
+    """A checkbox with its label, a legend sample, and a place for a count."""
     marks = "".join(f' data-{name}="{html.escape(value)}"' for name, value in data.items())
     output = f'<output data-count="{html.escape(count)}"></output>' if count else ""
     return (
@@ -121,7 +121,7 @@ def page(title: str, lead: str, body: str, plotly: str, links: Sequence[tuple[st
 
     Arguments:
         title: Its name.
-        lead: What stands under it.
+        lead: The text under the title.
         body: Trusted markup.
         plotly: The source of plotly, a trusted script.
         links: Identifiers of sections and their headings.

@@ -57,23 +57,23 @@ CURVE_PX, SMALL_PX, PLANE_PX = 440, 250, 400
 # Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
 DENSITY_POINTS = 3000
 COMMAND = "evaluate"  # whose report it is, and which is not over yet
-# Of the first section: sentences of designs, which a table says of all, and notes that are not folded.
+# In the first section: sentences about designs (a table has all), and notes that are not folded.
 MOST_SENTENCES, MOST_NOTES = 3, 2
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Everything that a report is made of.
+    """The content of a report.
 
     Arguments:
-        evaluation: What was found.
+        evaluation: The evaluation.
         shown: The designs in a held-out scene.
         title: The page's title.
-        density: The learned density as it can be looked at; None where a run has no samples.
+        density: Views of the learned density; None where a run has no samples.
         density_m: Points that it observes, drawn by their weights, shape (K, 3) [m].
-        constraints: How tight each constraint is, by the name of the design.
-        times: Where the time of each command went.
-        reproduce: How to get the same figures again.
+        constraints: The slack of each constraint, by the name of the design.
+        times: Times of each command by phase.
+        reproduce: Commands and facts to reproduce the results.
     """
 
     evaluation: Evaluation
@@ -95,13 +95,13 @@ def evaluation_report(
     times: Mapping[str, Mapping[str, float]],
     command: Sequence[str],
 ) -> Report:
-    """Everything that the report of an evaluation is made of.
+    """The content of the report of an evaluation.
 
     Arguments:
         evaluation: The scores.
-        request: What was asked for.
-        folder, config: The run whose density the designs are of.
-        times: Where the time of each command went, as a clock tells it.
+        request: The request of the evaluation.
+        folder, config: The run whose density the designs were fitted to.
+        times: Seconds of each command by phase, as of `Clock.timings`.
         command: The command line that makes the page again.
     """
     manifest = read_manifest(folder)
@@ -169,7 +169,7 @@ def report_html(report: Report) -> str:
 
 
 def _parts(report: Report) -> list[tuple[str, str, str]]:
-    """Identifier, heading and content of every section; empty content where there is nothing to tell."""
+    """Identifier, heading and content of every section; the content may be empty."""
     evaluation = report.evaluation
     designs = [one.design for one in report.shown.designs]
     # lines without marks are told apart by their dashes
@@ -196,7 +196,7 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
 
 
 def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str:
-    """The result: who is better and by how much, how far chosen rays are from the best, and notes.
+    """The section of the result: differences to the strongest baseline, certificates of chosen rays, and notes.
 
     Arguments:
         evaluation: The scores.
@@ -221,7 +221,7 @@ def result_section(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> str
 
 
 def headline(evaluation: Evaluation, pair: Paired) -> str:
-    """A pair in a sentence: who is better and by how much, or that no difference was found."""
+    """A sentence about a pair: the better one and by how much, or that no difference was found."""
     text = difference_text(pair, evaluation.metric.better, evaluation.metric.unit)
     return f"{text.replace('no difference', 'No difference', 1) if text.startswith('no difference') else text}."
 
@@ -258,7 +258,7 @@ def _about(evaluation: Evaluation) -> list[str]:
 
 
 def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list[str]:
-    """The distance of chosen rays from the best, in one sentence for all designs; none without chosen rays."""
+    """The certified gaps of chosen rays, in one sentence for all designs; empty without chosen rays."""
     rows = evaluation.headline_rows
     gaps = [
         f"{100 * entry['gap']:.1f} % ({design.name})"
@@ -273,7 +273,7 @@ def _certificates(evaluation: Evaluation, designs: Sequence[DesignSpec]) -> list
 
 
 def _figures(value: float, item: Row | Paired, sign: str = "") -> tuple[str, str]:
-    """A figure and its interval, which stays in one line, also where cells wrap."""
+    """A value and its interval as text, with no-break spaces in the interval."""
     figure, low, high = figure_and_interval(value, item.ci_low, item.ci_high, sign=sign)
     return figure, low if item.ci_low is None else f"{low}\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}{high}"
 

@@ -1,8 +1,8 @@
 """Error against seconds of every sweep: a panel each, on logarithmic axes, and tables.
 
-A line joins the settings that no other one beats in both; those that are beaten are pale. The tolerance is a dashed
-line, the run's own setting has a ring, the one to choose has another colour. A reference, whose error is nothing,
-stands on the lower edge as a triangle, as do settings whose errors are too small to show.
+A line joins the settings that no other one beats in both, the Pareto front; the others are pale. The tolerance is a
+dashed line, the run's own setting has a ring, the one to choose has another colour. A reference, whose error is 0,
+is on the lower edge as a triangle, as are settings whose errors are too small to show.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Panel:
-    """A sweep as it is drawn.
+    """The panel of a sweep.
 
     Arguments:
         sweep: The sweep.
@@ -81,12 +81,12 @@ class Panel:
 
     @property
     def front(self) -> list[Mark]:
-        """The marks that no other one beats, the fastest first."""
+        """The marks of the Pareto front, the fastest first."""
         return sorted((mark for mark in self.marks if not mark.beaten), key=lambda mark: (mark.x, -mark.y))
 
     @property
     def error_title(self) -> str:
-        """The vertical axis: what the error is, with its unit."""
+        """The title of the vertical axis: the error with its unit."""
         return f"error [{self.sweep.unit}]" if self.sweep.unit else "error [share]"
 
 
@@ -108,7 +108,7 @@ def _panel(sweep: Sweep) -> Panel:
 
 
 def _spanned(low: float, high: float) -> tuple[float, float]:
-    """Ends of a logarithmic axis that holds both values and is not too short."""
+    """Ends of a logarithmic axis around two values, at least `LEAST_SPAN` long."""
     factor = BEYOND * math.sqrt(max(LEAST_SPAN / (high / low), 1.0))
     return low / factor, high * factor
 
@@ -145,9 +145,9 @@ def _mark(measurement: Measurement, least_seconds: float, errors: tuple[float, f
 
 
 def label_places(panel: Panel) -> list[tuple[float, float, str]]:
-    """Places of the marks' settings: pixels to the right and upwards, and the side of the text that is aligned.
+    """Places of the marks' labels: pixels to the right and upwards of the mark, and the aligned side of the text.
 
-    To the right of its mark, to the left in the right third of the panel; moved up where texts would meet.
+    To the right of the mark, to the left in the right third of the panel; moved up where texts would overlap.
     """
     height = PANEL_PX - ABOVE_PX - BELOW_PX
     across = [_share(mark.x, panel.seconds) for mark in panel.marks]
@@ -168,7 +168,7 @@ def _share(value: float, ends: tuple[float, float]) -> float:
 
 
 def pareto_figures(sweeps: Sequence[Sweep]) -> list[dict[str, Any]]:
-    """One panel per sweep; hovering tells what a measurement is."""
+    """One figure per sweep with two measurements or more; hovering shows a measurement's values."""
     return [_pareto_figure(panel) for panel in panels(sweeps)]
 
 
@@ -301,7 +301,7 @@ def _tolerance(panel: Panel) -> dict[str, Any]:
 
 
 def accuracy_tables(sweeps: Sequence[Sweep]) -> str:
-    """Every sweep with all its measurements, what its figures mean and its verdict."""
+    """A table of each sweep with all its measurements, an explanation and its verdict."""
     return "".join(_table(sweep) for sweep in sweeps)
 
 

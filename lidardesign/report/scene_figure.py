@@ -1,6 +1,6 @@
-"""Designs in a scene and what becomes of their rays, and their shapes as float32 triangles and lines, for the 3D view.
+"""Designs in a scene with the outcomes of their rays, and their shapes as float32 triangles and lines, for the 3D view.
 
-As many rays, positions and frames are kept as a page can hold; `SceneFigure` says which are left out.
+As many rays, positions and frames are kept as a page can hold; `SceneFigure` has the numbers of all.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class DrawnDesign:
     """A design with its rays at each of P positions and T frames; N rays are drawn.
 
     Arguments:
-        design: As it is in its file.
+        design: The design of the file.
         placed: The design at each position.
         rays: The drawn rays at each position, N each.
-        length_m: How far each ray is drawn: to its return, the first hit, or the end of its gate, shape (P, T, N).
+        length_m: Drawn length of each ray: to its return, the first hit, or the end of its gate, shape (P, T, N) [m].
         outcome: Values of `Outcome`, shape (P, T, N).
         fired: The number of its rays.
     """
@@ -84,8 +84,8 @@ class SceneFigure:
         frames: The frames of it that are shown, ascending.
         places: The condition values that are shown, ascending; one empty entry without conditions.
         designs: The designs, with their rays there.
-        physics: Whether a detector's effects decide what becomes of rays, or geometry alone.
-        all_places: How many condition values there are.
+        physics: Whether outcomes include a detector's effects, or are of geometry alone.
+        all_places: Number of all condition values.
     """
 
     scene: Scene
@@ -116,7 +116,7 @@ def scene_figure(
         scene: The scene.
         designs: The designs.
         places: The condition values that they are evaluated at, ascending.
-        laid_out: A design's rays at a condition value; at every one as many.
+        laid_out: A design's rays at a condition value, equal numbers at each.
         planner: How effects are chosen; None: geometry alone.
         seed: Of the effects' random numbers.
     """
@@ -204,7 +204,7 @@ def drawn_share(scene: Scene) -> float:
 def body_triangles(body: Body, frame: int, bounds_m: np.ndarray, share: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """World vertices (V, 3) float32 [m] and faces (F, 3) int32 of a body; planes are cut at bounds (2, 3).
 
-    Of a mesh about a share of its triangles is drawn.
+    Meshes are thinned to about a share of their triangles.
     """
     pose = body.pose(frame)
     vertices, faces = own_triangles(body, pose, bounds_m, share)
@@ -214,7 +214,7 @@ def body_triangles(body: Body, frame: int, bounds_m: np.ndarray, share: float = 
 def own_triangles(
     body: Body, pose: np.ndarray, bounds_m: np.ndarray, share: float = 1.0, steps: int = STEPS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same in the body's own frame, with so many steps round round bodies; the pose is for planes."""
+    """`body_triangles` in the body's own frame, round bodies in `steps` steps; the pose is used for planes."""
     shape = body.shape
     if isinstance(shape, Mesh):
         vertices, faces = thinned(shape.vertices, shape.faces, math.ceil(share * len(shape.faces)))
@@ -233,7 +233,7 @@ def own_triangles(
 
 
 def round_steps(scene: Scene) -> int:
-    """Steps round round bodies: fewer where a scene has very many of them."""
+    """Steps of a turn of round bodies, fewer where a scene has many of them."""
     count = sum(isinstance(body.shape, Round) for body in scene.bodies)
     # a ball of n steps has about n (n + 2) triangles
     most = math.sqrt(MOST_FACES / max(count, 1)) - 1

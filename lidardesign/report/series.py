@@ -1,4 +1,4 @@
-"""Curves of scores: one series per design and baseline with its look, axes that suit the values, words of outcomes."""
+"""Curves of scores: one series per design and baseline with its style, scales of axes, words of outcomes."""
 
 from __future__ import annotations
 
@@ -74,13 +74,13 @@ def position(row: Row, against: Against) -> float:
 
 
 def logarithmic(values: Sequence[float]) -> bool:
-    """True for values that span so much that a logarithmic axis shows them better."""
+    """True for positive values that span more than `LOGARITHMIC_FACTOR`."""
     positive = [value for value in values if value > 0]
     return len(positive) == len(values) > 1 and max(positive) > LOGARITHMIC_FACTOR * min(positive)
 
 
 def log_ticks(values: Sequence[float]) -> list[float]:
-    """Round places to label on a logarithmic axis that holds some values: more to a decade where it has few of them."""
+    """Round values to label on a logarithmic axis of some values: more per decade where it has few decades."""
     low, high = min(values), max(values)
     mantissas = FEW_MANTISSAS if high > WIDE_FACTOR * low else MANY_MANTISSAS
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)

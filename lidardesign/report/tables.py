@@ -39,7 +39,7 @@ def four_digits(value: float) -> str:
 
 
 def plain_number(value: float, digits: int, tiny: float = TINY) -> str:
-    """A number of at least 0 without an exponent; what is tiny as its upper limit."""
+    """A number of at least 0 without an exponent; below `tiny` as `<tiny`."""
     if 0 < value < tiny:
         return f"<{tiny:g}"
     rounded = float(f"{value:.{digits}g}")
@@ -47,7 +47,7 @@ def plain_number(value: float, digits: int, tiny: float = TINY) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number of things in words."""
+    """A number with its noun, as "1 ray" or "2 rays"."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
@@ -195,9 +195,9 @@ class CommandTimes:
 
     Arguments:
         command: Its name, as `learn`.
-        when: When it ended, as written in the run.
+        when: Time of its end, as written in the run.
         phases: Seconds by phase, phases inside of phases as "learning/target".
-        memory_bytes: The most memory that it took; None where that is not known.
+        memory_bytes: Peak memory; None where that is not known.
     """
 
     command: str
@@ -213,10 +213,10 @@ class CommandTimes:
 
 @dataclass(frozen=True)
 class Reproduction:
-    """Commands and facts by which anybody gets the same figures again.
+    """Commands and facts to reproduce the results.
 
     Arguments:
-        commands: What was typed, in order, with what each is for.
+        commands: Purposes and command lines, in order.
         facts: Seed, versions and the like, by name.
         config: The run's configuration as YAML; empty where there is none.
     """
@@ -227,7 +227,7 @@ class Reproduction:
 
 
 def constraints_table(name: str, found: Sequence[ConstraintSlack]) -> str:
-    """One row per bound of a design, the tightest sensor, what room it leaves and how much of the bound is used."""
+    """A row per bound of a design: the tightest sensor, its slack and the used share of the bound."""
     if not found:
         return f"<p>{html.escape(name)} has no constraints.</p>"
     headings = ("constraint", "bound", "closest", "room", "used", "verdict")
@@ -258,7 +258,7 @@ def _room(room: float, bound: Any) -> str:
 
 
 def _used(one: ConstraintSlack) -> str:
-    """A bar that is full where a design is at its bound; in words for who cannot see it."""
+    """A bar of the used share of a bound, with the share as text for screen readers."""
     if one.share is None:
         return "-"
     used = PERCENT * min(max(1.0 - one.share, 0.0), 1.0)
@@ -268,7 +268,7 @@ def _used(one: ConstraintSlack) -> str:
 
 
 def number(value: Any) -> str:
-    """A figure, a text, or a list or mapping of them, for people; of a list of places how many there are."""
+    """A value, or a list or mapping of values, as text; a list of places as their number."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {number(item)}" for name, item in value.items())
     if isinstance(value, list | tuple):
@@ -323,7 +323,7 @@ def reproduction(how: Reproduction) -> str:
 
 
 def _scrolled(headings: Sequence[str], text: Sequence[int], rows: Iterable[str], caption: str) -> str:
-    """A table of rows in markup; headings of text stand on the left."""
+    """A scrolling HTML table of rows in markup; `text` columns are aligned left."""
     label = html.escape(caption)
     head = "".join(
         f'<th scope="col"{" class=text" if index in text else ""}>{html.escape(heading)}</th>'
@@ -336,7 +336,7 @@ def _scrolled(headings: Sequence[str], text: Sequence[int], rows: Iterable[str],
 
 
 def effects_section(evaluation: Evaluation) -> str:
-    """Effects that could change the scores, and which of them were simulated; one sentence where none could."""
+    """The section of effects that could change the scores, simulated or not; one sentence where none could."""
     effects = evaluation.effects
     detector = html.escape(evaluation.detector)
     if not any(effect.on or effect.range_m or effect.lost for effect in effects):

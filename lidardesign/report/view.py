@@ -2,8 +2,8 @@
 
 The data are one JSON document, numbers as base64 of little-endian arrays. Bodies at rest are merged, moving ones keep
 their own frame and a pose per frame; sensors are a few numbers each, and the page draws their fields of view and gates;
-a ray is where it starts, where it looks, how far it goes and what becomes of it. The page's script
-(`assets/scene.js`) puts together what is switched on.
+a ray is its origin, direction, length and outcome. The page's script (`assets/scene.js`) draws the parts that
+are switched on.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from lidardesign.scenes.scene import Body
 from lidardesign.sensors.pattern import field_on_sphere
 from lidardesign.sensors.sensor import Sensor, interval_factor
 
-MOST_SENSORS = 40  # drawn as frusta and switched one by one; a scan has hundreds, and its rays say it all
+MOST_SENSORS = 40  # drawn as frusta and switched one by one; of more only rays are drawn
 MOST_BODIES = 2000  # of a scene, the largest first
 MARGIN = 1.0  # of the scene's extent: rays that go farther are cut there
 BESIDE_DEG, ABOVE_DEG = 129.0, 26.0  # of the first view: from where sensors look, and above the ground
@@ -61,7 +61,7 @@ def view_document(shown: SceneFigure, looks: Sequence[Series], density_m: np.nda
 
     Arguments:
         shown: The scene, and the designs in it.
-        looks: The colour and dash of each design, in the same order.
+        looks: The style of each design, in the same order.
         density_m: Points that the learned density observes, shape (K, 3) [m].
     """
     bodies = drawn_bodies(shown)
@@ -108,7 +108,7 @@ def _size(body: Body) -> float:
 
 
 def view_bounds(shown: SceneFigure) -> np.ndarray:
-    """The box that is drawn, shape (2, 3) [m]: scene, sensors, and their rays as far as they stay near."""
+    """The drawn box, shape (2, 3) [m]: scene, sensors, and their rays up to a margin."""
     rays = [one for design in shown.designs for one in design.rays]
     each = np.array([scene_bounds(shown.scene, frame, rays) for frame in {shown.frames[0], shown.frames[-1]}])
     low, high = each[:, 0].min(axis=0), each[:, 1].max(axis=0)
@@ -121,7 +121,7 @@ def view_bounds(shown: SceneFigure) -> np.ndarray:
 
 
 def _drawn_points(one: DrawnDesign) -> list[np.ndarray]:
-    """Ends of rays, and gates and origins that are drawn at the first and the last position."""
+    """Drawn points of a design: ends of rays, and gates and origins at the first and the last position."""
     points = [one.ends_m.reshape(-1, 3)]
     for design in (one.placed[0], one.placed[-1]) if len(one.design.sensors) <= MOST_SENSORS else ():
         for sensor in design.sensors:
@@ -131,7 +131,7 @@ def _drawn_points(one: DrawnDesign) -> list[np.ndarray]:
 
 
 def is_flat(directions: np.ndarray) -> bool:
-    """True where all rays lie in planes of constant z: a world that is looked at as a map."""
+    """True where all rays lie in planes of constant z: a scene that is viewed as a map."""
     return bool(len(directions)) and float(np.abs(directions[:, 2]).max()) < EPSILON_FLOAT32
 
 
@@ -195,7 +195,7 @@ def _cone(sensor: Sensor, level: float) -> np.ndarray:
     """Origin, forward, horizontal and vertical (3 each), field of view, gate (2 each), three axes of its origins."""
     variances, axes = np.linalg.eigh(sensor.covariance_m2)
     reach = interval_factor(level) * np.sqrt(np.clip(variances, 0.0, None))
-    # what hardly spreads looks like one place; the largest axis comes first
+    # spreads below the smallest are drawn as points; the largest axis comes first
     spread = np.where(reach < SMALLEST_SPREAD_M, 0.0, reach) * axes
     return np.concatenate(
         [sensor.origin_m, sensor.frame.ravel(), field_on_sphere(sensor), sensor.gate_m, spread.T[::-1].ravel()]
@@ -217,7 +217,7 @@ OF_SOLID = ("up", "down", "above")
 
 
 def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndarray | None) -> str:
-    """Everything of the view; `looks` are the designs' colours and dashes, `density_m` (K, 3) observed points."""
+    """The HTML section of the view; `looks` are the designs' styles, `density_m` (K, 3) observed points [m]."""
     # a world in a plane is always seen from above
     left_out = OF_SOLID if is_flat(shown.directions) else ()
     buttons = "".join(

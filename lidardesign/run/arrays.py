@@ -1,8 +1,7 @@
 """Archives of numpy arrays and rows of CSV, read without running anything in them.
 
-Archives take no more memory than they truly need. The header of every array is read first: objects (pickles) are
-refused, and so is one that promises more data than it has. numpy itself would make room for the promise before it finds
-that the data is missing.
+The header of every array is read first: objects (pickles) are refused, and so is an array with less data than its shape
+needs, for which numpy would allocate memory before it finds the data missing.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from lidardesign.run.inputs import ARRAYS, MOST_COLUMNS, MOST_ROWS, Kind, check_
 
 NUMERIC_KINDS = "buif"
 LARGEST_HEADER_BYTES = 10_000
-# What an archive says at its end, and of how large a list of arrays.
+# Marks at the end of an archive, and the largest size of its list of arrays.
 END_MARK, END_MARK_64 = b"PK\5\6", b"PK\6\7"
 END_BYTES, LARGEST_LIST_BYTES = 1 << 16, 1_000_000
 Result = TypeVar("Result")
@@ -37,9 +36,9 @@ def read_npz(
 
     Arguments:
         path: The file.
-        kind: How large it may be.
+        kind: The kind of file, which limits its size.
         kinds: Letters of the numpy kinds that it may hold.
-        hint: What to do with a damaged file.
+        hint: The remedy for a damaged file.
 
     Raises:
         DataError: The file cannot be read, is damaged or too large, or holds something else.
@@ -49,7 +48,7 @@ def read_npz(
 
 
 def guarded(read: Callable[[], Result], path: Path, hint: str) -> Result:
-    """What a reader of a file gives; whatever it raises on garbage becomes a `DataError`."""
+    """The result of a reader of a file; any exception it raises becomes a `DataError`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -79,10 +78,10 @@ def _read(path: Path, kind: Kind, kinds: str, hint: str) -> dict[str, np.ndarray
 
 
 def _check_list(file: BinaryIO, where: str, hint: str) -> None:
-    """Refuse what is no archive, and one whose list of arrays would take long to read and much memory.
+    """Refuse a file that is no archive, or whose list of arrays is too large.
 
     Raises:
-        DataError: So it is.
+        DataError: It is no archive, or lists too many arrays.
     """
     if not zipfile.is_zipfile(file):
         raise DataError("is not an .npz file, or is cut short", where=where, hint=hint)
@@ -94,7 +93,7 @@ def _check_list(file: BinaryIO, where: str, hint: str) -> None:
 
 
 def check_kind(dtype: np.dtype, name: str, where: str, kinds: str = NUMERIC_KINDS) -> None:
-    """Refuse what holds no plain values.
+    """Refuse an array type that holds no plain values.
 
     Raises:
         DataError: An array of Python objects, or of another kind than those allowed.
@@ -108,7 +107,7 @@ def check_kind(dtype: np.dtype, name: str, where: str, kinds: str = NUMERIC_KIND
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, kinds: str, where: str, hint: str) -> np.ndarray:
-    """One array, once its header is found to tell the truth about its data."""
+    """An array of an archive, whose header was checked against the size of its data."""
     name = member.filename.removesuffix(".npy")
     if name == member.filename:
         raise DataError(
@@ -122,7 +121,7 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, kinds: str, where:
         data = member.file_size - file.tell()
         if math.prod(shape) * dtype.itemsize != data:
             raise DataError(f"{name!r} of shape {shape} has {data} bytes of data", where=where, hint=hint)
-    # the size that the archive states is no more than a promise either: memory is used where there is data
+    # the archive may overstate its size, too: memory grows with the data read
     with archive.open(member) as file:
         array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=LARGEST_HEADER_BYTES)
     if array.dtype.kind == "U":

@@ -1,7 +1,7 @@
-"""Work in a process of its own, which may crash, hang, print or close files that are not its own.
+"""Work in a child process, which may crash, hang, print or close files.
 
 The process calls a function, named as `module:function`, with a request and the stream of its answers; the function
-returns the last one. Requests and answers are lines of JSON. What the work prints is kept apart from its answers.
+returns the last one. Requests and answers are lines of JSON. Prints are kept apart from answers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PROGRAM = (
 BEGUN = b"begun\n"
 # Python and this package are loaded within this time [s].
 START_SECONDS = 60.0
-# Work that limits its own time has ended by then, and said so [s].
+# Time for work that limits its own time to end and answer [s].
 GRACE_SECONDS = 2.0
 # The exit code of a process whose stream of answers was closed.
 UNANSWERED = 117
@@ -40,7 +40,7 @@ class ChildError(Exception):
 
     Arguments:
         message: The sentence.
-        reason: Whether it was not started, was too late, died, or others wrote into its answers.
+        reason: The cause: not started, too late, died, or foreign output among its answers.
     """
 
     def __init__(self, message: str, reason: Literal["unstarted", "late", "died", "foreign"]) -> None:
@@ -49,11 +49,11 @@ class ChildError(Exception):
 
 
 class Child:
-    """A process that works on a request; to be ended in any case.
+    """A child process that works on a request; `end` must be called in any case.
 
     Arguments:
-        function: What it calls with the request and the stream of its answers, as `module:function`.
-        request: Anything that JSON holds.
+        function: The function that it calls with the request and the stream of its answers, as `module:function`.
+        request: A JSON value.
         environment: Variables beside those of this process.
 
     Raises:
@@ -68,7 +68,7 @@ class Child:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            # a request that is written is gone: nothing is left over to be written to a process that died
+            # unbuffered, so that nothing remains to be flushed to a process that died
             bufsize=0,
             env={**os.environ, **(environment or {})},
             # what the work starts is ended with it, and a terminal's Ctrl-C is for this process
@@ -80,7 +80,7 @@ class Child:
 
     @property
     def alive(self) -> bool:
-        """True while it runs, in the process that started it."""
+        """True while it runs; False in other processes than the one that started it."""
         return self.owner == os.getpid() and self._process.poll() is None
 
     @property
@@ -89,16 +89,16 @@ class Child:
         return self._printed.decode(errors="replace").splitlines()
 
     def send(self, document: Any) -> None:
-        """Write a line to its standard input; where it died, the next answer says so."""
+        """Write a line to its standard input; a failure is reported by the next answer."""
         with contextlib.suppress(OSError, ValueError):
             self._process.stdin.write(json.dumps(document).encode() + b"\n")  # type: ignore[union-attr]
 
     def answer(self, seconds: float, when: str) -> dict[str, Any]:
-        """The next answer, the first at the latest so long after the work began, later ones after this call.
+        """The next answer; the time limit starts with the work for the first one, with this call for later ones.
 
         Arguments:
-            seconds: The time that it may take [s].
-            when: What it does meanwhile, as "while it is imported".
+            seconds: The time limit [s].
+            when: Its present work, as "while it is imported".
 
         Raises:
             ChildError: There is none.
@@ -121,18 +121,18 @@ class Child:
         raise ChildError(f"writes to a stream that is not its own {when}", "foreign")
 
     def _next_line(self, deadline: float) -> tuple[float, bytes | None]:
-        """The next line and when it came: empty at the end, None where none came in time."""
+        """The time of arrival and the next line: empty at the end of the stream, None after the deadline."""
         try:
             found = self._lines.get(timeout=max(deadline - time.monotonic(), 0.0))
         except queue.Empty:
             return deadline, None
         if not found[1]:
-            # for whoever asks again
+            # the end stays in the queue for further calls
             self._lines.put(found)
         return found
 
     def _died_of(self, deadline: float, when: str) -> str | None:
-        """Its end in words; None where it only closed its stream and hangs until the deadline and a little longer."""
+        """The end of the process in words; None where it still runs `GRACE_SECONDS` after the deadline."""
         try:
             code = self._process.wait(max(deadline - time.monotonic(), 0.0) + GRACE_SECONDS)
         except subprocess.TimeoutExpired:
@@ -167,7 +167,7 @@ class Child:
 def ask(
     function: str, request: Any, seconds: float, when: str, environment: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """The one answer of a process of its own, which is ended then; arguments as for `Child` and its `answer`.
+    """The single answer of a child process, which is then ended; arguments as of `Child` and its `answer`.
 
     Raises:
         ChildError: There is none.
@@ -180,7 +180,7 @@ def ask(
 
 
 def serve(function: str, request: Any) -> None:
-    """In that process: call the function, write its last answer, and end with all threads and exit handlers."""
+    """In the child: call the function, write its last answer, and exit at once, without exit handlers."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     module, _, name = function.partition(":")

@@ -1,8 +1,8 @@
 """The time of a command: seconds by phase, phases inside of phases.
 
-A clock runs for as long as a command, or a library call that reports its own times. Code anywhere below marks what it
-does with `phase`, as a context or a decorator; where no clock runs, that does nothing. Clocks that run inside of each
-other all count the same phases, each from its own beginning.
+A clock runs for as long as a command, or a library call that reports its own times. Code below marks its work with
+`phase`, as a context or a decorator, which does nothing where no clock runs. Nested clocks all count the same phases,
+each from its own start.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _RUNNING: ContextVar[tuple[Clock, ...]] = ContextVar("clocks that run", default=
 
 
 class Clock:
-    """Wall time by phase, from its making on."""
+    """Wall time by phase, from its creation on."""
 
     def __init__(self) -> None:
         self._started = time.perf_counter()
@@ -44,7 +44,7 @@ class Clock:
 
     @contextlib.contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        """Count the time inside towards a phase; a phase directly inside of one of its name is the same one."""
+        """Count the time inside towards a phase; directly inside a phase of the same name it is that one."""
         before = self._within
         if before[-1:] == (name,):
             yield
@@ -72,7 +72,7 @@ class Clock:
 
 @contextlib.contextmanager
 def running(clock: Clock | None = None) -> Iterator[Clock]:
-    """Let a clock count the phases inside; those of clocks that run already go on."""
+    """A context in which a clock counts phases, beside clocks that run already."""
     clock = Clock() if clock is None else clock
     token = _RUNNING.set((*_RUNNING.get(), clock))
     try:
@@ -82,7 +82,7 @@ def running(clock: Clock | None = None) -> Iterator[Clock]:
 
 
 def outermost_clock() -> Clock | None:
-    """The clock that has run longest, as a command's; None where none runs."""
+    """The outermost running clock, that of the command; None where none runs."""
     clocks = _RUNNING.get()
     return clocks[0] if clocks else None
 
@@ -97,8 +97,8 @@ def phase(name: str) -> Iterator[None]:
 
 
 def peak_memory_bytes() -> int | None:
-    """The most memory that this process held at once; None where the system does not tell."""
-    # what getrusage tells on Linux begins with what the process held that this one was started by
+    """The peak memory of this process [bytes]; None where the system does not report it."""
+    # on Linux getrusage includes the memory of the parent at the time of the fork
     with contextlib.suppress(OSError, ValueError, IndexError):
         return int(PROCESS_STATUS.read_text().split("VmHWM:")[1].split()[0]) * KIBIBYTE
     try:
@@ -118,7 +118,7 @@ def keep_timings(
         run: The run folder.
         command: Its name.
         clock: Its clock.
-        wait_s: How long to wait for another writer.
+        wait_s: Time to wait for another writer [s].
         further: Mappings of the manifest that get further entries, by name.
 
     Raises:

@@ -1,6 +1,6 @@
 """Files that are either whole or absent.
 
-Who left a temporary file behind is known from its name, and removed once that process is gone.
+A temporary file names its process, and is removed once that process is gone.
 
 One writer per run folder: a lock of the operating system, which frees it however its process ends.
 
@@ -27,7 +27,7 @@ HOST_DIGITS = 8
 
 
 def is_gone(pid: int) -> bool:
-    """Whether no process of this computer has an id; one that cannot be asked counts as there."""
+    """True where no process of this computer has an id; False where that cannot be found out."""
     if os.name != "posix":  # elsewhere the question ends the process
         return False
     try:
@@ -57,7 +57,7 @@ def write_atomic(path: Path, content: bytes | str) -> None:
     """Write a file so that a reader, or a crash at any time, finds the old content or the new one.
 
     The content goes to a temporary file in the same folder, is flushed to the disk, and takes the name by a
-    rename. What killed writers of the same file left is removed. A pipe or a device (as /dev/stdout) is written
+    rename. Leftovers of killed writers of the same file are removed. A pipe or a device (as /dev/stdout) is written
     straight.
 
     Arguments:
@@ -103,7 +103,7 @@ def write_atomic(path: Path, content: bytes | str) -> None:
 
 
 def _write_straight(path: Path, payload: bytes) -> None:
-    """Write to a pipe or a device; one that nobody reads is an error, not waited for."""
+    """Write to a pipe or a device; a pipe without a reader is an error, not waited for."""
     descriptor = os.open(path, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
     os.set_blocking(descriptor, True)
     with open(descriptor, "wb") as file:
@@ -129,7 +129,7 @@ def _unwritten(path: Path, error: OSError) -> DataError:
 
 
 def temporary_beside(path: Path) -> Path:
-    """A name in the folder of a file that no other writer uses and that tells whose it is."""
+    """A unique temporary path beside a file, named after its computer and process."""
     name = os.fsdecode(os.fsencode(path.name)[:NAME_BYTES])
     return path.with_name(f".{name}.{host_mark()}-{os.getpid()}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
 
@@ -145,7 +145,7 @@ def _remove_abandoned(temporary: Path) -> None:
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file of this name is one that a writer makes before the file itself."""
+    """True for the name of a writer's temporary file."""
     return _TEMPORARY.fullmatch(name) is not None
 
 
@@ -186,7 +186,7 @@ FILE_NAME = ".lock"
 
 
 def check_lock(run: Path) -> None:
-    """Refuse a lock that is none: one that is a link would empty what it leads to.
+    """Refuse a lock that is no regular file: opening a link would truncate its target.
 
     Raises:
         DataError: A folder, a link, a pipe or a device stands where the lock would be.
@@ -198,13 +198,13 @@ def check_lock(run: Path) -> None:
 
 @contextlib.contextmanager
 def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
-    """Hold a run folder's lock; what is left of a lock whose process was killed is no obstacle.
+    """Hold a run folder's lock; the file of a killed process does not block it.
 
     Temporary files that a killed writer left in the folder are removed once the lock is held.
 
     Arguments:
         run: The run folder.
-        wait_s: How long to wait for another writer: commands that write one file hold the lock for an instant.
+        wait_s: Time to wait for another writer [s]; commands that write one file hold the lock for an instant.
 
     Raises:
         ConfigError: Another process writes this run.
@@ -231,14 +231,14 @@ def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
         remove_stray_temporaries(Path(run))
         yield
     finally:
-        # while it is held: whoever has opened the file meanwhile finds that it is no longer there
+        # removed while held, so that a process that opened it meanwhile finds it gone
         with contextlib.suppress(OSError):
             path.unlink()
         lock.release()
 
 
 def writer(run: Path) -> str | None:
-    """Who is writing a run at this moment; None where nobody is, or only a dead process's lock file is left."""
+    """The process that holds a run's lock, in words; None where there is none, or it is dead."""
     if not os.path.lexists(Path(run) / FILE_NAME):
         return None
     try:

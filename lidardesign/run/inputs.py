@@ -1,7 +1,7 @@
 """Limits of input files: one table of their sizes, and one way to open them.
 
-Only regular files are opened: a pipe, a device or a socket could be waited for or read for ever. Sizes are looked at
-before memory is taken.
+Only regular files are opened: a pipe, a device or a socket could block or never end. Sizes are checked before
+memory is taken.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ class Kind:
     """A kind of input file.
 
     Arguments:
-        name: What people call it.
-        most_bytes: How large the file may be.
-        unpacked_bytes: How large what is packed in it may be; None: nothing is packed.
-        error: What is raised where such a file cannot be used.
+        name: Its name for people.
+        most_bytes: Largest size of the file.
+        unpacked_bytes: Largest size of its content when unpacked; None: nothing is packed.
+        error: Exception class for a file that cannot be used.
     """
 
     name: str
@@ -62,7 +62,7 @@ def size_text(size: float) -> str:
 
 
 def check_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint: str | None = None) -> int:
-    """The size of a file [bytes], once it is known to be one that can be read without waiting.
+    """The size of a file [bytes], checked to be a regular file within its kind's limit.
 
     Raises:
         DataError, ConfigError: By the kind: it is missing, no regular file, or too large.
@@ -111,7 +111,7 @@ def read_file(path: Path | str, kind: Kind, *, allowed: str | None = None, hint:
 
 
 def read_head(path: Path | str, kind: Kind, *, hint: str | None = None) -> bytes:
-    """The first bytes of a file, which tell what is in it.
+    """The first bytes of a file, by which its format is recognised.
 
     Raises:
         DataError, ConfigError: As of `read_file`.

@@ -1,4 +1,4 @@
-"""The manifest of a run: what made it, when, and the SHA-256 of every file in it."""
+"""The manifest of a run: versions, command, time, and the SHA-256 of every file in it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LEARN_HINT = "lidardesign learn TASK --out RUN makes a run"
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on, read without importing any of it."""
+    """Versions of the libraries that results depend on, read without importing them."""
     found = {"lidardesign": __version__, "python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -71,7 +71,7 @@ def read_manifest(run: Path) -> dict[str, Any]:
         raise DataError(f"the manifest cannot be read: {error}", where=str(path), hint="learn the run again") from None
     if not isinstance(manifest, dict) or not isinstance(manifest.get("files"), dict):
         raise DataError("the manifest lists no files", where=str(path), hint="learn the run again")
-    # Refuse entries that nothing of this program writes, before anybody works with them
+    # Refuse entries that this program does not write
     for name, entry in manifest["files"].items():
         contents = [entry, entry.get("replaces") or entry] if isinstance(entry, dict) else [entry]
         if not all(
@@ -115,7 +115,7 @@ def record(run: Path, names: Iterable[str]) -> None:
 
 
 def forget(run: Path, names: Iterable[str]) -> None:
-    """Remove files of a run and then their entries; those that are gone already are only no longer listed."""
+    """Remove files of a run and then their entries; missing files lose only their entry."""
     run, names = Path(run), list(names)
     if not names:
         return
@@ -152,7 +152,7 @@ def write_recorded(run: Path, name: str, content: bytes) -> None:
 
 
 def changed_since_recorded(run: Path, name: str) -> str | None:
-    """In what a file differs from the one that was recorded, in words; None where it does not, or never was.
+    """The change of a file since it was recorded, in words; None where it is unchanged or was not recorded.
 
     Raises:
         DataError: The manifest or the file cannot be read.
@@ -168,7 +168,7 @@ def changed_since_recorded(run: Path, name: str) -> str | None:
 
 
 def _hashes(entry: dict[str, Any]) -> list[str]:
-    """The SHA-256 of every content that a file may have: its own, and what it replaces while it is being written."""
+    """The valid SHA-256 values of a file: its own, and that of the content it replaces while being written."""
     return [version["sha256"] for version in (entry, entry.get("replaces")) if version]
 
 

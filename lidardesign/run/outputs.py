@@ -1,4 +1,4 @@
-"""Files that a command will write, looked at before it works: they can be written, and they are nobody else's."""
+"""Checks of a command's output files before its work: they can be written, and overwrite nothing else."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lidardesign.run.files import FILE_NAME as LOCK
 from lidardesign.run.inputs import parse_json
 from lidardesign.run.manifest import FILE_NAME as MANIFEST
 
-# What fits keep in a run of what training scenes show of rays.
+# The cache of information of rays about training scenes.
 CACHE = "informed.npz"
-# What a run has beside the files that its manifest lists.
+# Files of a run that its manifest does not list.
 RUN_FILES = (MANIFEST, LOCK, CACHE, "config.yaml", "progress.jsonl")
 STREAMS = {1: "standard output", 2: "standard error"}
 # A full disk has room for an empty file.
@@ -28,10 +28,10 @@ ELSEWHERE = "give another place"
 def check_outputs(
     outputs: Mapping[str, Path | None], inputs: Iterable[Path | str] = (), folders: Collection[str] = ()
 ) -> None:
-    """Refuse outputs that cannot be written, or that would replace what is needed.
+    """Refuse outputs that cannot be written, or that would overwrite inputs or files of a run.
 
     Arguments:
-        outputs: What will be written, by the option that says so; None is left out.
+        outputs: Output paths by their options; None is left out.
         inputs: Files that the command reads.
         folders: The options whose output is a folder of files.
 
@@ -53,12 +53,12 @@ def check_outputs(
 
 
 def _is_device(path: Path) -> bool:
-    """Whether a path is a device or a pipe, to which anything may be sent."""
+    """True for an existing path that is neither a file nor a folder: a device or a pipe."""
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def _check_replaced(name: str, path: Path, inputs: Iterable[Path]) -> None:
-    """Refuse a file that is there and is read, belongs to a run, or is what a stream of this process goes to."""
+    """Refuse an existing file that is an input, belongs to a run, or receives this process's output."""
     if not path.is_file():
         return
     for stream, words in STREAMS.items():
@@ -73,14 +73,14 @@ def _check_replaced(name: str, path: Path, inputs: Iterable[Path]) -> None:
 
 
 def _files_of(run: Path) -> set[str]:
-    """The names of the files of a run; whoever needs its manifest says that it is damaged."""
+    """The names of the files of a run; of one with a damaged manifest only the usual ones."""
     with contextlib.suppress(OSError, ValueError, AttributeError, TypeError):
         return {*RUN_FILES, *parse_json((run / MANIFEST).read_bytes()).get("files", ())}
     return {*RUN_FILES}
 
 
 def check_writable(path: Path, *, is_folder: bool = False) -> None:
-    """Refuse a place where nothing can be written; a small file without a name is written there.
+    """Refuse a place that cannot be written, by writing a small unnamed file there.
 
     Arguments:
         path: The file or folder; folders above it may be missing.
@@ -101,7 +101,7 @@ def check_writable(path: Path, *, is_folder: bool = False) -> None:
             if not (stat.S_ISFIFO(found.st_mode) or stat.S_ISCHR(found.st_mode)) or not os.access(path, os.W_OK):
                 raise DataError("cannot be written", where=str(path), allowed="a file, a pipe or a character device")
             return
-        # what a link leads to is written, not the link
+        # writing follows links
         place = Path(os.path.realpath(path))
         there = next(folder for folder in ([place] if is_folder else []) + [*place.parents] if _look_up(folder))
         if not there.is_dir():
@@ -117,7 +117,7 @@ def check_writable(path: Path, *, is_folder: bool = False) -> None:
 
 
 def _look_up(path: Path) -> os.stat_result | None:
-    """What the system says of a path; None where nothing is there."""
+    """The `stat` of a path; None where nothing is there."""
     try:
         return os.stat(path)
     except (FileNotFoundError, NotADirectoryError):

@@ -1,6 +1,6 @@
-"""Values of files and of `--set KEY=VALUE`, checked: errors say where, what was found and what is allowed.
+"""Validation of values of files and of `--set KEY=VALUE`: errors have the place, the value and the allowed values.
 
-Booleans and quoted text are no numbers, and names do not steer terminals.
+Booleans and quoted text are no numbers, and names hold no control characters.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def is_name(value: Any) -> bool:
-    """Whether a value is text that may be shown: not blank, and without characters that steer a terminal."""
+    """True for text that is not blank and has no control characters."""
     shown = isinstance(value, str) and bool(value.strip())
     return shown and not any(unicodedata.category(letter) == "Cc" for letter in value)
 
 
 def parts(annotation: Any) -> list[Any]:
-    """An annotation and everything that it is a union, list or annotated form of."""
+    """The types inside unions, lists, tuples and annotated forms of an annotation, or itself."""
     origin = typing.get_origin(annotation)
     if origin in (typing.Union, UnionType, list, tuple, typing.Annotated):
         return [part for argument in typing.get_args(annotation) for part in parts(argument)]
@@ -39,13 +39,13 @@ def parts(annotation: Any) -> list[Any]:
 
 
 def nested_model(annotation: Any) -> type[BaseModel] | None:
-    """The model that an annotation admits, if it admits one."""
+    """The first pydantic model that an annotation admits; None without one."""
     models = [part for part in parts(annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
     return models[0] if models else None
 
 
 def wrong_kinds(model: type[BaseModel], values: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
-    """Where values are booleans or text although a model asks for numbers, with what stands there."""
+    """Paths and values of booleans and text where a model has numbers."""
     if not isinstance(values, dict):
         return
     for name, value in values.items():
@@ -76,7 +76,7 @@ def check_model(model: type[Model], values: Any, locate: Callable[..., str], sec
     Arguments:
         model: The section's model.
         values: Plain values.
-        locate: Where the value, or with `key=True` the key, of a path (section in front) came from.
+        locate: The position of the value, or with `key=True` of the key, of a path (section in front).
         section: Name of the section in messages.
     """
     try:
@@ -91,7 +91,7 @@ def check_model(model: type[Model], values: Any, locate: Callable[..., str], sec
 
 
 def anchor_paths(values: Any, given: Any, model: type[BaseModel], base: Path) -> None:
-    """Make the relative paths among the given values absolute, where the model says that they are paths."""
+    """Make the relative paths among the given values absolute where the model has the type `Path`."""
     if not isinstance(values, dict) or not isinstance(given, dict):
         return
     for name, value in given.items():
@@ -122,7 +122,7 @@ def _explain(
     locate: Callable[..., str],
     section: str,
 ) -> ConfigError:
-    """The ConfigError of a pydantic error: unknown keys first, since they often explain the others."""
+    """The ConfigError of a pydantic error; unknown keys come first, since they often explain the others."""
     details = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
     detail = details[0]
     path = _real_path(detail["loc"], values)
@@ -149,7 +149,7 @@ def _explain(
     found = f": found {_short(detail['input'])}"
     more = f" (and {len(details) - 1} more)" if len(details) > 1 and len(detail["loc"]) == len(path) else ""
     if detail["type"] in ("value_error", "assertion_error"):
-        # a mapping says nothing that the text does not
+        # the text describes a mapping already
         found = "" if not path or isinstance(detail["input"], Mapping) else found
         return ConfigError(f"{name}: {text}{found}{more}" if name else f"{text}{more}", where=where)
     return ConfigError(f"{name}{found}{more}".removeprefix(": "), where=where, allowed=_allowed(detail["type"], text))
@@ -163,7 +163,7 @@ def _allowed(kind: str, text: str) -> str:
 
 
 def _real_path(location: tuple[Any, ...], values: Any) -> KeyPath:
-    """The part of a pydantic location that is in the values (it also names the members of unions)."""
+    """The keys of a pydantic location that are in the values, without names of union members."""
     path: list[str | int] = []
     for index, key in enumerate(location):
         last = index == len(location) - 1
@@ -184,13 +184,13 @@ def _fields_at(model: type[BaseModel], path: KeyPath) -> list[str]:
 
 
 def suggest(key: str, allowed: Iterable[str]) -> str | None:
-    """A hint at the allowed name that an unknown one is most like, if any is."""
+    """A hint at the allowed name closest to an unknown one; None where none is close."""
     close = difflib.get_close_matches(key, list(allowed), n=1)
     return f"did you mean {close[0]!r}?" if close else None
 
 
 def _elsewhere(model: type[BaseModel], key: str) -> str | None:
-    """A hint at the section of a model that has a key which was given outside of it, if one has."""
+    """A hint at the section of a model that has a misplaced key; None without one."""
     sections = {name: nested_model(info.annotation) for name, info in model.model_fields.items()}
     found = [f"{name}.{key}" for name, nested in sections.items() if nested and key in nested.model_fields]
     return f"did you mean {found[0]!r}?" if found else None

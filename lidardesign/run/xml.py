@@ -19,7 +19,7 @@ MOST_ELEMENTS = 500_000
 LONGEST_QUOTE = 80
 # The parser hands text over in pieces of so much, not line by line: each is joined to what already exists.
 PIECE_BYTES = 1 << 20
-# What the parser says at the end of a file that goes on.
+# Messages of the parser at the end of a truncated file.
 CUT_SHORT = frozenset(
     expat.errors.codes[text]
     for text in (
@@ -76,7 +76,7 @@ class _Builder:
 
     @property
     def unfinished(self) -> str:
-        """What is missing of a file that ends too early."""
+        """The error text for a file that ends too early."""
         if not self._open:
             return "is not XML, or ends early: it has no element"
         last = self._open[-1]
@@ -114,10 +114,10 @@ class _Builder:
 
 
 def numbers_of(text: str | None, count: int, where: str, name: str) -> list[float]:
-    """So many finite numbers, separated by blanks.
+    """`count` finite numbers from a text, separated by blanks.
 
     Raises:
-        DataError: They are more or fewer, or none.
+        DataError: Another count, or a part that is no finite number.
     """
     try:
         values = [plain_number(part) for part in (text or "").split()]

@@ -27,7 +27,7 @@ MAX_DIGITS = 100
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _BaseDumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 QUOTE_HINT = 'quote text that begins with a sign or has a colon in it, such as "*hand"'
-# What libyaml and its Python twin say of text without them.
+# Messages of libyaml and its Python twin about text without quotes.
 UNQUOTED = ("found character", "mapping values", "did not find expected alphabetic")
 
 _NULL = re.compile(r"~|null|Null|NULL|")
@@ -92,7 +92,7 @@ def load_yaml(path: Path, kind: Kind = YAML, *, empty_sections: bool = False) ->
 
     Arguments:
         path: The file.
-        kind: What it is, which says how large it may be.
+        kind: The kind of file, which limits its size.
         empty_sections: Whether a key of the first level may have nothing behind it, as a section all of whose keys
             are comments.
 
@@ -128,7 +128,7 @@ def parse_yaml(text: str, *, where: str, empty_sections: bool = False) -> Docume
 
 
 def resolve_scalar(text: str) -> Any:
-    """What a plain scalar means: None, a boolean, a number, or the text itself.
+    """The value of a plain scalar: None, a boolean, a number, or the text itself.
 
     Raises:
         ValueError: A number that is not finite or too long.
@@ -152,12 +152,12 @@ def resolve_scalar(text: str) -> Any:
 
 
 def plain_number(text: str) -> float:
-    """The number that a text is in options and tables: decimal digits, as in files.
+    """The number of a text in options and tables: decimal digits, as in files.
 
-    Python also reads `1_0`, digits of other scripts, `nan` and `inf`, which nobody writes on purpose.
+    `1_0`, digits of other scripts, `nan` and `inf`, which Python reads, are refused.
 
     Raises:
-        ValueError: It is none, or not finite.
+        ValueError: No number, or not finite.
     """
     number = float(text) if _FLOAT.fullmatch(text.strip()) else math.nan
     if not math.isfinite(number):
@@ -317,10 +317,10 @@ def _position(event: yaml.Event) -> Position:
 
 
 class _Dumper(_BaseDumper):  # type: ignore[misc, valid-type]
-    """Quotes text that either YAML 1.1 or this module would read as something else; writes no aliases."""
+    """A dumper that quotes text which YAML 1.1 or this module would read as another type, and writes no aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Repeated values are written out each time."""
+        """True, so that repeated values are written out each time."""
         return True
 
 
@@ -335,7 +335,7 @@ def dump_yaml(value: Any) -> str:
 
     Raises:
         NumericalError: A number is not finite.
-        ConfigError: A text is none, as the name of a file may be that is not in UTF-8.
+        ConfigError: Text that is not valid Unicode, as a file name that is not UTF-8.
     """
     return yaml.dump(
         _plain(value), Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True

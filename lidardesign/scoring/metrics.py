@@ -119,7 +119,7 @@ class SurfaceCloud:
 
     @cached_property
     def gap_m(self) -> float:
-        """One place of the surface in a thousand is further than this from all points [m].
+        """The distance from all points that one place of the surface in a thousand exceeds [m].
 
         Beyond r there is no point with the probability exp(-pi n r^2), and neighbours are 0.5 / sqrt(n) apart.
         """
@@ -135,7 +135,7 @@ class SurfaceCloud:
 
 
 def ray_spacing(directions: np.ndarray) -> np.ndarray:
-    """The spacing of rays where each of them looks: the mean distance to its neighbours on the unit sphere.
+    """The local spacing of rays: the mean distance of each to its neighbours on the unit sphere.
 
     Neighbours are those of the Delaunay triangulation of all rays: the rings of a spinning scanner have neighbours in
     other rings, although many rays of their own are nearer.
@@ -153,7 +153,7 @@ def ray_spacing(directions: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=512)
 def _ray_spacing(directions: bytes) -> np.ndarray:
-    """Found once for rays that are fired in many scenes."""
+    """`ray_spacing` of unit vectors as bytes, cached for rays that are fired in many scenes."""
     distinct, inverse = np.unique(np.frombuffer(directions).reshape(-1, 3), axis=0, return_inverse=True)
     spacing = np.full(len(distinct), np.inf)
     faces, seen = _delaunay_faces(distinct)
@@ -185,7 +185,7 @@ def delaunay_surface(
         viewpoint: Where they are seen from [m], shape (3,).
         steepest_deg: Triangles seen at a flatter angle than this from their normal are left out: they bridge
             from one surface to another behind it.
-        spacing: How far apart rays are at each point, as `ray_spacing` of all that were fired, shape (N,). Triangles
+        spacing: Spacing of rays at each point, as `ray_spacing` of all that were fired, shape (N,). Triangles
             with an edge of more than three spacings are left out: rays in between saw nothing there.
 
     If no triangle is left, all stay.
@@ -216,7 +216,7 @@ def delaunay_surface(
 
 
 def _delaunay_faces(directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
-    """Triangles (F, 3) of those of the directions (N, 3) that a mask keeps, and it; None where they span none."""
+    """Delaunay triangles (F, 3) of the directions (N, 3) in a mask, and the mask; None where they span none."""
     from scipy.spatial import Delaunay, QhullError
 
     if len(directions) < 3:

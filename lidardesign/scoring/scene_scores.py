@@ -1,7 +1,7 @@
 """Scores of many sets of rays in every scene, each scene under the effects that it calls for.
 
-A scene is the unit of work: all its rays are planned and traced together, and what comes of it depends on nothing
-else. So scenes can be scored one after the other here, or by workers (`lidardesign.workers`), to the same numbers.
+A scene is the unit of work: all its rays are planned and traced together, and its scores depend on nothing else. So
+scenes can be scored one after the other here, or by workers (`lidardesign.workers`), to the same numbers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lidardesign.workers import Starmap
 RaysPerCondition = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000
-# So many scenes and frames show whether targets return anything; a larger share of them in which nothing does is told.
+# Frames that are checked for returns from targets; a larger share without any is noted.
 WATCHED, MOST_SILENT = 16, 0.5
 
 
@@ -44,12 +44,12 @@ def score_lists(
 ) -> Iterator[tuple[Score, float]]:
     """Scores of many sets of rays in one scene, in their order, each with its share of the time [s].
 
-    As many are traced together as a bounded memory allows. Chance is the same for all sets and another one at each
-    position.
+    As many are traced together as a bounded memory allows. Random numbers are the same for all sets and differ between
+    positions.
 
     Arguments:
-        task: Whose score is taken.
-        metric: What it means.
+        task: The task that scores.
+        metric: Its metric.
         scene: The scene.
         jobs: The sets of rays.
         casters: One per frame.
@@ -98,7 +98,7 @@ def _groups(jobs: Sequence[RaysPerCondition], frames: int) -> Iterator[list[Rays
 def checked_score(task: Task, metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
     """The score that a task gives to returns in a scene; a failure has the metric's worst value.
 
-    A value beyond the worst one counts as the worst, so that failing is never the better choice.
+    A value beyond the worst one counts as the worst, so that failing is never better.
 
     Raises:
         PluginError: The task's score raised, or returned something that is no finite score.
@@ -141,8 +141,8 @@ def silent_notes(scenes: Sequence[Scene], fired: Mapping[str, RaysPerCondition])
     """Lines on sets of rays that have no return from any target in most of a few scenes and frames.
 
     Arguments:
-        scenes: The scenes, of which some are looked at, without effects.
-        fired: The rays of each set, from all its positions, by what it is called.
+        scenes: The scenes, of which some are checked, without effects.
+        fired: The rays of each set, from all its positions, by its name.
     """
     frames = [(scene, frame) for scene in scenes for frame in range(scene.frames)]
     watched = [frames[number] for number in np.unique(np.linspace(0, len(frames) - 1, WATCHED).astype(int))]
@@ -169,8 +169,8 @@ class ScenePass:
     """Sets of rays to be scored in all held-out scenes.
 
     Arguments:
-        task: Whose score is taken.
-        metric: What it means.
+        task: The task that scores.
+        metric: Its metric.
         seed: Root of the effects' random streams.
         scenes: The held-out scenes.
         fired: The sets of rays that are fired in a scene, by its number.
@@ -187,7 +187,7 @@ class ScenePass:
     plans: Sequence[EffectPlan] = ()
 
     def known(self, number: int) -> EffectPlan | None:
-        """The plan of a scene, if it is known."""
+        """The known plan of a scene, else None."""
         return self.plans[number] if self.plans else None
 
 
@@ -196,10 +196,10 @@ class SceneScores:
     """Scores of all sets of rays in a scene, and the effects that it was simulated with.
 
     Arguments:
-        plan: What was simulated.
-        planning_seconds: Time to find that out [s].
+        plan: The effects that were simulated.
+        planning_seconds: Time to plan them [s].
         scores: Of every set of rays, in their order, each with its share of the time [s].
-        second_casts: How often meshes had to be asked twice, in planning too.
+        second_casts: Counts of second casts at meshes, those of planning included.
     """
 
     plan: EffectPlan
@@ -214,9 +214,9 @@ def score_scenes(
     """Score scene by scene, so that only one scene's casters are held at a time; or by workers, to the same numbers.
 
     Arguments:
-        scenes: The scenes, what is fired there, and under which effects.
+        scenes: The scenes, the rays fired in each, and their effects.
         progress: Called with the name of the scene, the scenes done, and all scenes.
-        starmap: How scenes are scored.
+        starmap: Map over scenes.
     """
     found, total = [], len(scenes.scenes)
     asked = (
@@ -245,8 +245,8 @@ def score_in_scene(
     """Score sets of rays in one scene.
 
     Arguments:
-        task: Whose score is taken.
-        metric: What it means.
+        task: The task that scores.
+        metric: Its metric.
         scene: The scene.
         lists: The sets of rays.
         planner: How effects are chosen.

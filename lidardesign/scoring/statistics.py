@@ -1,7 +1,7 @@
 """Means over scenes with their intervals, and paired differences (Efron and Tibshirani 1993, ch. 13).
 
-Scenes of one group share what was drawn, as the poses of one mesh: what is resampled are groups. Fewer than 10 say
-too little of their distribution for a bootstrap, whose intervals are then too narrow; they have Student's t interval.
+Scenes of one group share random draws, as the poses of one mesh: groups are resampled. Fewer than 10 give bootstrap
+intervals that are too narrow; they have Student's t interval.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LARGEST_TABLE = 2_000_000  # resampled indices held at once; bounds memory at 16
 
 
 class Interval(NamedTuple):
-    """A mean with the ends of its interval; without ends where a single group says nothing about others."""
+    """A mean with the ends of its interval; the ends are None for a single group."""
 
     mean: float
     low: float | None
@@ -34,9 +34,8 @@ def mean_interval(
 ) -> Interval:
     """The mean over scenes with its interval over groups: a percentile bootstrap, below 10 groups Student's t.
 
-    Values that are all equal in two groups or more give an interval without width: they say nothing of groups that
-    they have not seen. The seed alone decides which groups are drawn, so rows over the same scenes share their
-    resamples.
+    Values that are all equal in two groups or more give an interval without width. The seed alone decides which groups
+    are drawn, so rows over the same scenes share their resamples.
 
     Arguments:
         values: One per scene, shape (S,).
@@ -62,7 +61,7 @@ def mean_interval(
     if (values == values[0]).all():
         return Interval(float(values[0]), float(values[0]), float(values[0]))
     if len(counts) < FEWEST_RESAMPLED:
-        # what groups move the mean by: their own means' deviations, where all have equally many scenes
+        # contributions of groups to the mean: deviations of their means where all have equally many scenes
         moved = (sums - mean * counts) / counts.mean()
         error = math.sqrt(np.square(moved).sum() / (len(moved) * (len(moved) - 1)))
         return student_interval(mean, error, len(moved) - 1, level)
@@ -72,7 +71,7 @@ def mean_interval(
 
 
 def student_interval(mean: float, error: float, degrees: float, level: float = LEVEL) -> Interval:
-    """The interval of a mean with a standard error that has so many degrees of freedom, not always a whole number."""
+    """Student's t interval of a mean with a standard error of `degrees` degrees of freedom, which may be fractional."""
     half = error * float(stdtrit(degrees, (1 + level) / 2))
     return Interval(mean, mean - half, mean + half)
 

@@ -1,4 +1,4 @@
-"""Sweeps: what a numerical choice costs at each of its settings, in error and in seconds.
+"""Sweeps: error and time of a numerical choice at each of its settings.
 
 A sweep has one measurement per setting, the roughest first. Its error is taken against a closed form or the finest
 setting, and has an uncertainty of its own; the cheapest setting inside the sweep's tolerance is the one to choose.
@@ -39,7 +39,7 @@ class Measurement:
         error: Against the sweep's reference, in the sweep's unit; 0 for the reference itself.
         uncertainty: Standard error of `error`, in the same unit.
         seconds: Median time of the sweep's work at this setting [s].
-        memory_bytes: The most memory that the work took beyond what was there before; None where it was not measured.
+        memory_bytes: Peak memory of the work beyond that held before; None where it was not measured.
         default: Whether the run uses this setting.
         reference: Whether errors are taken against this measurement.
         values: Further figures of the measurement by name, with their unit in the name.
@@ -61,14 +61,14 @@ class Sweep:
 
     Arguments:
         knob: The key that sets it, for example "density.quadrature_points", or a name where no key does.
-        error_of: What the error is, in a few words.
+        error_of: The error in a few words.
         unit: Of errors and the tolerance; "" for shares.
-        against: What errors are taken against.
+        against: The reference of errors.
         tolerance: Errors up to this one do not matter, for the reason in `because`.
-        because: Why the tolerance is what it is.
-        work: What the seconds are the time of.
+        because: The reason for the tolerance.
+        work: The work that is timed.
         measurements: The roughest first, 1 or more.
-        note: What a reader should know, one line, or "".
+        note: A line for readers, or "".
     """
 
     knob: str
@@ -85,8 +85,8 @@ class Sweep:
     def chosen(self) -> Measurement:
         """The cheapest inside the tolerance, uncertainty included; of those that cost the same, the most accurate.
 
-        What the run does already stays where it is inside the tolerance and nothing there is cheaper by more than can
-        be told. Where no measurement is inside the tolerance, the most accurate one.
+        The run's own setting is kept where it is inside the tolerance and none there is significantly better. Where no
+        measurement is inside the tolerance, the most accurate one.
         """
         inside = [one for one in self.measurements if one.error + one.uncertainty <= self.tolerance]
         if not inside:
@@ -116,7 +116,7 @@ class Sweep:
 
     @property
     def verdict(self) -> str:
-        """The chosen setting beside the run's own, in one line; whether chance had a part in it."""
+        """The chosen setting compared with the run's own, in one line, with a doubt where errors do not fall."""
         return self._comparison + ("" if self.falls else "; but errors do not fall here: by chance, perhaps")
 
     @property
@@ -193,9 +193,9 @@ def timed(call: Callable[[], Value]) -> tuple[Value, float, int | None]:
 
 
 def with_memory(call: Callable[[], Value]) -> tuple[Value, int | None]:
-    """A call's value and by how much its peak of resident memory lay above what was resident before [bytes].
+    """A call's value and the rise of peak resident memory during it [bytes].
 
-    None where the system does not tell (it does on Linux).
+    None where the system does not report it (Linux does).
     """
     before = None
     with contextlib.suppress(OSError):
@@ -207,7 +207,7 @@ def with_memory(call: Callable[[], Value]) -> tuple[Value, int | None]:
 
 
 def _resident(name: str) -> int | None:
-    """A size of this process from the system's status, in bytes."""
+    """A size of this process from the system's status [bytes]."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         for line in _STATUS.read_text(encoding="ascii").splitlines():
             if line.startswith(f"{name}:"):

@@ -1,4 +1,4 @@
-"""Shares of rays, and what a design costs to read out: bins, bits and frames per second (paper, section 6).
+"""Shares of rays, and the read-out bandwidth of a design: bins, bits and frames per second (paper, section 6).
 
 A gate of width w listens for the round-trip time 2 w / c, cut into bins of one fixed duration. Every bin
 of every ray is read out once per frame, so the bandwidth is sum(bins) * bits * rate.
@@ -83,7 +83,7 @@ def split_budget(weights: np.ndarray, count: int, *, each: bool = False) -> np.n
 
     Largest remainder (Hamilton): every sensor gets the whole part of its quota, the rays left over go to the
     largest fractional parts, the lower index first where they tie. Too few rays leave some sensors without; with
-    `each` those get one of the sensors with most, as far as there are rays for all.
+    `each` these get one ray from the sensors with most, as far as there are rays for all.
 
     Raises:
         ConfigError: Weights that are negative, not finite or all zero; a negative count.
@@ -108,5 +108,5 @@ def split_budget(weights: np.ndarray, count: int, *, each: bool = False) -> np.n
 
 
 def mean_mbps(positions: Sequence[Rays], bandwidth: Bandwidth) -> float:
-    """What reading rays out costs, averaged over condition values [Mbit/s]."""
+    """The bandwidth of rays, averaged over condition values [Mbit/s]."""
     return math.fsum(bandwidth.mbps(rays) for rays in positions) / len(positions)

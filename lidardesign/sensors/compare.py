@@ -1,7 +1,7 @@
-"""Two designs beside each other, sensor by sensor; what a design costs to read out; and whether it fits a space at all.
+"""Differences of two designs, sensor by sensor; the bandwidth of a design; and notes on designs outside a space.
 
-Sensors of the same names are compared by name; otherwise each sensor of one design with one of the other so that all
-differences together are smallest, where a metre of place and of gate counts as much as a radian at the designs' range.
+Sensors of the same names are compared by name; otherwise sensors are assigned with the smallest sum of differences,
+where a metre of place and of gate counts as much as a radian at the designs' range.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ MODEL_KEYS = ("bin_ps", "bits_per_bin", "rate_hz")
 
 @dataclass(frozen=True, eq=False)
 class SensorPair:
-    """Two sensors that stand for one another; one is None where the other design has more.
+    """A sensor of each of two designs; one is None where the other design has more.
 
     Arguments:
-        first, second: Of the first and the second design.
+        first, second: The sensors of the first and the second design.
     """
 
     first: Sensor | None
@@ -80,7 +80,7 @@ def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[SensorPair]:
         }
         for design in (first, second)
     )
-    # how different each sensor of one design is from each of the other, shape (G, H) [m]
+    # the difference of each sensor of one design from each of the other, shape (G, H) [m]
     distances_m = sum(np.linalg.norm(one[key][:, None] - other[key][None], axis=2) for key in one)
     rows, columns = linear_sum_assignment(distances_m)
     pairs = [SensorPair(first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)]
@@ -112,7 +112,7 @@ class BandwidthUse:
 
 
 def readout_of(design: DesignSpec) -> BandwidthUse:
-    """What a design's gates cost, by the read-out of its own constraints or the usual one."""
+    """The bandwidth of a design, by the read-out model of its own constraints or the default one."""
     budget = design.constraints.get("budget") or {}
     model = Bandwidth(**{name: float(budget[name]) for name in MODEL_KEYS if budget.get(name) is not None})
     if design.patterns:
@@ -128,7 +128,7 @@ def readout_of(design: DesignSpec) -> BandwidthUse:
 
 
 def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
-    """What is said of a design far outside a design space, one line at most.
+    """A note on a design far outside a design space, likely in other units; else an empty list.
 
     Arguments:
         design: Its sensors' origins and gates, and those of its rays where it has patterns.
@@ -154,7 +154,7 @@ def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
 
 
 def outside_space(design: DesignSpec, space: DesignSpace) -> str:
-    """How much of a design lies outside a design space, as "3 of 361 rays ... outside"; nothing where all is inside.
+    """The part of a design outside a design space, as "3 of 361 rays ... outside"; empty where all is inside.
 
     Arguments:
         design: Its rays where it has patterns, else its sensors' origins, boresights and gates.
@@ -168,7 +168,7 @@ def outside_space(design: DesignSpec, space: DesignSpace) -> str:
         what, origins_m = "sensors", np.array([sensor.origin_m for sensor in sensors]).reshape(-1, 3)
         directions = np.array([sensor.boresight for sensor in sensors]).reshape(-1, 3)
         gates_m = np.array([sensor.gate_m for sensor in sensors]).reshape(-1, 2)
-    # what a gate hears inside the space, if anything
+    # the range of a gate nearest to the middle of the space's
     range_m = np.clip((space.low[RANGE] + space.high[RANGE]) / 2, gates_m[:, 0], gates_m[:, 1])
     points = np.column_stack([origins_m, *angles(directions), range_m])
     points[:, space.conditioned] = np.array(space.low)[list(space.conditioned)]

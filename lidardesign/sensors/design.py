@@ -30,7 +30,7 @@ Gates = Literal["sensor", "ray"]
 
 @dataclass(frozen=True, eq=False)
 class DesignSpec:
-    """A LiDAR system: sensors, the patterns that they fire, and where it came from.
+    """A LiDAR system: sensors, the patterns that they fire, and its provenance.
 
     Arguments:
         name: The file's stem, the row's name in tables.
@@ -39,7 +39,7 @@ class DesignSpec:
             rings; `fixed`: the rays of real parts or of a rig.
         patterns: Its rays, by ascending number; none of the layout `even`.
         constraints: The constraint document that it satisfies (plain values).
-        certificates: How far from the best each choice of rays may be, one entry per number of rays.
+        certificates: Bounds on each choice of rays, one entry per number of rays.
         provenance: Command, seed, run and versions, for people.
         level: The share of each marginal that fields of view and gates hold.
         at: The condition values that the design is for, where it is for one, as {"x_m": 0.37}.
@@ -59,7 +59,7 @@ class DesignSpec:
 
     @property
     def frame(self) -> str:
-        """The frame of its places and directions, in words: the world's, or that of a robot's body."""
+        """The frame of its origins and directions, in words: the world's, or that of a robot's body."""
         return "the world's frame" if self.mount is None else f"the frame of the robot's body {self.mount!r}"
 
     @property
@@ -90,15 +90,15 @@ class DesignSpec:
 
     @property
     def has_gates_per_ray(self) -> bool:
-        """Whether rays of one sensor have gates of their own."""
+        """True where rays of one sensor have different gates."""
         return any(pattern.gates == "ray" for pattern in self.patterns)
 
     def pattern(self, count: int) -> Pattern | None:
-        """The pattern of a number of rays; None where it has none."""
+        """The pattern with `count` rays; None where it has none."""
         return next((pattern for pattern in self.patterns if len(pattern) == count), None)
 
     def rays_per_sensor(self, count: int | None = None) -> np.ndarray | None:
-        """How many rays each sensor fires, of a number or of its own, shape (S,); None where that is open."""
+        """Rays of each sensor, of `count` or of its own number, shape (S,); None where that is open."""
         count = self.count if count is None else count
         if count is None:
             return None
@@ -109,7 +109,7 @@ class DesignSpec:
 
     @property
     def _own_counts(self) -> np.ndarray:
-        """How many rays of its largest pattern are each sensor's, shape (S,)."""
+        """Rays of each sensor in its largest pattern, shape (S,)."""
         return self.patterns[-1].per_sensor(len(self.sensors))
 
     def rays(
@@ -118,15 +118,15 @@ class DesignSpec:
         at: Mapping[str, float] | None = None,
         rate_hz: float = DEFAULT_RATE_HZ,
     ) -> Rays:
-        """The rays that it fires, evenly over a frame; every other part of the program asks here.
+        """The rays that it fires, evenly over a frame: the one source of a design's rays.
 
         Arguments:
             count: Rays per frame; None takes its own number.
-            at: Condition values, as {"x_m": 0.37}: rays that differ along it are those there, others move there.
+            at: Condition values, as {"x_m": 0.37}: patterns along a condition are evaluated, others are moved.
             rate_hz: Frames per second [Hz].
 
         Raises:
-            ConfigError: It does not fire so many rays, no number is known, or it cannot be at such a place.
+            ConfigError: It cannot fire so many rays, has no number of its own, or cannot be at this condition.
         """
         count = self.count if count is None else count
         if count is None:
@@ -162,10 +162,10 @@ class DesignSpec:
         )
 
     def at_condition(self, at: Mapping[str, float]) -> DesignSpec:
-        """The design as it is at one value of its conditions, with patterns of one knot.
+        """The design at one value of its conditions, with patterns of one knot.
 
-        Patterns along a condition give their rays there. Other designs are carried by what moves: the named coordinate
-        of every origin becomes the value; directions and gates stay.
+        Patterns along a condition are evaluated there. Other designs are moved: the named coordinate of every origin
+        becomes the value; directions and gates stay.
 
         Raises:
             ConfigError: A name that is no coordinate, a value beyond the ends of a pattern, or none where rays differ.
@@ -179,7 +179,7 @@ class DesignSpec:
         return replace(self, sensors=sensors, patterns=patterns, at={**self.at, **at})
 
     def _moves(self, at: Mapping[str, float]) -> dict[int, float]:
-        """The coordinates of origins that change. Only origins move; a design for one direction is not for another."""
+        """The new coordinates of origins by axis; conditions other than origins cannot change."""
         for name, value in at.items():
             if name not in DIMENSIONS:
                 raise ConfigError(
@@ -202,5 +202,5 @@ CERTIFIED = ("rays", "value", "bound", "gap", "held_back_value", "candidates", "
 
 
 def certificates_of(design: DesignSpec) -> list[dict[str, Any]]:
-    """How far from the best a design's choices of rays may be, one entry per number of rays; none that is damaged."""
+    """The certificates of a design's choices of rays, one per number of rays, without damaged entries."""
     return [entry for entry in design.certificates if all(type(entry.get(name)) in (int, float) for name in CERTIFIED)]

@@ -56,7 +56,7 @@ class _Keys(BaseModel):
 
 
 class OriginEntry(_Keys):
-    """Where a sensor stands [m], or the mean and covariance of a region in which its rays start [m^2]."""
+    """The origin of a sensor [m], or the mean and covariance of a region in which its rays start [m^2]."""
 
     mean: Vector
     covariance: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = None
@@ -72,7 +72,7 @@ class OriginEntry(_Keys):
 
 
 class BoresightEntry(_Keys):
-    """Where a sensor looks: azimuth from +x towards +y, elevation up from the xy plane, roll about the boresight."""
+    """The boresight of a sensor [rad]: azimuth from +x to +y, elevation up from the xy plane, roll about itself."""
 
     azimuth_rad: Azimuth
     elevation_rad: Elevation
@@ -87,7 +87,7 @@ class FieldEntry(_Keys):
 
 
 class GateEntry(_Keys):
-    """From where to where a sensor listens, one way; the start is included, the end is not."""
+    """The gate of a sensor as one-way distances [m]; the start is included, the end is not."""
 
     start: Distance
     end: Distance
@@ -112,7 +112,7 @@ class SensorEntry(_Keys):
 
 
 class PatternEntry(_Keys):
-    """The rays of one number of rays: a list for each ray's property, with a row for each knot of a condition."""
+    """A pattern: a table for each property of its rays, with a row for each knot of a condition."""
 
     dimension: Literal["x_m", "y_m", "z_m"] | None = None
     knots_m: list[Coordinate] = []
@@ -149,7 +149,7 @@ COLUMNS = (
 
 
 class MountEntry(_Keys):
-    """The body of a robot that the sensors are on, in whose frame places and directions are."""
+    """The body of a robot that the sensors are mounted on, the frame of origins and directions."""
 
     body: Name
 
@@ -293,7 +293,7 @@ def design_from_document(document: Any, where: str = "design", locate: Callable[
 
 
 def without_nulls(value: Any) -> Any:
-    """A document without the keys that are null: an optional key that is null counts as absent."""
+    """A mapping without keys of null: an optional key that is null counts as absent."""
     return {key: item for key, item in value.items() if item is not None} if isinstance(value, Mapping) else value
 
 

@@ -31,9 +31,9 @@ class Pattern:
     """The rays of a design at the knots of a condition, in the order in which they fire; one knot without a condition.
 
     Arguments:
-        origin_m: Where rays start [m], shape (P, N, 3).
-        azimuth_rad, elevation_rad: Where they look, shape (P, N); azimuths are unrolled along the knots.
-        gate_m: From where to where they listen [m], shape (P, N, 2).
+        origin_m: Origins of rays [m], shape (P, N, 3).
+        azimuth_rad, elevation_rad: Their directions, shape (P, N); azimuths are unrolled along the knots.
+        gate_m: Start and end of their gates [m], shape (P, N, 2).
         sensor: The index of the sensor of each ray, shape (N,).
         dimension: The condition, as "x_m"; None without one.
         knots: Its values at the knots, ascending, shape (P,); none without a condition.
@@ -55,15 +55,15 @@ class Pattern:
 
     @classmethod
     def along(cls, dimension: str, knots: Sequence[float], lists: Sequence[Rays], ends: tuple[float, float]) -> Pattern:
-        """The pattern of lists of rays at knots; beyond the first and last knot rays stay as they are there.
+        """The pattern of lists of rays at knots; beyond the first and last knot rays are constant.
 
-        Ray n is at each knot the one that aims nearest to where it aimed at the knot before, all of a sensor together.
+        Rays of neighbouring knots are matched, sensor by sensor, by the least sum of squared distances of aims.
 
         Arguments:
             dimension: The condition.
             knots: Distinct values of it, P of them.
-            lists: As many rays of each sensor at each of them.
-            ends: From where to where the pattern leads, which holds the knots.
+            lists: The rays at each knot, equal numbers of each sensor.
+            ends: First and last value of the pattern, which enclose the knots.
         """
         order = np.argsort(knots)
         rays = [lists[order[0]]]
@@ -98,17 +98,17 @@ class Pattern:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """From where to where it leads along its condition."""
+        """The first and last value of its condition."""
         return self.knots[0], self.knots[-1]
 
     @property
     def gates(self) -> str:
-        """Whether two rays of one sensor have different gates anywhere: "ray", else "sensor"."""
+        """The kind of gates: "ray" where rays of one sensor differ at any knot, else "sensor"."""
         _, first, sensor = np.unique(self.sensor, return_index=True, return_inverse=True)
         return "ray" if (self.gate_m != self.gate_m[:, first[sensor]]).any() else "sensor"
 
     def per_sensor(self, sensors: int) -> np.ndarray:
-        """How many rays each of so many sensors fires, shape (S,)."""
+        """The number of rays of each of `sensors` sensors, shape (S,)."""
         return np.bincount(self.sensor, minlength=sensors)
 
     def at(self, value: float | None = None) -> Rays:
@@ -144,12 +144,12 @@ class Pattern:
         return Rays.from_angles(origin_m, *rest, self.sensor)
 
     def moved(self, values: Mapping[int, float]) -> Pattern:
-        """The pattern with these coordinates of all origins, by their index."""
+        """The pattern with given coordinates of all origins, by axis [m]."""
         return replace(self, origin_m=with_coordinates(self.origin_m, values))
 
 
 def with_coordinates(origin_m: np.ndarray, values: Mapping[int, float]) -> np.ndarray:
-    """Origins (..., 3) with these coordinates, by their index [m]."""
+    """Origins (..., 3) with given coordinates, by axis [m]."""
     moved = np.array(origin_m, dtype=np.float64)
     for axis, value in values.items():
         moved[..., axis] = value
@@ -157,7 +157,7 @@ def with_coordinates(origin_m: np.ndarray, values: Mapping[int, float]) -> np.nd
 
 
 def _assigned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Which point after (N, 3) each point before (N, 3) becomes, so that the squares of all moves sum to the least."""
+    """The index in `after` (N, 3) of each point of `before` (N, 3), with the least sum of squared moves."""
     # slow to import
     from scipy.optimize import linear_sum_assignment
 
@@ -165,7 +165,7 @@ def _assigned(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def even_rays(sensors: Sequence[Sensor], counts: Sequence[int]) -> Rays:
-    """A grid of so many rays in the field of view of each sensor, with its gate, from its place."""
+    """An even grid of rays in each sensor's field of view, `counts` of each, with its gate and origin."""
     tangents = [grid_tangent(*field_on_sphere(one), int(n)) for one, n in zip(sensors, counts, strict=True)]
     sensor = np.repeat(np.arange(len(sensors)), counts)
     looking = [tangent_directions(one.frame, tangent) for one, tangent in zip(sensors, tangents, strict=True)]
@@ -244,7 +244,7 @@ def low_discrepancy(count: int, axes: int) -> np.ndarray:
 
 
 def _radical_inverse(count: int, base: int) -> np.ndarray:
-    """The digits of 1 to `count` in a base, mirrored at the point, shape (count,), inside (0, 1)."""
+    """The radical inverse of 1 to `count` in a base: their digits mirrored at the point, shape (count,)."""
     left, place, total = np.arange(1, count + 1), 1.0, np.zeros(count)
     while left.any():
         place /= base
@@ -260,7 +260,7 @@ def even_subset(points: np.ndarray, count: int) -> np.ndarray:
     number of points but for one; of each the point nearest to its centre stays. Deterministic, and O(M log M).
 
     Raises:
-        ConfigError: More are wanted than there are.
+        ConfigError: `count` exceeds the number of points.
     """
     if not 0 <= count <= len(points):
         raise ConfigError(f"{count} of {len(points)} rays", where="rays", allowed=f"0 to {len(points)}")
@@ -274,7 +274,7 @@ def even_subset(points: np.ndarray, count: int) -> np.ndarray:
         if wanted == 1:
             kept.append(int(members[np.square(inside - inside.mean(axis=0)).sum(axis=1).argmin()]))
             continue
-        # to so many digits, so that rounding does not choose among equal extents and positions
+        # rounded, so that rounding errors do not decide between equal extents and positions
         axis = np.round(np.ptp(inside, axis=0), 9).argmax()
         order = members[np.argsort(np.round(inside[:, axis], 9), kind="stable")]
         first = wanted // 2

@@ -1,4 +1,4 @@
-"""A sensor: where it stands, where it looks, how wide, and when it listens.
+"""A sensor: origin, boresight, field of view and gate.
 
 It is one component of a mixture over design space, a product q(d) = N(x) N(u) N(r): the origin with its covariance, the
 direction in the tangent plane of the boresight, the range. Tangent coordinates u = (horizontal, vertical) are true
@@ -22,7 +22,7 @@ from lidardesign.numerics import sphere_exp, sphere_log
 from lidardesign.space import angles, direction
 
 DEFAULT_LEVEL = 0.95
-# Beyond these an interval is next to nothing, or next to everything, of a normal distribution.
+# Beyond these an interval holds almost none or almost all of a normal distribution.
 LEVELS = (0.01, 0.999999)
 # Returns of so many fill some 100 MB per scene; no scanner fires more in a frame.
 MOST_RAYS = 1_000_000
@@ -72,13 +72,13 @@ class Sensor:
     Arguments:
         name: Unique within its design.
         weight: Share of the rays, 0 to 1, where rays are even.
-        origin_m: Where it stands [m], shape (3,); the middle of a region.
+        origin_m: Its origin, or the mean of a region [m], shape (3,).
         azimuth_rad, elevation_rad, roll_rad: The boresight.
         field_of_view_rad: Full horizontal and vertical angles in the boresight's tangent plane.
-        gate_m: Start and end of the ranges that it listens in.
+        gate_m: Start and end of its gate.
         origin_covariance_m2: Of the origins of its rays where they start all over a region [m^2], shape (3, 3); None
             where they start at one place.
-        part: The part of the catalogue that it is, where it is one.
+        part: The name of its part in the catalogue, where it is one.
     """
 
     name: str
@@ -116,7 +116,7 @@ class Sensor:
         """Angles from the boresight of unit vectors (N, 3), shape (N, 2) [rad]; 0 where its field has no width."""
         tangent = tangent_coordinates(self.frame, directions)
         fan = np.array(self.field_of_view_rad) > 0
-        # in a fan of rays only the angle along the fan says where a point lies
+        # in a fan of rays only the angle along the fan counts
         tangent[:, ~fan & fan.any()] = 0.0
         return tangent
 

@@ -1,4 +1,4 @@
-"""Tables of designs for `show`, `fit` and `constrain`: sensors, constraints, and parts that sensors became."""
+"""Tables of designs for `show`, `fit` and `constrain`: sensors, constraints and certificates."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SPACE_MARK = ".space."
 
 
 def with_error(estimate: dict[str, Any]) -> str:
-    """A figure and its error as far as the error reaches, as `-3.142 +- 0.005`."""
+    """A value and its standard error, rounded to the error's digits, as `-3.142 +- 0.005`."""
     value, error = estimate["value"], estimate["error"]
     if not error or error < SMALLEST_ERROR * abs(value):
         return number(value)
@@ -56,7 +56,7 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
 
 
 def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
-    """Print what chosen rays leave unknown, and how much less any other choice of the same candidates could leave."""
+    """Print the loss of chosen rays, and by how much any choice of the same candidates could lower it."""
     from lidardesign.sensors.design import certificates_of
 
     columns = ("rays", "loss", "on other scenes", "less by at most", "candidates", "scenes")
@@ -76,13 +76,13 @@ def _show_certificates(design: DesignSpec, rich: RichConsole) -> None:
 
 
 def _rays_of(design: DesignSpec) -> list[int | None]:
-    """How many rays each sensor fires of the largest number that the design was made for."""
+    """Rays of each sensor at the largest number of rays of the design; None where that is open."""
     counts = design.rays_per_sensor()
     return [None] * len(design.sensors) if counts is None else counts.tolist()
 
 
 def _show_along(design: DesignSpec, rich: RichConsole) -> None:
-    """Print what rays that differ along a condition do over it: from where to where each looks and listens."""
+    """Print the range of each ray's angles and gate along a condition."""
     from numpy import degrees
 
     pattern, name = design.patterns[-1], design.condition
@@ -118,7 +118,7 @@ def _condition(design: DesignSpec) -> str:
 
 
 def _poses(design: DesignSpec) -> tuple[str, list[dict[str, str]]]:
-    """Where a design is, in words, and the cells of its sensors; a place that all share is in the words alone."""
+    """The place of a design in words, and the table cells of its sensors; without origins where all share one."""
     cells = [sensor.as_text() for sensor in design.sensors]
     if len({cell["origin [m]"] for cell in cells}) > 1:
         return f"in {design.frame}", cells
@@ -148,10 +148,10 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
 
 
 def _left(room: float | None, share: float | None) -> str:
-    """How far a value is inside its bound, with the share of the bound that this is."""
+    """The slack of a constraint, with its share of the bound; a dash where it is broken or has none."""
     if room is None or room < 0:
         return "-"
-    # what is left below the rounding of the checks themselves is nothing
+    # slack below the rounding of the checks counts as none
     if room == 0 or (share is not None and share < SMALLEST_ERROR):
         return "0"
     return number(room, 3) if share is None else f"{number(room, 3)} ({number(100 * share, 2)} %)"
@@ -160,7 +160,7 @@ def _left(room: float | None, share: float | None) -> str:
 def show_fit(
     document: dict[str, Any], design: DesignSpec, checks: Sequence[Any], rich: RichConsole, *, verbose: bool
 ) -> None:
-    """Print what `fit` and `constrain` made: sensors, how rays were chosen, which constraints limit them; or all."""
+    """Print the result of `fit` and `constrain`: sensors, choice of rays, tight constraints; or all tables."""
     if not verbose:
         _show_sensors(design, rich)
         _show_choice(design, rich)
@@ -180,7 +180,7 @@ def show_fit(
 
 
 def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:
-    """A line per sensor; rays are those of the largest number that was chosen."""
+    """Print a line per sensor, with its rays at the largest number of rays."""
     counts = [str(count) for count in design.counts or [design.count] if count is not None]
     several = f"{', '.join(counts[:-1])} or " if counts[:-1] else ""
     rays = f"{several}{counts[-1]} rays {_frames(design)}" if counts else "any number of rays"
@@ -198,7 +198,7 @@ def _show_sensors(design: DesignSpec, rich: RichConsole) -> None:
 
 
 def _frames(design: DesignSpec) -> str:
-    """Where so many rays are fired: in every frame, or at every value of a condition."""
+    """The unit of a number of rays: per frame, or at every value of a condition."""
     if design.condition is None:
         return "per frame"
     first, last = design.patterns[-1].ends
@@ -206,7 +206,7 @@ def _frames(design: DesignSpec) -> str:
 
 
 def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
-    """Among how many rays, on how many scenes, and how far from the best choice that may be."""
+    """Print the numbers of candidates and scenes of a choice, its loss and the lower bound of the loss."""
     from lidardesign.sensors.design import certificates_of
 
     entries = certificates_of(design)
@@ -221,7 +221,7 @@ def _show_choice(design: DesignSpec, rich: RichConsole) -> None:
 
 
 def _tight(checks: Sequence[ConstraintCheck], sensors: Sequence[str]) -> str:
-    """The constraints that limit the design, with the sensors that lean on them."""
+    """The tight constraints of a design with their sensors, as a sentence."""
     from lidardesign.constraints.slack import room_of, split_name
 
     tight: dict[str, list[str]] = {}

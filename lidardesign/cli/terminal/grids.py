@@ -24,7 +24,7 @@ SHARE, LEAST_S, MOST_S = 0.2, 10.0, 600.0
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """A figure, a text, or a list or mapping of them, for people; a dash where there is none."""
+    """A value, or a list or mapping of values, as text; a dash for None and non-finite numbers."""
     if isinstance(value, dict):
         return ", ".join(f"{name} {number(item, digits)}" for name, item in value.items())
     if isinstance(value, list | tuple):
@@ -35,7 +35,7 @@ def number(value: Any, digits: int = 4) -> str:
 
 
 def value_cells(row: Mapping[str, Any]) -> list[str]:
-    """The value of a row and its interval, as fine as the interval says; a dash where there is none."""
+    """The value of a row and its interval, rounded by the interval's width; a dash without one."""
     from lidardesign.estimates import figure_and_interval
 
     value, low, high = figure_and_interval(row["value"], row["ci_low"], row["ci_high"])
@@ -43,7 +43,7 @@ def value_cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def difference_cell(pair: Mapping[str, Any], sign: str = "") -> str:
-    """The difference of a pair and its interval, as fine as the interval says."""
+    """The difference of a pair and its interval, rounded by the interval's width."""
     from lidardesign.estimates import figure_and_interval
 
     difference, low, high = figure_and_interval(pair["difference"], pair["ci_low"], pair["ci_high"], sign=sign)
@@ -122,7 +122,7 @@ def print_table(
 
 
 def _print_parts(lines: Sequence[Sequence[str]], text: Sequence[str], rich: RichConsole) -> None:
-    """As many columns beside each other as fit; the texts in front stand in each part."""
+    """Print a table in parts of as many columns as fit, with the text columns in each."""
     names = [column for column, heading in enumerate(lines[0]) if heading in text]
     rest = [column for column in range(len(lines[0])) if column not in names]
     while rest:
@@ -146,10 +146,10 @@ def _fits(table: Table, rich: RichConsole) -> bool:
 
 
 class ProgressDisplay:
-    """Shows how far work has come, while it is a context.
+    """A context that displays progress.
 
     Arguments:
-        label: What is done, where `show` does not say.
+        label: The label where `show` gives none.
         say: Prints a line away from a terminal.
         console: The terminal's, or None.
     """
@@ -186,13 +186,13 @@ class ProgressDisplay:
         left_s: float | None = None,
         line: str = "",
     ) -> None:
-        """Show where the work is.
+        """Show the progress of the work.
 
         Arguments:
-            done: How much of it is done.
-            total: How much there is; 0 where that is not known.
-            label: What is done now.
-            detail: More of it.
+            done: Units of work done.
+            total: All units; 0 where their number is not known.
+            label: The current step.
+            detail: Further text.
             left_s: The time that remains; by default what follows from the time until now [s].
             line: The name of the line, where there are several.
         """

@@ -1,4 +1,4 @@
-"""Options that several subcommands share, and the values that a shell may offer for them; files it lists itself."""
+"""Options that several subcommands share, and their values for shell completion (files are completed by the shell)."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def constraint_keys() -> list[tuple[str, str]]:
 
 
 def _keys(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str]]:
-    """The dotted keys of a model, each with =, and what they are."""
+    """The dotted keys of a model, each with =, and their descriptions."""
     from lidardesign.run.validation import nested_model
 
     for name, info in model.model_fields.items():
@@ -244,7 +244,7 @@ ConfigFile = Annotated[
 
 
 def parse_at(texts: list[str] | None) -> dict[str, float]:
-    """The values of `--at`, as {"x_m": 0.37}; whether a density has them is for the design space to say.
+    """The values of `--at`, as {"x_m": 0.37}; the design space checks their names.
 
     Raises:
         ConfigError: One is not NAME=VALUE with a finite number, or a name is given twice.
@@ -267,7 +267,7 @@ def parse_at(texts: list[str] | None) -> dict[str, float]:
 
 
 def sensor_count(text: str | None) -> int | str | None:
-    """The value of `--sensors`: a number, or a word that is left to whoever takes it."""
+    """The value of `--sensors`: an int where it is a number, else the text as it is."""
     return int(text) if text is not None and re.fullmatch("[0-9]{1,9}", text) else text
 
 
@@ -284,10 +284,10 @@ def part_names(text: str | None) -> list[str] | str | None:
 
 
 class StrictCommand(TyperCommand):
-    """A command that takes no values which nobody writes on purpose."""
+    """A command that refuses option values that are likely typing errors."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the command line; a value that is empty or -, or `1_0` where a number is asked for, is a mistake.
+        """Read the command line; values that are empty or -, and numbers such as `1_0`, are refused.
 
         Raises:
             ConfigError: At the option or argument.
@@ -317,10 +317,10 @@ class StrictCommand(TyperCommand):
 
 
 def _texts(given: Any) -> list[str]:
-    """The texts of a command line for a parameter: none, one, or several."""
+    """The values of a parameter that are texts of the command line, as a list."""
     return [text for text in (given if isinstance(given, list | tuple) else [given]) if isinstance(text, str)]
 
 
 def _name(parameter: Any) -> str:
-    """A parameter as the command line calls it."""
+    """The name of a parameter on the command line."""
     return parameter.opts[0] if parameter.param_type_name == "option" else parameter.metavar or parameter.name

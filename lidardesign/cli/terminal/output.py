@@ -109,7 +109,7 @@ class Output:
             print_message(text)
 
     def says(self, note: str) -> bool:
-        """True where people are told a note."""
+        """True where a note is printed."""
         return not self.quiet and (self.verbose or not isinstance(note, BackgroundNote))
 
     def remark(self, text: str) -> None:
@@ -176,7 +176,7 @@ class Output:
             rich.print(f"{label}: {path}", soft_wrap=True)
 
     def keep(self, content: str, suffix: str) -> None:
-        """Keep what cannot be put where it belongs in a temporary file, and say where; without room, print it."""
+        """Write content that could not be delivered to a temporary file and print its path; else print the content."""
         try:
             descriptor, place = tempfile.mkstemp(prefix="lidardesign-", suffix=suffix)
             with open(descriptor, "w", encoding="utf-8", errors="backslashreplace") as file:
@@ -193,7 +193,7 @@ class Output:
 
 
 def print_message(text: str) -> None:
-    """Print on stderr; where nobody listens there any more, that is no reason to stop working."""
+    """Print on stderr; a closed stderr is replaced by the null device."""
     try:
         print(text, file=sys.stderr, flush=True)
     except (OSError, ValueError):
@@ -256,7 +256,7 @@ def _guarded_stdout(output: Output) -> Iterator[None]:
 
 
 def close_stdout_guard() -> None:
-    """Send what threads and exit handlers of plugins still print to stderr, once the program has answered."""
+    """Redirect later prints of plugins' threads and exit handlers from stdout to stderr."""
     if _is_of_process(sys.stdout):
         sys.stdout.flush()
         os.dup2(STDERR, STDOUT)
@@ -324,7 +324,7 @@ def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any]
 
 
 def _damaged_cache(error: BaseException) -> str | None:
-    """The folder of numba's cache where an error came of reading it: files that are cut or changed are no pickles."""
+    """The folder of numba's cache where an error came from reading a damaged file in it; else None."""
     trace = error.__traceback__
     while trace is not None:
         frame, trace = trace.tb_frame, trace.tb_next
@@ -338,9 +338,9 @@ def _damaged_cache(error: BaseException) -> str | None:
 def keep_times(
     run: Path, name: str, output: Output, *, wait_s: float = SHORT_WAIT_S, further: Mapping[str, Any] | None = None
 ) -> None:
-    """Enter the times of a command, and further entries, in the manifest of its run; where that cannot be, say so.
+    """Enter the times of a command, and further entries, in the manifest of its run.
 
-    The work is done by then: that its times are not kept is no reason to fail.
+    The work is done by then, so a failure to write is a note, not an error.
     """
     try:
         keep_timings(run, name, output.clock, wait_s=wait_s, further=further)
@@ -385,7 +385,7 @@ def terminate_cleanly() -> None:
 
 @contextlib.contextmanager
 def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
-    """The file to write for a path: for a pipe or a device one that is copied there when it is whole.
+    """A context with the file to write for a path; for a pipe or device a temporary file, copied there at the end.
 
     Raises:
         DataError: It is a folder, or cannot be written.
@@ -424,9 +424,9 @@ def claim_outputs(output: Output, *, csv: Path | None = None, report: Path | Non
 
 
 def announce(paths: Sequence[Path], output: Output) -> None:
-    """Say which folders are made for files, so that a misspelt one is seen; each once, by its topmost new part.
+    """Note each folder that will be created for output files, by its topmost new part.
 
-    Where one of the files is standard output, people read everything else on standard error.
+    Where one of the files is standard output, the output of the command goes to standard error.
     """
     if not output.json and any(map(_is_stdout, paths)):
         output.stream = sys.stderr

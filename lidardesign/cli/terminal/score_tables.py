@@ -36,7 +36,7 @@ def show_evaluation(document: Entry, evaluation: Evaluation, rich: RichConsole, 
 
 
 def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) -> None:
-    """A row of every design, against the strongest baseline; what else was asked for in a line each."""
+    """Print a row per design with its difference to the strongest baseline, and a line on each further result."""
     from lidardesign.scoring.evaluation.thresholds import difference_text
 
     rows, pairs = evaluation.headline_rows, evaluation.headline_pairs
@@ -80,7 +80,7 @@ def _show_designs(document: Entry, evaluation: Evaluation, rich: RichConsole) ->
 
 
 def sentence(evaluation: Evaluation, pairs: Sequence[Paired]) -> str:
-    """What designs are against the strongest baseline, in one sentence."""
+    """A sentence that compares designs with the strongest baseline."""
     from lidardesign.scoring.evaluation.results import verdict
     from lidardesign.scoring.evaluation.thresholds import difference_text
 
@@ -186,7 +186,7 @@ def _show_errors(document: Entry, rich: RichConsole) -> None:
 
 
 def _show_grid(title: str, places: Sequence[tuple[str, int, str]], cells: Sequence[str], rich: RichConsole) -> None:
-    """One line per design and number of rays, one column per baseline; places have these three."""
+    """Print a line per design and number of rays with a column per baseline; `places` are these three."""
     columns = list(dict.fromkeys(column for _, _, column in places))
     lines: dict[tuple[str, int], dict[str, str]] = {}
     for (design, rays, column), cell in zip(places, cells, strict=True):
@@ -199,7 +199,7 @@ def _show_grid(title: str, places: Sequence[tuple[str, int, str]], cells: Sequen
 
 
 def _show_effects(document: Entry, rich: RichConsole) -> None:
-    """What was simulated and why; one line where nothing is called for."""
+    """Print the effects that were simulated with the reasons; one line where none was needed."""
     from lidardesign.report.tables import plain_number
 
     detector, effects = document["detector"], document["effects"]

@@ -49,7 +49,7 @@ class Grids:
 
 
 class BodyArrays(NamedTuple):
-    """What the compiled loops need to know of `Bodies` and of the `Grids` of their meshes.
+    """`Bodies` and the `Grids` of their meshes as arrays for the compiled loops.
 
     Arguments:
         kinds, sizes, to_body, grid, low, high, starts: See `Bodies`.
@@ -88,7 +88,7 @@ class Pairs:
 
     @property
     def shape(self) -> tuple[int]:
-        """Of one value per pair, (P,)."""
+        """The shape of an array with one value per pair, (P,)."""
         return self.columns.shape
 
     @property
@@ -97,7 +97,7 @@ class Pairs:
         return np.repeat(np.arange(len(self.row_starts) - 1), np.diff(self.row_starts))
 
     def where(self, mask: np.ndarray) -> Pairs:
-        """Those that a mask (P,) keeps."""
+        """The pairs in a mask (P,)."""
         before = np.concatenate([[0], np.cumsum(mask)])
         return Pairs(before[self.row_starts], self.columns[mask], self.distances[mask], self.bodies[mask])
 
@@ -140,7 +140,7 @@ class Bodies:
 
     @cached_property
     def arrays(self) -> BodyArrays:
-        """All of it, for the compiled loops."""
+        """The arrays for the compiled loops."""
         # a little wider, so that no rounding passes over a surface on a face of its box
         grids, slack = self.grids, ROUNDINGS * EPSILON * np.maximum(np.abs(self.low), np.abs(self.high))
         edges = np.concatenate([(self.low - slack).T, (self.high + slack).T])
@@ -163,7 +163,7 @@ class Bodies:
 
     @cached_property
     def group_edges(self) -> np.ndarray:
-        """Boxes around `GROUP_COLUMNS` neighbouring columns each, as `BodyArrays.edges`; empty groups are nowhere."""
+        """Boxes around `GROUP_COLUMNS` neighbouring columns each, as `BodyArrays.edges`; inverted for empty groups."""
         first = np.arange(0, self.columns, GROUP_COLUMNS)
         rows = self.starts[first]
         low, high = np.full((len(first), 3), np.inf), np.full((len(first), 3), -np.inf)
@@ -183,7 +183,7 @@ class Bodies:
         return replace(self, **fields, column=np.repeat(np.arange(len(columns)), counts), starts=starts)
 
     def apart(self) -> Bodies:
-        """The same bodies with a column of its own for each."""
+        """The same bodies, each in its own column."""
         return replace(self, column=np.arange(len(self)), starts=np.arange(len(self) + 1))
 
 

@@ -104,7 +104,7 @@ def _least(reach, first, last):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True, fastmath=BOXES)
 def _within(reach, first, last, limit):  # noqa: ANN001, ANN202
-    """How many of some bodies a point is in the box of, or nearer to it than the root of `limit`."""
+    """The number of bodies whose box holds a point or is nearer to it than the root of `limit`."""
     count = 0
     for b in range(first, last):
         count += 1 if reach[b] < limit or reach[b] == 0.0 else 0
@@ -149,7 +149,7 @@ def near_columns(bodies, group_edges, points, log_weights, group_weights, precis
                 leader = g
         best, kept = -np.inf, 0
         for turn in range(groups):
-            # the most promising group first: it tells how much the others may miss
+            # the most promising group first: it sets the bound that others must reach
             g = leader if turn == 0 else (0 if turn == leader else turn)
             if hopes[g] < best - tolerance:
                 continue
@@ -302,7 +302,7 @@ def add_log_weight_gradients(bodies, values, points, row_starts, nearest, weight
 
 @njit(cache=True, nogil=True, fastmath=BOXES)
 def _entries(edges, first, last, origin, inverse, limit, out) -> None:  # noqa: ANN001
-    """Where a ray with inverse direction enters the boxes `first` to `last`, infinite where it passes one by."""
+    """Fill `out` with the distances at which a ray enters boxes `first` to `last`; inf for those it misses."""
     (x, y, z), (by_x, by_y, by_z) = origin, inverse
     for b in range(first, last):
         left, right = (edges[0, b] - x) * by_x, (edges[3, b] - x) * by_x
@@ -315,7 +315,7 @@ def _entries(edges, first, last, origin, inverse, limit, out) -> None:  # noqa: 
 
 @njit(cache=True, nogil=True, inline="always")
 def _inverse(value):  # noqa: ANN001, ANN202
-    """A number instead of infinity for 0: what is crossed is then beyond every range, as it should be."""
+    """The inverse of a number, finite for 0, so that crossings lie beyond every range."""
     return 1.0 / math.copysign(max(abs(value), TINY), value)
 
 

@@ -111,7 +111,7 @@ def distance_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
 
 
 def is_wound(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Where a surface winds around points by more than half, shape (N,) bool."""
+    """Mask of the points with a winding number above 1/2 in size, shape (N,) bool."""
     import igl
 
     # -1 is the inside of a part whose faces all point inwards
@@ -121,9 +121,9 @@ def is_wound(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.
 def is_inside(
     points: np.ndarray, distance: np.ndarray, vertices: np.ndarray, faces: np.ndarray, grid: Grid
 ) -> np.ndarray:
-    """Which grid points a closed surface winds around, shape (size,) bool, by few winding numbers.
+    """Mask of the grid points inside a closed surface, shape (size,) bool, from few winding numbers.
 
-    Neighbours that are both more than half a step away from the surface have none of it between them.
+    No surface lies between neighbours that are both more than half a step away from it.
     """
     from scipy.ndimage import label
 
@@ -148,7 +148,7 @@ def narrow_band(
 
 
 def nearest_known(beyond: np.ndarray, grid: Grid) -> np.ndarray:
-    """For the grid points that are `beyond` a band, shape (size,) bool: the rows of the nearest ones that are not."""
+    """Rows of the nearest grid points inside a band, for each of those `beyond` it, shape (size,) bool."""
     from scipy.ndimage import distance_transform_edt
 
     nearest = distance_transform_edt(beyond.reshape(grid.counts), return_distances=False, return_indices=True).reshape(
@@ -158,7 +158,7 @@ def nearest_known(beyond: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def cache_folder() -> Path:
-    """Where grids are cached: $LIDARDESIGN_CACHE, else the user's cache folder."""
+    """The folder of cached grids: $LIDARDESIGN_CACHE, else the user's cache folder."""
     chosen = os.environ.get("LIDARDESIGN_CACHE")
     return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lidardesign"
 
@@ -175,13 +175,13 @@ def cached_grids(
     named: Callable[[Mesh], str],
     workers: int = 2,
 ) -> list[np.ndarray]:
-    """What `build` makes of each mesh, shape (size,) float32: from the cache where it is known, else built and kept.
+    """Grid values of each mesh, shape (size,) float32: cached ones, else built by `build` and stored.
 
     Arguments:
-        meshes: Any number.
-        grid: Where the values are.
-        build: Makes them.
-        named: What it does, and all that it depends on besides the geometry of mesh and grid.
+        meshes: The meshes.
+        grid: The grid of the values.
+        build: Builds the values of a mesh.
+        named: A key of `build` and all that it depends on besides the geometry of mesh and grid.
         workers: Threads.
     """
 
@@ -205,7 +205,7 @@ def _cache_path(mesh: Mesh, grid: Grid, name: str) -> Path:
 
 
 def _load(path: Path, size: int) -> np.ndarray | None:
-    """The values of a cached field; None where the file is not whole: its hash stands behind the array."""
+    """The values of a cached field; None where the file is damaged by the hash at its end."""
     try:
         content = read_file(path, MESH)
         if _digest(content[:-DIGEST_BYTES]) != content[-DIGEST_BYTES:]:

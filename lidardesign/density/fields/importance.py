@@ -81,7 +81,7 @@ class LogWeights(Protocol):
 
     @property
     def peak(self) -> float:
-        """What no value exceeds."""
+        """An upper bound of all values."""
 
     def values(self, points: np.ndarray) -> np.ndarray:
         """log w at points: (N, 3) to (N, columns)."""
@@ -159,7 +159,7 @@ class BodyWeights:
 
     @cached_property
     def spread(self) -> float:
-        """By how much a log weight may be below the largest of its column [nats]."""
+        """The largest difference of a log weight to the largest of its column [nats]."""
         return float((self.column_peaks[self.bodies.column] - self.bodies.log_weight[:, 1]).max(initial=0.0))
 
     def values(self, points: np.ndarray) -> np.ndarray:
@@ -227,12 +227,12 @@ class UnionWeights:
 
 
 def is_weighted(scenes: Sequence[Scene]) -> bool:
-    """Whether any target counts otherwise than 1."""
+    """True where any target has an importance other than 1."""
     return any(log_weight_range(body) != (0.0, 0.0) for scene in scenes for body in scene.bodies if body.is_target)
 
 
 def importance_notes(scenes: Sequence[Scene]) -> list[str]:
-    """From what to what targets count, where they do not all count 1."""
+    """A note on the range of importance of the targets, where it is not 1 throughout."""
     if not is_weighted(scenes):
         return []
     ranges = np.array([log_weight_range(body) for scene in scenes for body in scene.bodies if body.is_target])

@@ -99,7 +99,7 @@ def _contract(table, corners, fraction, column_weight, zero):  # noqa: ANN001, A
 
 @njit(cache=True, nogil=True, fastmath=FAST, inline="always")
 def _lengthen(row, squared):  # noqa: ANN001, ANN202
-    """Distances (C,) on a face of the grid become those of a point beyond it."""
+    """Turn distances (C,) on a face of the grid into those of a point beyond it, in place."""
     for c in range(row.shape[0]):
         inner = max(row[c], 0.0)
         row[c] = math.sqrt(squared + inner * inner)
@@ -138,7 +138,7 @@ def table_gradient(field, points, weights, out):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True, fastmath=FAST, inline="always")
 def _pulled(row, squared, column_weight):  # noqa: ANN001, ANN202
-    """Beyond the grid: weights (C,) become those of the distances (C,) on its face; what is left pulls outwards."""
+    """Turn weights (C,) of a point beyond the grid into those of its face; return that of the outward pull."""
     outward = 0.0
     for c in range(row.shape[0]):
         inner = max(row[c], 0.0)

@@ -34,7 +34,7 @@ MAXIMUM_POINTS = 1024
 # The share of probed rays that quadrature may see through although ray casting finds them opaque.
 MISSED_SHARE_TO_CARE = 0.005
 OPAQUE, TRANSPARENT = 0.01, 0.1
-# Shares of a grid step: sigma below the first blurs curved surfaces, below the second nothing curved is told apart.
+# Shares of a grid step: sigma below the first blurs curved surfaces, below the second they are not resolved.
 BLURRED_SHARE, UNRESOLVED_SHARE = 0.5, 0.01
 # Roundings of coordinates that a distance passes through.
 ROUNDINGS = 4
@@ -161,10 +161,10 @@ def refine_quadrature(target: Target, probes: np.ndarray) -> tuple[Target, list[
 
 
 def resolution_notes(target: Target, settings: DensitySettings) -> list[str]:
-    """What sigma blurs.
+    """Notes on surfaces that a sigma below the grid step blurs.
 
     Raises:
-        ConfigError: Sigma is finer than distances are known.
+        ConfigError: Sigma is below the accuracy of distances.
     """
     sigma_m, space = settings.sigma_m, target.space
     farthest = max(np.abs([*space.low[:3], *space.high[:3]]).max(), space.high[RANGE])
@@ -199,7 +199,7 @@ def resolution_notes(target: Target, settings: DensitySettings) -> list[str]:
 
 
 def flatness_notes(target: Target, sigma_m: float, generator: np.random.Generator) -> list[str]:
-    """Whether a sigma wider than all that the space can observe leaves the density flat, measured by uniform points."""
+    """A note where a sigma wider than the observable region leaves the density flat over uniform points."""
     points = target.space.sample(FLATNESS_PROBES, generator)
     if not target.space.free or sigma_m < float(np.linalg.norm(np.ptp(observed_point(points), axis=0))):
         return []

@@ -1,4 +1,4 @@
-"""Points that know nothing of the flow, with the density that they were drawn from: for balancing and for coverage.
+"""Points drawn independently of the flow, with their density: for balancing and for coverage.
 
 - Both angles free: the surfaces of the target draw them (`surfaces`), where they have an end.
 - An angle fixed: hardly any surface point can be aimed at from a given origin, but few dimensions are free, so uniform
@@ -133,7 +133,7 @@ class ProposedPoints:
     Arguments:
         points: Shape (N, 6), inside the space.
         log_density: Per chart volume, up to one constant, shape (N,).
-        surface_range_m: The range of the surface that each listens at, without the range error, shape (N,).
+        surface_range_m: The range of the surface that each observes, without the range error, shape (N,) [m].
         column: The column of that surface, an index into `columns`, shape (N,).
         columns: Scene and frame of the columns that were drawn from.
     """
@@ -178,7 +178,7 @@ def occluded_share(scenes: Sequence[Scene], proposals: ProposedPoints, margin_m:
 
 
 def _is_hidden(caster: SceneCaster, places: np.ndarray, points: np.ndarray, margin_m: float) -> np.ndarray:
-    """Which points (N, 3) have something more than the margin in front of them, seen from places (3,) or (N, 3)."""
+    """Mask of the points (N, 3) with a hit more than the margin in front of them, from places (3,) or (N, 3)."""
     offset = points - places
     reach_m = np.linalg.norm(offset, axis=1)
     seen = np.flatnonzero(reach_m > 0)
@@ -266,7 +266,7 @@ def _with_range_error(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (N, 6), the ranges of their surfaces (N,), and which points are to be kept (N,) bool.
 
-    A fixed range is an error that is known: a ray is kept with the probability that its surface has this error.
+    With a fixed range the error is given: a ray is kept with the normal probability of this error.
     """
     points, surface_range = rays.copy(), rays[:, RANGE].copy()
     if RANGE in space.free:

@@ -1,7 +1,7 @@
 """A check that lengths fit together: the targets, where sensors are, how far they reach, and sigma. Needs no torch.
 
 Rays are aimed from random origins of the design space at points that are uniform in area on the targets of a few scenes
-and frames, and cast. What they meet tells, before anything is learned, that the space looks past the targets or ends
+and frames, and cast. Their hits show, before anything is learned, that the space looks past the targets or ends
 before them, that they are hidden, that they are seen edge-on, and that sigma blurs them away. Where an angle is fixed
 hardly any point can be aimed at: uniform rays of the space take their place.
 
@@ -29,13 +29,13 @@ from lidardesign.task import random_generator
 
 RAYS = 8192
 MOST_COLUMNS = 64
-# Of fewer rays no share is told.
+# Shares of fewer rays are not reported.
 FEWEST_RAYS = 32
 # Casting finds a point again within this share of its range.
 SAME_PLACE = 1e-3
 # Below this share of the targets' surface in the space's angles, or in its angles and range, it looks past them.
 LEAST_IN_VIEW = 0.01
-# Above this share of the surface that rays meet out of range, most of what can be seen is not heard.
+# Above this share of the visible surface out of range, a note is given.
 MOST_OUT_OF_RANGE = 0.5
 # Above this share of the rays, other bodies hide the targets.
 MOST_HIDDEN = 0.99
@@ -72,7 +72,7 @@ class _Sample:
 
     @property
     def aims(self) -> bool:
-        """Whether points can be aimed at: both angles are free."""
+        """True where rays can be aimed at points: both angles are free."""
         return AZIMUTH in self.space.free and ELEVATION in self.space.free
 
     def rays_at(self, blur_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +93,7 @@ class _Sample:
         return np.concatenate(parts), np.concatenate(of)
 
     def first_hits(self, points: np.ndarray, column: np.ndarray) -> _SampledHits:
-        """What rays (N, 6) meet first in their columns (N,)."""
+        """First hits of rays (N, 6) in their columns (N,)."""
         met = _SampledHits(np.full(len(points), np.inf), np.zeros(len(points), dtype=bool), np.zeros(len(points)))
         for number in np.unique(column):
             rows, (index, frame) = np.flatnonzero(column == number), self.columns[number]
@@ -106,7 +106,7 @@ class _Sample:
         return met
 
     def inside_share(self, points: np.ndarray, column: np.ndarray) -> float:
-        """The share of rays (N, 6) that leave closed targets once more than they enter them: they start inside."""
+        """The share of rays (N, 6) that start inside closed targets: those with an odd number of crossings."""
         odd = np.zeros(len(points), dtype=bool)
         for number in np.unique(column):
             rows, (index, frame) = np.flatnonzero(column == number), self.columns[number]
@@ -131,7 +131,7 @@ def _directions(points: np.ndarray) -> np.ndarray:
 
 @phase("scale")
 def scale_notes(scenes: Sequence[Scene], config: RunConfig) -> list[str]:
-    """What is wrong with the lengths of training scenes, design space and sigma, and what to do; mostly nothing.
+    """Notes on lengths of training scenes, design space and sigma that do not fit together, each with a remedy.
 
     Arguments:
         scenes: The training scenes.
@@ -155,7 +155,7 @@ def _in_angles(space: DesignSpace, points: np.ndarray) -> np.ndarray:
 
 
 def _unit_doubt(one_m: float, other_m: float) -> str:
-    """A question, where two lengths differ by so much that they are more likely in different units."""
+    """A question about units where two lengths differ by a factor that suggests different ones; else empty."""
     return " (are all lengths in metres?)" if max(one_m, other_m) > OTHER_UNIT * min(one_m, other_m) else ""
 
 
@@ -164,7 +164,7 @@ def _visible(points: np.ndarray, met: _SampledHits) -> np.ndarray:
 
 
 def _view_notes(sample: _Sample, points: np.ndarray, column: np.ndarray, met: _SampledHits) -> list[str]:
-    """What of the targets rays of the space can reach."""
+    """Notes on targets that rays of the space cannot reach."""
     space, reach_m = sample.space, sample.space.high[RANGE]
     viewed, across_m = _in_angles(space, points), float(np.ptp(observed_point(points), axis=0).max())
     shapes = [body.shape for scene in sample.scenes for body in scene.bodies if body.is_target]
@@ -207,7 +207,7 @@ def _view_notes(sample: _Sample, points: np.ndarray, column: np.ndarray, met: _S
 
 
 def _sigma_notes(sample: _Sample, points: np.ndarray, met: _SampledHits, config: RunConfig) -> list[str]:
-    """What sigma leaves of what can be seen."""
+    """Notes on a sigma that does not suit the visible surface."""
     sigma_m = config.density.sigma_m
     seen = _in_angles(sample.space, points) & _visible(points, met)
     if seen.sum() < FEWEST_RAYS:
@@ -239,7 +239,7 @@ def _sigma_notes(sample: _Sample, points: np.ndarray, met: _SampledHits, config:
 
 
 def _thin_notes(sample: _Sample, config: RunConfig, least_m: float) -> list[str]:
-    """Whether rays that the density prefers pass what they listen for: things thinner than sigma."""
+    """A note where rays that the density prefers miss targets thinner than sigma."""
     optics = Optics.of(config.density)
     share = _returning_share(sample, optics)
     if share >= LEAST_RETURNING:
@@ -255,7 +255,7 @@ def _thin_notes(sample: _Sample, config: RunConfig, least_m: float) -> list[str]
 
 
 def _returning_share(sample: _Sample, optics: Optics) -> float:
-    """The share of the target density's mass whose rays meet a target; 1 where nothing of it is found.
+    """The share of the target density's mass whose rays meet a target; 1 where too few samples are found.
 
     Blurring surfaces by sigma in all directions gives the density without its visibility, where they are flat.
     """

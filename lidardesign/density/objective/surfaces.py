@@ -1,10 +1,10 @@
 """The target surfaces of all columns, and which columns can matter at a scene point: everything of p* but visibility.
 
-One interface, two forms. `SceneTable` evaluates every column at every point: meshes at rest share a table in which
+Two forms of one interface. `SceneTable` evaluates every column at every point: meshes at rest share a table in which
 that costs next to nothing. `MovingFrames` are thousands of columns of bodies in their own frames: bounding boxes tell
 which columns can come within a tolerance of the best surface term at a point, and only these are evaluated.
 
-Both also draw design points that listen at random surfaces and know the density of these draws:
+Both also draw design points that observe random surfaces, with the density of these draws:
 
 - `SceneTable`: a point is drawn uniform in area on a random scene's targets, moved along the normal by a normal offset
   of the target's own sigma, and observed from a random origin. Its density per volume is q(s) = sum_i N(SDF_i(s);
@@ -68,9 +68,8 @@ class NearSurfaces(Protocol):
 class Surfaces:
     """The surfaces that p* is near to, one column per scene and frame.
 
-    `log_column_weights` are the columns' own weights (columns,), `importance` is how much the surfaces count,
-    `rows_at_once` how many points keep the memory bounded, `grid_steps_m` the grid steps of all meshes, `can_propose`
-    whether `propose` draws them all.
+    `log_column_weights` are the columns' own weights (columns,), `importance` weights the surfaces, `rows_at_once` is
+    the chunk size in points, `grid_steps_m` the grid steps of all meshes, `can_propose` whether `propose` can draw.
     """
 
     log_column_weights: np.ndarray
@@ -81,11 +80,11 @@ class Surfaces:
 
     @property
     def log_peak(self) -> float:
-        """What no surface term of a single column exceeds."""
+        """An upper bound of the surface term of a single column."""
         return float(self.log_column_weights.max()) + (0.0 if self.importance is None else self.importance.peak)
 
     def near(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> NearSurfaces:
-        """What matters at scene points (N, 3): columns within a tolerance of the best one there."""
+        """Surface terms at scene points (N, 3) of the columns within a tolerance of the largest term there."""
 
     def log_proximity(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> np.ndarray:
         """log of the sum of surface terms at scene points, (N, 3) to (N,)."""

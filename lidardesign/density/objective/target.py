@@ -48,7 +48,7 @@ class Target:
 
     Arguments:
         scenes: What it is the density of, one column per scene and frame.
-        surfaces: The targets of the columns, and how much they count.
+        surfaces: The targets of the columns, with their importance.
         visibility: How occlusion is computed.
         optics: The final sigma and what goes with it.
         space: The design space; it fixes the chart that gradients are given in.
@@ -69,11 +69,11 @@ class Target:
 
     @property
     def rows_at_once(self) -> int:
-        """How many points keep the memory bounded."""
+        """The number of points evaluated at a time, which bounds memory."""
         return min(self.surfaces.rows_at_once, self.visibility.rows_at_once)
 
     def with_visibility(self, way: Visibility) -> Target:
-        """The same seen in another way, and heard in that way by the receiver of the scenes, where they have one."""
+        """The same target with another visibility, also towards the scenes' receiver where they have one."""
         receiver = common_receiver(self.scenes)
         return replace(self, visibility=way if receiver is None else BistaticVisibility(way, receiver))
 
@@ -116,7 +116,7 @@ class Target:
         return values, gradients
 
     def _evaluate(self, points: np.ndarray, optics: Optics, gradient: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        """Apart from the loop over chunks, so that the arrays of one chunk are gone before the next one's."""
+        """log p* and its gradient for one chunk; a function of its own frees the chunk's arrays."""
         rays = RayBatch.of(points)
         near = self.surfaces.near(rays.observed, optics.sigma_m, self.surface_tolerance_nats)
         passed = self.visibility.transmittance(rays, near.columns, optics, differentiable=gradient)
@@ -159,7 +159,7 @@ def nearby_order(points: np.ndarray) -> np.ndarray:
 
 
 def unusable(points: np.ndarray) -> str | None:
-    """What makes design points (N, 6) none, by the name of the dimension; a range of 0 is one."""
+    """The reason why design points (N, 6) are invalid (not finite, or a negative range), else None."""
     if np.isfinite(points).all() and points[:, RANGE].min(initial=0.0) >= -SLACK:
         return None
     for name, values in zip(DIMENSIONS, points.T, strict=True):

@@ -107,7 +107,7 @@ class RayBatch:
 
     @property
     def observed(self) -> np.ndarray:
-        """The scene points that they listen at, shape (N, 3)."""
+        """The scene points that they observe, shape (N, 3)."""
         return self.origins + self.ranges[:, None] * self.directions
 
 
@@ -151,7 +151,7 @@ class Visibility:
 
     @cached_property
     def one_way(self) -> Visibility:
-        """The way from a ray's origin alone, where light also has to come back to a receiver."""
+        """The visibility from a ray's origin alone, without the way back to a receiver."""
         return self
 
     def transmittance(
@@ -160,20 +160,20 @@ class Visibility:
         """log T where `columns` matter, 0 elsewhere; its gradient may only be asked for if `differentiable`."""
 
     def take(self, columns: np.ndarray) -> Visibility:
-        """The same for some columns, where it knows them one by one."""
+        """The same for some columns, where it is stored by column."""
         return self
 
 
 @dataclass(frozen=True, eq=False)
 class Blocked:
-    """Rays and columns of which some are blocked.
+    """The transmittance of rays and columns, of which some are blocked by a first hit.
 
     Arguments:
         log_values: log T.
         rays: The number of rays.
         rows: The ray of each that is blocked, shape (K,).
-        index: Which values these are.
-        hit_m: Where they are blocked, shape (K,) [m].
+        index: The index of their values in `log_values`.
+        hit_m: The ranges of their first hits, shape (K,) [m].
         plane: Minus the derivative of the hit range by the origin, shape (K, 3).
         attenuation_per_m: beta.
     """
@@ -218,7 +218,7 @@ class Blocked:
 
 @dataclass(frozen=True, eq=False)
 class Unmoved:
-    """log T that no ray changes by moving."""
+    """log T with a gradient of 0."""
 
     log_values: np.ndarray
     rays: int
@@ -311,7 +311,7 @@ class BodyRaycast(Visibility):
     def _cast(
         self, rays: RayBatch, limit_m: np.ndarray, met: tuple[np.ndarray, ...], hits: np.ndarray, normals: np.ndarray
     ) -> None:
-        """Enter what rays meet of meshes before anything else; `met` are rays, pairs and bodies, (K,) each."""
+        """Enter first hits on meshes before those on primitives; `met` are rays, pairs and bodies, (K,) each."""
         from lidardesign.density.fields import body_kernels
 
         bodies = self.bodies
@@ -337,7 +337,7 @@ class BodyRaycast(Visibility):
 
 
 def common_receiver(scenes: Sequence[Scene]) -> Receiver | None:
-    """The one receiver of all scenes; None where rays are heard at their own origins.
+    """The one receiver of all scenes; None where light is received at the rays' own origins.
 
     Raises:
         ConfigError: The scenes have different ones.
@@ -378,7 +378,7 @@ class BistaticVisibility(Visibility):
 
     Arguments:
         one_way: How either way is computed.
-        receiver: Where the light is heard.
+        receiver: The receiver of the light.
     """
 
     def __init__(self, one_way: Visibility, receiver: Receiver) -> None:
@@ -394,7 +394,7 @@ class BistaticVisibility(Visibility):
 
     @property
     def rows_at_once(self) -> int:
-        """How many rays keep its memory bounded: two ways at a time."""
+        """The number of rays evaluated at a time: half of one way's, since two ways are held."""
         return max(1, self.one_way.rows_at_once // 2)
 
     def take(self, columns: np.ndarray) -> BistaticVisibility:

@@ -90,7 +90,7 @@ def check_resumable(
     generator: torch.Generator,
     path: Path,
 ) -> None:
-    """Refuse a checkpoint that is whole, but of which training cannot go on.
+    """Refuse a checkpoint that training cannot resume from, although its file is whole.
 
     Arguments:
         arrays, state: Its content.
@@ -133,7 +133,7 @@ def check_resumable(
             raise DataError(f"the checkpoint belongs to another flow: {start[:-1]} differs", where=str(path), hint=HINT)
         if any(array.dtype.kind != "f" for array in found.values()):
             raise DataError(f"holds no numbers in {start[:-1]}", where=str(path), hint=HINT)
-        # squares are not negative, and who has moments has taken a step: the optimiser takes roots and divides
+        # the optimiser takes roots of squares and divides by steps: no negative squares, no moments without a step
         if found and (found[f"{start}exp_avg_sq"].min() < 0 or found[f"{start}step"].min() < 1):
             raise DataError(f"holds impossible numbers in {start[:-1]}", where=str(path), hint=HINT)
     stream, own = arrays.get("generator"), generator.get_state()
@@ -150,7 +150,7 @@ _NAME = re.compile(rf"{FOLDER}/step-(\d+)\.safetensors")
 
 
 def is_snapshot(step: int, settings: LearningSettings) -> bool:
-    """Whether the flow is kept after a step: error falls by a power of the steps, and doublings show it best."""
+    """True after the steps whose flow is kept: each doubling, since errors fall by a power of the steps."""
     doublings, rest = divmod(step, max(settings.pathwise_steps, 1))
     return rest == 0 and doublings.bit_count() == 1 and step < settings.steps
 

@@ -64,11 +64,11 @@ PILOTS = 2048  # of a flow's samples and of independent points, by which the sha
 
 @dataclass(frozen=True)
 class LearnResult:
-    """What learning reached; `timings` are seconds by phase, `notes` what the user should know.
+    """The result of learning; `timings` are seconds by phase, `notes` lines for the user.
 
     `misplaced` is the share of the density's mass in the wrong place. `error_estimates` has the standard errors of ess,
-    kl_nats, log_z, coverage and misplaced. `samples` says how many are of the flow and how many independent of it, and
-    what they are worth, together and those of the flow alone.
+    kl_nats, log_z, coverage and misplaced. `samples` has the numbers of samples of the flow and of
+    independent ones, and the effective numbers of all and of those of the flow alone.
     """
 
     run: str
@@ -87,7 +87,7 @@ class LearnResult:
 
     @property
     def verdict(self) -> Verdict:
-        """What the density is worth."""
+        """The verdict on the density."""
         return Verdict.of(self.misplaced, self.kl_nats, self.ess)
 
     def as_dict(self) -> dict[str, Any]:
@@ -97,10 +97,10 @@ class LearnResult:
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """What learning stands on, however many steps it takes: the target of the training scenes, notes, and proposals.
+    """The data of learning for any number of steps: the target of the training scenes, notes, and proposals.
 
-    `pool` is what balancing draws from: the `independent` points by their weights. `probes` are what is measured on
-    while learning.
+    `pool` has the `independent` points with their weights, for balancing. `probes` are points for measuring while
+    learning.
     """
 
     target: Target
@@ -116,7 +116,7 @@ def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str],
     Arguments:
         task: The plugin.
         config: The resolved configuration.
-        remark: Called with what is wrong with lengths as soon as there are scenes; the notes have it too.
+        remark: Called with notes on lengths as soon as there are scenes; they are in the notes too.
 
     Raises:
         ConfigError, DataError: Unusable settings or scenes.
@@ -153,7 +153,7 @@ def prepare_training_data(task: Task, config: RunConfig, remark: Callable[[str],
 
 
 def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
-    """Refuse scenes whose fixed receiver sees nothing that is lit: none of the points observed by rays (N, 6).
+    """Refuse scenes whose fixed receiver has none of the points observed by rays (N, 6) in its view.
 
     Raises:
         DataError: So it is.
@@ -236,7 +236,7 @@ def learn(
 def mix_samples(
     learned: LearnedFlow, measured: MeasuredFlow, data: TrainingData, probes: IndependentProbes
 ) -> MixedSamples:
-    """The samples of a flow together with balancing's independent points, in the share that is worth most.
+    """The samples of a flow with balancing's independent points, in the share of the largest effective number.
 
     Arguments:
         learned: The flow.
@@ -265,7 +265,7 @@ def mix_samples(
 
 @contextlib.contextmanager
 def on_one_thread() -> Iterator[None]:
-    """Let torch work on one thread: sums over several end in other bits."""
+    """Set torch to one thread, since sums over several threads round differently."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -275,11 +275,11 @@ def on_one_thread() -> Iterator[None]:
 
 
 def draft_note(measured: Sequence[tuple[int, Estimate]], preset: str) -> str | None:
-    """A line where learning longer than the preset draft does brought nothing that can be told; else None.
+    """A note where learning longer than the preset draft made no significant difference; else None.
 
     Arguments:
         measured: Misplaced shares by step.
-        preset: What was learned with.
+        preset: The preset of the run.
     """
     draft = PRESET_LEARNING["draft"]
     early = [(step, found) for step, found in measured if step <= draft["steps"]]

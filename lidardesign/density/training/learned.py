@@ -1,10 +1,7 @@
 """The learned density of a run: loaded, sampled, evaluated, and measured at the snapshots that its learning kept.
 
-What learning had reached after a part of its steps, and what its settings cost in accuracy.
-
-The snapshots that a run kept are measured anew. Gradients of steps are compared beside their own noise: a step's
-gradient is an estimate, another batch gives another one. What arithmetic or fewer scenes change in it matters only
-beside that noise, sqrt(E |g - E g|^2) over batches.
+Gradients of steps are compared relative to their own noise, sqrt(E |g - E g|^2) over batches: a step's gradient is an
+estimate, so errors of arithmetic or of fewer scenes matter only in comparison with it.
 """
 
 from __future__ import annotations
@@ -43,11 +40,11 @@ from lidardesign.task import Task
 
 @dataclass(frozen=True, eq=False)
 class SnapshotQuality:
-    """What a run's flow was worth after a step.
+    """The quality of a run's flow after a step.
 
     Arguments:
         step: The number of steps done.
-        seconds: What they took [s].
+        seconds: Time that they took [s].
         estimates: ess, kl_nats, log_z, coverage and misplaced, with standard errors.
     """
 
@@ -57,7 +54,7 @@ class SnapshotQuality:
 
 
 def check_kept(run: Path) -> None:
-    """Check all that a run is measured anew by: its flow, its snapshots and its progress.
+    """Verify the files that a run is measured anew from: its flow, its snapshots and its progress.
 
     Raises:
         DataError: The run is unfinished or damaged.
@@ -71,7 +68,7 @@ def remeasured(
 ) -> list[SnapshotQuality]:
     """The figures of every snapshot of a run and of its flow, in the order of steps.
 
-    All are measured on the same base points and the same probes, so that they differ by what was learned.
+    All are measured on the same base points and the same probes, so that only the flows differ.
 
     Arguments:
         run: The run's folder.
@@ -112,7 +109,7 @@ def load_flow(run: Path, name: str, config: RunConfig, target: Target, seed: int
 
 
 def seconds_at(run: Path) -> dict[int, float]:
-    """How long learning had taken after steps, ascending, from the run's progress [s]; nothing after none.
+    """Time of learning by the number of steps, ascending, from the run's progress [s]; 0 steps have 0 s.
 
     Raises:
         DataError: The progress is missing or damaged.
@@ -217,7 +214,7 @@ def in_arithmetic(flow: DesignFlow, dtype: str) -> DesignFlow:
 
 
 def noise_share(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> tuple[float, float]:
-    """The rms error of gradients as a share of the noise that the exact ones have anyway, and its standard error.
+    """The rms error of gradients as a share of the noise of the exact ones, and its standard error.
 
     Arguments:
         gradients: Of several batches, shape (P,) each, or (draws, P) of several draws for each batch; the standard

@@ -1,7 +1,7 @@
 """The two losses of learning: reverse KL along paths, then balancing by values.
 
 The path-wise loss (paper, eq. 7) moves samples along the gradient of log p* and finds the surfaces while sigma is
-annealed. It cannot tell how much mass belongs on either side of a silhouette, because there p* jumps as one scene
+annealed. It cannot find how much mass belongs on either side of a silhouette, because there p* jumps as one scene
 after another is hidden and its gradient has no term for the jump: on faces it stays at a KL of 0.25 nats with the neck
 starved by a factor of three. Balancing needs the values of p* only. For flow samples it follows the gradient of
 the reverse KL in its log-variance form. For samples of p* from independent proposals it follows that of the mean
@@ -96,12 +96,12 @@ class Pool:
         return drawn / drawn[-1]
 
     def emphasised(self, flow: DesignFlow, coordinates: Coordinates) -> Pool:
-        """The same proposals, each drawn by how much the flow starves it now: in proportion to p* (1 + p* / p)."""
+        """The same proposals, drawn in proportion to p* (1 + p* / p): those that the flow starves more often."""
         log_weights = self.log_target - log_prob_of_unit(flow, coordinates, self.unit).to(self.log_target)
         # E_pi[p / p*] = 1 / Z
         log_z = -torch.logsumexp(torch.log(self.weights) - log_weights, dim=0)
         starved = (log_weights - log_z).clamp(max=float(np.log(LARGEST_EMPHASIS))).exp()
-        # a flow that lost its numbers says nothing of what it starves
+        # a flow with non-finite parameters gives no emphasis
         return replace(self, emphasis=1.0 + torch.nan_to_num(starved, nan=0.0))
 
     def draw(self, count: int, generator: torch.Generator, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:

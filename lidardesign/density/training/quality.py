@@ -1,9 +1,9 @@
-"""What a learned density is worth, measured on its own samples and on points that know nothing of it.
+"""Quality of a learned density, measured on its own samples and on points drawn independently of it.
 
 Neither sees everything. Samples of the density p cannot see what it starves or dropped: where pi = p* / Z is a hundred
 times larger than p, they hardly ever are. Points of pi, which independent proposals become by their weights, see it,
 but not what leaked away to where pi is nothing. Effective sample size and KL divergence are therefore estimated on
-both sides, and the worse is told:
+both sides, and the worse is reported:
 
     ESS = 1 / E_pi[pi / p], from weights w = p* / p of samples: (sum w)^2 / (N sum w^2);
     KL(p || pi) on samples, KL(pi || p) on points of pi.
@@ -139,11 +139,11 @@ def coverage(
     return Estimate(float(mass[covered].sum() / mass.sum()), error)
 
 
-# Where log Z is found to: far below what samples can tell.
+# Tolerance of the root log Z, far below its statistical error.
 LOG_Z_TOLERANCE_NATS = SLACK
 # A group of fewer points than this on either side is judged by the groups that have more.
 LEAST_POINTS = 8
-# Densities that share less than this share nothing, and the division by it is safe.
+# An overlap below this counts as none, so that dividing by it is safe.
 LEAST_SHARED = TINY
 # Beyond so many nats a ratio of densities is no number that can be summed.
 LARGEST_NATS = 300.0
@@ -151,7 +151,7 @@ LARGEST_NATS = 300.0
 
 @dataclass(frozen=True)
 class Overlap:
-    """How far a density is from its target.
+    """The distances of a density from its target.
 
     Arguments:
         misplaced: The total variation, 0 to 1.
@@ -170,7 +170,7 @@ class Overlap:
     kl_error_nats: float
 
     def estimates(self) -> dict[str, Estimate]:
-        """The figures with their errors by name; log Z is told from samples."""
+        """The figures with their errors by name; log Z is taken from samples."""
         return {
             "ess": Estimate(self.ess, self.ess_error),
             "kl_nats": Estimate(self.kl_nats, self.kl_error_nats, "nats"),
@@ -179,7 +179,7 @@ class Overlap:
 
 
 def worse_of(samples: Mapping[str, Estimate], probes: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """The figures of a density, where both sides have one the worse: the lower ESS, the larger KL."""
+    """The figures of a density from samples and probes, of both sides the lower ESS and the larger KL."""
     ess = min(samples["ess"], probes["ess"], key=lambda estimate: estimate.value)
     kl_nats = max(samples["kl_nats"], probes["kl_nats"], key=lambda estimate: estimate.value)
     return {**samples, **probes, "ess": ess, "kl_nats": kl_nats}
@@ -265,7 +265,7 @@ def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.n
 
 
 def _bracket(gap: Callable[[float], float], start: float) -> tuple[float, float]:
-    """Two values of log Z with the root between them; the gap falls from 1 to -1, to 0 where nothing is shared."""
+    """Two values of log Z that bracket the root of a gap that falls from 1 to -1 (0 without overlap)."""
     ends = []
     for side in (-1.0, 1.0):
         end, reach = start, 1.0
@@ -285,7 +285,7 @@ NOT_COVERED = (
 
 @dataclass(frozen=True, eq=False)
 class IndependentProbes:
-    """Points that know nothing of a flow.
+    """Points drawn independently of a flow.
 
     Arguments:
         points: Design points inside the space, shape (N, 6).
@@ -306,7 +306,7 @@ class MeasuredFlow:
         samples: The thinned samples with both log densities.
         estimates: ess, kl_nats, log_z, coverage, and misplaced: the share of the mass in the wrong place.
         round_trip_nats: See `round_trip`.
-        notes: What the user should know.
+        notes: Lines for the user.
         thinning: What the flow was thinned by.
     """
 

@@ -11,8 +11,8 @@ and weights of max(w, Z) A. Nothing is lost: what is left out weighs little. Whe
 and A are those of a condition's group, and of every group as many are kept as of the one that keeps fewest. So that a
 group which was learned badly takes no samples from the others, it is thinned at less than Z, to a quarter at most.
 
-Beside the samples that are kept stand points that know nothing of the flow, where both densities p and q are known at
-all points. What is drawn from either has the density m = (1 - s) p + s q, with their shares as they are, and weights
+The samples that are kept are joined by points independent of the flow, where both densities p and q are known at all
+points. What is drawn from either has the density m = (1 - s) p + s q, with their shares as they are, and weights
 p* / m (Veach and Guibas 1995). q is known up to a constant, which is estimated by the optimal bridge between p and q.
 
 References:
@@ -44,16 +44,16 @@ POINTS_AT_ONCE = 16384
 CONDITION_GROUPS = 32
 # Of the independent points that there are: what is tried beside the flow's samples.
 MIXED_SHARES = (0.0, 0.25, 0.5, 1.0)
-# By how much independent points must be foretold to raise what samples are worth: less may be the pilots' luck.
+# Least predicted gain in effective samples by independent points; less may be noise of the pilots.
 LEAST_GAIN = 1.05
-# Beyond so many nats two densities have next to nothing in common.
+# Log ratios of densities are clipped here: beyond, two densities hardly overlap.
 LARGEST_NATS = 300.0
 # Of the samples of a condition group: what thinning leaves at least.
 LEAST_GROUP_SHARE = 0.25
 
 
 def condition_groups(space: DesignSpace, points: np.ndarray) -> np.ndarray | None:
-    """Which part of the first conditioning dimension's bounds points (N, 6) lie in, shape (N,)."""
+    """The condition group of points (N, 6): equal parts of the first condition's bounds, shape (N,); None without."""
     if not space.conditioned:
         return None
     first = space.conditioned[0]
@@ -73,7 +73,7 @@ class LearnedFlow:
 
 @dataclass(frozen=True)
 class Thinning:
-    """Which samples of a flow are kept.
+    """Thinning of a flow's samples by rejection of low weights.
 
     Arguments:
         log_least: log of the weight p* / p below which a sample is kept by chance, by condition group; one without.
@@ -94,7 +94,7 @@ class Thinning:
         parts = [log_weights]
         if groups is not None:
             parts = [log_weights[groups == n] for n in range(CONDITION_GROUPS)]
-            # a group without samples that are worth anything is as all of them
+            # a group without finite weights is thinned as all of them
             parts = [part if np.isfinite(part).any() else log_weights for part in parts]
         log_least = [_log_mean(part) for part in parts]
         if groups is not None:
@@ -108,7 +108,7 @@ class Thinning:
         return min(self.log_share)
 
     def log_prob(self, log_prob: np.ndarray, log_target: np.ndarray, groups: np.ndarray | None = None) -> np.ndarray:
-        """The log density that is left of a flow's at any points with log p* and their groups, shapes (N,)."""
+        """The log density of the thinned flow at any points with log p* and their groups, shapes (N,)."""
         least, share = self._of(groups)
         return np.minimum(log_prob, log_target - least) - share
 
@@ -220,10 +220,10 @@ class KnownPoints:
 
 
 def log_constant(flow: KnownPoints, independent: KnownPoints) -> Estimate:
-    """log of the factor by which the density of independent points is known too large, by the optimal bridge [nats].
+    """log of the unknown factor of the independent points' density, by the optimal bridge [nats].
 
     Raises:
-        ValueError: The two have nothing in common.
+        ValueError: The two densities do not overlap.
     """
     share = len(independent) / (len(flow) + len(independent))
     ratios = [np.clip(one.log_proposal - one.log_flow, -LARGEST_NATS, LARGEST_NATS) for one in (flow, independent)]
@@ -246,13 +246,13 @@ def log_constant(flow: KnownPoints, independent: KnownPoints) -> Estimate:
 def effective_count_of_mixture(
     flow: KnownPoints, independent: KnownPoints, counts: tuple[int, int], constant: float, space: DesignSpace
 ) -> float:
-    """How many samples of equal weight so many of a flow and so many independent ones are worth, by other draws.
+    """The effective sample size of a mixture of a flow's and independent samples, estimated from other draws.
 
     Arguments:
         flow, independent: Draws of both.
-        counts: How many there will be of each.
+        counts: Numbers of samples of each.
         constant: See `log_constant`.
-        space: Along a condition every part of it counts for itself.
+        space: The design space; effective sizes of condition groups add up.
     """
     total = sum(counts)
     drawn, worth = [flow, independent] if counts[1] else [flow], 0.0
@@ -309,14 +309,14 @@ class MixedSamples:
 
     @classmethod
     def of_flow_alone(cls, samples: Samples, constant: Estimate | None = None) -> Self:
-        """Samples of a flow, and nothing beside them."""
+        """Samples of a flow without independent points."""
         return cls(samples, 0, samples.independent, samples.independent, constant)
 
 
 def mixed(
     samples: Samples, kept: KnownPoints, pool: KnownPoints, pilots: tuple[KnownPoints, KnownPoints]
 ) -> MixedSamples:
-    """Samples of a flow with as many independent points as make them worth most; none where the flow is best alone.
+    """Samples of a flow with as many independent points as give the largest effective size, or none.
 
     Arguments:
         samples: Of the flow; `kept` says both densities there.

@@ -142,7 +142,7 @@ ROUND_TRIPS = 256
 
 @dataclass(frozen=True)
 class LearnProgress:
-    """Where learning stands, for progress bars and progress.jsonl.
+    """The state of learning for progress bars and progress.jsonl.
 
     Arguments:
         step, steps: Done, and the most that are taken; None where time decides.
@@ -164,7 +164,7 @@ _State = tuple[dict[str, np.ndarray], dict[str, Any]]
 
 
 def least_balancing_steps(pathwise_steps: int) -> int:
-    """How many steps balance at least, for a run of so many steps in all to have as many path-wise ones.
+    """The least number of balancing steps of a run with this many path-wise ones.
 
     After a single stretch a few points are still starved, too few for the misplaced share to see them.
     """
@@ -172,7 +172,7 @@ def least_balancing_steps(pathwise_steps: int) -> int:
 
 
 def reaches(misplaced: Estimate, goal: float) -> bool:
-    """Whether a misplaced share is no larger than a goal by more than what is known of it."""
+    """True where a misplaced share is below a goal by `STANDARD_ERRORS` of its standard errors."""
     return misplaced.value + STANDARD_ERRORS * (misplaced.error or 0.0) <= goal
 
 
@@ -223,7 +223,7 @@ class Trainer(LearnedFlow):
         return self.step - self.pathwise_steps
 
     def learned(self) -> LearnedFlow:
-        """What is learned by now, in float64: the best average that was measured, else the last one.
+        """The learned flow in float64: the best average that was measured, else the last one.
 
         Steps are taken in float32 as well and cost less; samples and their densities are worth float64.
         """
@@ -277,12 +277,12 @@ class Trainer(LearnedFlow):
         self._save(*self._state())
 
     def _reached(self, is_last: bool) -> dict[str, float]:
-        """The misplaced share and its standard error after a stretch of balancing, and at the end; the best is kept."""
+        """Measure the misplaced share after each stretch of balancing and at the end; keep the best average."""
         if self.probes is None or len(self.probes.points) < FEWEST_PROBES or not self._may_stop:
             return {}
         if self.balanced_steps % STRETCH and not is_last:
             return {}
-        # of the same base points every time, so that averages differ by what was learned
+        # the same base points every time, so that only the averages differ
         own = torch.Generator().manual_seed(0)
         try:
             found = measure(self._in_double(self.average, own), self.probes, STOPPING_POINTS).estimates["misplaced"]
@@ -344,7 +344,7 @@ class Trainer(LearnedFlow):
 
     @torch.no_grad()
     def _average(self) -> None:
-        """Follow the flow: exactly until balancing begins, as the mean of polynomial weight from there."""
+        """Update the average: the flow itself until balancing begins, then a mean with polynomial weights."""
         done = max(self.balanced_steps, 1)
         share = (AVERAGING + 1) / (AVERAGING + done)
         torch._foreach_lerp_(list(self.average.parameters()), list(self.flow.parameters()), share)
@@ -372,8 +372,8 @@ class Trainer(LearnedFlow):
     def _begin_stretch(self) -> None:
         """Prepare the balancing steps up to the next snapshot; the stream is left alone.
 
-        They are taken in float64 where float32 gets the densities wrong that they ask for, and their proposals are
-        drawn by what the flow starves now.
+        They are taken in float64 where float32 densities are too inaccurate, and proposals that the flow starves are
+        drawn more often.
         """
         if self.step < self.pathwise_steps:
             return
@@ -395,9 +395,9 @@ class Trainer(LearnedFlow):
             state.update({name: _moved(name, value, parameter) for name, value in state.items()})
 
     def _few_frames(self) -> Target:
-        """The target of a path-wise step. While sigma is wide thousands of frames would matter at every point.
+        """The target of a path-wise step, on a random subset of frames: at a wide sigma all would matter everywhere.
 
-        Balancing needs the values of p* and sees all frames; at the final sigma few of them matter.
+        Balancing needs the values of p* and uses all frames; at the final sigma few of them matter at a point.
         """
         if self.target.columns <= self.settings.frames:
             return self.target
@@ -478,7 +478,7 @@ class Trainer(LearnedFlow):
 
 
 def _moved(name: str, value: torch.Tensor, parameter: torch.Tensor) -> torch.Tensor:
-    """A copy of a part of a parameter's optimiser state beside it: fused steps are counted on its device as well."""
+    """A copy of an entry of a parameter's optimiser state on its device, where fused steps are counted too."""
     return value.to(parameter.device, value.dtype if name == "step" else parameter.dtype, copy=True)
 
 

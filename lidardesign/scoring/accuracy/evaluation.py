@@ -33,7 +33,7 @@ from lidardesign.simulate.plan import EffectPlan, Planner, predicted_seconds
 from lidardesign.simulate.returns import build_casters
 from lidardesign.task import conditions_of, random_generator
 
-# Measured where the evaluation's own detector asks for nothing.
+# The detector for sweeps where the evaluation's own has no effects.
 STAND_IN = "single-photon"
 FOOTPRINT_RAYS = (1, 4, 16, 64, 256)
 # Rays in all frames and positions of a scene: the largest number of rays below this is simulated, else the smallest.
@@ -53,7 +53,7 @@ DRAWS = 32
 
 
 def physics_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """The footprint's sweep where beams have a width, and that of the effects that the scenes have."""
+    """The sweep of the footprint where beams have a width, and that of the effects present in the scenes."""
     asked = request.request
     if not asked.designs:
         return []
@@ -85,7 +85,7 @@ class Bench:
 
     Arguments:
         request: The evaluation's request.
-        planner: What measures, and how effects are chosen.
+        planner: The detector, and how effects are chosen.
         positions: The design's rays.
         scenes: The scenes.
     """
@@ -97,17 +97,17 @@ class Bench:
 
     @property
     def rays(self) -> int:
-        """In all frames and positions of a scene."""
+        """The number of rays in all frames and positions of a scene."""
         return sum(len(rays) for rays in self.positions) * self.scenes[0].frames
 
     @cached_property
     def casters(self) -> list[list[SceneCaster]]:
-        """Of every scene."""
+        """The casters of every scene."""
         return [build_casters(scene) for scene in self.scenes]
 
     @cached_property
     def plans(self) -> list[EffectPlan]:
-        """Of every scene."""
+        """The effect plan of every scene."""
         return [
             self.planner.plan(scene, list(self.positions), casters)
             for scene, casters in zip(self.scenes, self.casters, strict=True)
@@ -135,7 +135,7 @@ def _rays(asked: EvaluationRequest, design: DesignSpec) -> tuple[int, RaysPerCon
 
 
 def _paired(values: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
-    """The size of the mean difference over scenes, and its standard error."""
+    """The absolute mean difference over scenes, and its standard error."""
     mean, error = _mean(values - reference)
     return abs(mean), error
 
@@ -174,7 +174,7 @@ def _footprint(bench: Bench, note: str, own: Detector) -> Sweep:
 
 
 def _effects(bench: Bench, note: str, own: Detector) -> list[Sweep]:
-    """One sweep: nothing, every effect left out in turn, and all that there are; empty where there is none."""
+    """The sweep over effects: none, each left out in turn, and all present; empty where there are none."""
     present = {one.name for plan in bench.plans for one in plan.decisions if one.bound.range_m or one.bound.lost}
     rays, detector = bench.rays * len(bench.scenes), bench.planner.detector
     dear = {name for name in present if predicted_seconds(name, detector, rays) > MOST_SECONDS}
@@ -211,7 +211,7 @@ class _Pass:
 def _passes(bench: Bench, choices: Mapping[str, Sequence[frozenset[str]]]) -> dict[str, _Pass]:
     """All scenes under each choice of effects per scene.
 
-    One scene after the other under all choices, so that whatever else the machine does slows all alike.
+    Scene by scene under all choices, so that other load of the machine slows all alike.
     """
     measured: dict[str, list[tuple[float, float, int | None]]] = {name: [] for name in choices}
     for number in range(len(bench.scenes)):
@@ -228,7 +228,7 @@ def _passes(bench: Bench, choices: Mapping[str, Sequence[frozenset[str]]]) -> di
 
 
 def _effect_measurements(bench: Bench, there: Sequence[str], *, marks: bool) -> list[Measurement]:
-    """The roughest first; `marks`: the one that the evaluation itself has taken is its default."""
+    """Measurements by falling error; with `marks` that of the evaluation's own plan is the default."""
     everything, count = frozenset(there), len(bench.scenes)
     planned = [plan.effects & everything for plan in bench.plans]
     # compiled before anything is timed
@@ -255,7 +255,7 @@ def _effect_measurements(bench: Bench, there: Sequence[str], *, marks: bool) -> 
 
 
 def _measure(setting: str, found: _Pass, full: _Pass, changes: Mapping[str, tuple[float, float]]) -> Measurement:
-    """A setting with its error and uncertainty; `changes`: of the metric where an effect is left out or alone."""
+    """A measurement of a setting; `changes` of the metric are those of an effect left out and alone."""
     error = max(changes.values(), default=_paired(found.values, full.values))
     values = {f"change_{name}": change for name, (change, _) in changes.items()}
     if changes:
@@ -264,7 +264,7 @@ def _measure(setting: str, found: _Pass, full: _Pass, changes: Mapping[str, tupl
 
 
 def scenes_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """One sweep: the first design at its largest number of rays against `bounding`; none with fewer than 2 scenes."""
+    """The sweep over scenes: the first design at most rays against `bounding`; empty with fewer than 2 scenes."""
     rows = request.evaluation.rows
     first = next((row.design for row in rows if not row.baseline), None)
     pairs = [
@@ -275,7 +275,7 @@ def scenes_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     ]
     if not pairs:
         return []
-    # where designs are closest
+    # at most rays designs are closest
     design, baseline = max(pairs, key=lambda pair: pair[0].rays)
     differences = np.asarray(design.per_scene, dtype=np.float64) - np.asarray(baseline.per_scene, dtype=np.float64)
     if design.groups is not None:  # scenes of one group stand for each other
@@ -311,7 +311,7 @@ def _scenes_sweep(differences: np.ndarray, design: Row, request: AccuracyRequest
 
 
 def _measure_scenes(differences: np.ndarray, count: int, seconds: float, seed: int) -> Measurement:
-    """The mean half-width over sets of so many scenes; over the one set where all are taken."""
+    """The mean half-width of intervals over random sets of `count` scenes, or over the set of all."""
     total = len(differences)
     generator = random_generator(seed, "held-out ladder", count)
     draws = DRAWS if count < total else 1
@@ -360,7 +360,7 @@ def measure_accuracy(request: AccuracyRequest, progress: Progress | None = None)
     """Measure every sweep that applies.
 
     Arguments:
-        request: What to measure on.
+        request: The run and evaluation to measure on.
         progress: Called with the label of the next kind of sweeps, the kinds done, and all kinds.
     """
     measured: list[Sweep] = []

@@ -48,7 +48,7 @@ WARM_UP_PROBES = 32
 
 
 def field_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """One sweep; empty where no target is a mesh, or no ray meets one."""
+    """The sweep over field resolutions; empty where no target is a mesh, or no ray meets one."""
     scenes, config = list(request.request.train), request.config
     if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
         return []
@@ -58,7 +58,7 @@ def field_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
 
 
 def resolution_sweep(case: FieldCase) -> Sweep:
-    """Grid points along the longest side of a field, against exact distances."""
+    """The sweep over grid points along the longest side of a field, against exact distances."""
     own, measurements, left_out = case.settings.field_resolution, [], ""
     for count in sorted({*RESOLUTIONS, own}):
         # the time grows like the volume
@@ -85,14 +85,14 @@ def resolution_sweep(case: FieldCase) -> Sweep:
 
 @dataclass(frozen=True, eq=False)
 class FieldCase:
-    """A few scenes of meshes, and what their fields are compared by.
+    """A few scenes of meshes, with probes and exact values to compare their fields.
 
     Arguments:
-        few: These scenes.
+        few: The scenes.
         scenes: All scenes that share a grid with them.
-        settings: Of the density.
+        settings: The settings of the density.
         target: Their p* with the run's own field.
-        probes: Around their surfaces.
+        probes: Probes around their surfaces.
         observed: The scene points of these, shape (N, 3).
         log_transmittance: Their log T, shape (N, columns).
         exact: Their exact distances, shape (N, columns) [m].
@@ -146,7 +146,7 @@ class FieldCase:
 
 
 def _bytes(field: Field, case: FieldCase) -> int:
-    """The memory of the fields of all scenes; moving meshes have one each, however many scenes they are in."""
+    """The memory of the fields of all scenes; moving meshes have one each for all scenes."""
     if isinstance(field, TableField):
         return field.table.nbytes // field.columns * len(scene_columns(case.scenes))
     return field.bodies.grids.values.nbytes * _meshes(case.scenes) // max(_meshes(case.few), 1)
@@ -158,7 +158,7 @@ def _meshes(scenes: list[Scene]) -> int:
 
 
 def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: DensitySettings) -> Field:
-    """The field of a few scenes as the run would build it, whatever is cached."""
+    """The field of a few scenes as the run would build it, built without the cache."""
     padding_m = PADDING_SIGMAS * settings.sigma_m
     bodies = [(scene, body) for scene in scenes for body in scene.bodies if body.is_target]
     if all(isinstance(body.shape, Mesh) and scene.frames == 1 for scene, body in bodies):
@@ -183,7 +183,7 @@ class ExactField:
 
     Arguments:
         scenes: One column per scene and frame.
-        chosen: Which bodies count.
+        chosen: Predicate of the bodies to include.
     """
 
     def __init__(self, scenes: Sequence[Scene], chosen: Callable[[Body], bool]) -> None:
@@ -227,7 +227,7 @@ def mesh_distances(mesh: Mesh, points: np.ndarray) -> np.ndarray:
 
 
 def fresh_table(scenes: Sequence[Scene], around: Sequence[Scene], resolution: int, padding_m: float) -> TableField:
-    """The table of scenes whose targets are meshes at rest, built anew whatever is cached.
+    """The table of scenes whose targets are meshes at rest, built without the cache.
 
     Arguments:
         scenes: One column each.
@@ -247,13 +247,13 @@ def target_meshes(scene: Scene) -> list[Mesh]:
 
 
 def visibility_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """One sweep; empty where no ray sees a target."""
+    """The sweep over kinds of visibility; empty where no ray sees a target."""
     scenes, config = list(request.request.train), request.config
     few = affordable_scenes(scenes)
     case = VisibilityCase.of(few, config.space, config.density, config.seed, config.learning.batch)
     if case.is_blind:
         return []
-    # what the run's probe decided, and the points of its quadrature, refined as they were
+    # the visibility of the run's probe, and its refined points of quadrature
     default, points = request.decided_visibility or config.density.visibility, config.density.quadrature_points
     if default == "quadrature":
         points = request.target.visibility.one_way.points
@@ -264,10 +264,10 @@ def visibility_sweep(case: VisibilityCase, points: int, default: str, note: str 
     """No visibility, the quadrature with its own points, and ray casting.
 
     Arguments:
-        case: What they are measured on.
-        points: Of the quadrature.
-        default: off, quadrature or raycast: what the run uses.
-        note: What a reader should know.
+        case: The case to measure on.
+        points: Midpoints of the quadrature.
+        default: The run's own: off, quadrature or raycast.
+        note: A line for readers.
     """
     exact = case.exact
     ways = {
@@ -302,13 +302,13 @@ def affordable_scenes(scenes: list[Scene]) -> list[Scene]:
 
 @dataclass(frozen=True, eq=False)
 class VisibilityCase:
-    """Scenes and what visibility is measured on there.
+    """Targets of scenes with probes to measure visibility at.
 
     Arguments:
         cast, integrated: The target with ray casting and with quadrature.
-        probes: Points that know nothing of the flow.
-        few: How many of these a quadrature is evaluated at.
-        batch: How many of them are timed.
+        probes: Points drawn independently of the flow.
+        few: Number of these that a quadrature is evaluated at.
+        batch: Number of these that are timed.
     """
 
     cast: Target

@@ -1,4 +1,4 @@
-"""The scenes of a density that sweeps are measured on, and weighted points that know nothing of the flow."""
+"""The scenes of a density that sweeps are measured on, and weighted points independent of the flow."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class AccuracyRequest:
         config: The run's configuration.
         run: The run's folder.
         request: The evaluation's request: task, scenes, designs, samples, layouts, planner, seed.
-        evaluation: What the evaluation found.
+        evaluation: The result of the evaluation.
     """
 
     config: RunConfig
@@ -55,7 +55,7 @@ class AccuracyRequest:
 
     @property
     def decided_visibility(self) -> str | None:
-        """The visibility that the run's own probe decided on; None where it left no word of it."""
+        """The visibility that the run's own probe decided on; None where it is not recorded."""
         return read_manifest(self.run).get("visibility")
 
 
@@ -83,14 +83,14 @@ class Probes:
 def draw_probes(target: Target, count: int, seed: int, label: str, *, widening: float = 1.0) -> Probes:
     """At most `count` probes of a target, none where no ray of the space comes near a surface.
 
-    Points that were drawn several times count once, with the weight of all: evaluating them again adds nothing.
+    Points that were drawn several times are kept once, with the weight of all.
 
     Arguments:
-        target: What to probe.
+        target: The target.
         count: The number of draws.
         seed: The run's.
         label: Of the random stream.
-        widening: How many sigmas from the surface probes spread, where other surfaces are to be met too.
+        widening: Factor on sigma for the spread of probes, to reach other surfaces too.
     """
     wide = replace(target, optics=target.optics.widened(widening * target.optics.sigma_m))
     generator = random_generator(seed, "accuracy", label)

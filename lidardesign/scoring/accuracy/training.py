@@ -82,13 +82,13 @@ def steps_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
 
 
 def dtype_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """One sweep; empty where no ray meets a target."""
+    """The sweep over arithmetic; empty where no ray meets a target."""
     steps = run_steps(request)
     return [] if steps is None else [dtype_sweep(steps, request.config.seed)]
 
 
 def run_steps(request: AccuracyRequest) -> LearningSteps | None:
-    """The steps of a run's learning at the flow that it learned, made once; None where no probe reaches a surface."""
+    """The steps of a run's learning at its learned flow, cached; None where no probe reaches a surface."""
     if request in _STEPS:
         return _STEPS[request]
     target, config, steps = request.target, request.config, None
@@ -152,7 +152,7 @@ def _dtype_measure(
 
 
 def frames_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
-    """One sweep; empty for a few scenes, or where no ray meets a target."""
+    """The sweep over numbers of frames; empty for a few scenes, or where no ray meets a target."""
     steps = run_steps(request)
     if steps is None or steps.target.columns <= POWERS[0]:
         return []
@@ -160,7 +160,7 @@ def frames_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
 
 
 def frames_sweep(steps: LearningSteps, seed: int) -> Sweep:
-    """The error of a path-wise step's gradient when a few scenes and frames, drawn anew each time, stand for all."""
+    """The error of a path-wise step's gradient on random subsets of scenes and frames."""
     flow, columns = in_arithmetic(steps.flow, steps.settings.dtype), steps.target.columns
     seeds, default = range(seed, seed + FRAMES_BATCHES), min(steps.settings.frames, columns)
     exact = [gradient(flow, steps.pathwise(), number, steps.settings.clip_norm) for number in seeds]

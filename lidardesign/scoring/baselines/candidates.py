@@ -20,7 +20,7 @@ from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.sensor import MOST_RAYS
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
-# A gate without width hears nothing, since gates are open at their end. Ranges that never vary get the width
+# A gate without width receives nothing, since gates are open at their end. Ranges that never vary get the width
 # of the default 100 ps bin around them.
 SMALLEST_GATE_M = 0.015
 # Bandwidth grows almost in proportion to the number of rays: a few steps find the largest number that fits.
@@ -42,7 +42,7 @@ def rays_at(points: np.ndarray, gate_m: np.ndarray) -> Rays:
 
 
 def opened_gate(start_m: float | np.ndarray, end_m: float | np.ndarray) -> np.ndarray:
-    """Gates that hear both their ends, shape (..., 2) [m]; those without width get `SMALLEST_GATE_M`."""
+    """Gates that include both their ends, shape (..., 2) [m]; those without width get `SMALLEST_GATE_M`."""
     start, end = np.asarray(start_m, dtype=np.float64), np.asarray(end_m, dtype=np.float64)
     around = np.maximum(0.0, start - SMALLEST_GATE_M / 2)
     wide = end > start
@@ -56,8 +56,8 @@ class LayoutSite(NamedTuple):
 
     Arguments:
         space: The design space at a condition value.
-        number: Which of the values it is.
-        scene: The held-out scene, for what is drawn anew in each.
+        number: The index of that value.
+        scene: The number of the held-out scene, for layouts drawn anew in each.
     """
 
     space: DesignSpace
@@ -66,7 +66,7 @@ class LayoutSite(NamedTuple):
 
 
 class Candidate(Protocol):
-    """One layout that a baseline may take; `drawn_anew` says whether it differs from scene to scene."""
+    """A layout of a baseline; `drawn_anew` is true where it differs from scene to scene."""
 
     name: str
     drawn_anew: bool
@@ -77,9 +77,9 @@ class Candidate(Protocol):
     def positions_within(
         self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth
     ) -> RaysPerCondition | None:
-        """As many rays as fit in a bandwidth [Mbit/s], the same number in each space; none where not one fits.
+        """As many rays as fit in a bandwidth [Mbit/s], the same number in each space; empty where not one fits.
 
-        None where more fit than any sensor fires.
+        None where more than `MOST_RAYS` fit.
         """
 
 
@@ -149,12 +149,12 @@ def most_within(
     *,
     close_enough: float = 1.0,
 ) -> RaysPerCondition | None:
-    """The most rays that a few steps in proportion to the bandwidth find; never more than fit.
+    """The most rays within a bandwidth that a few proportional steps find.
 
-    None where they are more than any sensor fires.
+    None where they are more than `MOST_RAYS`.
 
     Arguments:
-        lay_out: The rays of any number.
+        lay_out: Gives the rays of a number.
         limit_mbps: The bandwidth [Mbit/s].
         bandwidth: The read-out model.
         count: The number to begin with.
@@ -174,7 +174,7 @@ def most_within(
 
 
 def rays_within(limit_mbps: float, bandwidth: Bandwidth, gate_m: np.ndarray) -> int:
-    """The number of rays with one gate (2,) [m] that fit in a bandwidth [Mbit/s], however many."""
+    """The number of rays with one gate (2,) [m] that fit in a bandwidth [Mbit/s], without an upper limit."""
     width_m = np.diff(gate_m)
     # the ratio of two multiples of one bin may lie an ulp below a whole number
     count = math.floor(limit_mbps / bandwidth.mbps_of_widths(width_m) * (1 + EPSILON))
@@ -184,5 +184,5 @@ def rays_within(limit_mbps: float, bandwidth: Bandwidth, gate_m: np.ndarray) -> 
 
 
 def whole_range(space: DesignSpace) -> np.ndarray:
-    """The gate that hears all of a space's range, shape (2,) [m]."""
+    """The gate over all of a space's range, shape (2,) [m]."""
     return opened_gate(space.low[RANGE], space.high[RANGE])

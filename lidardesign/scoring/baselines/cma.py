@@ -1,10 +1,10 @@
-"""The baseline `cma`: the first design with what direct optimisation makes of its sensors, by N. Hansen's `cma`.
+"""The baseline `cma`: the first design with its sensors optimised directly, by N. Hansen's `cma`.
 
 A vector holds, sensor by sensor, the shift of its origin, of its boresight (azimuth, elevation, roll) and of its gates,
 and the logarithms by which its field of view and its gates are wider, as far as they are free, in steps that change a
-score about equally. The design's own rays move with their sensors, so the vector 0 is the design, whatever its layout,
-and what is found is no worse than it on the scenes of the search. Constraints bound the vector and cut gates; rays that
-take more bandwidth than the design's rank behind all others.
+score about equally. The design's own rays move with their sensors, so the vector 0 is the design in any layout, and
+the result is no worse than it on the scenes of the search. Constraints bound the vector and clip gates; rays with more
+bandwidth than the design's rank behind all others.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class CmaSettings:
     Arguments:
         seconds: Wall time [s].
         evaluations: Scores of one candidate in one scene.
-        show: Told how each search stands.
+        show: Called with the progress of each search.
     """
 
     seconds: float = DEFAULT_SECONDS
@@ -69,14 +69,14 @@ class CmaSettings:
 
 @dataclass(frozen=True)
 class SearchRecord:
-    """A search and what came of it.
+    """A search and its result.
 
     Arguments:
         rays: The number of rays.
-        sensors, parameters: How many sensors and how many numbers of them it varied.
+        sensors, parameters: Numbers of sensors and of parameters that it varied.
         seconds: Wall time [s].
-        candidates: How many were scored.
-        training_scenes: The scenes that each was scored in.
+        candidates: Number of candidates scored.
+        training_scenes: Number of scenes that each was scored in.
         start_value, value: Mean scores of the design and of the best candidate there.
     """
 
@@ -134,7 +134,7 @@ class MovableSensors:
         self.vector_bounds = [(side / self._unit)[self._free] for side in (self._low, self._high)]
 
     def _changes(self, every: Rays, spread: np.ndarray) -> np.ndarray:
-        """Largest fall and rise of each number, shape (2, G, 10); 0 where it is not free."""
+        """Lowest and highest change of each parameter, shape (2, G, 10); 0 where it is not free."""
         axes, bounds, sides = self._axes, self._bounds, np.zeros((2, self.count, 10))
         first, last = np.full((self.count, 3), np.inf), np.full((self.count, 3), -np.inf)
         np.minimum.at(first, every.sensor, every.origin_m)
@@ -158,7 +158,7 @@ class MovableSensors:
         return sides
 
     def _units(self, every: Rays, spread: np.ndarray) -> np.ndarray:
-        """One unit of each number, shape (G, 10)."""
+        """The unit of each parameter, shape (G, 10)."""
         unit = np.full((self.count, 10), LOG_STEP)
         unit[:, ORIGIN] = np.maximum(BOX_SHARE * (self._bounds.origin_high - self._bounds.origin_low), TINY)
         middle = every.direction.mean(axis=0)
@@ -199,7 +199,7 @@ class MovableSensors:
         return Rays(rays.origin_m + own[:, ORIGIN], direction(azimuth, elevation), gate_m, sensor, rays.time_s)
 
     def excess(self, positions: RaysPerCondition) -> float:
-        """The share by which rays take more bandwidth than the design's; 0 where they do not."""
+        """The share by which the bandwidth of rays exceeds the design's; 0 where it does not."""
         return max(max(mean_mbps(positions, model) / limit - 1 - SLACK, 0.0) for model, limit in self._limits)
 
 
@@ -212,7 +212,7 @@ class CmaCandidate:
         starts: Its rays by their number.
         space: The design space at one condition value.
         objective: The metric on training scenes.
-        settings: How long each search takes.
+        settings: Limits of each search.
         seed: Root of the random numbers.
         bandwidth: The read-out model.
     """

@@ -3,7 +3,7 @@
 A `Zone` is a box of azimuths and elevations: its rows are even in elevation and have rays in proportion to their
 length. A `Patch` is a rectangle in the azimuthal equal-area projection about a middle direction (J. H. Lambert 1772),
 which for narrow fields is the tangent plane: areas keep their ratio however wide it is, and no direction is singular
-but the one opposite to its middle. What looks over more than a hemisphere is a zone, anything else a patch.
+but the one opposite to its middle. A field of more than a hemisphere is a zone, any other a patch.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class SphereField(Protocol):
         """All azimuths and elevations of a lattice with (nearly) hexagonal cells of one area, shape (K, 2) [rad]."""
 
     def widened(self, share: float, space: DesignSpace) -> SphereField:
-        """The field with a share of its extents more at every side, as far as the design space goes."""
+        """The field widened by a share of its extents at every side, within the design space."""
 
     @property
     def area_sr(self) -> float:
@@ -193,7 +193,7 @@ class Patch:
 def widened_angles(
     low: np.ndarray, high: np.ndarray, share: float, space: DesignSpace
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (2,) of a box of azimuths and elevations with a share of its extents more at every side, in the space."""
+    """Corners (2,) of a box of azimuths and elevations widened by a share at every side, within the space."""
     low, high = low - share * (high - low), high + share * (high - low)
     lowest, highest = (np.array(end)[AZIMUTH : ELEVATION + 1] for end in (space.low, space.high))
     if space.full_azimuth:  # it may start anywhere
@@ -285,7 +285,7 @@ def even_placement(low: np.ndarray, high: np.ndarray, count: int, field: SphereF
 
 
 def bounding(views: TrainingViews, *, gates_per_ray: bool = False) -> list[GatedLayout]:
-    """The layouts of the baseline: what an engineer would build in five minutes from where training scenes return.
+    """The layouts of the baseline: what an engineer would build in five minutes from the training returns.
 
     One even layout, cropped to the central 99 % of the returns in direction and range. Where both angles are free, the
     crop is the smallest rectangle about their mean direction, else an interval of the angle. With free origins it is
@@ -313,7 +313,7 @@ class Crop:
         low, high: A box of rays (x, y, z, azimuth, elevation), shape (5,).
         directions: The directions, where they are not those of the box.
         gate_m: The gate of all rays, shape (2,).
-        table: What dense rays in the crop return, for gates per ray.
+        table: Gives returns of dense rays in the crop, for gates per ray.
     """
 
     low: np.ndarray
@@ -327,13 +327,13 @@ CropOf = Callable[[TrainingViews, DesignSpace, Observed], Crop | None]
 
 
 def crop_kinds(space: DesignSpace) -> dict[str, CropOf]:
-    """Ways to crop a design space to what returns; with free origins there are two."""
+    """Ways to crop a design space to the returns, by name: two with free origins, else one."""
     origins = [axis for axis in space.free if axis < AZIMUTH and axis not in space.conditioned]
     return {"parallel": _parallel_crop, "cropped": box_crop} if origins else {"cropped": box_crop}
 
 
 def _cropped(name: str, views: TrainingViews, crop_of: CropOf, gates_per_ray: bool) -> list[GatedLayout]:
-    """The layouts of a kind of crop; none where there is nothing to crop to."""
+    """The layouts of a kind of crop; empty without returns."""
 
     @cache
     def crop_at(space: DesignSpace) -> Crop | None:
@@ -386,7 +386,7 @@ def _parallel_crop(views: TrainingViews, space: DesignSpace, observed: Observed)
 
 
 def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, float]:
-    """Straight down where the space allows it, else straight up, else the median direction of the returns."""
+    """Azimuth and elevation of parallel rays: straight down if admitted, else up, else the returns' median [rad]."""
     middle = np.median(observed.points[:, AZIMUTH])
     vertical = [end for end in (-math.pi / 2, math.pi / 2) if space.low[ELEVATION] <= end <= space.high[ELEVATION]]
     return float(middle), vertical[0] if vertical else float(np.median(observed.points[:, ELEVATION]))

@@ -1,12 +1,12 @@
 """The baseline `greedy`: rays and gates chosen on training scenes as a design's are, but without any density.
 
 Candidates are even over where training scenes return: on the lattice of `silhouette`, with free origins in the crops of
-`bounding`. Which of them fire, and through which gates, is chosen as by `fit`: by what the task says
-that returns tell about scenes, of the same scenes, as many, and in the bandwidth of the design beside it. Where no
-design has gates per ray there is one gate, that of the crops, and at equal rays it costs what it costs.
+`bounding`. Rays and gates are chosen as by `fit`: by the task's information about
+the same scenes, as many, and in the bandwidth of the design compared with. Where no design has gates per ray there is
+one gate, that of the crops, whatever its bandwidth at equal rays.
 
 Where the density has conditions, rays are chosen at each of their values, all of them at once: the bandwidth is a mean
-over the values, and is spent at those where it tells most.
+over the values, and is spent where it gains most information.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from lidardesign.rays.training import InformedScene, TrainingScenes
 
 GREEDY = "greedy"
-USUAL_SCENES = 200  # that rays are chosen on where no design says on how many it was
+USUAL_SCENES = 200  # that rays are chosen on where no design has a number of its own
 # Rays over all values of a condition: choosing more would take longer than all else in an evaluation.
 MOST_CHOSEN = 2000
 SMALLEST_SHARE = 0.1  # of even rays that return: where fewer do, candidates are those that return most often
 
 
 def greedy_rays(task: Task, positions: int, counts: Iterable[int]) -> tuple[list[int], list[str]]:
-    """The numbers of rays that `greedy` can choose at so many condition values, and why not the others, for people."""
+    """The numbers of rays that `greedy` can choose at `positions` condition values, and notes on the others."""
     from lidardesign.rays.information import informs_rays
 
     if not informs_rays(task):
@@ -57,7 +57,7 @@ def greedy_rays(task: Task, positions: int, counts: Iterable[int]) -> tuple[list
 
 
 class Fired(NamedTuple):
-    """A number of rays that a design beside it fires, and their bandwidth [Mbit/s]."""
+    """The number of rays of a design compared with, and their bandwidth [Mbit/s]."""
 
     rays: int
     mbps: float
@@ -76,13 +76,13 @@ class GreedyCandidate:
     """Chosen rays as a baseline's layout.
 
     Arguments:
-        views: The training scenes, for where they return.
+        views: The training scenes, for their returns.
         spaces: The design space at each of the condition values.
         training: Scenes to choose on, as designs with chosen rays are chosen on.
-        scenes: On how many scenes rays are chosen.
+        scenes: Number of scenes that rays are chosen on.
         gates_per_ray: Whether each ray has a gate of its own.
-        candidates: How many rays are chosen from, at each of the values.
-        fired: What the designs beside it fire.
+        candidates: Number of candidates at each of the values.
+        fired: Rays and bandwidth of the designs compared with.
         bandwidth: The read-out model.
     """
 
@@ -115,7 +115,7 @@ class GreedyCandidate:
         return self._chosen(min(fit, most), np.inf)
 
     def _chosen(self, count: int, limit_mbps: float) -> RaysPerCondition:
-        """The choice of so many rays at each value, in a bandwidth that is a mean over the values [Mbit/s]."""
+        """The choice of `count` rays at each value, within a bandwidth that is a mean over the values [Mbit/s]."""
         if (count, limit_mbps) not in self._known:
             self._known[count, limit_mbps] = self._choice(count, limit_mbps)
         return self._known[count, limit_mbps]
@@ -128,7 +128,7 @@ class GreedyCandidate:
         with phase("choice"):
             choice = choose_within(table.coverage, counts, limit_mbps * values)
             if len(choice.rays) < count * values:
-                # no design spends less than one bin per ray
+                # the least bandwidth of any design is one bin per ray
                 choice = choose(table.coverage, counts, price=1 / COARSE_SLACK)
         gate_m = table.gates_m[choice.rays, choice.gate[choice.rays]]
         fired = replace(table.selection.rays.subset(choice.rays), gate_m=gate_m)
@@ -143,7 +143,7 @@ class GreedyCandidate:
         return [self._candidates(space) for space in self.spaces]
 
     def _candidates(self, space: DesignSpace) -> Rays:
-        """Even candidates at a value; where nothing returns there, by what returns at any of them."""
+        """Even candidates at a value, by its returns, or by those of all values where it has none."""
         views = self.views
         crops = self._crops(space) or self._crops(views.space)
         found = None
@@ -166,7 +166,7 @@ class GreedyCandidate:
         return [crop for crop in crops if crop is not None]
 
     def _returning(self, crop: Crop, count: int) -> np.ndarray:
-        """At least so many even rays in a crop, those in whose place scenes return most often, (K, 5)."""
+        """At least `count` even rays in a crop, those with the highest share of returns, (K, 5)."""
         place = partial(even_placement, crop.low, crop.high, field=crop.directions)
         share = float((self.views.returns(place(count)).share >= LEAST_SHARE).mean())
         points = place(math.ceil(count / max(share, SMALLEST_SHARE)))
@@ -188,7 +188,7 @@ class GreedyCandidate:
 
     @phase("gates")
     def _gates(self, rays: Rays, visits: Sequence[slice], informed: Sequence[InformedScene]) -> np.ndarray:
-        """The gates that candidates may have, (N, G, 2) [m]; the last is of one bin, so that any design's bits do."""
+        """The gates of candidates to choose from, (N, G, 2) [m]; the last has one bin, for any design's bandwidth."""
         from lidardesign.rays.gates import gate_choices
 
         own = rays.gate_m[:, None]

@@ -1,4 +1,4 @@
-"""The baselines `silhouette` and `lloyd`: rays and gates by what dense rays return in training scenes.
+"""The baselines `silhouette` and `lloyd`: rays and gates from returns of dense rays in training scenes.
 
 `silhouette` lays a hexagonal lattice over all directions in which at least 1 % of the training scenes and frames return
 on a target; its spacing is such that exactly as many rays as asked for fall inside (of a few more those that return
@@ -44,7 +44,7 @@ PROBABILITY_POWER, AREA_POWER = 0.75, 1.5
 
 
 class Survey(NamedTuple):
-    """Returns of dense rays from one place, and over which box and directions they are even."""
+    """Returns of dense rays from one place, even over a box and directions."""
 
     low: np.ndarray
     high: np.ndarray
@@ -53,12 +53,12 @@ class Survey(NamedTuple):
 
     @property
     def supported(self) -> np.ndarray:
-        """The dense rays that return often enough, shape (K,)."""
+        """Indices of the dense rays that return in at least `LEAST_SHARE` of the views, shape (K,)."""
         return np.flatnonzero(self.table.share >= LEAST_SHARE)
 
 
 def survey(views: TrainingViews, space: DesignSpace) -> Survey | None:
-    """Dense rays from the middle of a space's origins to a little beyond where the returns are; None without any."""
+    """Returns of dense rays from the middle of a space's origins, over a widened crop of the returns; None without."""
     middle = (np.array(space.low) + np.array(space.high)) / 2
     low, high = np.array(space.low), np.array(space.high)
     low[:AZIMUTH] = high[:AZIMUTH] = middle[:AZIMUTH]
@@ -107,7 +107,7 @@ def _layouts(name: str, views: TrainingViews, place: PlaceRays, tail: float, sig
 
 
 def lattice_rays(found: Survey, count: int) -> np.ndarray:
-    """The rays of a lattice where enough scenes return, shape (count, 5)."""
+    """Rays of a lattice over directions with enough returns, shape (count, 5)."""
     table, field = found.table, found.directions
     supported = found.supported
     if not count or field is None or field.area_sr < TINY:
@@ -169,7 +169,7 @@ def _lloyd_rays(found: Survey, count: int) -> np.ndarray:
 
 
 def _fine_points(found: Survey, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Even rays of a survey's box and directions, (count, 5), with a number in (0, 1) that is even too, (count,)."""
+    """Even rays of a survey's box and directions, (count, 5), with an even coordinate in (0, 1), (count,)."""
     if found.directions is not None:
         points = np.tile(found.low, (count, 1))
         spread = found.directions.spread(count, 1)

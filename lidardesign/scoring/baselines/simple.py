@@ -78,12 +78,12 @@ class Baselines:
         space: The design space.
         train: Training scenes.
         seed: Root of the baselines that are drawn.
-        judge: What lists of rays score on training scenes, lower is better; None counts missing returns.
+        judge: Scores lists of rays on training scenes, lower is better; None counts missing returns.
         conditions: The condition values that rays are laid out at.
         gates_per_ray: Whether the rays of `bounding` may have gates of their own.
-        without_visibility: Makes the layout that stands for `no-visibility`; called when that is asked for.
-        optimised: Makes the layout that stands for `cma`; called when that is asked for.
-        chosen: Makes the layout that stands for `greedy`; called when that is asked for.
+        without_visibility: Makes the layout of `no-visibility`, when that is asked for.
+        optimised: Makes the layout of `cma`, when that is asked for.
+        chosen: Makes the layout of `greedy`, when that is asked for.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class Baselines:
     def options_within(self, name: str, limit_mbps: float, bandwidth: Bandwidth) -> list[Option]:
         """All candidates of a baseline with as many rays as fit in a bandwidth [Mbit/s].
 
-        None where more fit than any sensor fires: without them the baseline would not be what it can be.
+        Empty where more than `MOST_RAYS` fit for one of them, since the baseline would be weaker without it.
         """
         options = []
         for one in self.candidates(name):
@@ -138,9 +138,9 @@ class Baselines:
 
     @phase("baselines")
     def best(self, choices: Sequence[tuple[str, list[Option]]]) -> list[Option]:
-        """Of each baseline's options the one that scores best on training scenes, the first of equals.
+        """The option of each baseline that scores best on training scenes, the first of equals.
 
-        All that still have to be judged are judged together.
+        All options that were not scored before are scored together.
         """
         unknown = {
             key: option.positions
@@ -248,7 +248,7 @@ class TwinCandidate:
     Arguments:
         fit: The design with so many rays, within a bandwidth [Mbit/s] or without a limit.
         conditions: The condition values.
-        fired: What the designs beside it fire.
+        fired: Rays and bandwidth of the designs compared with.
     """
 
     drawn_anew = False
@@ -292,9 +292,9 @@ def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> Baseline
 
     The grid's cells are cubes; a cell's probability is the share of training scenes and frames in which a target's
     surface lies in it. A ray starts at a uniform admissible origin and is aimed at a uniform point of a cell that is
-    drawn by its probability, among all such pairs that the design space admits; nothing asks whether anything stands in
-    between. The gate is the central 99 % of the distances to these points. Rays are drawn anew for every scene. At a
-    condition value where none ends in an occupied cell, rays are uniform in what is left of the space.
+    drawn by its probability, among all such pairs that the design space admits; occlusion is ignored. The gate is
+    the central 99 % of the distances to these points. Rays are drawn anew for every scene. At a condition value where
+    none ends in an occupied cell, rays are uniform in what is left of the space.
     """
     if not train:
         return None
@@ -336,7 +336,7 @@ def occupancy_grid(scenes: Sequence[Scene], space: DesignSpace, seed: int) -> Oc
 
 @dataclass(frozen=True, eq=False)
 class OccupancyGrid:
-    """A grid, and how often targets' surfaces lie in its cells.
+    """A grid with the probability that targets' surfaces lie in its cells.
 
     Arguments:
         low_m: Its lower corner, shape (3,).
@@ -374,7 +374,7 @@ class AimedPoints:
     Arguments:
         grid: The cells.
         space: The design space, or what is left of it at a condition value.
-        seed, number: Root of the draws, and which of the condition values it is.
+        seed, number: Root of the draws, and the index of the condition value.
     """
 
     def __init__(self, grid: OccupancyGrid, space: DesignSpace, seed: int, number: int) -> None:
@@ -384,9 +384,9 @@ class AimedPoints:
         self._blocks: list[tuple[np.ndarray, np.ndarray]] = []
 
     def first(self, effective_samples: int) -> tuple[np.ndarray, np.ndarray]:
-        """The first points (N, 6) worth so many of equal weight, and their weights (N,); fewer where there are not.
+        """The first points (N, 6) of this effective number, or of less where it is out of reach, with weights (N,).
 
-        How many were asked for before changes nothing.
+        The result does not depend on earlier calls.
         """
         chosen: list[tuple[np.ndarray, np.ndarray]] = []
         total = squares = 0.0

@@ -51,7 +51,7 @@ class ReturnTable:
         space: The design space, whose range all gates keep to.
         points: The rays (x, y, z, azimuth, elevation), shape (M, 5).
         range_m: Ranges of their returns, NaN where there is none, shape (V, M).
-        cosine: Of the angle between a ray and the surface's normal, shape (V, M).
+        cosine: Cosine of the angle between a ray and the surface's normal, shape (V, M).
     """
 
     def __init__(self, space: DesignSpace, points: np.ndarray, range_m: np.ndarray, cosine: np.ndarray) -> None:
@@ -98,12 +98,12 @@ class ReturnTable:
         return among[cKDTree(self._tree.data[among]).query(asked)[1]]
 
     def gates(self, points: np.ndarray, tail: float, margin_m: float) -> np.ndarray:
-        """Gates that hold what the table's rays return that are nearer to each ray than to any other, (N, 5) to (N, 2).
+        """Gates of rays (N, 5) that hold the returns of the table's rays nearest to each of them, (N, 2) [m].
 
         Arguments:
             points: The rays.
             tail: The share of these returns that is left out at either end.
-            margin_m: How much further the gates reach at either end, inside the space's range [m].
+            margin_m: Margin at either end, within the space's range [m].
         """
         if not len(points):
             return np.zeros((0, 2))
@@ -117,7 +117,7 @@ class ReturnTable:
         return opened_gate(np.clip(low - margin_m, lowest, highest), np.clip(high + margin_m, lowest, highest))
 
     def _ends(self, cell: np.ndarray, count: int, tail: float) -> tuple[np.ndarray, np.ndarray]:
-        """Quantiles of what the rays of each cell return, rounded outwards; NaN where they return nothing."""
+        """Low and high quantiles of the returns in each cell, rounded outwards; NaN without returns."""
         range_m, ray = self._ascending
         order = np.argsort(cell[ray], kind="stable")
         returns = np.bincount(cell[ray], minlength=count)
@@ -130,13 +130,13 @@ class ReturnTable:
 
 
 def _scales(points: np.ndarray) -> tuple[float, float]:
-    """Units of directions and origins in which both extend over about 1."""
+    """Units of directions and of origins in which each spans about 1."""
     looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
     return tuple(float(np.ptp(part, axis=0).max()) or 1.0 for part in (looking, points[:, :3]))
 
 
 def _features(points: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
-    """Coordinates that are near each other where rays are, (N, 5) to (N, 6)."""
+    """Scaled directions and origins, whose Euclidean distance compares rays, (N, 5) to (N, 6)."""
     looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
     return np.column_stack([looking / scale[0], points[:, :3] / scale[1]])
 
@@ -212,7 +212,7 @@ def spread_frames(scenes: Sequence[Scene], most: int = MOST_VIEWS) -> list[tuple
 
 
 def dense_rays(axes: int) -> int:
-    """The number of rays that are dense over so many axes."""
+    """The number of dense rays over this many axes."""
     return DENSE_RAYS if axes > 1 else DENSE_RAYS_ON_A_LINE
 
 
@@ -243,8 +243,8 @@ class TrainingObjective:
     """The task's metric on training scenes, turned so that lower is better.
 
     Arguments:
-        task: Whose score is taken.
-        metric: What it means.
+        task: The task that scores.
+        metric: Its metric.
         scenes: Training scenes.
         planner: The detector, and how effects are chosen.
         seed: Root of the effects' random streams.

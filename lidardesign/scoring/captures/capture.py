@@ -136,9 +136,9 @@ class Capture:
 
     @cached_property
     def background_per_bin(self) -> float:
-        """The usual background of a bin: the median over pixels of the median of 16 stretches' means.
+        """The typical background of a bin: the median over pixels of the median of 16 stretches' means.
 
-        Where that is 0 it follows from how many stretches are empty, which e^-mean of them are.
+        Where that is 0 it follows from the share of empty stretches, e^-mean.
         """
         edges = np.linspace(0, self.bins, min(STRETCHES, self.bins) + 1).astype(np.int64)
         rows = max(1, CHUNK // self.bins)
@@ -150,7 +150,7 @@ class Capture:
 
 
 def _rare_background(means: np.ndarray) -> float:
-    """Mean counts of a stretch where most are empty, (P, S): without each pixel's fullest and its neighbours."""
+    """Mean background of a stretch by the share of empty ones, without each pixel's fullest and its neighbours."""
     # a surface fills the fullest, and its pulse may reach into the next
     away = np.abs(np.arange(means.shape[1]) - means.argmax(axis=1)[:, None]) > 1
     empty = means[away] == 0
@@ -236,7 +236,7 @@ def _scalar(arrays: Mapping[str, np.ndarray], name: str, where: str) -> float:
 
 
 def _per_pixel(arrays: Mapping[str, np.ndarray], name: str, pixels: tuple[int, ...], where: str) -> np.ndarray:
-    """One number per pixel, shape (P,); of a list of pixels a row or a column is one too, as MATLAB has no lists."""
+    """One number per pixel, shape (P,); a list of pixels may be a row or a column, as MATLAB has no lists."""
     array = arrays[name]
     count = int(np.prod(pixels))
     of_list = len(pixels) == 1 and array.size == count and array.ndim <= 2 and count in array.shape
@@ -277,7 +277,7 @@ def _refuse_counts(bad: np.ndarray, part: np.ndarray, first: int, allowed: str, 
 
 
 def _check_values(capture: Capture, where: str) -> None:
-    """Refuse numbers that are right for another unit."""
+    """Refuse numbers that suggest another unit."""
     low, high = BIN_LIMITS_PS
     for name, value in (("bin_width_ps", capture.bin_ps), ("pulse_fwhm_ps", capture.pulse_fwhm_ps)):
         if value is not None and not low <= value <= high:
@@ -388,7 +388,7 @@ def read_matlab(path: Path) -> dict[str, np.ndarray]:
 
 
 def convert(request: dict[str, Any], _: object) -> dict[str, Any]:
-    """In that process: write the arrays of a file into another, and say their names and sizes, or what was refused."""
+    """In the child: write the arrays of a file into another; return their names and sizes, or the refusal."""
     from scipy.io import loadmat, whosmat
 
     source, target, most = request["source"], request["target"], request["most"]
@@ -413,6 +413,6 @@ def convert(request: dict[str, Any], _: object) -> dict[str, Any]:
 
 
 def refused(name: str, kind: str, where: str) -> DataError:
-    """The error that something in a file is no full array of real numbers."""
+    """The error for a variable that is no full array of real numbers."""
     allowed, hint = "full numeric arrays", "save arrays, not structures"
     return DataError(f"{name!r} is a MATLAB {kind}", where=where, allowed=allowed, hint=hint)

@@ -1,9 +1,9 @@
 """A captured scan seen through a list of rays: of each ray the nearest pixel, and its histogram inside the ray's gate.
 
-A design would have measured what is cut out of what was captured: a ray takes the pixel that looks its way, and hears
-only the bins whose middles lie in its gate. Ranges are found as `lidardesign.simulate.detector.kernels` finds them in
-simulated histograms. Where a gate holds too few photons to tell the background, its threshold takes the level that is
-usual in the whole capture.
+A design's measurement is cut out of the capture: a ray takes the pixel nearest to its direction, and only the bins
+whose middles lie in its gate. Ranges are found as `lidardesign.simulate.detector.kernels` finds them in simulated
+histograms. Where a gate holds too few photons to estimate the background, its threshold uses the typical level of the
+whole capture.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SAME_PLACE_M = 0.005
 
 
 class Captured(IntEnum):
-    """Why a capture has nothing of a ray, or that it has it."""
+    """The capture of a ray: captured, or the reason why not."""
 
     YES = 0
     OTHER_PLACE = 1
@@ -46,7 +46,7 @@ class CapturedScan:
         captured: Values of `Captured`, shape (N,).
         pixel: The pixel that each ray takes, -1 where it was not captured, shape (N,).
         away_rad: The angle between the ray and its pixel, or the nearest one, shape (N,).
-        first_bin, last_bin: The bins that it hears, the last one excluded, shape (N,).
+        first_bin, last_bin: The bins in its gate, the last one excluded, shape (N,).
         photons: Counts in them, shape (N,).
         range_m: The measured one-way range [m], NaN without a return, shape (N,).
         points_m: Measured points along the pixels, NaN without a return, shape (N, 3).
@@ -76,8 +76,8 @@ def scan(
         capture: The captured histograms.
         rays: The rays; their gates are one-way ranges.
         within_rad: The largest angle between a ray and the pixel that it takes [rad].
-        estimation: How ranges follow from histograms.
-        name: Whose rays they are, for the message.
+        estimation: The estimation of ranges from histograms.
+        name: The name of the design, for the message.
 
     Raises:
         DataError: Not one ray was captured.
@@ -113,17 +113,17 @@ def gate_bins(capture: Capture, pixel: np.ndarray, gate_m: np.ndarray) -> tuple[
 
 
 def whole_window(rays: Rays, capture: Capture) -> Rays:
-    """The same rays without gates: they hear all that was captured."""
+    """The same rays with gates over the whole captured window."""
     return replace(rays, gate_m=np.tile(_listening_windows_m(capture), (len(rays), 1)))
 
 
 def _listening_windows_m(capture: Capture) -> np.ndarray:
-    """The captured window from the pulse on: what is counted before it left the scanner comes from no surface."""
+    """The captured window from the pulse on [m]; counts before it come from no surface."""
     return np.maximum(capture.window_m, 0.0)
 
 
 def uniform_rays(capture: Capture, count: int) -> Rays:
-    """So many rays even over the field of a capture, without gates: what a scanner without a design would fire.
+    """So many rays even over the field of a capture, without gates, as of a scanner without a design.
 
     A cell-centred grid in scan angles over all pixels and half a pixel round them.
     """
@@ -140,10 +140,10 @@ def uniform_rays(capture: Capture, count: int) -> Rays:
 
 
 def default_within_rad(capture: Capture) -> float:
-    """The angle within which a pixel stands for a ray: as far as neighbouring pixels are apart.
+    """The default angle between a ray and its pixel: the spacing of neighbouring pixels [rad].
 
     Raises:
-        ConfigError: All pixels look one way.
+        ConfigError: All pixels have the same direction.
     """
     if capture.spacing_rad is None:
         raise ConfigError(
@@ -160,7 +160,7 @@ class Estimation:
 
     Arguments:
         estimator: Its highest bin, or the log-matched filter with the pulse.
-        false_alarm: Probability that background alone is taken for a return, over all bins that a ray hears.
+        false_alarm: Probability that background alone is taken for a return, over all bins in a ray's gate.
     """
 
     estimator: Estimator = "peak"
@@ -188,7 +188,7 @@ def measured(
     place, photons = np.full(len(pixel), np.nan), np.zeros(len(pixel))
     for begin, end in _chunks(last - first):
         lengths = np.maximum(last - first, 0)[begin:end]
-        # the counts that rays hear one after the other, and where each begins in them
+        # the counts in the gates of all rays, concatenated, and the first of each ray
         offset = np.concatenate([[0], np.cumsum(lengths)])
         at = np.arange(offset[-1]) - np.repeat(offset[:-1] - first[begin:end], lengths)
         counts = capture.counts[np.repeat(pixel[begin:end], lengths), at].astype(np.int64)
@@ -208,7 +208,7 @@ def measured(
 
 
 def _chunks(lengths: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Rays whose bins are worked on together, as begin and end."""
+    """Slices of rays with at most `CHUNK_BINS` bins together, as begin and end."""
     ends = np.append(0, np.cumsum(lengths))
     begin = 0
     while begin < len(lengths):
@@ -237,7 +237,7 @@ def _measured(
 def _refuse_nothing_captured(
     capture: Capture, rays: Rays, captured: np.ndarray, away: np.ndarray, offset: np.ndarray, name: str | None
 ) -> None:
-    """Refuse rays of which none was captured: the two are of other places or in other frames."""
+    """Refuse rays of which none was captured: they have another place or frame than the capture."""
     if not len(rays) or (captured == Captured.YES).any():
         return
     start, end = capture.window_m

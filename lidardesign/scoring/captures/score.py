@@ -1,6 +1,6 @@
 """Designs in a captured scan: ranges, outliers and a surface, gated, not gated, and beside `uniform`, also ray by ray.
 
-Ranges are judged by the capture's true ranges where it has them; else by the median range of each pixel and its
+Ranges are compared with the capture's true ranges where it has them; else with the median range of each pixel and its
 nearest neighbours over their whole histograms, which a single outlier does not move.
 """
 
@@ -58,10 +58,10 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """Settings by which a capture is judged.
+    """Settings of the evaluation of a capture.
 
     Arguments:
-        estimation: How ranges follow from histograms.
+        estimation: The estimation of ranges from histograms.
         within_rad: The largest angle between a ray and the pixel that it takes [rad].
         outlier_m: A return whose range is off by more is an outlier [m].
         reference: A mesh file of the surface in the design's frame, in metres; None: the true ranges' surface.
@@ -81,9 +81,9 @@ class CaptureRow:
         design: Its name.
         gate: `own` with the rays' gates, `whole` with all that was captured.
         rays: Its rays.
-        scan: What they measured.
+        scan: Their measurements.
         reference_m: The range that each ray's pixel should have given [m], NaN where nothing is known, shape (N,).
-        outlier: Which returns are outliers, shape (N,).
+        outlier: Mask of returns that are outliers, shape (N,).
         chamfer_mm: Distance between the surface through the returns and the reference surface; None: there is none.
         baseline: Whether it is no design.
     """
@@ -100,7 +100,7 @@ class CaptureRow:
     def estimates(self) -> dict[str, Estimate]:
         """The figures that are means or medians over rays, with their standard errors over other rays."""
         estimates, outliers, known = {}, int(self.outlier.sum()), ~np.isnan(self.reference_m)
-        # returns that can be told to be outliers or not, and how far those that are none are off
+        # returns with a reference, and the errors of those that are no outliers
         judged = int((self.scan.returned & (self.outlier | known)).sum())
         errors_m = np.abs(self.scan.range_m - self.reference_m)[self.scan.returned & ~self.outlier & known]
         if judged:
@@ -140,12 +140,12 @@ class CaptureEvaluation:
     """All rows of a capture.
 
     Arguments:
-        capture: What was captured.
-        settings: How it was judged.
+        capture: The capture.
+        settings: The settings.
         rows: Each design with its gates and without, then `uniform` at their numbers of rays; of a gated detector
             only the first.
-        ranges_from, surface_from: What ranges and the surface were judged by, in words; None: no surface.
-        notes: What a reader should know, one line each.
+        ranges_from, surface_from: The references of ranges and of the surface, in words; None: no surface.
+        notes: Lines for readers.
     """
 
     capture: Capture
@@ -181,12 +181,12 @@ class CaptureEvaluation:
 def evaluate_capture(
     capture: Capture, designs: Sequence[tuple[str, Rays]], settings: CaptureSettings
 ) -> CaptureEvaluation:
-    """Score lists of rays by what was captured.
+    """Score lists of rays in a capture.
 
     Arguments:
         capture: The captured histograms.
         designs: Names and rays, in the capture's frame.
-        settings: How it is judged.
+        settings: The settings.
 
     Raises:
         DataError: Not one ray of a design was captured, or the reference cannot be used.
@@ -198,7 +198,7 @@ def evaluate_capture(
         found = scan(capture, rays, settings.within_rad, settings.estimation, name)
         wanted = np.where(found.pixel >= 0, reference_m[found.pixel], np.nan)
         off = np.abs(found.range_m - wanted) > settings.outlier_m
-        # where a true range says that nothing is, every return is wrong
+        # where the true range is NaN, every return is wrong
         off |= np.isnan(wanted) if capture.true_range_m is not None else False
         chamfer = None if surface is None else _chamfer_mm(capture, found, surface)
         return CaptureRow(name, gate, rays, found, wanted, off & found.returned, chamfer, baseline)
@@ -235,7 +235,7 @@ def _notes(capture: Capture, rows: Sequence[CaptureRow]) -> list[str]:
 
 
 def _reference_ranges(capture: Capture, estimation: Estimation) -> tuple[np.ndarray, str]:
-    """The range that every pixel should have measured, shape (P,) [m], and where it is from."""
+    """The reference range of every pixel, shape (P,) [m], and its source in words."""
     if capture.true_range_m is not None:
         return capture.true_range_m, "the capture's true ranges"
     ranges = scan_pixels(capture, estimation).range_m
@@ -258,7 +258,7 @@ def _reference_surface(capture: Capture, mesh: Path | None) -> tuple[SurfaceClou
 
 
 def _surface(capture: Capture, points: np.ndarray, directions: np.ndarray) -> SurfaceCloud | None:
-    """The surface through the points of rays (N, 3), NaN where one measured nothing; None where they span none."""
+    """The surface through the points of rays (N, 3), NaN without a return; None where they span none."""
     kept = np.isfinite(points).all(axis=1)
     spacing = ray_spacing(directions)[kept]
     surface = delaunay_surface(points[kept], capture.origin_m, steepest_deg=STEEPEST_DEG, spacing=spacing)

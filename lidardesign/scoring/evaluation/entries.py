@@ -1,7 +1,7 @@
 """The rows of an evaluation: the rays of every design and baseline, at equal rays and at equal bandwidth.
 
-Baselines are built from training scenes alone. The one to be held against is the strongest of them there. Which effects
-all rows were simulated with, and why, is summed up over scenes.
+Baselines are built from training scenes alone. Designs are compared with the strongest of them there. The
+effects of all rows, with their reasons, are summed up over scenes.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from lidardesign.task import conditions_of
 # Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
 # at a fraction of the held-out scenes' cost.
 JUDGED_SCENES = 8
-# The strongest baseline is found on training scenes that no baseline's rays were chosen on: whoever picks the best of
-# several by their scores on held-out scenes holds designs against a lucky one.
+# The strongest baseline is found on training scenes that no baseline's rays were chosen on: picking the best
+# of several by their scores on held-out scenes would favour a lucky one.
 MOST_BASELINE_SCENES = 20
 FEWEST_BASELINE_SCENES = 5
 LARGEST_BASELINE_SHARE = 0.1  # of the rays that an evaluation fires may be fired to find it
@@ -46,15 +46,15 @@ MILLIMETRES = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """One row to be.
+    """A row of an evaluation before it is scored.
 
     Arguments:
         name: The design's or baseline's.
         positions: The rays per condition value.
         baseline: Whether it is a baseline.
-        redraw: Rays of a scene, for what is drawn anew in each.
+        redraw: Gives the rays of a scene, for layouts drawn anew in each.
         matched_to, matched_rays: The design and its number of rays whose bandwidth this baseline was given.
-        search: How a direct search found its rays.
+        search: The record of a direct search for its rays.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Entry:
 
     @cached_property
     def key(self) -> tuple[Any, ...]:
-        """Equal for entries that fire the same rays."""
+        """A key that is equal for entries that fire the same rays."""
         if not self.baseline:
             return ("design", self.name, self.rays)
         arrays = (array for rays in self.positions for array in (rays.origin_m, rays.direction, rays.gate_m))
@@ -89,7 +89,7 @@ class Entry:
 
 @phase("rays")
 def entries_of(request: EvaluationRequest) -> list[Entry]:
-    """All rows to be: designs at the numbers of rays that they can fire, baselines, then those at each one's bandwidth.
+    """All entries: designs at the numbers of rays that they can fire, baselines, then those at each one's bandwidth.
 
     Raises:
         ConfigError: No design can fire any of the numbers of rays, or its rays end before where it is evaluated.
@@ -243,7 +243,7 @@ def strongest_baseline(request: EvaluationRequest, entries: Sequence[Entry], ray
 
     Arguments:
         request: The evaluation.
-        entries: All its rows to be.
+        entries: All its entries.
         rays: The number of rays.
     """
     baselines = [entry for entry in entries if entry.baseline and entry.matched_to is None and entry.rays == rays]
@@ -304,7 +304,7 @@ def mean_baseline(found: Iterable[StrongestBaseline | None], better: str) -> Str
 
 
 def effect_summaries(plans: Sequence[EffectPlan]) -> list[EffectSummary]:
-    """One line per effect, in the order in which light meets them."""
+    """A summary per effect, in the order of the simulation."""
     return [_summary(name, plans) for name in EFFECTS]
 
 
@@ -318,9 +318,9 @@ class EffectSummary:
         range_m: Its largest bound on ranges, in any scene [m].
         lost: Its largest bound on the share of returns.
         tolerance: Of all skipped effects together.
-        reason: Why, in the scene where it could change most.
-        seconds: What simulating it in all scenes takes, predicted [s].
-        missing: What its simulation needs and is not there.
+        reason: The reason, in the scene where it could change most.
+        seconds: Predicted time to simulate it in all scenes [s].
+        missing: A missing requirement of its simulation.
     """
 
     name: str
@@ -339,7 +339,7 @@ class EffectSummary:
 
     @property
     def exceeds(self) -> bool:
-        """True where it could change more than is tolerated."""
+        """True where its bound exceeds the tolerance."""
         return self.range_m > self.tolerance.range_m or self.lost > self.tolerance.lost
 
     def as_dict(self) -> dict[str, Any]:

@@ -26,7 +26,7 @@ class LastScore:
         rays: Rays per frame.
         scenes: The number of held-out scenes.
         value, ci_low, ci_high: The mean score over them, and its 95 % interval.
-        detector: What measured.
+        detector: The name of the detector.
         settings: Settings of the task other than those that were learned with.
         baseline: The strongest baseline; None where no baseline was scored.
         difference, difference_low, difference_high: The design minus the baseline, scene by scene.
@@ -52,7 +52,7 @@ def last_scores_of(
     """The scores of designs, by the names of their files.
 
     Arguments:
-        evaluation: What was found.
+        evaluation: The evaluation.
         paths: The file of each design, by the name that it was scored under.
         settings: Settings of the task other than those that were learned with.
     """

@@ -1,9 +1,9 @@
-"""The cost of careless mounting: sensors that stand and look a little off, in the same scenes.
+"""The cost of mounting errors: sensors with a shifted and rotated pose, in the same scenes.
 
-Every sensor is off by a normal draw of its own in every scene, along each axis and about each. Draws belong to a scene
-and the number of a sensor, so all designs are mounted by the same hands. A sensor keeps its rays, their gates and its
-error at every position of what it is bolted to. Where it stands in the end is known, as after a calibration: rays go
-elsewhere, and points are where they are measured.
+Every sensor has a normal error of its own in every scene, along each axis and about each. Errors depend on the scene
+and the number of a sensor alone, so all designs have the same. A sensor keeps its rays, their gates and its error at
+every position of its carrier. The erroneous pose is known, as after a calibration: rays change, and points are where
+they are measured.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ class MountError:
 
     @classmethod
     def parse(cls, text: str) -> MountError:
-        """An error as people write it, as `5mm,0.5deg`; of one part alone the other is 0.
+        """An error as people write it, as `5mm,0.5deg`; a missing part is 0.
 
         Raises:
-            ConfigError: It is something else.
+            ConfigError: Text of another form.
         """
         found: dict[str, float] = {}
         for part in text.split(","):
@@ -66,7 +66,7 @@ class MountError:
         return f"{1e3 * self.place_m:.3g} mm and {math.degrees(self.angle_rad):.3g} degrees"
 
     def misplaced(self, positions: RaysPerCondition, seed: int, scene: int) -> RaysPerCondition:
-        """The rays of sensors that are off as in the scene of a number, at every position."""
+        """The rays of sensors with the mounting errors of a scene, at every position."""
         sensors = max((int(rays.sensor.max(initial=-1)) for rays in positions), default=-1) + 1
         draws = random_generator(seed, "mounting", scene).normal(size=(sensors, 6))
         turn = Rotation.from_rotvec(self.angle_rad * draws[:, 3:]).as_matrix() if sensors else np.zeros((0, 3, 3))

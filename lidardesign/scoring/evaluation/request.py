@@ -1,7 +1,6 @@
 """The request of an evaluation.
 
-At which numbers of rays which designs are evaluated: a fixed pattern fires all its rays, or where only fewer are asked
-for an even subset of them.
+Numbers of rays of designs: a fixed pattern fires all its rays, or an even subset where only fewer are asked for.
 """
 
 from __future__ import annotations
@@ -29,16 +28,16 @@ from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Task, metric_of, mount_of
 from lidardesign.workers import Starmap
 
-# Fixed patterns of more rays are scored without baselines, unless their number is asked for: scans have 100,000.
+# Fixed patterns of more rays are scored without baselines, unless their number is asked for: some have 100,000.
 MOST_SHARED = 2000
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluationRequest:
-    """Everything that an evaluation needs.
+    """A whole request of an evaluation.
 
     Arguments:
-        task: The task whose score is taken.
+        task: The task that scores.
         config: The task's configuration; its condition values are evaluated at.
         space: The design space that baselines fill.
         seed: Root of the drawn baselines and the bootstrap.
@@ -52,10 +51,10 @@ class EvaluationRequest:
             bandwidth [Mbit/s] or without a limit; None where there is none.
         density: Samples of what was learned, for figures; None where a run has none.
         training: Scenes that the baseline `greedy` chooses on; None: it is left out.
-        cma: How long the baseline `cma` searches, and who is told how it stands.
+        cma: Limits and progress of the searches of the baseline `cma`.
         planner: The detector, and how the effects that are simulated are chosen.
         audit: Whether all rows are scored under all effects too.
-        mount_error: How carelessly sensors are mounted in rows beside the exact ones; None: there are none.
+        mount_error: Mounting errors of sensors in further rows; None: there are none.
         starmap: How held-out scenes are scored: in this process, or by workers, to the same numbers.
         scenes_seed: Root of the held-out scenes; None: `seed`.
         alone: Those numbers of rays at which fixed patterns are evaluated without baselines and other designs.
@@ -95,7 +94,7 @@ class EvaluationRequest:
             return metric_of(self.task, self.config)
 
     def check(self) -> None:
-        """Refuse what makes no sense.
+        """Refuse an invalid request.
 
         Raises:
             ConfigError: No scenes, designs of one name, an unknown baseline, or no rays.
@@ -129,9 +128,9 @@ class EvaluationRequest:
 
 
 def numbers_fired(design: DesignSpec, asked: Iterable[int], alone: Sequence[int] = ()) -> list[int]:
-    """Those of some numbers of rays at which a design is evaluated: a fixed pattern at its own only, where asked for.
+    """The numbers of rays, of those asked for, at which a design is evaluated: a fixed pattern at its own if asked for.
 
-    What is bought fires all its rays; subsets of them may rank designs of several sizes in another order.
+    Real parts fire all their rays; subsets may rank designs of several sizes in another order.
     """
     size, chosen, asked = design.size, design.counts, list(asked)
     if size in asked:
@@ -142,12 +141,12 @@ def numbers_fired(design: DesignSpec, asked: Iterable[int], alone: Sequence[int]
 
 
 def numbers_alone(counts: Iterable[int], budgets: Iterable[int]) -> list[int]:
-    """Those of the usual numbers of rays that only fixed patterns have and that take baselines minutes."""
+    """The usual numbers of rays above the task's and `MOST_SHARED`, for which baselines would take minutes."""
     return [count for count in counts if count > max(MOST_SHARED, *budgets)]
 
 
 def usual_numbers(designs: Iterable[DesignSpec], budgets: Iterable[int]) -> list[int]:
-    """The numbers to evaluate at where none is asked for: the task's, those of fixed patterns, and of chosen rays."""
+    """The default numbers of rays: the task's, those of fixed patterns, and of chosen rays."""
     designs = list(designs)
     sizes = {design.size for design in designs if design.size is not None}
     chosen = (design.counts or () for design in designs)
@@ -155,7 +154,7 @@ def usual_numbers(designs: Iterable[DesignSpec], budgets: Iterable[int]) -> list
 
 
 def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[int]:
-    """Those of some numbers of rays that any design can fire, in their order; all without a design.
+    """The numbers of rays, of those asked for, that any design can fire; all without a design.
 
     Raises:
         ConfigError: No design can fire any of them.

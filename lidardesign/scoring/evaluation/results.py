@@ -42,7 +42,7 @@ class _WithInterval:
 
     @property
     def half_width(self) -> float | None:
-        """Half of the interval: how far the figure may be off over other scenes, in the metric's unit."""
+        """Half of the interval, in the metric's unit; None without one."""
         return None if self.ci_low is None or self.ci_high is None else (self.ci_high - self.ci_low) / 2
 
     def _drawn(self, middle: float) -> tuple[float, float]:
@@ -135,10 +135,10 @@ class Paired(_WithInterval):
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """Rows at equal rays as they score when mounted carelessly.
+    """Rows at equal rays with mounting errors.
 
     Arguments:
-        error: How carelessly.
+        error: The standard deviations of the errors.
         rows: The same designs and baselines, in the order of the exact rows.
         costs: Each of them against itself, mounted exactly, scene by scene.
     """
@@ -148,7 +148,7 @@ class Mounting:
     costs: Sequence[Paired]
 
     def as_dict(self) -> dict[str, Any]:
-        """For `--json`: rows, each with what its mounting costs."""
+        """For `--json`: rows, each with the cost of its mounting."""
         return {
             "place_m": self.error.place_m,
             "angle_rad": self.error.angle_rad,
@@ -172,20 +172,20 @@ class Evaluation:
     """All rows of an evaluation.
 
     Arguments:
-        metric: What the values mean.
+        metric: The metric of the values.
         scenes: The number of held-out scenes.
         rows: Designs, then baselines, at equal numbers of rays.
         paired: Every design against every baseline and every later design, at equal numbers of rays.
         equal_bandwidth: Every baseline with as many rays as fit in the bandwidth of each row of a design.
         paired_bandwidth: Every design against those.
-        notes: What a reader should know, one line each.
-        detector: The name of what measured.
-        effects: What was simulated, and why.
-        planning_seconds: Time to find that out [s].
+        notes: Lines for readers.
+        detector: The name of the detector.
+        effects: The effects, simulated or not, with reasons.
+        planning_seconds: Time to plan the effects [s].
         audit: The same rows under all effects, where that was asked for.
-        mounting: The rows with sensors that are mounted carelessly, where that was asked for.
-        accuracy: What accuracy costs in time, where that was asked for.
-        searches: How the rows of `cma` were found, where they were asked for.
+        mounting: The rows with mounting errors, where that was asked for.
+        accuracy: The sweeps of accuracy, where that was asked for.
+        searches: The searches of the baseline `cma`, where it was asked for.
         seeds: Of learning and fitting, where rows and differences are means over several.
         strongest_baseline: The best baseline at `middle_rays` on training scenes; None where no baseline was scored.
     """
@@ -209,7 +209,7 @@ class Evaluation:
 
     @property
     def middle_rays(self) -> int:
-        """The number of rays that a single figure is told at, see `middle_rays`."""
+        """The number of rays of headline figures, see `middle_rays`."""
         return middle_rays(self.rows)
 
     @property
@@ -234,12 +234,12 @@ class Evaluation:
 
     @property
     def groups(self) -> int:
-        """The number of groups of held-out scenes that were drawn independently: what intervals are over."""
+        """The number of independent groups of held-out scenes, over which intervals are taken."""
         known = next((row.groups for row in self.rows if row.groups is not None), None)
         return self.scenes if known is None else int(known.max()) + 1
 
     def estimates(self) -> dict[str, Estimate]:
-        """The designs' values and their differences to the baselines with half of their intervals, by what they are."""
+        """The designs' values and their differences to others with half-widths, by a description."""
         unit, rows = self.metric.unit, [row for row in self.rows if not row.baseline]
         values = {
             f"{row.design} at {row.rays} rays": Estimate(row.value, row.half_width, unit, HALF_INTERVAL) for row in rows
@@ -308,7 +308,7 @@ def verdict(evaluation: Evaluation, pair: Paired) -> str:
 
 @dataclass(frozen=True)
 class AuditRow:
-    """The difference that skipped effects make to one row.
+    """The change of one row by skipped effects.
 
     Arguments:
         design: Its name.
@@ -451,5 +451,5 @@ def write_csv(evaluation: Evaluation, path: Path) -> None:
 
 
 def _no_formula(text: str) -> str:
-    """A name that spreadsheets would read as a formula is quoted with an apostrophe."""
+    """A name, with an apostrophe in front where spreadsheets would read a formula."""
     return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text

@@ -41,8 +41,7 @@ OUTLINE_SHARE = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """All entries under a planner's effects: by key their score in every scene, each with the time that it took [s];
-    a plan per scene, and the time to plan [s]."""
+    """Scores of all entries by key and scene, each with its time [s]; a plan per scene, and the time to plan [s]."""
 
     scores: Mapping[tuple[Any, ...], Sequence[tuple[Score, float]]]
     plans: Sequence[EffectPlan]
@@ -54,7 +53,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     """Score every design and baseline on every held-out scene.
 
     Arguments:
-        request: What to evaluate.
+        request: The request.
         progress: Called with the name of the scene, the scenes done, and all scenes.
 
     Raises:
@@ -112,7 +111,7 @@ def _audit(
     plans: Sequence[EffectPlan],
     progress: Progress | None,
 ) -> Audit:
-    """The same entries under all effects that there are, with the same random numbers."""
+    """The audit: the same entries under all effects, with the same random numbers."""
     planner = replace(request.planner, choice="all")
     scored = _score_all(request, entries, planner, progress, [planner.chosen_from(plan) for plan in plans])
     paired = list(zip(effect_summaries(plans), effect_summaries(scored.plans), strict=True))
@@ -135,7 +134,7 @@ def _mounting(
     plans: Sequence[EffectPlan],
     progress: Progress | None,
 ) -> Mounting:
-    """The entries at equal rays with misplaced sensors, under the same effects, and what that costs them."""
+    """The entries at equal rays with mounting errors, under the same effects, and their cost."""
     careless = [
         replace(entry, name=str(number), redraw=partial(_misplaced, error, entry, request.seed))
         for number, entry in enumerate(entries)
@@ -159,7 +158,7 @@ def _score_all(
     progress: Progress | None,
     known: Sequence[EffectPlan] = (),
 ) -> _Scored:
-    """All scenes, here or by workers; plans that are known are not made again."""
+    """Score all entries in all scenes, here or by workers; `known` plans are not made again."""
     jobs = {entry.key: entry for entry in entries}
     scene_pass = request.scene_pass(lambda number: [entry.rays_in(number) for entry in jobs.values()], planner, known)
     scenes = score_scenes(scene_pass, progress, request.starmap)
@@ -265,7 +264,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
 
 
 def group_notes(scenes: Sequence[Scene]) -> list[str]:
-    """Lines on intervals that are not just over the held-out scenes."""
+    """Lines on missing intervals and on intervals over groups of scenes."""
     groups = int(group_numbers(scenes).max()) + 1
     if len(scenes) == 1:
         return ["only one held-out scene, so there are no intervals"]
@@ -280,10 +279,9 @@ def group_notes(scenes: Sequence[Scene]) -> list[str]:
 
 
 def worst_notes(rows: Sequence[Row], metric: Metric) -> list[str]:
-    """A line on scenes that score the worst value: what they differ in beyond it is not seen.
+    """A line on scenes that score the worst value, which hides any differences beyond it.
 
-    The row that is named is a design's, if one of them has such scenes, and has the most of them; rows without rays
-    have a note of their own.
+    It names the row with the most such scenes, a design if any has them; rows without rays have a note of their own.
     """
     counts = [int(np.isclose(row.per_scene, metric.worst, rtol=ROUNDING, atol=0.0).sum()) for row in rows]
     some = [(row, count) for row, count in zip(rows, counts, strict=True) if count and row.rays]
@@ -301,7 +299,7 @@ def worst_notes(rows: Sequence[Row], metric: Metric) -> list[str]:
 
 
 def slipped_notes(casts: SecondCasts) -> list[str]:
-    """A line on rays that slipped between the triangles of meshes, where they are more than pass outlines."""
+    """A line on rays that slipped between the triangles of meshes, where they are more than outlines explain."""
     if casts.found <= OUTLINE_SHARE * casts.rays:
         return []
     note = f"{casts.found:,} of {casts.rays:,} rays ({casts.found / casts.rays:.2%}) had slipped between triangles, as "

@@ -61,11 +61,11 @@ def two_way_interval(table: Any, level: float = LEVEL) -> Interval:
 def over_seeds(evaluations: Sequence[Evaluation], seeds: Sequence[int], scenes_seed: int) -> Evaluation:
     """One evaluation of many: rows and differences are means over seeds; failures and seconds are sums.
 
-    Rows that not every seed has are left out, with a note. What was simulated is said as the first seed has it.
+    Rows that not every seed has are left out, with a note. Effects are those of the first seed.
 
     Arguments:
         evaluations: One per seed, over the same scenes in the same order.
-        seeds: Theirs.
+        seeds: Their seeds.
         scenes_seed: Of the held-out scenes.
     """
     first = evaluations[0]
@@ -121,7 +121,7 @@ def _key(row: Row) -> RowKey:
 
 
 def _table(per_scene: np.ndarray, groups: np.ndarray | None) -> np.ndarray:
-    """Values (R, S) as seeds by groups (R, G) with the same mean: means over groups where these are of one size."""
+    """Values (R, S) as a table of seeds by groups (R, G) with the same mean: group means where sizes are equal."""
     if groups is None:
         return per_scene
     counts, mean = np.bincount(groups), per_scene.mean()
