@@ -32,7 +32,7 @@ from soak.scaled_flatland import NAME
 DONE, TOO_ROUGH, INFEASIBLE = 0, 3, 4
 # It was the soak that somebody wanted to end.
 INTERRUPTED = (130, 143)
-TOO_ROUGH_WORDS = re.compile("the density is too rough|samples count as only|effective samples")
+TOO_ROUGH_WORDS = re.compile("the density is too rough|samples count as only|effective samples|tells anything")
 NOTHING_SEEN_WORDS = "no ray of the design space reaches a target surface"
 # Outcomes: all four commands did their work; the two refusals that learning may end with.
 WHOLE, ROUGH, BLIND = "whole", "density too rough", "nothing in sight"
