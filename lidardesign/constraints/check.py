@@ -313,7 +313,8 @@ def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[Cons
     bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * PICOSECOND_S / 2
     widths = [_pattern_widths(pattern, bin_m) for pattern in document.get("patterns") or ()]
     asked, limit, checks = budget.get("rays"), budget.get("bandwidth_mbps"), []
-    rays = _get(document, "constraints", "budget", "rays") if asked is None else asked
+    own = _get(document, "constraints", "budget", "rays")
+    rays = asked if own is None else own
     if not widths and rays is not None:
         widths = [_even_widths(document["sensors"], rays)]
     if asked is not None:

@@ -349,8 +349,9 @@ class Features:
         weights = np.asarray(weights, dtype=np.float64) / np.sum(weights)
         columns = [*axes.origin, *([RANGE] if axes.range else [])]
         linear = points[:, columns]
-        centre = weights @ linear
-        spread = np.sqrt(weights @ np.square(linear - centre))
+        # not by BLAS, whose threads share out long sums and change their last bit
+        centre = np.einsum("n,nk->k", weights, linear)
+        spread = np.sqrt(np.einsum("n,nk->k", weights, np.square(linear - centre)))
         extent = np.array(space.high)[columns] - np.array(space.low)[columns]
         return cls(points, weights, axes, centre, np.maximum(spread, IDLE_AXIS_SHARE * extent))
 
@@ -386,7 +387,7 @@ class Features:
     @cached_property
     def angular_scale(self) -> float:
         """Root mean square angle of the directions from their mean, at most 1 rad and never 0 [rad]."""
-        resultant = float(np.linalg.norm(self.directions @ self.weights))
+        resultant = float(np.linalg.norm(np.einsum("kn,n->k", self.directions, self.weights)))
         return min(max(math.sqrt(max(2 * (1 - resultant), 0.0)), IDLE_AXIS_SHARE), 1.0)
 
     @cached_property

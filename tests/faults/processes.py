@@ -21,9 +21,9 @@ LATE = (
     "lidardesign.cli.main", "lidardesign.fitting.request", "lidardesign.density.fields.body_kernels",
     "lidardesign.density.fields.table_kernels", "lidardesign.density.training.learn",
     "lidardesign.density.spline_kernels", "lidardesign.mixture.support", "lidardesign.mixture.fit",
-    "lidardesign.scoring.metrics", "lidardesign.report.page", "lidardesign.scoring.evaluation.score",
-    "lidardesign.scoring.evaluation.results", "lidardesign.scoring.evaluation.workers", "lidardesign_tasks.flatland",
-    "plotly.io", "rich.table", "torch._dynamo",
+    "lidardesign.fitting.chosen", "lidardesign.rays.pool", "lidardesign.scoring.metrics", "lidardesign.report.page",
+    "lidardesign.scoring.evaluation.score", "lidardesign.scoring.evaluation.results", "lidardesign.workers",
+    "lidardesign_tasks.flatland", "plotly.io", "rich.table", "torch._dynamo",
 )  # fmt: skip
 # Every step by which files come, change their names and go: what is on the disk changes only here.
 STEPS = ("fsync", "link", "mkdir", "replace", "rmdir", "unlink")

@@ -12,6 +12,9 @@ from faults.processes import forked, fresh
 from lidardesign.density.training.checkpoint import load_arrays
 from lidardesign.errors import LidardesignError
 from lidardesign.formats.designs import load_design
+from lidardesign.rays.pool import FILE_NAME as POOL
+from lidardesign.run.arrays import read_npz
+from lidardesign.run.inputs import SAMPLES as LIMITS
 from lidardesign.run.manifest import read_manifest, verify
 from lidardesign.samples import load_samples
 
@@ -29,7 +32,7 @@ FINISHED = (0, 1)
 TIMES = ("manifest.json", "page.html")
 COMMANDS = {
     "learn": LEARN,
-    "fit": ["fit", "run", "--layout", "even", "--sensors", "2", "--quiet"],
+    "fit": ["fit", "run", "--sensors", "2", "--rays", "8", "--quiet"],
     # half of its time it writes
     "evaluate": ["evaluate", "run", "--rays", "8", "--csv", "run/rows.csv", "--report", "run/page.html",
                  "--quiet"],
@@ -93,6 +96,8 @@ def unreadable(run: Path) -> Iterator[str]:
     for name, read in ((STATE, lambda: load_arrays(run, STATE)), (SAMPLES, lambda: load_samples(run))):
         if (run / name).exists() and name in manifest["files"]:
             yield from _refused(name, read)
+    if (run / POOL).exists():
+        yield from _refused(POOL, lambda: read_npz(run / POOL, LIMITS))
     for path in (run / "designs").glob("*.yaml"):
         yield from _refused(path.name, lambda path=path: load_design(path))
     page = run / "page.html"

@@ -5,17 +5,16 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import trimesh
 import yaml
-from lidardesign.layouts.rays import lay_out
 from scipy.io import savemat
 from support.captures import BIN_PS, BINS, make_capture
 from support.command_line import make_run
+from support.sensors import normal_sensor
 
 from lidardesign.config import resolve
 from lidardesign.formats.galvo import write_galvo
@@ -24,8 +23,10 @@ from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, read_manifest
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.scenes.rays import Rays
+from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
-from lidardesign.sensors.sensor import Coupling, DesignSpec, Sensor, Track
+from lidardesign.sensors.pattern import Pattern
+from lidardesign.sensors.sensor import Sensor
 from lidardesign.simulate.detector.files import FOLDER as DETECTORS
 
 ROOT = Path(__file__).parents[2]
@@ -49,33 +50,37 @@ CONSTRAINTS = (
 )  # fmt: skip
 
 
-def sensor(index: int = 0, *, spread_m: float = 0.0, coupled: bool = False) -> Sensor:
-    """A sensor that looks along -x."""
-    covariance = np.diag([spread_m**2, (2 * spread_m) ** 2, 0.0])
-    coupling = Coupling(np.full((2, 3), 0.1), np.array([0.2, 0.0, 0.1]), np.array([0.0, 0.3]), np.full(2, 0.02), 0.01)
-    return Sensor(
-        f"sensor {index}", 0.5, np.array([0.4, 0.1 * index, 0.0]), covariance, 3.1 + 0.2 * index, 0.02, 0.1, 0.05, 0.04,
-        0.4, 0.02, coupling=coupling if coupled else None,
+def sensor(index: int = 0, region_m2: np.ndarray | None = None) -> Sensor:
+    """A sensor that looks along -x, from one place or from a region."""
+    return normal_sensor(
+        f"sensor {index}", 0.5, (0.4, 0.1 * index, 0.0), 3.1 + 0.2 * index, 0.02, 0.1, (0.05, 0.04), 0.4, 0.02,
+        origin_covariance_m2=region_m2,
     )  # fmt: skip
 
 
+def fan(count: int, offset_rad: float = 0.0) -> Rays:
+    """So many rays along -x, half of them of each of two sensors, with a gate that differs between these."""
+    owner = np.arange(count) * 2 // count
+    gate_m = np.stack([0.2 + 0.1 * owner, np.full(count, 0.5)], axis=1)
+    azimuth_rad = np.linspace(3, 3.3, count) + offset_rad
+    return Rays.from_angles(np.zeros((count, 3)), azimuth_rad, np.zeros(count), gate_m, owner)
+
+
 def sample_designs() -> list[DesignSpec]:
-    """A grid, explicit rays, a scan along a track, and a distributed design with couplings."""
-    pair = (sensor(0), sensor(1))
-    table = Rays.from_angles(
-        np.zeros((4, 3)), np.linspace(3, 3.3, 4), np.zeros(4), np.tile([0.2, 0.5], (4, 1)), np.array([0, 0, 1, 1])
-    )
-    knots = np.array([0.0, 0.5, 1.0])
-    gates = np.tile([0.2, 0.5], (3, 2, 1))
-    track = Track("x_m", knots, np.full((3, 2), 3.1), np.zeros((3, 2)), gates, np.array([0, 1]))
-    spread = (sensor(0, spread_m=0.1, coupled=True), sensor(1, spread_m=0.2))
-    constraints = {"gate": {"width_m": {"max": 0.5}}}
+    """Even rays, chosen ones of two numbers and along a condition, regions of origins, and bounds of each sensor."""
+    pair, knots = (sensor(0), sensor(1)), (0.0, 0.5, 1.0)
+    wide = tuple(sensor(index, spread_m**2 * np.diag([1.0, 4.0, 0.0])) for index, spread_m in enumerate((0.1, 0.2)))
+    bounded = {"gate": {"width_m": {"max": 0.5}}, "budget": {"rays": 60}}
+    each = {"budget": {"rays": 14}, "each": [{"gate": {"end_m": {"max": 0.5}}}, {"field_of_view": {}}]}
+    certificate = {"rays": 4, "value": 0.5, "bound": 0.6, "gap": 0.2}
+    chosen = (Pattern.of(fan(4)), Pattern.of(fan(6)))
+    moving = Pattern.along("x_m", knots, [fan(2, 0.1 * knot) for knot in knots], (0.0, 1.0))
     return [
-        DesignSpec("grid", pair, rays=60, constraints=constraints, provenance={"run": "..", "seed": 3}),
-        DesignSpec("rays", pair, layout="density", rays=4, ray_table=table),
-        DesignSpec("track", pair, layout="scan", rays=2, track=track),
-        DesignSpec("spread", spread, layout="distributed", rays=40, level=0.99),
-        DesignSpec("own", tuple(replace(one, rays=7) for one in pair), rays=14, at={"x_m": 0.5}),
+        DesignSpec("even", pair, constraints=bounded, provenance={"run": "..", "seed": 3}),
+        DesignSpec("chosen", pair, "chosen", chosen, certificates=(certificate,)),
+        DesignSpec("moving", pair, "chosen", (moving,)),
+        DesignSpec("regions", wide, constraints={"budget": {"rays": 40}}, level=0.99),
+        DesignSpec("each", pair, constraints=each, at={"x_m": 0.5}, mount="head"),
     ]
 
 
@@ -223,7 +228,7 @@ def captures_hdf5(_: Path) -> list[bytes]:
 def steering_lists(folder: Path) -> list[bytes]:
     """The rays of a design as a scanner's list."""
     design, path = sample_designs()[0], folder / "rays.galvo.csv"
-    write_galvo(design, lay_out(design), path)
+    write_galvo(design, design.rays(), path)
     return [path.read_bytes()]
 
 

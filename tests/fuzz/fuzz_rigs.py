@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from lidardesign.layouts.rays import lay_out
 from support.command_line import files_under, make_run
 
 from fuzz import corpus
@@ -50,7 +49,7 @@ def rigs(kind: str) -> Callable[[Path], list[bytes]]:
             design = corpus.sample_designs()[index]
             exporter = EXPORTERS[kind]
             path = folder / f"rig{index}{exporter.suffix}"
-            exporter.write(design, lay_out(design), path)
+            exporter.write(design, design.rays(), path)
             found.append(path.read_bytes())
         return found
 

@@ -22,7 +22,7 @@ from fuzz.fuzz_runs import (
 )  # fmt: skip
 from fuzz.mutators import either, mutate_bytes, mutate_json, mutate_text, mutate_yaml
 
-MOST_LAID_OUT = 5000
+MOST_FIRED = 5000
 
 
 def read_configuration(path: Path) -> object:
@@ -94,18 +94,19 @@ def read_constraints(path: Path) -> object:
 
 def read_design(path: Path) -> object:
     """As `show` and `export` do: what was read can be written and read again, and its rays are rays."""
-    from lidardesign.layouts.rays import lay_out
-
+    from lidardesign.formats.designs import load_design
     from lidardesign.run.yaml import dump_yaml, parse_yaml
-    from lidardesign.sensors.design_file import design_document, design_from_document, load_design
+    from lidardesign.sensors.design_file import design_document, design_from_document
 
     design = load_design(path)
     again = design_from_document(parse_yaml(dump_yaml(design_document(design)), where="written again").value)
     if len(again.sensors) != len(design.sensors):
         raise AssertionError("the design that was written again has another number of sensors")
-    if design.track is None and (design.rays or 0) <= MOST_LAID_OUT and len(design.sensors) <= MOST_LAID_OUT:
-        return design, lay_out(design, design.rays or max(30, len(design.sensors)))
-    return design
+    count = design.count or max(30, len(design.sensors))
+    if max(count, len(design.sensors)) > MOST_FIRED:
+        return design
+    ends = [{design.condition: end} for end in design.patterns[-1].ends] if design.condition else [None]
+    return design, [design.rays(count, at) for at in ends]
 
 
 def _own(place: str) -> Callable[[Path], object]:

@@ -21,6 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from support.command_line import files_under
+from support.fits import fitted
 from support.hard_cases import hard_case
 from support.small_runs import shifted
 from support.tables import each_row
@@ -35,7 +36,6 @@ from lidardesign.density.training.quality import coverage, quality
 from lidardesign.errors import LidardesignError
 from lidardesign.fitting import fit as fit_design
 from lidardesign.mixture.em import lloyd
-from lidardesign.mixture.fit import fit
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples
@@ -58,7 +58,7 @@ FLATLAND = (
     ) for word in ("--set", setting)),
 )  # fmt: skip
 BYTES = ("flow.safetensors", "samples.npz")
-GRID, DENSITY = (("--layout", name, "--sensors", "2") for name in ("grid", "density"))
+EVEN = ("--layout", "even", "--sensors", "2")
 NOT_NUMBERS = (math.nan, math.inf, -math.inf)
 
 
@@ -93,8 +93,9 @@ class TestTheSameBytes:
     def chain(lidardesign, run):
         """All files of learning, fitting, constraining and exporting but times, and the scores."""
         assert lidardesign(*FLATLAND, "--out", run).code == 0
-        assert lidardesign("fit", run, "--sensors", 2, "--rays", 20, "--layout", "density").code == 0
-        assert lidardesign("constrain", run, *DENSITY, "--set", "gate.width_m.max=0.4", "--name", "tight").code == 0
+        assert lidardesign("fit", run, "--sensors", 2, "--rays", 20).code == 0
+        tight = ("--set", "gate.width_m.max=0.4", "--name", "tight")
+        assert lidardesign("constrain", f"{run}/designs/fit.yaml", *tight).code == 0
         assert lidardesign("export", f"{run}/designs/tight.yaml", "--format", "csv", "--rays", 20).code == 0
         rows = lidardesign("evaluate", run, "--rays", 20, "--json").json["rows"]
         files = files_under(Path(run))
@@ -110,9 +111,9 @@ class TestTheSameBytes:
         assert first == second
 
     def test_another_process_with_another_hash_seed_and_more_threads_writes_the_same_design(self, lidardesign, flat):
-        assert lidardesign("fit", flat, *GRID, "--name", "here").code == 0
+        assert lidardesign("fit", flat, *EVEN, "--name", "here").code == 0
         environment = {**os.environ, "PYTHONHASHSEED": "12345", "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
-        command = [sys.executable, "-m", "lidardesign", "fit", str(flat), *GRID, "--name", "there"]
+        command = [sys.executable, "-m", "lidardesign", "fit", str(flat), *EVEN, "--name", "there"]
         subprocess.run(command, env=environment, check=True, capture_output=True)
         here, there = ((flat / "designs" / f"{name}.yaml").read_text() for name in ("here", "there"))
         assert here.replace("here", "there") == there
@@ -177,8 +178,8 @@ GIVEN = {
     "Target.log_density_and_gradient": lambda x: target().log_density_and_gradient(np.array([[0, 0, 0, 0, 0, x]])),
     "quality": lambda x: quality(np.zeros(3), np.array([0, x, 0])),
     "Samples.weights": lambda x: samples_with(abs(x), "log_target").weights,
-    "fit, points": lambda x: fit(samples_with(x, "points"), sensors=1),
-    "fit, log_prob": lambda x: fit(samples_with(x, "log_prob"), sensors=1),
+    "fit_sensors, points": lambda x: fitted(samples_with(x, "points"), sensors=1),
+    "fit_sensors, log_prob": lambda x: fitted(samples_with(x, "log_prob"), sensors=1),
     "split_budget": lambda x: split_budget([1.0, x], 10),
     "lloyd": lambda x: lloyd(np.array([[0.0], [x], [1.0]]), np.ones(3), 2, np.random.default_rng(0)),
     "Constraints": lambda x: Constraints.from_mapping({"gate": {"width_m": {"max": x}}}),
@@ -218,8 +219,8 @@ class TestNoNaNLeaves:
 
     def test_every_number_that_the_commands_print_is_finite(self, lidardesign, flat):
         made = [
-            lidardesign("fit", flat, *GRID, "--name", "one", "--json"),
-            lidardesign("constrain", flat, "--set", "budget.rays=9", *DENSITY, "--name", "two", "--json"),
+            lidardesign("fit", flat, *EVEN, "--name", "one", "--json"),
+            lidardesign("constrain", flat, "--set", "budget.rays=9", "--sensors", 2, "--name", "two", "--json"),
             lidardesign("show", flat / "designs" / "two.yaml", "--json"),
             lidardesign("export", flat / "designs" / "two.yaml", "--format", "csv", "--json"),
             lidardesign("evaluate", flat, "--rays", 9, "--json"),
@@ -384,7 +385,7 @@ class TestEveryFigureHasItsError:
             assert (estimate["unit"] == "nats") == (name in ("kl_nats", "log_z"))
 
     def test_what_fits_report_has_unit_method_and_error(self, lidardesign, flat):
-        document = lidardesign("fit", flat, *GRID, "--rays", 20, "--json").json
+        document = lidardesign("fit", flat, *EVEN, "--rays", 20, "--json").json
         assert set(document["error_estimates"]) >= FIGURES["fit"]
         for name, estimate in document["error_estimates"].items():
             self.complete(estimate)
@@ -394,7 +395,7 @@ class TestEveryFigureHasItsError:
             assert {"name", "bound", "value", "satisfied"} == set(check)
 
     def test_every_score_and_every_difference_has_unit_method_and_error(self, lidardesign, flat):
-        assert lidardesign("fit", flat, *GRID, "--name", "one").code == 0
+        assert lidardesign("fit", flat, *EVEN, "--name", "one").code == 0
         document = lidardesign("evaluate", flat, "--rays", 8, "--rays", 12, "--set", "test=4", "--json").json
         estimates, unit = document["error_estimates"], document["metric"]["unit"]
         for row in document["rows"]:
@@ -410,7 +411,7 @@ class TestEveryFigureHasItsError:
             assert estimate["error"] == pair["half_width"]
 
     def test_tables_print_errors_and_units_beside_the_figures(self, lidardesign, flat):
-        assert "+-" in lidardesign("fit", flat, *GRID, "--name", "one", "-v").out
+        assert "+-" in lidardesign("fit", flat, *EVEN, "--name", "one", "-v").out
         table = lidardesign("evaluate", flat, "--rays", 8, "--set", "test=4").out
         assert "mm" in table
         assert "95 %" in table
@@ -457,15 +458,13 @@ def longer_gates(document):
 )
 class TestDesignsKeepTheirConstraints:
     @settings(max_examples=12)
-    @given(RULES, st.sampled_from(["grid", "density"]))
+    @given(RULES, st.sampled_from(["even", "chosen"]))
     def test_the_written_design_satisfies_them_all_or_the_command_exits_4(self, made, rules, layout):
         folder = made.parent / "tried"
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(made, folder)
         path = made.parent / "rules.yaml"
         path.write_text(json.dumps(rules))
-        if layout == "density" and "budget" not in rules:
-            layout = "grid"
         options = ("--layout", layout, *(() if "sensors" in rules else ("--sensors", "2")))
         with pytest.raises(SystemExit) as ended:
             run_program(["constrain", str(folder), "--constraints", str(path), *options, "--name", "d", "-q"])
@@ -482,7 +481,7 @@ class TestDesignsKeepTheirConstraints:
         dump = fit_design.dump_yaml
         # as if a gate had been written a little too long
         monkeypatch.setattr(fit_design, "dump_yaml", lambda document: dump(longer_gates(document)))
-        done = lidardesign("constrain", flat, *GRID, "--set", "gate.width_m.max=0.4", "--name", "never", "--json")
+        done = lidardesign("constrain", flat, *EVEN, "--set", "gate.width_m.max=0.1", "--name", "never", "--json")
         assert done.code == 4
         assert any("gate" in name for name in done.json["error"]["conflicts"])
         assert not (flat / "designs" / "never.yaml").exists()

@@ -70,22 +70,30 @@ def _counts(design: Mapping[str, Any], rules: Mapping[str, Any]) -> Iterator[Che
     if "count" in asked:
         yield f"sensors.count {asked['count']}", asked["count"] == found, found
     budget = rules.get("budget") or {}
-    given = [sensor.get("rays") for sensor in design["sensors"]]
-    rays = len(design["ray_table"]["sensor"]) if design.get("ray_table") else None if None in given else sum(given)
+    fired = [_widths(design, pattern) for pattern in design.get("patterns") or [None]]
     if "rays" in budget:
-        yield f"budget.rays {budget['rays']}", budget["rays"] == rays, rays
-    if "bandwidth_mbps" in budget and not design.get("track"):
-        spent = _bandwidth_mbps(design, budget)
-        limit = budget["bandwidth_mbps"]
+        counts = [sum(count for _, count in widths) for knots in fired for widths in knots]
+        yield f"budget.rays {budget['rays']}", {*counts} == {budget["rays"]}, counts
+    if "bandwidth_mbps" in budget:
+        spent, limit = max(_bandwidth_mbps(widths, budget) for knots in fired for widths in knots), budget["bandwidth_mbps"]
         yield f"budget.bandwidth_mbps {limit}", spent <= limit * (1 + ROUNDING), spent
 
 
-def _bandwidth_mbps(design: Mapping[str, Any], budget: Mapping[str, Any]) -> float:
-    table = design.get("ray_table")
-    if table:
-        widths = [(end - start, 1) for start, end in zip(table["gate_start_m"], table["gate_end_m"], strict=True)]
-    else:
-        widths = [(s["gate_m"]["end"] - s["gate_m"]["start"], s["rays"]) for s in design["sensors"]]
+def _widths(design: Mapping[str, Any], pattern: Mapping[str, Any] | None) -> list[list[tuple[float, int]]]:
+    """Widths of gates and how many rays have them, at each knot of a pattern, or of even rays."""
+    if pattern:
+        knots = zip(pattern["gate_start_m"], pattern["gate_end_m"], strict=True)
+        return [[(end - start, 1) for start, end in zip(*ends, strict=True)] for ends in knots]
+    sensors, rays = design["sensors"], (design["constraints"].get("budget") or {}).get("rays", 0)
+    counts = [math.floor(sensor["weight"] * rays + ROUNDING) for sensor in sensors]
+    most_left = sorted(range(len(sensors)), key=lambda index: round(counts[index] - sensors[index]["weight"] * rays, 9))
+    for index in most_left[: rays - sum(counts)]:
+        counts[index] += 1
+    gates = [sensor["gate_m"] for sensor in sensors]
+    return [[(gate["end"] - gate["start"], count) for gate, count in zip(gates, counts, strict=True)]]
+
+
+def _bandwidth_mbps(widths: list[tuple[float, int]], budget: Mapping[str, Any]) -> float:
     bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * 1e-12 / 2
     bins = sum(count * max(math.ceil(width / bin_m * (1 - ROUNDING)), 1) for width, count in widths)
     return bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6
@@ -98,17 +106,12 @@ def _gate(sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> Iterator[Check
 
 
 def _rays(design: Mapping[str, Any], index: int, rules: Mapping[str, Any]) -> Iterator[Check]:
-    """The gates of a sensor's own rays, and of its rays at every knot of a track."""
-    table, track, asked = design.get("ray_table"), design.get("track"), rules.get("gate") or {}
-    pairs: list[tuple[float, float]] = []
-    if table:
-        rows = zip(table["sensor"], table["gate_start_m"], table["gate_end_m"], strict=True)
-        pairs = [(start, end) for owner, start, end in rows if owner == index]
-    if track:
-        column = track["sensor"].index(index)
-        pairs = [(s[column], e[column]) for s, e in zip(track["gate_start_m"], track["gate_end_m"], strict=True)]
-    for start, end in pairs:
-        yield from _gate({"gate_m": {"start": start, "end": end}}, {"gate": asked})
+    """The gates of a sensor's own rays, at every knot."""
+    for pattern in design.get("patterns") or []:
+        for starts, ends in zip(pattern["gate_start_m"], pattern["gate_end_m"], strict=True):
+            for owner, start, end in zip(pattern["sensor"], starts, ends, strict=True):
+                if owner == index:
+                    yield from _gate({"gate_m": {"start": start, "end": end}}, rules)
 
 
 def _angles(sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Mapping[str, Any]) -> Iterator[Check]:
@@ -136,7 +139,7 @@ def _origin(
 ) -> Iterator[Check]:
     asked = rules.get("origin") or {}
     mean = np.array(sensor["origin_m"]["mean"])
-    covariance = np.array(sensor["origin_m"]["covariance"])
+    covariance = np.array(sensor["origin_m"].get("covariance", np.zeros((3, 3))))
     slack = ROUNDING * max(np.abs(mean).max(), 1e-30)
     for name, sign in (("low_m", 1), ("high_m", -1)):
         if name in asked:

@@ -39,18 +39,21 @@ class Bounds:
 
 
 def kept_already(
-    design: Mapping[str, Any], bounds: Bounds, generator: np.random.Generator, *, is_scan: bool = False
+    design: Mapping[str, Any], bounds: Bounds, generator: np.random.Generator, *, is_moving: bool = False
 ) -> Rules:
-    """Some bounds that a fitted design keeps with room to spare: a fit under them has to succeed."""
+    """Some bounds that a fitted design keeps with room to spare: a fit under them has to succeed.
+
+    Sensors that follow a condition take no bounds of their places.
+    """
     sensors = design["sensors"]
     options: list[Callable[[], Rules]] = [
         lambda: {"gate": _gate_around(sensors, bounds)},
         lambda: {"field_of_view": _field_around(sensors)},
         lambda: {"boresight": _boresight_around(sensors, bounds)},
-        lambda: {"origin": _origin_around(sensors, bounds)},
+        lambda: {"sensors": {"max": len(sensors) + int(generator.integers(0, 3))}},
     ]
-    if not is_scan:  # whose every ray is a sensor
-        options.append(lambda: {"sensors": {"max": len(sensors) + int(generator.integers(0, 3))}})
+    if not is_moving:
+        options.append(lambda: {"origin": _origin_around(sensors, bounds)})
     return _some(options, generator)
 
 
@@ -90,7 +93,8 @@ def _origin_around(sensors: Sequence[Mapping[str, Any]], bounds: Bounds) -> Rule
     means = np.array([sensor["origin_m"]["mean"] for sensor in sensors])
     low, high = np.array(bounds.low[:3]), np.array(bounds.high[:3])
     room = 0.3 * (high - low)
-    spread = max(math.sqrt(max(np.linalg.eigvalsh(np.array(s["origin_m"]["covariance"]))[-1], 0.0)) for s in sensors)
+    covariances = [np.array(sensor["origin_m"].get("covariance", np.zeros((3, 3)))) for sensor in sensors]
+    spread = max(math.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)) for covariance in covariances)
     return {
         "low_m": np.maximum(means.min(axis=0) - room, low).tolist(),
         "high_m": np.minimum(means.max(axis=0) + room, high).tolist(),
@@ -98,22 +102,18 @@ def _origin_around(sensors: Sequence[Mapping[str, Any]], bounds: Bounds) -> Rule
     }
 
 
-def drawn(bounds: Bounds, sensors: int, generator: np.random.Generator, *, is_scan: bool = False) -> Rules:
-    """Some bounds drawn without a look at any design: a fit keeps them all, or refuses them.
-
-    A scan's rays have neither mounts nor bounds of their own, and one from a fixed place has its own number of rays.
-    """
+def drawn(bounds: Bounds, sensors: int, generator: np.random.Generator) -> Rules:
+    """Some bounds drawn without a look at any design: a fit keeps them all, or refuses them."""
     options: list[Callable[[], Rules]] = [
         lambda: {"gate": _drawn_gate(bounds, generator)},
         lambda: {"field_of_view": _drawn_field(bounds, generator)},
         lambda: {"boresight": _drawn_boresight(bounds, generator)},
-        lambda: {"origin": _drawn_origin(bounds, sensors, generator, is_scan)},
+        lambda: {"origin": _drawn_origin(bounds, sensors, generator)},
         lambda: {"budget": _drawn_budget(bounds, sensors, generator)},
+        lambda: {"sensors": {"count": int(generator.integers(1, 13))}},
     ]
-    if not is_scan:
-        options.append(lambda: {"sensors": {"count": int(generator.integers(1, 13))}})
     rules = _some(options, generator)
-    if not is_scan and generator.random() < 0.25:
+    if generator.random() < 0.25:
         some = int(generator.integers(1, sensors + 1))
         rules["each"] = [{"gate": _drawn_gate(bounds, generator)} for _ in range(some)]
     return rules
@@ -151,7 +151,7 @@ def _drawn_boresight(bounds: Bounds, generator: np.random.Generator) -> Rules:
     return {"azimuth_deg": {"min": start, "max": start + float(generator.uniform(1, 120))}}
 
 
-def _drawn_origin(bounds: Bounds, sensors: int, generator: np.random.Generator, is_scan: bool) -> Rules:
+def _drawn_origin(bounds: Bounds, sensors: int, generator: np.random.Generator) -> Rules:
     low, high = np.array(bounds.low[:3]), np.array(bounds.high[:3])
     inside = [(low + (high - low) * share).tolist() for share in generator.random((sensors + 1, 3))]
     ends = np.sort(np.array(inside[:2]), axis=0).tolist()
@@ -166,10 +166,9 @@ def _drawn_origin(bounds: Bounds, sensors: int, generator: np.random.Generator, 
         {"spread_m": {"max": size * float(generator.uniform(0.001, 0.3))}},
         {"thickness_m": {"max": size * float(generator.uniform(0.001, 0.3))}},
         {"exclude": [taken]},
+        {"fixed_m": inside[0]},
     ]
-    if not is_scan:
-        choices.append({"fixed_m": inside[0]})
-    if not is_scan and len({tuple(point) for point in inside}) == len(inside):
+    if len({tuple(point) for point in inside}) == len(inside):
         choices.append({"mounts_m": inside})
     return choices[int(generator.integers(len(choices)))]
 
@@ -183,7 +182,7 @@ def _drawn_budget(bounds: Bounds, sensors: int, generator: np.random.Generator) 
     return {"rays": rays, "bandwidth_mbps": float(widest * generator.uniform(0.02, 1.0))}
 
 
-def contradictions(bounds: Bounds, sensors: int, *, is_scan: bool = False) -> dict[str, Rules]:
+def contradictions(bounds: Bounds, sensors: int) -> dict[str, Rules]:
     """Constraint files that no design keeps, by what is wrong with them."""
     near, far, size = bounds.low[5], bounds.high[5], bounds.size_m
     away = [high + size for high in bounds.high[:3]]
@@ -206,12 +205,12 @@ def contradictions(bounds: Bounds, sensors: int, *, is_scan: bool = False) -> di
             "field_of_view": {"horizontal_deg": {"min": 20.0, "max": 10.0}}
         },
         "a bandwidth below one bin per ray": {"budget": {"rays": 100, "bandwidth_mbps": 0.02}},
+        "mounts outside the space": {
+            "origin": {"mounts_m": [[away[0] + i * size, *away[1:]] for i in range(sensors)]}
+        },
+        "at least 5 and at most 3 sensors": {"sensors": {"min": 5, "max": 3}},
+        "fewer rays than sensors": {"sensors": {"count": 8}, "budget": {"rays": 7}},
     }
-    if not is_scan:
-        mounts = [[away[0] + i * size, *away[1:]] for i in range(sensors)]
-        found["mounts outside the space"] = {"origin": {"mounts_m": mounts}}
-        found["at least 5 and at most 3 sensors"] = {"sensors": {"min": 5, "max": 3}}
-        found["fewer rays than sensors"] = {"sensors": {"count": 8}, "budget": {"rays": 7}}
     if up < 80:
         found["a boresight above the space"] = {"boresight": {"elevation_deg": {"min": min(up + 5.0, 90.0)}}}
     if down > -80:

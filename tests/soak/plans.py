@@ -57,6 +57,16 @@ class RunPlan:
         return self.config["density"]["sigma_m"] / self.size_m
 
     @property
+    def layout(self) -> str:
+        """The layout that `fit` is asked for."""
+        return self.fit[self.fit.index("--layout") + 1]
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether its designs are for all values of a condition."""
+        return "condition" in self.config["space"] and "--at" not in self.fit
+
+    @property
     def free(self) -> tuple[str, ...]:
         """Names of the free dimensions."""
         return tuple(name for name in DIMENSIONS if isinstance(self.config["space"][name], list))
@@ -68,9 +78,10 @@ def random_plan(seed: int) -> RunPlan:
     size = _power(generator, *SIZES_M)
     offset = [float(v) for v in size * _pick(generator, [0.0, 1.0, 100.0]) * generator.normal(size=3)]
     space, density = _space(generator, size, offset), _density(generator, size)
-    # the value that the designs are for, where the density has a condition
+    # designs are for one value of the density's condition, or for all
     at = ("--at", f"x_m={float(generator.uniform(*space['x_m']))!r}") if "condition" in space else ()
-    layout = _pick(generator, ["grid", "grid", "density", "scan", "distributed"])
+    at = _pick(generator, [at, ()])
+    layout = _pick(generator, ["even", "chosen", "chosen"])
     sensors = int(generator.integers(1, MOST_SENSORS + 1))
     return RunPlan(
         seed,
@@ -83,7 +94,7 @@ def random_plan(seed: int) -> RunPlan:
         },
         sensors,
         (*_fit_options(generator, layout, sensors), *at),
-        _evaluate_options(generator, reach_m=np.max(space["range_m"])),
+        _evaluate_options(generator, layout, reach_m=np.max(space["range_m"])),
     )
 
 
@@ -193,20 +204,19 @@ def _affordable(learning: dict[str, Any], density: dict[str, Any]) -> dict[str, 
 
 def _fit_options(generator: np.random.Generator, layout: str, sensors: int) -> tuple[str, ...]:
     options = ["--layout", layout, "--level", f"{_pick(generator, [0.5, 0.9, 0.95, 0.99])}"]
-    if layout == "scan":
-        return (*options, "--rays", str(sensors))
     options += ["--sensors", _pick(generator, [str(sensors)] * 5 + ["best"])]
-    if layout != "grid" or generator.random() < 0.5:
+    if generator.random() < 0.5:
         options += ["--rays", str(int(generator.integers(MOST_SENSORS, 65)))]
-        if generator.random() < 0.3:
-            options += ["--gates", _pick(generator, ["sensor", "ray"])]
+    if layout == "chosen" and generator.random() < 0.3:
+        options += ["--gates", _pick(generator, ["sensor", "ray"])]
     return tuple(options)
 
 
-def _evaluate_options(generator: np.random.Generator, *, reach_m: float) -> tuple[str, ...]:
+def _evaluate_options(generator: np.random.Generator, layout: str, *, reach_m: float) -> tuple[str, ...]:
     detectors = ["ideal", *(name for name, farthest_m in DETECTORS.items() if reach_m < farthest_m)]
-    options = ["--rays", str(int(generator.integers(1, 65))), "--detector", _pick(generator, detectors)]
-    options += ["--effects", _pick(generator, ["auto", "auto", "none", "all"])]
+    options = ["--detector", _pick(generator, detectors), "--effects", _pick(generator, ["auto", "auto", "none", "all"])]
+    if layout == "even":  # others fire what they were chosen for
+        options += ["--rays", str(int(generator.integers(1, 65)))]
     if generator.random() < 0.2:
         options += ["--baseline", _pick(generator, ["occupancy", "no-visibility"])]
     return tuple(options)

@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask, reconstruct_curve
+from lidardesign_tasks.flatland import ITEMS, TRUTH_STEP_M, FlatlandConfig, FlatlandTask, in_space, reconstruct_curve
 from pydantic import Field
 
+from lidardesign.rays.information import surface_information
 from lidardesign.scenes.rays import Returns
 from lidardesign.scenes.scene import Body, Scene
 from lidardesign.scoring.metrics import chamfer_m
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Metric, Score, Split
+from lidardesign.task import Defaults, Information, Metric, Score, Split
 
 NAME = "scaled-flatland"
 PERMILLE = 1000.0
@@ -58,6 +59,15 @@ class ScaledFlatlandTask:
         if curve is None or not len(scene.truth["curve_m"]):
             return Score(self.metric.worst, failed=True)
         return Score(min(PERMILLE * chamfer_m(curve, scene.truth["curve_m"]), self.metric.worst))
+
+    def informs(self, scene: Scene, returns: Sequence[Returns]) -> Information:
+        """Flatland's information, of the curve where it was moved to."""
+        curve = in_space(scene.truth["curve_m"])
+        points = curve[np.linspace(0, len(curve) - 1, min(ITEMS, len(curve))).astype(int)]
+        moved = scene.truth["size_m"] * points + scene.truth["offset_m"]
+        length_m = scene.truth["size_m"] * TRUTH_STEP_M * len(curve) * len(returns)
+        is_target = [body.is_target for body in scene.bodies]
+        return surface_information([moved] * len(returns), returns, is_target, length_m, dimensions=1)
 
     @staticmethod
     def _home(space: DesignSpace, config: ScaledFlatlandConfig) -> DesignSpace:

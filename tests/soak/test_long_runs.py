@@ -13,7 +13,7 @@ from support.long_runs import amount, ended_after, paragraph, table
 
 from soak.plans import random_plan
 from soak.scaled_flatland import offer
-from soak.whole_runs import BLIND, DONE, INFEASIBLE, ROUGH, USAGE, WHOLE, plan_lines, whole_run
+from soak.whole_runs import BLIND, DONE, INFEASIBLE, ROUGH, WHOLE, plan_lines, whole_run
 
 NAME, TITLE = "runs", "Random whole runs"
 # Minutes on a busy machine; a run that takes this long hangs.
@@ -58,7 +58,7 @@ def parts(pieces: list[dict]) -> list[str]:
     for command, asked, code, _ in (step for one in pieces for step in one["steps"]):
         if command == "constrain":
             kinds.setdefault(names.get(asked, "contradictions"), Counter())[code] += 1
-    codes = ("constraints", "asked", "kept", "refused with exit 4", "too few samples left, exit 2")
+    codes = ("constraints", "asked", "kept", "refused with exit 4")
     return [
         paragraph(
             f"{len(whole)} runs did all of learn, fit, constrain and evaluate: widths of {span('size_m')} m, sigma of "
@@ -67,5 +67,5 @@ def parts(pieces: list[dict]) -> list[str]:
             "run was done twice, and is to repeat every document and every byte of densities, samples and designs."
         ),
         table(("how it ended", "runs"), [(text, outcomes[outcome]) for outcome, text in meaning.items()]),
-        table(codes, [(kind, n.total(), n[DONE], n[INFEASIBLE], n[USAGE]) for kind, n in sorted(kinds.items())]),
+        table(codes, [(kind, n.total(), n[DONE], n[INFEASIBLE]) for kind, n in sorted(kinds.items())]),
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -46,9 +47,9 @@ def test_plans_cover_sizes_sigmas_dimensions_and_sensors_to_their_ends():
         assert (tenths > 0).all()
     assert {len(plan.free) for plan in PLANS} == set(range(1, 7))
     assert {plan.sensors for plan in PLANS} == set(range(1, MOST_SENSORS + 1))
-    layouts = {plan.fit[plan.fit.index("--layout") + 1] for plan in PLANS}
-    assert layouts == {"grid", "density", "scan", "distributed"}
-    assert any("condition" in plan.config["space"] for plan in PLANS)
+    assert {plan.layout for plan in PLANS} == {"even", "chosen"}
+    conditioned = [plan for plan in PLANS if "condition" in plan.config["space"]]
+    assert {(plan.layout, plan.is_moving) for plan in conditioned} == set(product(("even", "chosen"), (True, False)))
 
 
 def test_a_number_always_gives_the_same_plan():
@@ -86,15 +87,10 @@ def hand_made():
             "boresight": {"azimuth_rad": 1.0 + index, "elevation_rad": 0.1 - 0.2 * index, "roll_rad": 0.0},
             "field_of_view_rad": {"horizontal": 0.4, "vertical": 0.2},
             "gate_m": {"start": 0.5, "end": 0.8 + 0.1 * index},
-            "spread": {
-                name: width / 3.919927969080108
-                for name, width in (("horizontal_rad", 0.4), ("vertical_rad", 0.2), ("range_m", 0.3 + 0.1 * index))
-            },
-            "rays": 10,
         }
         for index in range(2)
     ]
-    return {"level": 0.95, "layout": "grid", "sensors": sensors, "rays": 20}
+    return {"level": 0.95, "layout": "even", "sensors": sensors, "constraints": {"budget": {"rays": 20}}}
 
 
 SPACE = dict(zip(DIMENSIONS, ([0, 2], [-1, 1], [0, 0], [0, 3], [-1, 1], [0, 2]), strict=True))
@@ -137,11 +133,13 @@ def test_the_second_reader_tells_kept_from_broken_bounds_as_the_program_does(nam
 
 def test_the_second_reader_looks_at_every_ray_and_at_the_design_space():
     design = hand_made()
-    table_of_rays = {"gate_start_m": [0.5, 0.5], "gate_end_m": [0.7, 0.9], "sensor": [0, 1]}
-    limit = {"gate": {"end_m": {"max": 0.9}}}
-    assert broken_bounds({**design, "ray_table": table_of_rays}, limit, SPACE) == []
-    table_of_rays["gate_end_m"][1] = 0.91
-    assert broken_bounds({**design, "ray_table": table_of_rays}, limit, SPACE)
+    pattern = {"gate_start_m": [[0.5, 0.5]] * 2, "gate_end_m": [[0.7, 0.9], [0.7, 0.9]], "sensor": [0, 1]}
+    # 0.2 and 0.4 m are 14 and 27 bins of 100 ps: 41 bins of 40 bits at 10 Hz
+    limit = {"gate": {"end_m": {"max": 0.9}}, "budget": {"rays": 2, "bandwidth_mbps": 0.0164}}
+    assert broken_bounds({**design, "patterns": [pattern]}, limit, SPACE) == []
+    pattern["gate_end_m"][1][1] = 0.92
+    broken = broken_bounds({**design, "patterns": [pattern]}, limit, SPACE)
+    assert [line.split(" ")[0] for line in broken] == ["budget.bandwidth_mbps", "sensor"]
     away = copy.deepcopy(design)
     away["sensors"][1]["origin_m"]["mean"][0] = 2.1
     assert broken_bounds(away, {}, SPACE)

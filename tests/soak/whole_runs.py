@@ -30,11 +30,9 @@ from soak.scaled_flatland import NAME
 
 # Exit codes (docs): a design was made; the density is too rough to fit to; no design keeps the constraints.
 DONE, TOO_ROUGH, INFEASIBLE = 0, 3, 4
-# Where a density or constraints leave few different samples, a scan cannot have as many rays as asked for.
-USAGE, TOO_FEW_SAMPLES = 2, re.compile(r"^\d+ rays from \d+ samples$")
 # It was the soak that somebody wanted to end.
 INTERRUPTED = (130, 143)
-TOO_ROUGH_WORDS = re.compile("the density is too rough|samples count as only")
+TOO_ROUGH_WORDS = re.compile("the density is too rough|samples count as only|effective samples|tells anything")
 NOTHING_SEEN_WORDS = "no ray of the design space reaches a target surface"
 # Outcomes: all four commands did their work; the two refusals that learning may end with.
 WHOLE, ROUGH, BLIND = "whole", "density too rough", "nothing in sight"
@@ -67,8 +65,7 @@ class Record:
     @classmethod
     def of(cls, plan: RunPlan) -> Record:
         """Of a run that is about to be done."""
-        layout = plan.fit[plan.fit.index("--layout") + 1]
-        return cls(plan.seed, plan.size_m, plan.sigma_share, len(plan.free), plan.sensors, layout)
+        return cls(plan.seed, plan.size_m, plan.sigma_share, len(plan.free), plan.sensors, plan.layout)
 
     def differences(self, other: Record) -> list[str]:
         """What two runs of one seed did not repeat: commands whose document, and files whose bytes differ."""
@@ -156,22 +153,20 @@ class _Doing:
 
     def _constrain(self) -> None:
         kept = self.generator.random() < 0.5
-        is_scan = self.record.layout == "scan"
         if kept:
-            rules = kept_already(_read("fit"), self.bounds, self.generator, is_scan=is_scan)
+            rules = kept_already(_read("fit"), self.bounds, self.generator, is_moving=self.plan.is_moving)
         else:
-            rules = drawn(self.bounds, self.plan.sensors, self.generator, is_scan=is_scan)
+            rules = drawn(self.bounds, self.plan.sensors, self.generator)
         code, found = self._constrain_with(rules, "held", "kept already" if kept else "drawn")
         if code == DONE:
             self._expect(found["satisfied"] is True, "constrain: satisfied is not true")
             self._check_design("held", rules)
             return
         self._check_refusal(code, found, "held")
-        excused = not kept or _has_too_few(code, found)
-        self._expect(excused, f"constrain: bounds that the fit keeps were refused: {_message(found)}; {rules}")
+        self._expect(not kept, f"constrain: bounds that the fit keeps were refused: {_message(found)}; {rules}")
 
     def _contradict(self) -> None:
-        options = contradictions(self.bounds, self.plan.sensors, is_scan=self.record.layout == "scan")
+        options = contradictions(self.bounds, self.plan.sensors)
         what = list(options)[int(self.generator.integers(len(options)))]
         code, found = self._constrain_with(options[what], "impossible", what)
         self._expect(code == INFEASIBLE, f"constrain: {what}: ended with {code}: {_message(found)}")
@@ -188,8 +183,6 @@ class _Doing:
 
     def _check_refusal(self, code: int, found: dict[str, Any], name: str) -> None:
         error = found.get("error", {})
-        if _has_too_few(code, found):
-            return
         self._expect(code == INFEASIBLE, f"constrain ended with {code}: {_message(found)}")
         # a pinned origin has no mass: then the samples that are left are told
         told = bool(error.get("conflicts")) or error.get("admissible_mass") is not None or LEFT in _message(found)
@@ -210,8 +203,6 @@ class _Doing:
 
     def _evaluate(self) -> None:
         code, found = self._call("evaluate", "", "run", *self.plan.evaluate)
-        if _has_too_few(code, found):
-            return
         self._expect(code == DONE, f"evaluate ended with {code}: {_message(found)}", stop=True)
         for row in found["rows"] + found["equal_bandwidth"]:
             # a single group of scenes has no interval, and that of a few is not cut at the worst value
@@ -275,10 +266,6 @@ def _exit_code(arguments: list[str]) -> int:
 
 def _not_json(name: str) -> float:
     raise ValueError(f"{name} is no JSON")
-
-
-def _has_too_few(code: int, found: Mapping[str, Any]) -> bool:
-    return code == USAGE and bool(TOO_FEW_SAMPLES.search(_message(found)))
 
 
 def _message(found: Mapping[str, Any]) -> str:
