@@ -32,8 +32,11 @@ TESTS = {
     "lidardesign/numerics.py": ("test_numerics.py",),
     "lidardesign/mixture/components.py": ("design/test_mixture.py",),
     "lidardesign/constraints/document.py": ("design/test_constraints.py", "design/test_check.py"),
-    "lidardesign/layouts/rays.py": (
-        "design/test_rays.py", "design/test_catalog.py", "design/test_track.py", "workflow/test_select_rays.py",
+    "lidardesign/sensors/pattern.py": (
+        "design/test_samplers.py", "design/test_pattern.py", "design/test_rays.py", "design/test_designs.py",
+    ),
+    "lidardesign/rays/choice.py": (
+        "selection/test_choice.py", "selection/test_groups.py", "selection/test_certified.py",
     ),
 }  # fmt: skip
 # Packages and modules that a mutant is to meet anew; the tests are too.

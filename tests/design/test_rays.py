@@ -109,6 +109,12 @@ def test_a_budget_in_the_proportion_of_the_field_is_the_regular_grid_with_no_ray
 # --- subsets
 
 
+def test_a_field_without_height_or_width_is_one_even_row():
+    row = 0.2 * np.arange(-2, 3)
+    np.testing.assert_allclose(grid_tangent(1.0, 0.0, 5), np.stack([row, 0 * row], axis=1), atol=1e-15)
+    np.testing.assert_allclose(grid_tangent(0.0, 1.0, 5), np.stack([0 * row, row], axis=1), atol=1e-15)
+
+
 @given(st.integers(0, 1000), st.integers(0, 40))
 def test_an_even_subset_has_its_number_of_distinct_points_in_their_order(seed, count):
     points = np.random.default_rng(seed).integers(0, 3, (40, 2)).astype(float)

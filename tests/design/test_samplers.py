@@ -400,6 +400,7 @@ def test_points_of_an_occupancy_grid_are_drawn_by_its_probabilities():
 @pytest.mark.parametrize("axes", [2, 3, 4, 5, 6])
 def test_even_points_are_more_even_than_draws_in_every_pair_of_their_axes(axes, count):
     points = low_discrepancy(count, axes)
+    assert points.shape == (count, axes)
     edges = edges_of(10, 10, low=0.0)
     for first in range(axes):
         for second in range(first):

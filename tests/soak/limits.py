@@ -205,9 +205,7 @@ def contradictions(bounds: Bounds, sensors: int) -> dict[str, Rules]:
             "field_of_view": {"horizontal_deg": {"min": 20.0, "max": 10.0}}
         },
         "a bandwidth below one bin per ray": {"budget": {"rays": 100, "bandwidth_mbps": 0.02}},
-        "mounts outside the space": {
-            "origin": {"mounts_m": [[away[0] + i * size, *away[1:]] for i in range(sensors)]}
-        },
+        "mounts outside the space": {"origin": {"mounts_m": [[away[0] + i * size, *away[1:]] for i in range(sensors)]}},
         "at least 5 and at most 3 sensors": {"sensors": {"min": 5, "max": 3}},
         "fewer rays than sensors": {"sensors": {"count": 8}, "budget": {"rays": 7}},
     }
