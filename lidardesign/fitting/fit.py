@@ -309,7 +309,7 @@ class Fitter:
             self.training.first(CHOICE)
 
         def fit(trial: FitRequest) -> DesignSpec:
-            self.progress(f"trying {trial.sensors} sensors")
+            self.progress(f"trying --sensors {trial.sensors}")
             return self._fitted(trial, is_trial=True, may_idle=True).design
 
         trials = trials_of(request, scenes, fit)
