@@ -196,7 +196,7 @@ def draw_scores(axes: Axes, evaluation: dict[str, Any]) -> None:
     axes.grid(True, color="#e4e7eb", linewidth=0.9)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(QUIET)
-    axes.set_ylim(2.6, 150.0)
+    axes.set_ylim(1.3, 150.0)
     lines = axes.get_lines()
     look = {"frameon": False, "fontsize": 12, "labelcolor": INK, "handlelength": 2.6}
     axes.add_artist(axes.legend(handles=lines[:2], loc="lower left", **look))
