@@ -4,7 +4,7 @@
 set -euo pipefail
 own="$("$1" -c 'import sys; print("%d.%d" % sys.version_info[:2])')"
 core=(tests/test_numerics.py tests/test_space.py tests/test_config.py tests/test_meshio.py tests/density/test_quality.py
-    tests/density/test_splines.py tests/simulate/test_plan.py tests/selection tests/workflow/test_api.py)
+    tests/density/test_splines.py tests/simulate/test_plan.py tests/selection tests/api/test_api.py)
 for version in 3.11 3.12 3.13; do
     [ "$version" = "$own" ] && continue
     found=("${PYENV_ROOT:-$HOME/.pyenv}"/versions/"$version".*/bin/python)
