@@ -120,7 +120,7 @@ def bandwidth_table(evaluation: Evaluation) -> str:
     if not evaluation.equal_bandwidth:
         return ""
     unit = evaluation.metric.unit
-    headings = ["design", "baseline", "rays", "its rays", "Mbit/s", f"design [{unit}]", f"baseline [{unit}]"]
+    headings = ["design", "baseline", "rays", "its rays", "Mbit/s", f"design [{unit}]", f"its [{unit}]"]
     headings += ["difference (95 % interval)", "design is"]
     own = {(row.design, row.rays): row for row in evaluation.rows if not row.baseline}
     pairs = zip(evaluation.equal_bandwidth, evaluation.paired_bandwidth, strict=True)

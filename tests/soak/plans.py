@@ -214,8 +214,8 @@ def _fit_options(generator: np.random.Generator, layout: str, sensors: int) -> t
 
 def _evaluate_options(generator: np.random.Generator, layout: str, *, reach_m: float) -> tuple[str, ...]:
     detectors = ["ideal", *(name for name, farthest_m in DETECTORS.items() if reach_m < farthest_m)]
-    options = ["--detector", _pick(generator, detectors)]
-    options += ["--effects", _pick(generator, ["auto", "auto", "none", "all"])]
+    effects = _pick(generator, ["auto", "auto", "none", "all"])
+    options = ["--detector", _pick(generator, detectors), "--effects", effects]
     if layout == "even":  # others fire what they were chosen for
         options += ["--rays", str(int(generator.integers(1, 65)))]
     if generator.random() < 0.2:
