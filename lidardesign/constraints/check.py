@@ -331,11 +331,14 @@ def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[Cons
 
 
 def _even_widths(sensors: Sequence[Mapping[str, Any]], rays: int) -> np.ndarray:
-    """The gate width of each even ray, rays split by weight with largest remainders, shape (rays,) [m]."""
+    """The gate width of each even ray, (rays,) [m]; rays are split by weight with largest remainders, each one."""
     quotas = np.array([sensor["weight"] for sensor in sensors]) * rays
     counts = np.floor(quotas + AGREEMENT)
     for index in np.argsort(-(np.round(quotas - counts, 9)), kind="stable")[: rays - int(counts.sum())]:
         counts[index] += 1
+    while counts.min() == 0 and counts.max() > 1:
+        counts[counts.argmax()] -= 1
+        counts[counts.argmin()] += 1
     widths = [sensor["gate_m"]["end"] - sensor["gate_m"]["start"] for sensor in sensors]
     return np.repeat(widths, counts.astype(int))
 

@@ -322,7 +322,7 @@ class BandwidthBudget:
 
     def mbps(self, widths_m: np.ndarray, weights: np.ndarray, rays: int) -> float:
         """Bandwidth of gates (K,) [m] whose rays are split by weights (K,)."""
-        return self.model.mbps_of_widths(widths_m, split_budget(weights, rays))
+        return self.model.mbps_of_widths(widths_m, split_budget(weights, rays, each=True))
 
     def fits(self, widths_m: np.ndarray, weights: np.ndarray, rays: int) -> bool:
         """True where this number of rays keeps the budget."""
@@ -384,7 +384,7 @@ def fit_within_budget(
 
 def _affordable_bins(budget: BandwidthBudget, widths: np.ndarray, weights: np.ndarray, rays: int) -> int:
     """The largest common cap in bins that keeps the budget with the present weights, at least 1."""
-    counts = split_budget(weights, rays)
+    counts = split_budget(weights, rays, each=True)
     bins = budget.model.bins(widths)
     unit = budget.model.mbps_of_widths(np.zeros(1), 1)
     wider = range(2, int(bins.max()) + 1)

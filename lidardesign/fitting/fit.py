@@ -1,8 +1,8 @@
 """One road from a density to a design: fit sensors, propose, inform, choose, certify; then check what is written.
 
-Where the number of sensors is open, designs of several numbers are fitted at the middle number of rays, in the
-bandwidth of the one with most sensors, and scored on training scenes that were held back. The fewest sensors within a
-standard error of the best are taken.
+Where the number of sensors is open, designs of several numbers are fitted at the middle number of rays and scored on
+training scenes that were held back, each in the bandwidth that it takes. The fewest sensors within a standard error of
+the best are taken, where bandwidth has the price that it has for rays.
 
 A design's twin is fitted to the density without its occlusion term, without learning again: the baseline
 `no-visibility`.
@@ -32,6 +32,7 @@ from lidardesign.mixture.fit import FitProblem, FittedSensors, fit_sensors
 from lidardesign.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, Retarget, at_condition, condition_text
 from lidardesign.rays.information import checked_information
 from lidardesign.rays.proposals import nearest_samples
+from lidardesign.rays.selection import SHARE_PER_BANDWIDTH
 from lidardesign.rays.training import CHOICE, HELD_BACK, TrainingScenes
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
@@ -43,7 +44,7 @@ from lidardesign.scenes.scene import Scene, group_numbers
 from lidardesign.sensors.bandwidth import Bandwidth, mean_mbps
 from lidardesign.sensors.design import DesignSpec
 from lidardesign.sensors.design_file import design_document
-from lidardesign.task import mount_of, random_generator
+from lidardesign.task import Metric, mount_of, random_generator
 from lidardesign.workers import Starmap
 
 if TYPE_CHECKING:
@@ -313,11 +314,10 @@ class Fitter:
             return self._fitted(trial, is_trial=True, may_idle=True).design
 
         trials = trials_of(request, scenes, fit)
-        best = best_of(trials, scenes)
-        sign = 1.0 if metric.better == "lower" else -1.0
-        found = ", ".join(f"{trial.sensors}: {sign * trial.scores.mean():.4g}" for trial in trials)
+        best = best_of(trials, scenes, metric)
+        found = ", ".join(f"{one.sensors}: {one.scores.mean():.4g} in {one.mbps:.3g} Mbit/s" for one in trials)
         text = f"sensors: {best.sensors}; {metric.name} [{metric.unit}] on {len(scenes)} training scenes "
-        self.notes(BackgroundNote(f"{text}in {trials[-1].mbps:.3g} Mbit/s by their number: {found}"))
+        self.notes(BackgroundNote(f"{text}by their number: {found}"))
         return best.sensors
 
     def _parts(self) -> FitResult:
@@ -354,7 +354,7 @@ class Fitter:
 
 
 class Trial(NamedTuple):
-    """A design of some number of sensors: its score on each scene, turned so that lower is better, and its bits."""
+    """A design of some number of sensors, its score on each scene, and its bandwidth."""
 
     sensors: int
     scores: np.ndarray
@@ -363,7 +363,7 @@ class Trial(NamedTuple):
 
 @phase("trials")
 def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRequest], DesignSpec]) -> list[Trial]:
-    """Designs of several numbers of sensors, all in the bandwidth of the one with most: its gates are the narrowest.
+    """Designs of several numbers of sensors, ascending.
 
     Arguments:
         request: What is asked for, but for the number of sensors.
@@ -380,46 +380,41 @@ def trials_of(request: FitRequest, scenes: Sequence[Scene], fit: Callable[[FitRe
     rays = request.counts[len(request.counts) // 2]
     conditions = [{**request.at, **one} for one in run.conditions(run.config.space.at(request.at))]
     casters = [build_casters(scene) for scene in scenes]
-    sign = 1.0 if run.metric.better == "lower" else -1.0
     low = max(bounds.sensors.min or 1, len(bounds.each))
     high = bounds.sensors.max or math.inf
     trials: list[Trial] = []
     refused = None
-    for count in reversed([count for count in COUNTS if low <= count <= high] or [low]):
-        constraints = _within(bounds, trials[0].mbps) if trials else bounds
+    for count in [count for count in COUNTS if low <= count <= high] or [low]:
         try:
-            design = fit(replace(request, sensors=count, rays=rays, constraints=constraints))
+            design = fit(replace(request, sensors=count, rays=rays))
         except InfeasibleError as error:
-            refused = error
+            refused = refused or error
             continue
         fired = tuple(design.rays(rays, at=at or None) for at in conditions)
         scores = [
             next(score_lists(run.task, run.metric, scene, [fired], caster))[0].value
             for scene, caster in zip(scenes, casters, strict=True)
         ]
-        trials.append(Trial(count, sign * np.array(scores), mean_mbps(fired, Bandwidth())))
+        trials.append(Trial(count, np.array(scores), mean_mbps(fired, Bandwidth())))
     if not trials and refused is not None:
         raise refused
-    return trials[::-1]
+    return trials
 
 
-def best_of(trials: Sequence[Trial], scenes: Sequence[Scene]) -> Trial:
-    """The fewest sensors that are no worse than the best by more than the standard error of the difference."""
-    best = min(trials, key=lambda trial: trial.scores.mean())
-    groups = group_numbers(scenes)
-    for trial in trials:
-        lost = np.bincount(groups, trial.scores - best.scores) / np.bincount(groups)
-        error = lost.std(ddof=1) / math.sqrt(len(lost)) if len(lost) > 1 else 0.0
-        if lost.mean() <= error:
-            return trial
-    return best
+def best_of(trials: Sequence[Trial], scenes: Sequence[Scene], metric: Metric) -> Trial:
+    """The fewest sensors that are no worse than the best by more than the standard error of the difference.
 
-
-def _within(constraints: Constraints, mbps: float) -> Constraints:
-    """The constraints with this bandwidth where they have none [Mbit/s]."""
-    document = constraints.as_document()
-    budget = document.get("budget") or {}
-    return Constraints.from_mapping({**document, "budget": {"bandwidth_mbps": mbps, **budget}})
+    Bandwidth costs what it does in a choice of rays: ten percent more of it must bring two percent of the best score,
+    or of its distance from the worst value, whichever is less.
+    """
+    sign, groups = 1.0 if metric.better == "lower" else -1.0, group_numbers(scenes)
+    score = sign * min(sign * trial.scores.mean() for trial in trials)
+    price = SHARE_PER_BANDWIDTH * min(abs(score), abs(metric.worst - score))
+    costs = [sign * trial.scores + price * math.log(trial.mbps) for trial in trials]
+    least = min(costs, key=np.mean)
+    lost = [np.bincount(groups, cost - least) / np.bincount(groups) for cost in costs]
+    errors = [one.std(ddof=1) / math.sqrt(len(one)) if len(one) > 1 else 0.0 for one in lost]
+    return next(trial for trial, one, error in zip(trials, lost, errors, strict=True) if one.mean() <= error)
 
 
 def twin_samples(run: RunFolder) -> Samples:

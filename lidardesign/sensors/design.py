@@ -105,7 +105,7 @@ class DesignSpec:
         pattern = self.pattern(count)
         if pattern is not None:
             return pattern.per_sensor(len(self.sensors))
-        return split_budget(self.weights if self.size is None else self._own_counts, count)
+        return split_budget(self.weights if self.size is None else self._own_counts, count, each=self.size is None)
 
     @property
     def _own_counts(self) -> np.ndarray:
@@ -140,7 +140,7 @@ class DesignSpec:
         if pattern is not None:
             return pattern.at()
         if self.layout == "even":
-            return even_rays(self.sensors, split_budget(self.weights, count))
+            return even_rays(self.sensors, split_budget(self.weights, count, each=True))
         if self.size is not None and count <= self.size:
             table = self.patterns[-1].at()
             shares = split_budget(self._own_counts, count)

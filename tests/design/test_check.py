@@ -235,7 +235,7 @@ def test_even_rays_are_shared_out_as_the_design_fires_them(weights, rays):
     checks = check_design(document, {"budget": {"rays": rays, "bandwidth_mbps": 1.0}})
     found = next(c.value for c in checks if c.name == "budget.bandwidth_mbps")
     widths = np.array([one.gate_m[1] - one.gate_m[0] for one in SENSORS])
-    assert found == pytest.approx(Bandwidth().mbps_of_widths(widths, split_budget(shares, rays)))
+    assert found == pytest.approx(Bandwidth().mbps_of_widths(widths, split_budget(shares, rays, each=True)))
 
 
 @pytest.mark.parametrize("rays", [32, 63, 65])

@@ -86,7 +86,7 @@ def test_even_rays_are_of_any_number_and_shared_out_by_weight(count):
     rays = EVEN.rays(count, rate_hz=20)
     assert len(rays) == count
     assert (np.diff(rays.sensor) >= 0).all()
-    np.testing.assert_array_equal(np.bincount(rays.sensor, minlength=3), split_budget(EVEN.weights, count))
+    np.testing.assert_array_equal(np.bincount(rays.sensor, minlength=3), split_budget(EVEN.weights, count, each=True))
     np.testing.assert_allclose(rays.time_s, np.arange(count) / (max(count, 1) * 20))
     for index, one in enumerate(EVEN.sensors):
         own = rays.sensor == index
