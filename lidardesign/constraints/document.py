@@ -245,6 +245,7 @@ class Constraints(SensorConstraints):
     sensors: SensorCount = SensorCount()
     budget: Budget = Budget()
     parts: Parts | None = None
+    survive: Literal[0, 1] = 0
     each: list[SensorConstraints] = []
 
     @classmethod

@@ -17,12 +17,13 @@ import numpy as np
 
 from lidardesign.constraints.document import Constraints, SensorRules, rules_of
 from lidardesign.errors import check_number
+from lidardesign.mixture.bounds import INWARD, bounds_of
 from lidardesign.mixture.fit import FittedSensors
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.rays.gates import GateLimits
 from lidardesign.rays.information import FEW_SCENES, MOST_SELECTED
 from lidardesign.rays.pool import CandidatePool, cached_information
-from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, first_candidates, owners, rays_of_points
+from lidardesign.rays.proposals import CANDIDATES_PER_RAY, Proposals, first_candidates, rays_of_points
 from lidardesign.rays.selection import Selected, Selection, inform_enough, select
 from lidardesign.rays.training import CHOICE, InformedScene, TrainingScenes
 from lidardesign.run.clock import phase
@@ -30,8 +31,18 @@ from lidardesign.samples import Samples
 from lidardesign.scenes.rays import Rays
 from lidardesign.sensors.bandwidth import Bandwidth, split_budget
 from lidardesign.sensors.pattern import Pattern
-from lidardesign.sensors.sensor import Sensor, tangent_directions
-from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, angles, direction
+from lidardesign.sensors.sensor import Sensor, interval_factor, tangent_directions
+from lidardesign.space import (
+    AZIMUTH,
+    DIMENSIONS,
+    ELEVATION,
+    RANGE,
+    DesignSpace,
+    aim,
+    angles,
+    direction,
+    observed_point,
+)
 from lidardesign.task import random_generator
 
 # Rounds in which a boresight moves to the middle of its rays: away from the poles it rests after two or three.
@@ -96,8 +107,11 @@ def choose_rays(
     """
     check_number(counts[-1], "--rays", 1, MOST_SELECTED)
     budget, conditions = constraints.budget, training.run.conditions(samples.space)
-    proposals = Proposals(fitted.sensors, constraints.rules, level, samples)
-    wanted, weights = CANDIDATES_PER_RAY * counts[-1], np.array([sensor.weight for sensor in fitted.sensors])
+    placed = fitted.sensors
+    if constraints.survive:
+        placed = widened(placed, constraints.rules, level, samples)
+    proposals = Proposals(placed, constraints.rules, level, samples, by_turns=bool(constraints.survive))
+    wanted, weights = CANDIDATES_PER_RAY * counts[-1], np.array([sensor.weight for sensor in placed])
     least = np.full(len(weights), CANDIDATES_PER_RAY if each_fires else 0)
     if len(conditions) > 1:
         # so that patterns along a condition fire as many rays of each sensor everywhere
@@ -106,7 +120,7 @@ def choose_rays(
     lists = picked[0] if picked else _drawn(proposals, conditions, wanted, least, training.seed)
     ends = np.cumsum([0, *map(len, lists)]).tolist()
     limits = GateLimits(
-        fitted.sensors, constraints.rules, level, samples.space, training.margin_m, is_shared=gates != "ray"
+        placed, constraints.rules, level, samples.space, training.margin_m, is_shared=gates != "ray"
     )
     selection = Selection(
         rays=Rays.joined(lists),
@@ -117,6 +131,7 @@ def choose_rays(
         shares=weights if len(lists) > 1 else None,
         is_shared=gates != "ray",
         each_fires=each_fires,
+        may_fail=bool(constraints.survive),
     )
     if picked:
         informed, held_back = picked[1:]
@@ -129,10 +144,10 @@ def choose_rays(
         informed, held_back = inform(selection, training, counts[len(counts) // 2], progress)
     selected = select(selection, informed, held_back, counts, certified, progress)
     patterns = tuple(_pattern(one, conditions, samples) for one in selected)
-    per_sensor = patterns[-1].per_sensor(len(fitted.sensors))
+    per_sensor = patterns[-1].per_sensor(len(placed))
     sensors = tuple(
         _around_rays(sensor, index, patterns, rules_of(constraints.rules, index), samples)
-        for index, sensor in enumerate(fitted.sensors)
+        for index, sensor in enumerate(placed)
     )
     shares = per_sensor / per_sensor.sum()
     return ChosenRays(
@@ -162,7 +177,7 @@ def _picked(
     number, known, lists = np.full(len(pool.points), -1), 0, []
     for visit, at in zip(pool.visits, conditions, strict=True):
         sensors, points = proposals.sensors_at(at), pool.points[visit]
-        owner, fired = owners(sensors, proposals.rules, proposals.level, points, proposals.samples.space.at(at))
+        owner, fired = proposals.owners(sensors, points, proposals.samples.space.at(at))
         inside = np.flatnonzero(owner >= 0)
         chosen = inside[first_candidates(owner[inside], count, least)]
         if len(chosen) < count or (np.bincount(owner[chosen], minlength=len(least)) < least).any():
@@ -194,11 +209,22 @@ def _around_rays(
     gate_m = np.concatenate([pattern.gate_m[:, own].reshape(-1, 2) for pattern, own in rows])
     if not len(gate_m):
         return sensor
-    looking, widest = direction(azimuth_rad, elevation_rad), np.array(sensor.field_of_view_rad)
-    fields, bounds = rules.field_of_view, rules.boresight
+    looking = direction(azimuth_rad, elevation_rad)
+    return replace(
+        smallest_field(sensor, looking, rules, samples.space),
+        gate_m=(float(gate_m[:, 0].min()), float(gate_m[:, 1].max())),
+    )
+
+
+def smallest_field(sensor: Sensor, looking: np.ndarray, rules: SensorRules, space: DesignSpace) -> Sensor:
+    """The sensor, turned where it may turn, with the smallest field inside its own that holds directions (N, 3).
+
+    It is unchanged where no field inside its own holds them.
+    """
+    widest, fields, bounds = np.array(sensor.field_of_view_rad), rules.field_of_view, rules.boresight
     least = np.radians([fields.horizontal_deg.min or 0.0, fields.vertical_deg.min or 0.0])
     ends = (bounds.azimuth_deg.min, bounds.azimuth_deg.max, bounds.elevation_deg.min, bounds.elevation_deg.max)
-    may_turn = all(end is None for end in ends) and {AZIMUTH, ELEVATION} <= set(samples.space.free)
+    may_turn = all(end is None for end in ends) and {AZIMUTH, ELEVATION} <= set(space.free)
     tried, best, smallest = sensor, sensor, math.inf
     for _ in range(CENTRING_ROUNDS if may_turn else 1):
         tangent = tried.tangent_of(looking)
@@ -210,4 +236,38 @@ def _around_rays(
         middle = (tangent.min(axis=0) + tangent.max(axis=0)) / 2
         azimuth, elevation = (float(angle) for angle in angles(tangent_directions(tried.frame, middle[None])[0]))
         tried = replace(tried, azimuth_rad=azimuth, elevation_rad=elevation)
-    return replace(best, gate_m=(float(gate_m[:, 0].min()), float(gate_m[:, 1].max())))
+    return best
+
+
+def widened(
+    sensors: Sequence[Sensor], rules: Sequence[SensorRules], level: float, samples: Samples
+) -> tuple[Sensor, ...]:
+    """Sensors of equal shares that see as much of the density as constraints allow, so that each can replace others."""
+    return tuple(
+        replace(_widened(sensor, index, rules, level, samples), weight=1 / len(sensors))
+        for index, sensor in enumerate(sensors)
+    )
+
+
+def _widened(sensor: Sensor, index: int, rules: Sequence[SensorRules], level: float, samples: Samples) -> Sensor:
+    space, own = samples.space, rules_of(rules, index)
+    origins = samples.points[:, :3].copy()
+    if sensor.origin_covariance_m2 is None:
+        placed = [axis for axis in range(3) if axis not in space.conditioned]
+        origins[:, placed] = np.asarray(sensor.origin_m)[placed]
+    points = space.wrap(aim(origins, observed_point(samples.points)))
+    looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
+    ends = (1 - level) / 2, (1 + level) / 2
+    values = np.column_stack([sensor.tangent_of(looking), points[:, RANGE]])
+    low, high = np.quantile(values, ends, axis=0, weights=samples.weights, method="inverted_cdf")
+    inside = ((low <= values) & (values <= high)).all(axis=1)
+    bounds = bounds_of(rules, space, (index,), interval_factor(level))
+    start = max(min(float(low[2]), sensor.gate_m[0]), float(bounds.start_low[0]))
+    end = min(max(float(high[2]), sensor.gate_m[1]), float(bounds.end_high[0]))
+    gate_m = (start, end) if end - start <= bounds.width_high[0] else sensor.gate_m
+    most_deg = (own.field_of_view.horizontal_deg.max, own.field_of_view.vertical_deg.max)
+    most = [2 * math.pi if one is None else (1 - INWARD) * math.radians(one) for one in most_deg]
+    view = tuple(limit if field > 0 else 0.0 for field, limit in zip(sensor.field_of_view_rad, most, strict=True))
+    return smallest_field(
+        replace(sensor, field_of_view_rad=view, gate_m=gate_m), looking[inside], own, space
+    )

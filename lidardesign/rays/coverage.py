@@ -128,6 +128,27 @@ class Coverage:
         bits, harm = (np.array([values[rays].sum(axis=0) for rays in groups]) for values in (self.bits, self.harm))
         return replace(self, start=begin, item=item, worth=worth, gates=gates, bits=bits, harm=harm)
 
+    def with_losses(self, sensor: np.ndarray, sensors: int) -> Coverage:
+        """The table whose F is the mean over the loss of each sensor: a copy of every item for each.
+
+        A ray informs about all copies but the one for the loss of its own sensor, whose harm is lost too.
+
+        Arguments:
+            sensor: The sensor of each ray, (N,).
+            sensors: Their number, at least 2.
+        """
+        others = np.array([np.delete(np.arange(sensors), own) for own in range(sensors)], dtype=np.int32)
+        copies = sensors * self.item[:, None] + others[sensor[self.ray]]
+        return replace(
+            self,
+            start=self.start * (sensors - 1),
+            item=copies.reshape(-1),
+            worth=np.repeat(self.worth, sensors - 1),
+            gates=np.repeat(self.gates, sensors - 1),
+            weight=np.repeat(self.weight, sensors) / sensors,
+            harm=self.harm * (1 - 1 / sensors),
+        )
+
     def known(self, gate: np.ndarray) -> np.ndarray:
         """The known worth of each item, (U,), by a choice of one gate per ray, -1 for none, (N,)."""
         known = np.empty(len(self.weight))
